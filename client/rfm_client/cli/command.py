@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What every command of ours is: options made of settings, errors on one line, exit codes."""
+"""Base of all commands: options made of settings, errors on one line, exit codes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, 
 
 STANDARD_OUTPUT = "-"
 
-Given: TypeAlias = dict[str, Any]  # values of the options that were given, by the names of the settings
+Given: TypeAlias = dict[str, Any]  # values of the given options, by setting
 
 
 class ExitCode(IntEnum):
-    """How a command ended, for scripts."""
+    """Exit codes of commands, for scripts."""
 
     OK = 0
     FAILED = 1
@@ -49,12 +49,14 @@ _ERROR_CODES: dict[type[BaseException], ExitCode] = {
 
 @dataclass(frozen=True)
 class OptionsOf:
-    """Marks a parameter of a command that gets settings. ``Given``: only those given; else an object of ``settings``.
+    """A mark of a command's parameter, whose settings become options.
+
+    A ``Given`` parameter gets only the given settings, another parameter an object of ``settings``.
 
     prefix: before each option's name
-    only: settings that have an option; none: all
+    only: settings with an option; empty: all
     required: settings that must be given
-    defaults: values of settings that are not given, in the place of their own defaults
+    defaults: replace the settings' own defaults
     """
 
     settings: type[Settings]
@@ -65,20 +67,20 @@ class OptionsOf:
 
     @property
     def chosen(self) -> list[Setting]:
-        """The settings that have an option."""
+        """The settings with an option."""
         known = settings_of(self.settings).values()
         return [each for each in known if each.has_option and (not self.only or each.name in self.only)]
 
     def option(self, setting: Setting) -> str:
-        """The option of a setting, with the prefix."""
+        """Return the option of a setting, with the prefix."""
         return f"--{self.prefix}{setting.option.removeprefix('--')}"
 
     def name(self, setting: Setting) -> str:
-        """The parameter that typer makes of an option."""
+        """Return the parameter name that typer makes of an option."""
         return f"{self.prefix}{setting.name}".replace("-", "_")
 
     def parameter(self, setting: Setting) -> inspect.Parameter:
-        """What typer reads. Its default is None, so that a file or the settings' own default can decide."""
+        """Return the parameter for typer. Its default is None, so that a file or the settings' default can decide."""
         is_required = setting.name in self.required
         default = None if is_required else self.defaults.get(setting.name, setting.default)
         option = self.option(setting)
@@ -103,7 +105,7 @@ class OptionsOf:
         )
 
     def taken_from(self, values: dict[str, Any]) -> Given:
-        """The settings that were given, out of the values of all options. Raises typer.BadParameter."""
+        """Remove this mark's options from ``values``, and return the given settings. Raises typer.BadParameter."""
         given = {}
         for each in self.chosen:
             value = values.pop(self.name(each))
@@ -118,7 +120,7 @@ class OptionsOf:
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command an option for each setting of its parameters that are ``Settings`` or marked by ``OptionsOf``."""
+    """Return the command with an option for each setting of its ``Settings`` and ``OptionsOf`` parameters."""
     hints = get_type_hints(command, include_extras=True)
     marked = {name: mark for name, hint in hints.items() if (mark := _mark(hint)) is not None}
     parameters: list[inspect.Parameter] = []
@@ -139,23 +141,23 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         except ConfigError as error:
             raise _named(error, marked.values()) from None
 
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # what typer reads
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
 
 
 class Command(TyperCommand):
-    """A command whose help has a section for each group of options, and whose ``--json`` may stand alone.
+    """A command with a help section for each group of options, and errors on one line, without traceback.
 
-    Its errors take one line and never a traceback.
+    Its ``--json`` may stand without a value.
     """
 
     program = "rfm-client"
     expected: tuple[type[Exception], ...] = (errors.RewardError, OSError)
-    has_codes = True  # of its own for errors that scripts want to tell apart
+    has_codes = True  # False: every error ends it with 1
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Gives a ``--json`` without a value the value ``-``, which the parser could not."""
+        """Give ``--json`` without a value the value ``-``, which the parser cannot do."""
         completed: list[str] = []
         for index, word in enumerate(args):
             completed.append(word)
@@ -165,7 +167,7 @@ class Command(TyperCommand):
         return super().parse_args(ctx, completed)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Writes a section for the arguments, one for the command's own options, and one for each group of settings."""
+        """Write sections for the arguments, the command's own options, and each group of settings."""
         sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
@@ -179,7 +181,7 @@ class Command(TyperCommand):
                     formatter.write_dl(records)
 
     def invoke(self, ctx: Any) -> Any:
-        """Runs the command, and reports an error on one line."""
+        """Run the command, and report an error on one line."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -195,12 +197,12 @@ class Command(TyperCommand):
 
 
 def exit_code(error: BaseException) -> ExitCode:
-    """The exit code of a command that fails with this error."""
+    """Return the exit code of a command that fails with this error."""
     return next((code for kind, code in _ERROR_CODES.items() if isinstance(error, kind)), ExitCode.FAILED)
 
 
 def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> ExitCode:
-    """The exit code of a command of whose samples some failed: a special one only if all failed for that one reason."""
+    """Return the exit code after failures of samples: a special code only if all samples failed for one reason."""
     codes = {exit_code(error) for error in failures}
     if not codes:
         return ExitCode.OK
@@ -208,19 +210,19 @@ def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> Exit
 
 
 def report(message: str, program: str = "rfm-client") -> None:
-    """Writes the message as one line to standard error."""
-    print(f"{program}: {' '.join(message.split())}", file=sys.stderr, flush=True)  # above a progress bar, if any
+    """Write the message as one line to standard error."""
+    print(f"{program}: {' '.join(message.split())}", file=sys.stderr, flush=True)  # Rich moves it above a progress bar
 
 
 def fail(message: str, program: str = "rfm-client") -> NoReturn:
-    """Reports the message and ends the command."""
+    """Report the message, and end the command with 1."""
     report(message, program)
     raise typer.Exit(ExitCode.FAILED)
 
 
 @contextmanager
 def usage_errors(option: str) -> Iterator[None]:
-    """A ValueError becomes wrong usage of ``option``."""
+    """Turn a ValueError into wrong usage of ``option``."""
     try:
         yield
     except ValueError as error:
@@ -228,12 +230,12 @@ def usage_errors(option: str) -> Iterator[None]:
 
 
 def missing_package(error: ImportError) -> str:
-    """What is missing, with the command that installs it."""
+    """Return the error's message with the command that installs the package."""
     return str(error) if "pip install" in str(error) else f'{error}: pip install "./client[cli]"'
 
 
 def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:
-    """Wrong usage of the options whose settings the error names; the error itself if it names others."""
+    """Wrong usage of the options whose settings the error names; the error itself for other settings."""
     keys = error.key.split(", ")
     for mark in marks:
         options = {each.name: mark.option(each) for each in mark.chosen}

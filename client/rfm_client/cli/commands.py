@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The commands. What a library brings along is imported when a command runs, so that ``--help`` is quick."""
+"""Commands of ``rfm-client``. Optional libraries are imported when a command runs, so that ``--help`` is quick."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ app = typer.Typer(
     epilog=EXIT_CODES,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # whose tables cut the names of options off where a terminal has 80 columns
+    rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -63,7 +63,7 @@ def main(
         bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Scores videos with a served reward model, and shows the state of its server."""
+    """Score videos with a served reward model, and show the state of its server."""
     logging.basicConfig(format="rfm-client: %(message)s", level=logging.WARNING)  # the client logs retries
     with usage_errors("--ca-file, --client-certificate, --client-key, --api-key-file"):
         context.obj = files.read()
@@ -79,7 +79,7 @@ def score(
     prefix: PrefixOptions,
     output: OutputOptions,
 ) -> None:
-    """Progress and success at each frame of one or many videos. One that fails does not stop the others."""
+    """Score each frame of one or more videos: progress and success. A failed video does not stop the others."""
     output.check(videos)
     if prefix.sampling is not None and video.max_frames is not None:
         raise ConfigError("sampling", f"expected no --max-frames with it, got {video.max_frames}")
@@ -118,10 +118,10 @@ def compare(
     video: VideoOptions,
     output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json", "plot"))],
 ) -> None:
-    """Which of several videos does the task best.
+    """Rank several videos by how well they do the task.
 
-    Every two are compared in both orders. They are ranked by the mean probability of winning against the others.
-    A video is not ranked ("?") if the orders disagree about it and another one. The progress in each is shown, too.
+    Every two videos are compared in both orders. The rank follows the mean probability of winning against the others.
+    A video has no rank ("?") if the orders disagree about one of its pairs. The table also shows each last progress.
     """
     if len(videos) < MIN_COMPARED:
         raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
@@ -151,7 +151,7 @@ def status(
         str | None, typer.Option(help="Where the server shows its metrics (http://<its host>:8002/metrics).")
     ] = None,
 ) -> None:
-    """The server's models, requests, batches, GPUs and memory."""
+    """Show the server's models, requests, batches, GPUs and memory."""
     from rfm_client.transport.status import read_status
 
     if metrics_url is not None and len(server.urls) > 1:
@@ -171,7 +171,7 @@ def status(
 def wait(
     context: typer.Context, server: Annotated[ServerOptions, OptionsOf(ServerOptions, defaults={"timeout_s": 120.0})]
 ) -> None:
-    """Return as soon as the model is ready. Of several servers, one is enough; --timeout bounds the wait."""
+    """Wait until the model is ready on one of the servers, at most for --timeout seconds."""
     with server.client(context.obj) as client:
         client.wait_ready(server.timeout_s)
 
@@ -184,7 +184,7 @@ def sample(
     synthetic: SyntheticSamples,
     output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json",))],
 ) -> None:
-    """Score synthetic samples, to see that the server answers. Their scores mean nothing."""
+    """Score synthetic samples, to check that the server answers. Their scores mean nothing."""
     with server.connected(context.obj) as client:
         samples = synthetic.samples(client)
         outcomes = client.evaluate(samples, return_errors=True)
@@ -210,7 +210,7 @@ def bench_input(
 ) -> None:
     """Write synthetic samples as input of Triton's perf_analyzer.
 
-    It prints the command that measures with them.
+    It prints a perf_analyzer command that sends them.
     """
     with server.connected(context.obj) as client:
         samples = synthetic.samples(client)
@@ -230,7 +230,7 @@ def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:
 
 
 def _add_gateway() -> None:
-    """Adds the command of the distribution rfm-gateway; without that, one that says how to install it."""
+    """Add rfm-gateway's command; without the package, a command that says how to install it."""
     try:
         for found in entry_points(group="rfm_client.commands", name="gateway"):
             app.command(found.name, cls=Command)(found.load())
@@ -241,7 +241,7 @@ def _add_gateway() -> None:
 
     @app.command("gateway", context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
     def gateway() -> None:
-        """Serve the FastAPI server's endpoints before a Triton server; it needs rfm-gateway."""
+        """Serve the FastAPI server's endpoints before a Triton server; needs rfm-gateway."""
         fail(f"gateway: {reason}: pip install ./client ./gateway")
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client compare``: which of several videos does a task best. N videos.
+"""``rfm-client compare``: rank videos by how well they do a task.
 
-A model's answer may depend on which of the two it is shown first, so it is asked in both orders. Where they disagree
-there is no answer.
+A model's preference may depend on the order of the two videos, so it compares each pair in both orders. If the orders
+disagree, the pair has no verdict.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ LEGEND = (
     "A video has no rank (?) if one of its pairs has no answer."
 )
 
-Order = tuple[int, int]  # numbers of two videos, as they are asked
+Order = tuple[int, int]  # numbers of the first and second video of a question
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """N sources, and what one version of the model says of them.
+    """N sources, and their preferences by one version of the model.
 
-    results: of every order of every two
+    results: for both orders of every pair
     """
 
     sources: Sequence[Source]
@@ -48,20 +48,20 @@ class Comparison:
 
     @property
     def scores(self) -> list[FrameScores]:
-        """Scores of each source, as told when the model compares it with the first one, in the order given."""
+        """Scores of each source in the given order, from its comparison with the first."""
         return [self.results[0, 1].first, *(self.results[0, other].second for other in self._numbers[1:])]
 
     def pair(self, first: int, second: int) -> PreferenceResult:
-        """Both orders of two sources as one result."""
+        """Return both orders of two sources as one result."""
         return PreferenceResult.of_both_orders(self.results[first, second], self.results[second, first])
 
     def couples(self) -> Iterator[Order]:
-        """Every two sources once, in the order given."""
+        """Yield every pair of sources once, in the given order."""
         return itertools.combinations(self._numbers, 2)
 
     @cached_property
     def wins(self) -> list[float]:
-        """The mean probability that a source wins, over both orders against all others, of each source."""
+        """Each source's mean probability of winning against the others, over both orders."""
         return [
             fmean(self.pair(index, other).preference for other in self._numbers if other != index)
             for index in self._numbers
@@ -69,20 +69,20 @@ class Comparison:
 
     @cached_property
     def ranks(self) -> list[int | None]:
-        """The place of each source by its ``wins``, from 1; None if one of the source's pairs has no verdict."""
+        """Each source's place by ``wins``, from 1; None if one of its pairs has no verdict."""
         best_first = sorted(self._numbers, key=self.wins.__getitem__, reverse=True)
         untold = {index for couple in self.couples() if self.pair(*couple).verdict is None for index in couple}
         return [None if index in untold else best_first.index(index) + 1 for index in self._numbers]
 
     @property
     def ranking(self) -> list[int] | None:
-        """The numbers of the sources, the best one first; None if a pair has no verdict."""
+        """Numbers of the sources, the best first; None if a pair has no verdict."""
         if None in self.ranks:
             return None
         return sorted(self._numbers, key=lambda index: cast(int, self.ranks[index]))
 
     def tables(self) -> list[Table | str]:
-        """The sources, the best one first if they have a ranking, both answers about every two, and a legend."""
+        """Return a table of sources, the best first, a table of pairs, and without a ranking a legend."""
         columns = ("video", "rank", "P(wins)", "its last progress", "its last success", "frames")
         pairs = ("first", "second", "P(first wins)", "asked second first", "mean", "orders")
         return [
@@ -92,7 +92,7 @@ class Comparison:
         ]
 
     def panels(self) -> list[Panel]:
-        """What a plot shows of it, in the order of the table."""
+        """Return a plot's panel for each source, in the order of the table."""
         return [
             self.sources[index].panel(
                 f"{self._rank(index)}. {PurePath(self.sources[index].name).name}: wins with P = {self.wins[index]:.3f}",
@@ -125,7 +125,7 @@ class Comparison:
 
 
 def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> Comparison:
-    """Which source does the task of the first best. Raises RewardError."""
+    """Compare every two sources at the task of the first. Raises RewardError."""
     sources = [Source.read(name, video) for name in names]
     trajectories = [_of_one_task(sources[0], source) for source in sources]
     fits = [fitted_to(client, ProgressSample(trajectory), video) for trajectory in trajectories]
@@ -144,7 +144,7 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
 
 
 def _of_one_task(first: Source, other: Source) -> Trajectory:
-    """The other's trajectory with the task of the first, so that both orders ask the same."""
+    """The other's trajectory with the task of the first, so that both orders have the same task."""
     if other is first:
         return first.trajectory
     try:

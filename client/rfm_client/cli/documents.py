@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The JSON documents of the commands. A score that a checkpoint does not predict is null, never a number."""
+"""JSON documents of the commands. A score that a checkpoint does not predict is null."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ SIDES = ("first", "second")  # of a comparison
 def score_document(
     server: ServerOptions, video: VideoOptions, prefix: PrefixOptions, outcomes: Sequence[Outcome]
 ) -> dict[str, Any]:
-    """The JSON document that ``score --json`` writes."""
+    """Return the document of ``score --json``."""
     asked = {"frame_steps": prefix.frame_steps, "sampling": prefix.sampling, "sampled_frames": prefix.frames}
     return {**server.origin, **_asked(video), **asked, "videos": [_outcome(outcome) for outcome in outcomes]}
 
 
 def comparison_document(server: ServerOptions, video: VideoOptions, comparison: Comparison) -> dict[str, Any]:
-    """What ``compare --json`` writes; a ``preference`` is the probability that the first of an order is preferred.
+    """Return the document of ``compare --json``. ``preference`` is the probability that an order's first video wins.
 
-    Of two videos it also has the answer to the order given, ``preference``, the verdict of both orders, and scores as
-    ``first`` and ``second``. No verdict, rank or ranking is null.
+    For two videos, the top level also has the ``preference`` in the given order, the verdict of both orders, and scores
+    as ``first`` and ``second``. A missing verdict, rank or ranking is null.
     """
     names = [source.name for source in comparison.sources]
     videos = [
@@ -66,7 +66,7 @@ def comparison_document(server: ServerOptions, video: VideoOptions, comparison: 
 
 
 def samples_document(server: ServerOptions, kind: str, outcomes: Sequence[Result | RewardError]) -> dict[str, Any]:
-    """The JSON document that ``sample --json`` writes."""
+    """Return the document of ``sample --json``."""
     samples = [
         _error(outcome, str(outcome)) if isinstance(outcome, RewardError) else result_document(outcome)
         for outcome in outcomes
@@ -75,7 +75,10 @@ def samples_document(server: ServerOptions, kind: str, outcomes: Sequence[Result
 
 
 def result_document(result: Result, times_s: Sequence[Times | None] = (None, None)) -> dict[str, Any]:
-    """A result of any type; times_s of the scored frames of its trajectories."""
+    """Return the document of a result.
+
+    times_s: float64 [T] for each trajectory, times of its T scored frames; None: unknown
+    """
     version = {"model_version": result.model_version}
     if isinstance(result, ProgressResult):
         return {**version, **frame_document(result, times_s[0])}
@@ -88,7 +91,7 @@ def result_document(result: Result, times_s: Sequence[Times | None] = (None, Non
 
 
 def frame_document(scores: FrameScores, times_s: Times | None) -> dict[str, Any]:
-    """Scores of each frame; frame_indices among the frames that were read."""
+    """Return the scores of each frame; ``frame_indices`` count the frames that were read."""
     indices = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
     return {
         "progress": _or_null(scores.progress),
@@ -99,7 +102,7 @@ def frame_document(scores: FrameScores, times_s: Times | None) -> dict[str, Any]
 
 
 def status_document(statuses: Sequence[ServerStatus]) -> dict[str, Any]:
-    """The JSON document that ``status --json`` writes."""
+    """Return the document of ``status --json``."""
     servers = []
     for status in statuses:
         models = [
@@ -135,5 +138,5 @@ def _error(error: Exception, message: str) -> dict[str, Any]:
 
 
 def _or_null(scores: npt.NDArray[np.float32]) -> list[float] | None:
-    """The scores [T] as float64 of the same value; None if the checkpoint does not predict them."""
+    """The scores as float64 of the same value; None if the checkpoint does not predict them."""
     return None if np.isnan(scores).all() else scores.tolist()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client label``, and what ``rfm label`` shares with it: a reward for every frame of a dataset."""
+"""``rfm-client label``: label every frame of a dataset. ``rfm label`` shares its parts."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ DatasetArgument = Annotated[
 
 @dataclass(frozen=True)
 class EpisodeTexts(Settings):
-    """How the episodes of a dataset are read. Raises ConfigError."""
+    """Task and orientation of a dataset's episodes. Raises ConfigError."""
 
     TITLE: ClassVar[str] = "Dataset"
 
@@ -72,13 +72,13 @@ class EpisodeTexts(Settings):
 
     @property
     def opening(self) -> dict[str, Any]:
-        """With what ``open_dataset`` opens the dataset."""
+        """Arguments of ``open_dataset`` after the source."""
         return {"task": self.task, "override_task": self.override_task, "orient": Orient.parse(self.orient)}
 
 
 @dataclass(frozen=True)
 class RunOptions(Settings):
-    """What a command does beside the labels, or in their place."""
+    """Engine, trial run and summary of a labelling command."""
 
     TITLE: ClassVar[str] = "Run"
 
@@ -103,11 +103,11 @@ def label(
     run: RunOptions,
     ray: RayOptions,
 ) -> None:
-    """Write a reward for every frame where training reads it.
+    """Label every frame of a dataset, in files that training reads.
 
-    The same command goes on with what is missing.
+    Run the same command again to label the missing episodes.
     """
-    credentials: Credentials = context.obj  # the context itself cannot travel to other machines
+    credentials: Credentials = context.obj  # Ray cannot send the context to other machines
 
     @contextmanager
     def connect() -> Iterator[Scorer]:
@@ -119,9 +119,11 @@ def label(
 
 @dataclass(frozen=True)
 class LabelCommand:
-    """A labelling run of a command: label, try, or only report.
+    """A labelling command's run: label, try, or only show the summary.
 
-    source: of ``open_dataset``; connect: gives a scorer; say: is called with a line for a person
+    source: as in ``open_dataset``
+    connect: returns a context with a scorer
+    say: takes a line for the user
     """
 
     source: str
@@ -133,7 +135,7 @@ class LabelCommand:
     say: Say
 
     def run(self) -> ExitCode:
-        """Does what the options say. Raises RewardError, OSError and ImportError."""
+        """Run as the options say. Raises RewardError, OSError and ImportError."""
         if self.options.report:
             self._report()
             return ExitCode.OK
@@ -143,7 +145,7 @@ class LabelCommand:
         if self.options.rrd is not None:
             from rfm_client.integrations.recording import load_rerun
 
-            load_rerun()  # or it would be found missing when all is labelled
+            load_rerun()  # a missing package must not fail after the labelling
             self.options.rrd.mkdir(parents=True, exist_ok=True)
         report = self._label()
         status = self._tell(report)
@@ -167,7 +169,7 @@ class LabelCommand:
             raise
 
     def _try(self) -> None:
-        """Checks everything, measures a few episodes, writes nothing."""
+        """Check everything, measure a few episodes, write nothing."""
         dataset = self._dataset()
         with self.connect() as scorer, ProgressBar(self.say) as watch:
             plan = plan_labels(dataset, scorer, self.labels, watch)
@@ -189,7 +191,7 @@ class LabelCommand:
         return ExitCode.OK
 
     def _record(self, folder: Path, report: Report) -> None:
-        """Records what is labelled, also by a run before."""
+        """Record the chosen episodes, also those labelled by an earlier run."""
         from rfm_client.integrations.recording import record_episodes
 
         dataset = self._dataset()
@@ -199,7 +201,7 @@ class LabelCommand:
             typer.echo(f"{file}")
 
     def _report(self) -> None:
-        """Shows the summary of labels that are there: of a dataset, or a file."""
+        """Show the summary of existing labels; the source is a dataset or a label file."""
         path = Path(self.source)
         if path.is_dir() or self.labels.output is not None:
             outputs = Outputs(self.labels.output or path, self.labels)
@@ -222,7 +224,7 @@ class LabelCommand:
 
 
 class ProgressBar(Watch):
-    """Shows a run: lines on standard error and, on a terminal, a bar with frames a second and the time left."""
+    """Lines on standard error and, on a terminal, a bar with frames a second and the time left."""
 
     def __init__(self, say: Say) -> None:
         from rich.console import Console
@@ -253,30 +255,30 @@ class ProgressBar(Watch):
         self._bar.stop()
 
     def note(self, text: str) -> None:
-        """Writes a line of its own."""
+        """Write the text on a line."""
         self._say(f"note: {text}")
 
     def checking(self, num_episodes: int) -> None:
-        """The bar counts the episodes that are checked."""
+        """Begin to count checked episodes."""
         self._begin("checking episodes", num_episodes, 0)
 
     def checked(self, episode: DatasetEpisode) -> None:
-        """The bar advances by one episode."""
+        """Advance the bar by an episode."""
         self._advance(1)
 
     def begin(self, num_frames: int, num_finished: int) -> None:
-        """The bar counts frames of labels."""
+        """Begin to count labelled frames."""
         if num_finished:
             self.note(f"{num_finished} of {num_frames} frames are labelled already")
         self.num_begun = num_frames
         self._begin("labelling frames", num_frames, num_finished)
 
     def scored(self, episode: DatasetEpisode) -> None:
-        """The bar advances by the frames of the episode."""
+        """Advance the bar by the episode's frames."""
         self._advance(episode.num_frames)
 
     def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
-        """Writes a line with the reason."""
+        """Write a line with the reason."""
         text = str(error)
         self._say(text if text.startswith(episode.name) else f"{episode.name}: {text}")
         self._advance(episode.num_frames)
@@ -292,14 +294,14 @@ class ProgressBar(Watch):
 
 
 def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int) -> float:
-    """How long the plan takes, after the first episodes, as many as are under way at a time."""
+    """Estimate of the plan's time, from its first ``workers`` episodes."""
     first = plan.items[:workers]
     memory = FrameMemory()
 
     def score(item: Item) -> None:
         episode_columns(dataset, item.episode, scorer, plan.recipe, memory=memory, go_on=lambda: None)
 
-    score(first[0])  # once without the clock, so that what happens once does not count
+    score(first[0])  # without the clock: the first call has costs of its own
     began_s = time.monotonic()
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(score, first))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Options that several commands of ``rfm-client`` have, each declared once: servers, videos, outputs."""
+"""Options that several commands share, each declared once: servers, videos, outputs."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from rfm_client.transport.credentials import Credentials
 
 DEFAULT_URL = "grpc://localhost:8001"
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 86_400
-MAX_PICTURED = 50  # videos; one picture of more could not be looked at, nor drawn much further
+MAX_PICTURED = 50  # videos; a larger picture is unreadable, and soon cannot be drawn
 _ENDINGS = {"json": (".json",), "plot": (".png", ".pdf", ".svg"), "rrd": (".rrd",)}
 
 
 @dataclass(frozen=True)
 class CredentialFiles(Settings):
-    """Files with which a server is reached that is not open to all."""
+    """Credentials for a protected server, as files: CAs, client certificate, API key."""
 
     ca_file: Path | None = setting(None, "Authorities (PEM) to trust; else the system's.", variable="RFM_CA_FILE")
     client_certificate: Path | None = setting(
@@ -43,7 +43,7 @@ class CredentialFiles(Settings):
     )
 
     def read(self) -> Credentials:
-        """What the files hold. Raises ValueError for what cannot be used."""
+        """Return the credentials in the files. Raises ValueError for an unusable file."""
         try:
             api_key = None if self.api_key_file is None else self.api_key_file.read_text().strip()
         except (OSError, UnicodeDecodeError) as error:
@@ -53,7 +53,7 @@ class CredentialFiles(Settings):
 
 @dataclass(frozen=True)
 class ServerOptions(Settings):
-    """The servers and model of a command, and how long a request may take."""
+    """Servers, model and timeout of a command."""
 
     TITLE: ClassVar[str] = "Server"
 
@@ -75,11 +75,11 @@ class ServerOptions(Settings):
 
     @property
     def origin(self) -> dict[str, Any]:
-        """What JSON documents say of it."""
+        """The servers and the model, for JSON documents."""
         return {"servers": list(self.urls), "model": self.model}
 
     def client(self, credentials: Credentials, **options: Any) -> RewardClient:
-        """A client. Raises typer.BadParameter for a URL that is none."""
+        """Return a client. Raises typer.BadParameter for an invalid URL."""
         with usage_errors("'--url'"):
             return RewardClient(
                 self.urls, model=self.model, **{"timeout_s": self.timeout_s, **credentials.options, **options}
@@ -87,7 +87,7 @@ class ServerOptions(Settings):
 
     @contextmanager
     def connected(self, credentials: Credentials) -> Iterator[RewardClient]:
-        """A client, once one of the servers answers and serves the model. If none does, it fails without a wait."""
+        """Yield a client if a server answers and serves the model. Otherwise raise RewardError at once."""
         with self.client(credentials) as client:
             self._check(credentials)
             yield client
@@ -111,7 +111,7 @@ class ServerOptions(Settings):
 
 @dataclass(frozen=True)
 class VideoOptions(Settings):
-    """How videos are read, and which of their frames are sent."""
+    """Task of the videos, and choice and size of the frames to send."""
 
     TITLE: ClassVar[str] = "Videos"
 
@@ -127,7 +127,7 @@ class VideoOptions(Settings):
 
 @dataclass(frozen=True)
 class PrefixOptions(Settings):
-    """Whether each frame is scored on its prefix, and by which rule that is sampled; else all in one pass."""
+    """Rule that samples each frame's prefix; without a rule, one pass scores all frames."""
 
     TITLE: ClassVar[str] = "Prefixes"
 
@@ -159,7 +159,7 @@ class PrefixOptions(Settings):
 
     @property
     def rule(self) -> str:
-        """Which frames decide the score of a frame, as a line for people."""
+        """A line for the user: which frames decide a frame's score."""
         if self.frame_steps:
             return f"Each frame is scored on its prefix: linspace_trunc, {self.frame_steps} frames."
         if self.sampling is not None:
@@ -170,7 +170,7 @@ class PrefixOptions(Settings):
 
 @dataclass(frozen=True)
 class OutputOptions(Settings):
-    """Where results are written. Raises ConfigError, before the first request, for where they cannot be."""
+    """Files of the results. Raises ConfigError, before the first request, for an unusable file."""
 
     TITLE: ClassVar[str] = "Outputs"
 
@@ -203,18 +203,18 @@ class OutputOptions(Settings):
 
     @property
     def prints_tables(self) -> bool:
-        """Whether tables are shown on standard output."""
+        """True if tables go to standard output."""
         return self.json != STANDARD_OUTPUT
 
     def check(self, videos: Sequence[str]) -> None:
-        """Raises ConfigError for more videos than they take."""
+        """Raise ConfigError for more videos than the files take."""
         if self.plot is not None and len(videos) > MAX_PICTURED:
             raise ConfigError("plot", f"expected at most {MAX_PICTURED} videos, got {len(videos)}")
         if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
             raise ConfigError("npy", f"expected a folder for {len(videos)} videos, got {self.npy}")
 
     def array_files(self, stems: Sequence[str]) -> list[Path]:
-        """The .npy file of each video; none if none is asked for."""
+        """Return the .npy file of each video, and make its folder; empty without --npy."""
         if self.npy is None:
             return []
         if self.npy.suffix == ".npy":
@@ -223,7 +223,7 @@ class OutputOptions(Settings):
         return [self.npy / f"{stem}.npy" for stem in stems]
 
     def write_json(self, document: Mapping[str, Any]) -> None:
-        """Writes the document to the file, to standard output, or not at all."""
+        """Write the document to the file or standard output, if --json is given."""
         if self.json is None:
             return
         text = json.dumps(document, indent=2, allow_nan=False)

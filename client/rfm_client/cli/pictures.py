@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pictures of scores: film strips with curves, and the summary of labels. Needs ``rfm-client[cli]``."""
+"""Pictures: film strips with curves of scores, and a summary of labels. Needs ``rfm-client[cli]``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 STRIP_FRAMES = 8
 WIDTH_IN = 10.0
-COLUMN_WIDTH_IN = 7.0  # where panels stand side by side
+COLUMN_WIDTH_IN = 7.0  # of panels side by side
 PANEL_HEIGHT_IN = 4.0
 DOTS_PER_IN = 200
 SUMMARY_HEIGHT_IN = 3.5
@@ -34,11 +34,11 @@ _CURVES = (("progress", "tab:blue", "-", "o"), ("success", "tab:green", "--", "s
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """What a plot shows of one trajectory.
+    """The part of a plot for one trajectory: T scored frames, and a strip of S frames of H x W pixels.
 
-    positions: float64 [T], where each scored frame stands on the time axis
+    positions: float64 [T], scored frames on the time axis
     unit: of the positions, ``s`` or ``frame``
-    strip: uint8 [S, H, W, 3], some of the frames; None: the trajectory is of embeddings
+    strip: uint8 [S, H, W, 3]; None: a trajectory of embeddings
     strip_positions: float64 [S]
     """
 
@@ -57,9 +57,10 @@ class Panel:
         frames: UInt8Array | None = None,
         times_s: npt.NDArray[np.float64] | None = None,
     ) -> Panel:
-        """The panel of a trajectory's scores, with all its frames and their times [T], as far as they are known.
+        """Return the panel of a trajectory's scores. It keeps copies of only the frames that it shows.
 
-        Of the frames it keeps only copies of those that it shows.
+        frames: uint8 [N, H, W, 3], all N frames that were read; None: embeddings
+        times_s: float64 [N], times of these frames; None: unknown
         """
         scored = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
         positions = scored.astype(np.float64) if times_s is None else times_s[scored]
@@ -69,9 +70,9 @@ class Panel:
 
 
 def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, columns: int = 1) -> None:
-    """Writes a picture, in the format that the file's name ends in: per panel a film strip, and below it the scores.
+    """Draw a picture, in the format of the file's suffix: for each panel a film strip, below it the scores.
 
-    columns: panels that stand side by side
+    columns: panels side by side
     """
     try:
         import matplotlib
@@ -81,7 +82,7 @@ def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, colum
 
     rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
     heights_in = [PANEL_HEIGHT_IN * (1 if any(panel.strip is not None for panel in row) else 0.7) for row in rows]
-    with matplotlib.rc_context({"pdf.fonttype": 42, "text.parse_math": False}):  # fonts that journals take
+    with matplotlib.rc_context({"pdf.fonttype": 42, "text.parse_math": False}):  # TrueType, which journals accept
         figure = Figure(
             figsize=(WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN * columns, sum(heights_in)), layout="constrained"
         )
@@ -120,7 +121,7 @@ def _draw(part: SubFigure, panel: Panel) -> None:
 
 
 def draw_summary(file: Path, summary: Summary) -> None:
-    """Writes a picture: how final progress is distributed, final progress by best success, steps that go backwards."""
+    """Draw histograms of final progress and of steps backwards, and best success over final progress."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:

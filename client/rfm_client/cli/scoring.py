@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client score``: trajectories from files, their scores from the server, each as soon as it is there."""
+"""``rfm-client score``: read trajectories from files, score them, show each result as soon as it arrives."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.data.fit_to_checkpoint import FittedSample, fitted, with_frame_indices
 from rfm_client.data.sampling import Sampling, of_prefixes, prefix_samples
 
-PREFIXES_AT_A_TIME = 64  # of one video: their frames lie in memory
-WORKERS = 8  # videos that are read, and lie in memory, at a time
-PROBE_S = 2.0  # within which a server that is there says so
+PREFIXES_AT_A_TIME = 64  # of one video, since their frames are in memory
+WORKERS = 8  # videos in memory at a time
+PROBE_S = 2.0  # timeout of the check for a live server
 NOT_ASKED = "not asked, since no server answers any more"
-COLUMNS = (  # of ``Scored.row``, and how wide they are
+COLUMNS = (  # headers of ``Scored.row``, and their widths
     *(("video", 0), ("last progress", 8), ("last success", 7), ("frames", 13)),
     *(("last at s", 7), ("took s", 6), ("version", 7)),
 )
@@ -48,7 +48,7 @@ Times = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A trajectory as it was read, before any frame was left out; times_s: float64 [T], None if not known."""
+    """A trajectory with all T frames that were read. times_s: float64 [T]; None: unknown"""
 
     name: str
     trajectory: Trajectory
@@ -56,7 +56,7 @@ class Source:
 
     @classmethod
     def read(cls, name: str, video: VideoOptions) -> Source:
-        """The source that a file or URL holds. Raises InvalidSampleError."""
+        """Read the source from a file or URL. Raises InvalidSampleError."""
         from rfm_client.data.inputs import ARRAY_SUFFIXES, load_trajectory
         from rfm_client.data.video import frame_times_s, is_url
 
@@ -65,24 +65,28 @@ class Source:
         trajectory = load_trajectory(name, task=video.task, fps=fps, orient=video.orient)
         if trajectory.frames is not None and not trajectory.task.strip():
             raise InvalidSampleError.at("task", "a sentence with frames", 'none: add --task "what is to be done"')
-        # What is behind a URL is gone once it is read.
+        # A video from a URL is not kept, so its times cannot be read.
         has_times = not are_arrays and not is_url(name)
         return cls(name, trajectory, frame_times_s(name, trajectory.num_frames) if has_times else None)
 
     def times_of(self, scores: FrameScores) -> Times | None:
-        """float64 [T], when in the video each scored frame is."""
+        """Return the scored frames' times in the video, float64 [T]; None: unknown."""
         if self.times_s is None or scores.frame_indices is None:
             return self.times_s
         return self.times_s[scores.frame_indices]
 
     def panel(self, title: str, scores: FrameScores) -> Panel:
-        """What a plot shows of it."""
+        """Return the source's panel of a plot."""
         return Panel.of(title, scores, self.trajectory.frames, self.times_s)
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A source's scores. num_frames: those that were read; times_s: float64 [T] of those that were scored."""
+    """A source's scores.
+
+    num_frames: frames that were read
+    times_s: float64 [T], times of the T scored frames; None: unknown
+    """
 
     name: str
     result: ProgressResult
@@ -93,7 +97,7 @@ class Scored:
 
     @property
     def row(self) -> tuple[str, ...]:
-        """The cells of this source under ``COLUMNS``."""
+        """The source's cells under ``COLUMNS``."""
         progress, success = self.result.progress, self.result.success
         frames = str(len(progress)) if len(progress) == self.num_frames else f"{len(progress)} of {self.num_frames}"
         seconds = "-" if self.times_s is None else f"{self.times_s[-1]:.1f}"
@@ -103,7 +107,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class Failed:
-    """A source that has no scores. is_server_gone: since no server answers any more."""
+    """A source without scores. is_server_gone: True: because no server answers any more"""
 
     name: str
     error: Exception
@@ -112,15 +116,15 @@ class Failed:
 
 
 Outcome: TypeAlias = Scored | Failed
-Tell = Callable[[int, Outcome], None]  # is called with the number of a source, and what came of it
-Record = Callable[[int, Source, FrameScores], None]  # is called by any thread
+Tell = Callable[[int, Outcome], None]  # takes a source's number and outcome
+Record = Callable[[int, Source, FrameScores], None]  # any thread calls it
 
 
 @dataclass
 class SourceScorer:
-    """Scores one source after the other, until no server answers any more. For several threads.
+    """Scores sources, in several threads, until no server answers any more.
 
-    record: is given each source with its frames, before they are forgotten; None: nothing is recorded
+    record: takes each source with its frames, before memory is freed; None: no record
     """
 
     client: RewardClient
@@ -130,7 +134,7 @@ class SourceScorer:
     _gone: RewardError | None = None
 
     def score_all(self, names: Sequence[str], tell: Tell) -> list[Outcome]:
-        """The outcome of each source, in order; each is told when it is there."""
+        """Return the outcomes of all sources, in order. ``tell`` takes each outcome as it arrives."""
         with ThreadPoolExecutor(WORKERS) as pool, _progress_bar(len(names)) as advance:
             try:
                 numbers: dict[Future[Outcome], int] = {
@@ -139,13 +143,13 @@ class SourceScorer:
                 for future in as_completed(numbers):
                     tell(numbers[future], future.result())
                     advance()
-            except BaseException:  # an interrupt, or a full disk: what has not begun shall not
+            except BaseException:  # an interrupt, or a full disk: no other source shall begin
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
         return [future.result() for future in numbers]
 
     def outcome(self, number: int, name: str) -> Outcome:
-        """The scores of the source of this number, or why there are none."""
+        """Return the scores of a source, or the reason of its failure."""
         started_s = time.monotonic()
         if self._gone is not None:
             return Failed(name, self._gone, NOT_ASKED, is_server_gone=True)
@@ -157,7 +161,7 @@ class SourceScorer:
         except ImportError as error:
             return Failed(name, error, missing_package(error))
         except (RewardError, OSError) as error:
-            message = str(error).removesuffix(f" ({name})")  # the report names the source in any case
+            message = str(error).removesuffix(f" ({name})")  # the report names the source
             return Failed(name, error, message, is_server_gone=self._is_server_gone(error))
         if self.record is not None:
             self.record(number, source, result)
@@ -171,7 +175,7 @@ class SourceScorer:
         )
 
     def _is_server_gone(self, error: Exception) -> bool:
-        """Whether the error comes of servers that are gone, and not of what one of them was asked."""
+        """True if the error means that no server answers any more, not that this source fails."""
         if isinstance(error, ProcessEndedError) or not isinstance(
             error, (ServerUnavailableError, DeadlineExceededError)
         ):
@@ -182,16 +186,16 @@ class SourceScorer:
 
 
 def exit_code_of_outcomes(outcomes: Sequence[Outcome]) -> ExitCode:
-    """The exit code of a command with these outcomes."""
+    """Return the exit code of a command with these outcomes."""
     failures = [outcome for outcome in outcomes if isinstance(outcome, Failed)]
     codes = {exit_code(failure.error) for failure in failures if failure.is_server_gone}
     if codes:
-        return min(codes)  # unavailable before out of time, which some may be of a server that is gone
+        return min(codes)  # UNAVAILABLE before DEADLINE, which a server that is gone also causes
     return exit_code_of([failure.error for failure in failures], some_succeeded=len(failures) < len(outcomes))
 
 
 def unique_stems(names: Sequence[str]) -> list[str]:
-    """A name for files about each source: its own without folder and ending, numbered where that is taken."""
+    """Return a file name for each source: its own without folder and suffix, numbered if taken."""
     stems: dict[str, None] = {}
     repeated: Counter[str] = Counter()
     for name in names:
@@ -206,11 +210,11 @@ def unique_stems(names: Sequence[str]) -> list[str]:
 def fitted_to(
     client: RewardClient, sample: ProgressSample, video: VideoOptions, *, samples_prefixes: bool = False
 ) -> FittedSample:
-    """The sample with frames left out as the options and the checkpoint require.
+    """Return the sample with frames left out as the options and the checkpoint require.
 
-    The frames are left out here: the client knows of no other limit than the checkpoint's.
+    The client cannot do it: it knows only the checkpoint's limit.
 
-    samples_prefixes: whether each prefix is sampled, so that the checkpoint's limit does not matter
+    samples_prefixes: True if each prefix is sampled, so that the checkpoint's limit does not matter
     """
     info = client.model_info(frames=sample.trajectory.frames is not None)
     limits = (video.max_frames, info.max_frames if video.subsample and not samples_prefixes else None)
@@ -230,7 +234,7 @@ def _evaluate(
     trained_frames = client.model_info(frames=sent.trajectory.frames is not None).max_frames
     try:
         sampling = Sampling.of(prefix.sampling, prefix.frames, trained_frames)
-    except ValueError as error:  # the options are checked: only the checkpoint leaves it open
+    except ValueError as error:  # the options are valid: the checkpoint lacks the number
         raise InvalidSampleError(f"--{error}") from error
     samples = prefix_samples(sent.trajectory, sampling)
     results: list[Result] = []
@@ -242,7 +246,7 @@ def _evaluate(
 
 @contextmanager
 def recorder(file: Path | None, names: Sequence[str]) -> Iterator[Record | None]:
-    """What records each source in a file of Rerun's, under its name without folder and ending; None: nothing is.
+    """Yield a function that records a source in a Rerun file, under its unique stem; None: no file.
 
     Raises ImportError if the package is missing.
     """
@@ -263,7 +267,7 @@ def recorder(file: Path | None, names: Sequence[str]) -> Iterator[Record | None]
 
 @contextmanager
 def _progress_bar(total: int) -> Iterator[Callable[[], None]]:
-    """A progress bar on standard error, shown only on a terminal. It gives a function to call after each source."""
+    """Show a progress bar on standard error, if a terminal. Yield the function to call after each source."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scores and a server's state as a person would look at them: tables. Needs ``rfm-client[cli]``."""
+"""Tables of scores and of a server's state. Needs ``rfm-client[cli]``."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 FILE_WIDTH = 200
-SHORT_CELL = 16  # characters that a column of figures shows in any case
+SHORT_CELL = 16  # characters; a column without longer cells does not wrap
 SHORTEST_NAME = 12
-CUT = "..."  # in the place of what is left out of a name
-GAP = "  "  # between columns of rows that come one by one
+CUT = "..."  # for the left-out part of a name
+GAP = "  "  # between columns of a ``StreamedTable``
 
 STATUS_LEGEND = (
     "since load: since the model was loaded, warm-up included, as Triton's statistics count; since start: since Triton "
@@ -36,12 +36,12 @@ _GIB = 2**30
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """The number, or ``-`` for one that is not predicted (None, NaN)."""
+    """Return the number as text; ``-`` for None and NaN, which mean not predicted."""
     return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 
 def shortened(name: str, width: int) -> str:
-    """The name in at most ``width`` characters: what is left out is in the middle, and no part of a file's own name."""
+    """Return the name in at most ``width`` characters, without its middle; a file's own name stays if it fits."""
     if len(name) <= width or width <= len(CUT):
         return name[:width]
     kept = width - len(CUT)
@@ -52,28 +52,28 @@ def shortened(name: str, width: int) -> str:
 
 @dataclass(frozen=True)
 class ShortName:
-    """A name or a path in a table, shortened to the room that the table has."""
+    """A name or a path in a table, shortened to fit."""
 
     text: str
 
     def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
-        """Its narrowest and its full width."""
+        """Return the narrowest and the full width."""
         from rich.measure import Measurement
 
         return Measurement(min(len(self.text), SHORTEST_NAME), len(self.text))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """The name, as much of it as fits."""
+        """Yield the name, shortened to fit."""
         from rich.text import Text
 
         yield Text(shortened(self.text, options.max_width), no_wrap=True, overflow="ellipsis")
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> Table:
-    """A table of texts. What is in square brackets is text too, not markup.
+    """Return a table of plain texts: square brackets are no markup.
 
-    names: so many columns, the first ones, hold names and paths, which are shortened where there is no room. Of the
-        others those with short cells are never broken, long ones wrap.
+    names: number of first columns with names and paths, which are shortened to fit; of the other columns, only those
+        with long cells wrap
     """
     from rich import box
     from rich.table import Table
@@ -93,7 +93,7 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
 
 
 def print_tables(*tables: object) -> None:
-    """Prints tables as wide as the terminal; into a file or a pipe, as wide as the content."""
+    """Print tables as wide as the terminal; to a file or a pipe, as wide as the content, at most FILE_WIDTH."""
     from rich.console import Console
 
     console = Console()
@@ -102,9 +102,10 @@ def print_tables(*tables: object) -> None:
 
 
 class StreamedTable:
-    """A table on standard output that is written row by row, as wide as the terminal.
+    """A table on standard output, written row by row, as wide as the terminal.
 
-    columns: headers and widths; the first is as wide as ``names``, all that it will have, and the terminal allow
+    columns: headers and widths; the first column is as wide as ``names`` need and the terminal allows
+    names: all cells of the first column
     """
 
     def __init__(self, columns: Sequence[tuple[str, int]], names: Sequence[str]) -> None:
@@ -117,7 +118,7 @@ class StreamedTable:
         self._is_begun = False
 
     def write(self, cells: Sequence[str]) -> None:
-        """Writes a row at once; before the first, the headers."""
+        """Write a row at once; before the first, the headers."""
         lines: list[Sequence[str]] = [[shortened(cells[0], self._widths[0]), *cells[1:]]]
         if not self._is_begun:
             self._is_begun = True
@@ -128,13 +129,13 @@ class StreamedTable:
             print(f"{GAP}{row}".rstrip(), flush=True)
 
     def end(self, text: str) -> None:
-        """Writes a line below the table, if it has a row."""
+        """Write a line below the table, if it has a row."""
         if self._is_begun:
             print(f"\n{GAP}{text}", flush=True)
 
 
 def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
-    """One row a trajectory: its question's answer, and the scores of its last frame."""
+    """Return a table with a row for each trajectory: its sample's answer, and the scores of its last frame."""
     shown = []
     for name, result in rows:
         scored: tuple[tuple[str, FrameScores], ...]
@@ -152,7 +153,7 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
 
 
 def status_tables(status: ServerStatus) -> list[Table | str]:
-    """The server's models, their batches, what the figures mean, and the machine if its metrics describe it."""
+    """Return tables of models, of their batches, and of the machine if its metrics describe it, with a legend."""
     version = f" {status.version}" if status.version else ""
     title = f"{status.url}: Triton{version}, {'ready' if status.ready else 'not ready'}"
     requests = ("model", "v", "state", "requests since load", "failed since load", "refused since start", "pending now")

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Synthetic samples of a seed, to see that a server answers and how fast; also as input of ``perf_analyzer``.
+"""Synthetic samples, to check that a server answers and how fast; also as input of ``perf_analyzer``.
 
-Their scores mean nothing. The file has the format of perf_analyzer's ``--input-data`` (its docs/input_data.md): under
-``data`` one entry a request, each tensor as ``content`` in row-major order and ``shape`` without the batch axis, which
-perf_analyzer adds. Numbers are base64 of their little-endian bytes.
+The file has the format of perf_analyzer's ``--input-data`` (its docs/input_data.md). ``data`` has an entry for each
+request. Each tensor has ``content`` in row-major order, and ``shape`` without the batch axis, which perf_analyzer adds.
+Numbers are base64 of their little-endian bytes.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ TASK = "put the block in the bowl"
 
 SampleType: TypeAlias = Literal["progress", "preference", "similarity"]
 
-_LENGTHS = re.compile(r"([1-9][0-9]{0,3})(?:-([1-9][0-9]{0,3}))?")  # a longer one would only fill the memory
+_LENGTHS = re.compile(r"([1-9][0-9]{0,3})(?:-([1-9][0-9]{0,3}))?")  # longer trajectories only fill the memory
 
 
 def parse_lengths(text: str) -> list[int]:
-    """The lengths that ``8``, ``4,8,16`` or ``4-16`` names. Raises ValueError."""
+    """Return the lengths in ``8``, ``4,8,16`` or ``4-16``. Raises ValueError."""
     lengths: list[int] = []
     for part in text.split(","):
         match = _LENGTHS.fullmatch(part.strip())
@@ -48,7 +48,7 @@ def parse_lengths(text: str) -> list[int]:
 
 @dataclass(frozen=True)
 class SyntheticSamples(Settings):
-    """Samples of one type, as many as ``num_samples``, whose trajectories have the lengths in turn."""
+    """Type and number of synthetic samples, and lengths of their trajectories."""
 
     TITLE: ClassVar[str] = "Samples"
 
@@ -64,7 +64,7 @@ class SyntheticSamples(Settings):
     seed: int = setting(0, "Seed of the random numbers.", least=0)
 
     def samples(self, client: RewardClient) -> list[Sample]:
-        """The samples, in the widths of the served checkpoint. Raises ModelNotFoundError if it does not take them."""
+        """Return samples in the widths of the served checkpoint. Raises ModelNotFoundError if no model takes them."""
         info = None
         if not self.use_frames:
             with suppress(ModelNotFoundError):
@@ -80,23 +80,23 @@ class SyntheticSamples(Settings):
 
 
 def are_frames(samples: Sequence[Sample]) -> bool:
-    """Whether synthetic samples are of raw frames."""
+    """True if synthetic samples have raw frames."""
     return samples[0].trajectories[0].frames is not None
 
 
 def perf_analyzer_input(samples: Sequence[Sample]) -> dict[str, Any]:
-    """The document: a request a sample, as RewardClient would send it alone."""
+    """Return the JSON document: for each sample a request as RewardClient would send it alone."""
     requests = [encode_samples([sample]) for sample in samples]
     return {"data": [{name: _tensor(array[0]) for name, array in request.items()} for request in requests]}
 
 
 def write_perf_analyzer_input(file: Path, samples: Sequence[Sample]) -> None:
-    """Writes the samples to ``file``, in perf_analyzer's JSON format."""
+    """Write the samples to ``file``, in perf_analyzer's JSON format."""
     file.write_text(json.dumps(perf_analyzer_input(samples)))
 
 
 def _tensor(array: npt.NDArray[Any]) -> dict[str, Any]:
-    if array.dtype == np.object_:  # BYTES: text, as it is
+    if array.dtype == np.object_:  # BYTES: plain text
         return {"content": [element.decode() for element in array.ravel()], "shape": list(array.shape)}
     little_endian = array.astype(array.dtype.newbyteorder("<"), copy=False)
     return {"content": {"b64": base64.b64encode(little_endian.tobytes()).decode()}, "shape": list(array.shape)}
