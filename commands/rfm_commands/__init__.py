@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The commands of ``rfm``: where the packages meet that do not know of each other."""
+"""Commands of ``rfm``: they join packages that do not import each other."""

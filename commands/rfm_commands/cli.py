@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The ``rfm`` command. The only place where packages meet that otherwise do not know of each other."""
+"""The ``rfm`` command. Only this package joins packages that do not import each other."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ app = typer.Typer(
     help="Reward models for robot learning, served by Triton.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # whose tables cut the names of options off where a terminal has 80 columns
+    rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -145,7 +145,7 @@ def serve(
 ) -> None:
     """Run tritonserver on a model repository until a signal stops it.
 
-    Only requests with the admin key can change its models, logging and tracing. Without an admin key, nobody can.
+    Only requests with the admin key can change its models, logging and tracing; without an admin key, no request can.
     """
     folder, more_arguments = _folder_and_arguments(words or (), repository)
     config = _config(config_file, serve=given, gateway=gateway_given)
@@ -180,7 +180,7 @@ app.add_typer(models_app, name="models")
 
 
 def _folder_and_arguments(words: Sequence[str], repository: Path | None) -> tuple[Path, Sequence[str]]:
-    """The repository, and arguments of tritonserver: what follows ``--`` comes as words, too."""
+    """The repository, and the arguments of tritonserver: typer passes words after ``--`` as words, too."""
     folder = words[0] if words and not words[0].startswith("-") else None
     if (folder is None) == (repository is None):
         got = "none" if folder is None else "both"
@@ -189,7 +189,7 @@ def _folder_and_arguments(words: Sequence[str], repository: Path | None) -> tupl
 
 
 def _beside(server: TritonServer, config: Config) -> GatewayConfig:
-    """The gateway before this server: what its section leaves open is the server's. It could start now."""
+    """The gateway's configuration, completed from the server's and checked: the gateway could start now."""
     gateway, endpoints = config.gateway, server.endpoints
     behind = replace(endpoints, host=from_here(endpoints.host))
     filled = replace(
@@ -210,7 +210,7 @@ def _beside(server: TritonServer, config: Config) -> GatewayConfig:
 
 
 def _config(file: Path | None, **options: Given) -> Config:
-    """The file's configuration with the options that were given on the command line, by section."""
+    """The file's configuration with the given options of each section."""
     return (Config() if file is None else Config.from_yaml(file)).with_options(**options)
 
 

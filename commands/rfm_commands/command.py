@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the commands of ``rfm`` share: errors on one line, options, what they tell."""
+"""Shared parts of ``rfm``'s commands: options, errors on one line, lines for the user."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rfm_client.cli import command
 from rfm_client.contract.settings import ConfigError
 from rfm_export.errors import ExportError
 
-OF_A_CHECKPOINT = ("checkpoint", "image_encoder", "text_encoder", "base_model")  # settings of an export
+OF_A_CHECKPOINT = ("checkpoint", "image_encoder", "text_encoder", "base_model")  # settings of an export that name it
 
 AdminKeyFile = Annotated[
     Path | None, typer.Option(help="File with the server's admin key; else RFM_ADMIN_KEY.", show_default=False)
@@ -28,7 +28,7 @@ TritonPath = Annotated[
 
 
 class RfmCommand(command.Command):
-    """A command whose expected errors take one line, and end it with 1."""
+    """A command that ends with 1 after an expected error, on one line."""
 
     program = "rfm"
     has_codes = False
@@ -39,10 +39,10 @@ class RfmCommand(command.Command):
 
 
 def say(line: str) -> None:
-    """Writes a line to standard error."""
+    """Write a line to standard error."""
     command.report(line, RfmCommand.program)
 
 
 def fail(message: str) -> NoReturn:
-    """Says why, and ends the command."""
+    """Write the message to standard error, and end the command with 1."""
     command.fail(message, RfmCommand.program)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One YAML file for everything that is served: a section for each time at which its keys take effect."""
+"""The YAML file of ``rfm``: a section for each time at which keys take effect, export, serve and gateway."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rfm_gateway.config import GatewayConfig
 
 SECTIONS: dict[str, type[Settings]] = {"export": ExportConfig, "serve": ServeConfig, "gateway": GatewayConfig}
 
-FASTAPI_KEYS = {  # of the FastAPI server's file, which has no sections, and what they are called in one
+FASTAPI_KEYS = {  # keys of the FastAPI server's file, which has no sections, with their settings
     "model_path": "export.checkpoint",
     "num_gpus": "export.num_gpus",
     "batch_size": "export.batch_size",
@@ -28,9 +28,9 @@ FASTAPI_KEYS = {  # of the FastAPI server's file, which has no sections, and wha
 
 @dataclass(frozen=True)
 class Config:
-    """All that one file sets, and the options that win over it.
+    """Settings of the file, and of the options that win over it. Raises ConfigError for a port used twice.
 
-    gateway.port None: there is no gateway
+    gateway.port: None: no gateway
     """
 
     export: ExportConfig = field(default_factory=ExportConfig)
@@ -47,13 +47,13 @@ class Config:
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Config:
-        """Reads the file. Raises ConfigError for what is not YAML, unknown keys and values that cannot be used."""
+        """Read the file. Raises ConfigError for invalid YAML, unknown keys and unusable values."""
         try:
             content = read_yaml(Path(path))
         except (OSError, ValueError) as error:
             raise ConfigError(str(path), f"expected a YAML file, got {error}") from error
         values: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
-        written: dict[str, str] = {}  # how the file names a key that stands outside a section
+        written: dict[str, str] = {}  # a setting's key in the file, for messages
         try:
             for name, setting, value in _entries(content):
                 section, _, key = setting.partition(".")
@@ -66,7 +66,7 @@ class Config:
             raise ConfigError(f"{path}: {error.key}" if error.key else str(path), error.expected) from None
 
     def with_options(self, **sections: Mapping[str, Any]) -> Config:
-        """The same with values by section and key. Raises ConfigError."""
+        """Return a copy with these values, by section and key. Raises ConfigError."""
         changed = {}
         for section, values in sections.items():
             try:
@@ -77,7 +77,7 @@ class Config:
 
 
 def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:
-    """Of each key how the file writes it, what it is called (``section.key``), and its value. Raises ConfigError."""
+    """Each key as the file writes it, its setting (``section.key``), and its value. Raises ConfigError."""
     for key, value in _items(content, ""):
         if key in FASTAPI_KEYS:
             yield key, FASTAPI_KEYS[key], value
@@ -91,7 +91,7 @@ def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:
 
 
 def _made(section: str, values: Mapping[str, Any], written: Mapping[str, str]) -> Any:
-    """A section of these values. Raises ConfigError for the key, as it stands in the file."""
+    """A section with these values. Raises ConfigError, which names the key as the file does."""
     kind = SECTIONS[section]
     known = settings_of(kind)
     try:
@@ -102,7 +102,7 @@ def _made(section: str, values: Mapping[str, Any], written: Mapping[str, str]) -
 
 
 def _items(content: Any, where: str) -> Iterable[tuple[Any, Any]]:
-    """Keys and values of a mapping; null is an empty one."""
+    """Keys and values of a mapping; null is empty."""
     if content is None:
         return ()
     if not isinstance(content, dict):
@@ -111,7 +111,7 @@ def _items(content: Any, where: str) -> Iterable[tuple[Any, Any]]:
 
 
 def _unknown(name: str, known: Iterable[str]) -> ConfigError:
-    """The error of a key that is not known, with what was probably meant: also a key of another section."""
+    """The error of an unknown key, with the most similar key of any section."""
     names = [*FASTAPI_KEYS, *(f"{section}.{key}" for section, kind in SECTIONS.items() for key in settings_of(kind))]
     keys = [each.rpartition(".")[2] for each in names]
     close = get_close_matches(name.rpartition(".")[2], keys, 1, cutoff=0.75)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm demo``: a video's scores from a server that runs as long as it takes, as a table and a picture."""
+"""``rfm demo``: a video's scores from a temporary server, as a table and a plot."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def demo(
 ) -> None:
     """Serve a checkpoint, score one video, plot, and stop everything."""
     try:
-        import av  # noqa: F401  which reads the video
+        import av  # noqa: F401  ``read_video`` needs it
         from rich.console import Console
 
         from rfm_client.data.video import read_video
@@ -61,7 +61,10 @@ def demo(
 def score_video(
     endpoints: Endpoints, video: Path, frames: UInt8Array, task: str, picture: Path, console: Console
 ) -> None:
-    """Scores the video's frames, or as many, evenly, as the checkpoint takes, and draws a picture."""
+    """Score the video, print the table, and draw the plot.
+
+    frames: uint8 [T, H, W, 3], T frames of H x W pixels, evenly thinned if the checkpoint takes fewer
+    """
     from rfm_client.cli.pictures import Panel, plot
     from rfm_client.data.video import frame_times_s
 
@@ -75,13 +78,13 @@ def score_video(
 
 
 def show_metrics(endpoints: Endpoints, console: Console) -> None:
-    """Prints what Triton counted while the demo ran."""
+    """Print Triton's counts of the demo's requests."""
     status = read_status(endpoints.http_url, metrics_url=endpoints.metrics_url)
     console.print(*status_tables(status), sep="\n", markup=False, highlight=False)
 
 
 def _exported_frames(checkpoint: str, settings: ExportConfig, repository: Path) -> Path:
-    """The new repository of a checkpoint that scores frames."""
+    """Export the checkpoint, and return the repository. Fails if the checkpoint scores only embeddings."""
     import rfm_export
 
     rfm_export.export(checkpoint, repository, settings)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A checkpoint in this process as the scorer of a dataset."""
+"""A scorer with a checkpoint in this process, without a server."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from rfm_export.verify import device_named
 
 
 class EngineScorer:
-    """Scores with an engine, one call at a time: while one thread scores, the others decode.
+    """Scores with an engine, one call at a time: while a thread scores, the others decode. T frames, H x W pixels.
 
-    The engine is on its device as soon as it scores; until then only the checkpoint is in memory.
+    The first call moves the checkpoint to the device.
 
-    notes: lines for the user, as ``rfm.families.notes`` has them of progress and success
+    notes: lines for the user, from ``rfm.families.notes`` for progress and success
     """
 
     def __init__(self, source: str, *, device: str = "cpu", **options: Any) -> None:
-        """The scorer of a checkpoint folder or Hugging Face id. Raises CheckpointError, and ExportError for a device.
+        """Load a checkpoint folder or Hugging Face id. Raises CheckpointError, or ExportError for a missing device.
 
         options: as in ``rfm.families.load``
         """
@@ -49,20 +49,20 @@ class EngineScorer:
         self._lock = threading.Lock()
 
     def checkpoint(self) -> CheckpointFacts:
-        """The facts of the checkpoint."""
+        """Return the facts of the checkpoint."""
         return self._facts
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
-        """The embeddings of frames and task. Raises RewardError."""
+        """Return embeddings of frames, uint8 [T, H, W, 3], and task. Raises RewardError."""
         with self._lock:
             encoders = self._engine.encoders
-            assert encoders is not None  # or the facts would not say that it encodes
+            assert encoders is not None  # callers encode only if the facts say ``encodes``
             encoder_sample = EncoderSample((Trajectory(frames=frames, task=task),))
             (outcome,) = encoders.encode([encoder_sample], Execution(), None)
         return cast(EncoderSample, _result(outcome)).trajectories[0]
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
-        """The result of each sample. Raises RewardError for the first that fails."""
+        """Return the result of each sample. Raises RewardError for the first failure."""
         with self._lock:
             outcomes = self._engine.evaluate(samples)
         return [cast(ProgressResult, _result(outcome)) for outcome in outcomes]
@@ -99,7 +99,7 @@ def _facts(
 def _settings_digest(
     checkpoint: Checkpoint, encoders: FrameEncoders | None, folders: Sequence[Path], told: Mapping[str, Any]
 ) -> str:
-    """Of all that decides the scores beside the folders' weights, encoders of the Hub with their weights."""
+    """Digest of all that decides the scores besides the folders' weights, with the weights of the Hub's encoders."""
     told = {**told, "network": config_fields(checkpoint.config)}
     if encoders is None:
         return settings_digest(folders, told)
@@ -108,13 +108,13 @@ def _settings_digest(
             encoders.save(Path(written))
             told["encoders"] = weights_digest([Path(written)])
             return settings_digest([*folders, Path(written)], told)
-    except (OSError, SafetensorError) as error:  # the latter of a full disk, too
+    except (OSError, SafetensorError) as error:  # safetensors reports a full disk as SafetensorError
         expected = "a folder of temporary files with room for a copy of the encoders"
         raise CheckpointError(f"TMPDIR: expected {expected}, got: {error}; name another one with it") from error
 
 
 def _named(value: Any) -> Any:
-    """An option; of one that names a local folder nothing, since its files are looked at."""
+    """The option, but None for a local folder, whose files count instead."""
     return None if isinstance(value, str) and Path(value).is_dir() else value
 
 

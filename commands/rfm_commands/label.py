@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm label``: a reward for every frame of a dataset, from a checkpoint in this process, without Triton."""
+"""``rfm label``: label every frame of a dataset with a checkpoint in this process, without Triton."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""``rfm models``: which models, and which versions of them, a running server serves.
+"""``rfm models``: list and change the models and versions that a running server serves.
 
-NAME is that of ``rfm export --name``: it stands for all models of the checkpoint. The server is reached over gRPC: a
-load over HTTP would keep its other callers waiting.
+NAME is that of ``rfm export --name``, and means all models of the checkpoint. The commands use gRPC, because a load
+over HTTP makes the server's other callers wait.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @dataclass(frozen=True)
 class AdministeredServer(Settings):
-    """A running server whose models are changed, and the repository that it reads."""
+    """A running server whose models change, and its repository."""
 
     TITLE: ClassVar[str] = "Server"
 
@@ -42,7 +42,7 @@ class AdministeredServer(Settings):
 
     @contextmanager
     def connected(self, context: typer.Context) -> Iterator[RepositoryApi]:
-        """Its API. Raises AdminKeyError, RepositoryApiError."""
+        """Yield the server's repository API. Raises AdminKeyError, RepositoryApiError."""
         credentials: Credentials = context.obj
         if credentials.uses_tls and not self.url.startswith(SECURE):
             raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {self.url}")
@@ -74,7 +74,7 @@ def list_models(
     context: typer.Context,
     server: Annotated[AdministeredServer, OptionsOf(AdministeredServer, only=("url", "admin_key_file"))],
 ) -> None:
-    """Each version of each model, its state, and why it is not ready."""
+    """List each version of each model, its state, and why it is not ready."""
     with server.connected(context) as api:
         rows = [_row(entry) for entry in api.index()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -85,7 +85,7 @@ def list_models(
 @app.command(cls=RfmCommand)
 @with_options
 def load(context: typer.Context, name: ExportedName, server: Administered) -> None:
-    """Serve NAME as its configurations say. It is new, or was unloaded."""
+    """Serve NAME, new or unloaded before, as its configurations say."""
     with server.connected(context) as api:
         for model in models_of(server.repository, name):
             api.load(model)
@@ -95,7 +95,7 @@ def load(context: typer.Context, name: ExportedName, server: Administered) -> No
 @app.command(cls=RfmCommand)
 @with_options
 def unload(context: typer.Context, name: ExportedName, server: Administered) -> None:
-    """Stop serving NAME when the requests in flight are answered. Its files stay."""
+    """Stop serving NAME after the answers to requests in flight. Its files stay."""
     with server.connected(context) as api:
         for model in reversed(models_of(server.repository, name)):
             api.unload(model)
@@ -113,7 +113,7 @@ def rollout(
 ) -> None:
     """Serve another version of NAME without losing a request.
 
-    It is loaded beside the old one, probed, then alone. If it fails the old one stays.
+    The new version is loaded beside the old version, probed, then served alone. If it fails, the old version stays.
     """
     with server.connected(context) as api:
         _roll_out(server, name, api, version)
@@ -122,7 +122,7 @@ def rollout(
 @app.command(cls=RfmCommand)
 @with_options
 def rollback(context: typer.Context, name: ExportedName, server: Administered) -> None:
-    """Serve the version before this one, as rollout does."""
+    """Serve the previous version of NAME, as rollout does."""
     with server.connected(context) as api:
         _roll_out(server, name, api, previous_version(server.repository, name, api))
 

@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Another version of a checkpoint's models on a running server, with no request lost.
+"""Change the served version of a checkpoint's models on a running server, without losing a request.
 
-Files and server go in step, so that a restart serves what ran. A checkpoint with encoders is three models: its encoder
-and its scorer (parts), and an ensemble, whose configuration names the versions of both. In this order:
+Files and server change in step, so that a restart serves the same versions. A checkpoint with encoders has three
+models: encoder and scorer (the parts), and an ensemble, whose configuration names the version of each part. The steps:
 
-1. Parts serve the new version beside the old. It is warmed up first, and one that cannot be loaded gets no request.
+1. Each part serves the new version beside the old. Triton warms the new version up first; if it fails, it gets no
+   request.
 2. The new version of each part answers a probe that names it.
-3. The ensemble goes over to the new version, and Triton finishes what the old one has begun.
-4. Parts serve the new version alone; Triton finishes again.
+3. The ensemble changes to the new version. Triton finishes the requests of the old version.
+4. Each part serves the new version alone. Triton again finishes the requests of the old version.
 
-Whatever fails on the way, the versions that were served before are loaded again with their own configurations. Those
-are put back even if the server is gone, so that a restart serves what was served before; a server that comes back
+If a step fails, the server loads the old versions with their own configurations again. The files of these
+configurations return even if the server is gone, so that a restart serves the old versions. A server that comes back
 within RETURN_S gets a request to load them.
 
-Requests that name no version are answered by the highest one that is ready: by the new one from step 1 on, in a
-rollback from step 4 on. Since one configuration holds for all versions of a model, step 1 has Triton load the old
-version a second time, with the new one's: for a moment there must be room for three copies.
+The highest ready version answers requests without a version: the new version from step 1 on, in a rollback from step 4
+on. A model has one configuration for all its versions, so Triton in step 1 loads the old version again, with the new
+configuration. For a moment there must be room for three copies.
 """
 
 from __future__ import annotations
@@ -52,11 +53,11 @@ Configs = Mapping[str, pb.ModelConfig]
 
 
 class RolloutError(ExportError):
-    """A version that is not served now, and why."""
+    """A version that cannot be served, and the reason."""
 
 
 def models_of(repository: Path, name: str) -> list[str]:
-    """The models that `rfm export --name NAME` made, an ensemble behind what it is made of. Raises RolloutError."""
+    """Return the models that ``rfm export --name NAME`` made, parts before their ensemble. Raises RolloutError."""
     names = (encoder_name(name), name, frames_name(name))
     models = [model for model in names if (repository / model / CONFIG_FILE).is_file()]
     if not models:
@@ -66,13 +67,13 @@ def models_of(repository: Path, name: str) -> list[str]:
 
 
 def names_of(repository: Path) -> list[str]:
-    """The names with which the repository's models were exported, `rfm export --name`."""
+    """Return the names of all exports in the repository, as in ``rfm export --name``."""
     endings = frames_name(""), encoder_name("")
     return sorted({model.removesuffix(endings[0]).removesuffix(endings[1]) for model in models_in(repository)})
 
 
 def previous_version(repository: Path, name: str, server: RepositoryApi) -> int:
-    """The version folder before the one that is served. Raises RolloutError, RepositoryApiError."""
+    """Return the version folder before the served version. Raises RolloutError, RepositoryApiError."""
     models = models_of(repository, name)
     served = [version for model in models for version in server.ready_versions(model)]
     if not served:
@@ -86,7 +87,7 @@ def previous_version(repository: Path, name: str, server: RepositoryApi) -> int:
 
 @dataclass(frozen=True)
 class Rollout:
-    """What is changed, on which server. report: is called with a line for each step"""
+    """A change of NAME's version on a server. report: takes a line for each step"""
 
     repository: Path
     name: str
@@ -94,7 +95,7 @@ class Rollout:
     report: Callable[[str], None]
 
     def to(self, version: int) -> None:
-        """Has ``version`` served, alone. Raises RolloutError, RepositoryApiError when nothing has been changed."""
+        """Serve ``version`` alone. Raises RolloutError, or before any change RepositoryApiError."""
         with alone(self.repository):
             self._to(version)
 
@@ -129,10 +130,10 @@ class Rollout:
                 probe(self.server, new[model], version)
 
     def _go_back(self, old: Configs, served: Mapping[str, Sequence[int]]) -> str:
-        """Serves what was served before. Gives what became of it, in words."""
+        """Serve the old versions again. Return the outcome in words."""
         self.report("going back")
         ends_s = time.monotonic() + RETURN_S
-        failed: dict[str, str | None] = dict.fromkeys(reversed(list(served)))  # the ensemble before what it names
+        failed: dict[str, str | None] = dict.fromkeys(reversed(list(served)))  # the ensemble before its parts
         while True:
             failed = {model: why for model in failed if (why := self._put_back(old[model], served[model]))}
             if not failed or time.monotonic() >= ends_s:
@@ -144,8 +145,8 @@ class Rollout:
         return f"served as before: {'; '.join(f'{model}: {_words(versions)}' for model, versions in served.items())}"
 
     def _put_back(self, config: pb.ModelConfig, versions: Sequence[int]) -> str | None:
-        """Restores a model's file and its served versions. Gives the reason if that fails: no server, or other models
-        come first.
+        """Restore a model's file and served versions. Return the reason of a failure: no server, or other models come
+        first.
         """
         try:
             self._write(serving_versions(config, versions) if versions else config)
@@ -171,7 +172,7 @@ class Rollout:
 
 
 def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
-    """Raises RepositoryApiError or RewardError unless the version answers with numbers."""
+    """Raise RepositoryApiError or RewardError unless the version answers synthetic samples with numbers."""
     reads = _dims(config.input)
     widths = None if wire.FRAMES in reads else (reads[wire.VIDEO_EMBEDDINGS], reads[wire.TEXT_EMBEDDING])
     trajectory = random_trajectory(np.random.default_rng(PROBE_SEED), PROBE_FRAMES, widths, task=PROBE_TASK)
@@ -185,7 +186,7 @@ def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
 
 
 def _dims(tensors: Iterable[Any]) -> dict[str, int]:
-    """The last dimension of each, by name."""
+    """Last dimension of each tensor, by name."""
     return {tensor.name: tensor.dims[-1] for tensor in tensors}
 
 
