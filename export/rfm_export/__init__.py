@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Checkpoint -> servable Triton model repository."""
+"""Export of a checkpoint into a Triton model repository."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> Any:
-        """A function of the exporter when it is first asked for: it needs PyTorch, which takes seconds to import."""
+        """Import an exporter function at its first use: the exporter needs PyTorch, which takes seconds to import."""
         if name not in ("check", "explain", "export"):
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from rfm_export import exporter

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which checkpoint a model serves, as parameters of its configuration: for those who ask the server."""
+"""Parameters of a model's configuration that tell clients which checkpoint it serves."""
 
 from __future__ import annotations
 
@@ -29,15 +29,16 @@ from rfm_client.contract.model_info import (
 )
 
 _OF_ORIGIN = (SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER)
-_SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # such as hub_token, wandb_api_key
+_SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for example hub_token, wandb_api_key
 
 
 def origin_of(source: str | Path, folder: Path) -> dict[str, str]:
-    """Where a checkpoint came from, as parameters by name.
+    """Return the checkpoint's origin as parameters by name: source, commit, config.yaml of the training run.
 
-    source: as the user named it; folder: where its files lie, of the Hub's in a snapshot named by its commit
+    The source of a folder is the end of its path. config.yaml becomes JSON without secrets.
 
-    Of a folder the end of its path is told; config.yaml of the training run as JSON, without secrets.
+    source: as the user named it
+    folder: the checkpoint's files, from the Hub in a snapshot named by its commit
     """
     revision = "" if is_folder(source) else commit_of(folder)
     file = find_run_config(folder)
@@ -46,18 +47,18 @@ def origin_of(source: str | Path, folder: Path) -> dict[str, str]:
 
 
 def origin_in(config: pb.ModelConfig) -> dict[str, str]:
-    """Where the checkpoint of an exported configuration came from, as ``origin_of``."""
+    """Return the origin in an exported configuration, as ``origin_of`` does."""
     told = {name: config.parameters[name].string_value for name in _OF_ORIGIN if name in config.parameters}
     return {SOURCE_PARAMETER: "", REVISION_PARAMETER: "", **told}
 
 
 def about(checkpoint: Checkpoint, origin: Mapping[str, str]) -> dict[str, str]:
-    """Parameters by name, without the digests of weights and settings: those are not written yet."""
+    """Return parameters by name, without the digests of weights and settings, whose files do not exist yet."""
     return {**origin, NETWORK_PARAMETER: json.dumps(_network(checkpoint))}
 
 
 def about_encoders(encoders: EncodersDescription, of_scorer: Mapping[str, str]) -> dict[str, str]:
-    """Parameters of the encoders that were exported with a scorer of these parameters."""
+    """Return the parameters of encoders, exported with a scorer of these parameters."""
     return {
         **{name: of_scorer[name] for name in (SOURCE_PARAMETER, REVISION_PARAMETER)},
         NETWORK_PARAMETER: json.dumps({"class": encoders.network_class}),
@@ -65,7 +66,7 @@ def about_encoders(encoders: EncodersDescription, of_scorer: Mapping[str, str]) 
 
 
 def record_digests(config: pb.ModelConfig, version: int, repository: Path) -> None:
-    """Sets the digests of a version's weights and settings in ``repository``; an ensemble has those of its parts."""
+    """Set the digests of a version's weights and settings in ``repository``; an ensemble has those of its parts."""
     parts = [step.model_name for step in config.ensemble_scheduling.step] or [config.name]
     folders = [repository / part / str(version) for part in parts]
     kinds = [pb.ModelInstanceGroup.Kind.Name(group.kind) for group in config.instance_group]
@@ -75,7 +76,7 @@ def record_digests(config: pb.ModelConfig, version: int, repository: Path) -> No
 
 
 def _public(value: Any) -> Any:
-    """A value of YAML as JSON can hold it, without the texts whose keys name a secret."""
+    """A YAML value in JSON's types, without texts whose keys name a secret."""
     if isinstance(value, dict):
         kept = {str(key): inner for key, inner in value.items() if not _is_secret(str(key), inner)}
         return {key: _public(inner) for key, inner in kept.items()}

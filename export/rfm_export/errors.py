@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""What can stop an export."""
+"""Errors that stop an export."""
 
 
 class ExportError(Exception):
-    """An export that cannot be made, and why."""
+    """An export that cannot be made, and the reason."""
 
 
 class ExportDiffersError(ExportError):
-    """The exported model does not give the numbers of its checkpoint, or there are none; nothing was published."""
+    """The export's scores differ from its checkpoint's, or are missing; nothing was published."""

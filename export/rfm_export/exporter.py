@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm export``: a checkpoint becomes the next version of its models in a Triton model repository."""
+"""``rfm export``: write a checkpoint into a Triton model repository, as the next version of its models."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _nobody(line: str) -> None:
 
 @dataclass(frozen=True)
 class _Source:
-    """What one export is made of; decisions: what decided the scores"""
+    """The checked input of an export. decisions: settings that the scores depend on"""
 
     family: Family
     checkpoint: Checkpoint
@@ -58,14 +58,15 @@ def export(
     device: str | None = None,
     say: Say = _nobody,
 ) -> int:
-    """Writes the checkpoint at ``source`` into ``repository`` and gives its version number.
+    """Write the checkpoint at ``source`` into ``repository``, and return its version number.
 
-    The staged files are loaded and compared with the original before anything in the repository changes.
-    other_machine: it is to be served elsewhere, so that ``num_gpus`` may be more than there are here
-    family: package of the checkpoint's family, which the server must be able to import too; None: one of ours
-    device: where the scores are compared; None: on the CPU, and those of a large network on a GPU with room for it
-    say: takes a line for the user: which config.yaml was read, those of ``rfm.families.notes``, and where the scores of
-        a large network are compared
+    The staged files are loaded and compared with the checkpoint before the repository changes.
+
+    other_machine: True: another machine serves it, so ``num_gpus`` may exceed the GPUs of this machine
+    family: package of the checkpoint's family, which the server must also be able to import; None: a built-in family
+    device: device that compares the scores; None: the CPU, for a large network a GPU with room for it
+    say: takes a line for the user: the run's config.yaml, ``rfm.families.notes``, the device of a large network
+
     Raises CheckpointError, ExportError.
     """
     if not other_machine:
@@ -93,15 +94,15 @@ def explain(
     family: str | None = None,
     say: Say = _nobody,
 ) -> Sequence[Decision]:
-    """What decided each thing that the scores of the checkpoint at ``source`` would depend on; writes nothing.
+    """Return all settings that the scores of the checkpoint at ``source`` depend on, with sources. Write nothing.
 
-    others: as of ``export``. Raises CheckpointError.
+    Parameters as of ``export``. Raises CheckpointError.
     """
     return _load(source, settings, family, say).decisions
 
 
 def _load(source: str | Path, settings: ExportConfig, family: str | None, say: Say) -> _Source:
-    """What is at ``source``, checked. Says which file holds the training run's settings, and what may be wrong."""
+    """Load and check ``source``. Tell the user the file of the training run's settings, and possible faults."""
     folder = families.find(source)
     kind = families.choose(folder, family)
     options = Options(settings.base_model, settings.image_encoder, settings.text_encoder)
@@ -117,7 +118,7 @@ def _load(source: str | Path, settings: ExportConfig, family: str | None, say: S
 
 
 def _check_gpus(num_gpus: int | None) -> None:
-    """Raises ExportError for more GPUs than this machine has: Triton would refuse to load the models."""
+    """Raise ExportError for more GPUs than this machine has: Triton would refuse to load the models."""
     there = torch.cuda.device_count()
     if num_gpus is not None and num_gpus > there:
         raise ExportError(
@@ -128,16 +129,15 @@ def _check_gpus(num_gpus: int | None) -> None:
 
 @contextmanager
 def _needing_disk(repository: Path) -> Iterator[None]:
-    """Raises ExportError where the repository's disk takes no more."""
+    """Raise ExportError if the repository's disk is full."""
     try:
         yield
-    except (OSError, SafetensorError) as error:  # the latter of a full disk, too
+    except (OSError, SafetensorError) as error:  # safetensors reports a full disk as SafetensorError
         kept = "the versions that are served stay as they are; make room there, or name another --repository"
         raise ExportError(f"{repository}: expected room for the exported files, got: {error}; {kept}") from error
 
 
 def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, staged: Path) -> None:
-    """Writes all files of the version."""
     folder = _checkpoint_folder(source.checkpoint.description, version, staged)
     source.checkpoint.save(folder)
     write(source.decisions, folder)
@@ -149,7 +149,7 @@ def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, 
 
 
 def _verify(source: _Source, version: Version, staged: Path, named: torch.device | None, say: Say) -> None:
-    """Raises ExportDiffersError unless what was staged gives the checkpoint's numbers."""
+    """Raise ExportDiffersError unless the staged files give the checkpoint's scores."""
     description, settings = source.checkpoint.description, version.settings
     dtype = settings.torch_dtype if description.is_large else None
     device = named or device_for(source.checkpoint, dtype, may_use_gpu=settings.num_gpus != 0)
@@ -180,7 +180,7 @@ def _encoders_folder(version: Version, repository: Path) -> Path:
 
 
 def check(repository: Path, settings: ExportConfig) -> list[str]:
-    """How the repository's generated files differ from what an export would write now; empty if they do not."""
+    """Return a line for each generated file that an export would now write differently. Raises ExportError."""
     scorer = settings.name if (repository / settings.name).exists() else frames_name(settings.name)
     config = _read_config(repository, scorer)
     versions = config.version_policy.specific.versions
@@ -204,7 +204,7 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
 
 
 def _generated(models: Sequence[GeneratedModel], repository: Path) -> dict[str, bytes]:
-    """Contents of the generated files by path in the repository, where the models' weights lie."""
+    """Contents of generated files by path, with digests of the weights in ``repository``."""
     for model in models:
         record_digests(model.config, model.version, repository)
     return {path: content for model in models for path, content in model.files().items()}
@@ -223,10 +223,10 @@ def _read_config(repository: Path, name: str) -> Any:
 
 
 def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], settings: ExportConfig) -> None:
-    """Raises ExportError for a model that would lose inputs or outputs, on which its clients rely.
+    """Raise ExportError for a model that would lose inputs or outputs, on which its clients rely.
 
-    A model may gain an optional input, which clients need not know, and lose that of frames' digests, without which
-    they send pixels.
+    A model may gain an optional input, which clients need not know. It may lose the input of frames' digests, without
+    which clients send pixels.
     """
     names = {model.name for model in models}
     for name in (settings.name, encoder_name(settings.name), frames_name(settings.name)):

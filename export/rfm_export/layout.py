@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The models that serve a checkpoint, and every generated file of them.
+"""The models that serve a checkpoint, and all their generated files.
 
-Of a checkpoint that scores embeddings ``<name>`` does so; with encoders there are also ``<name>_encoder`` and
-``<name>_frames``, the ensemble of the two, which scores raw frames. A checkpoint that scores raw frames itself is
-``<name>_frames`` alone.
+A checkpoint that scores embeddings is the model ``<name>``. With encoders there are two more models:
+``<name>_encoder``, and ``<name>_frames``, the ensemble of both, which scores raw frames. A checkpoint that scores raw
+frames is the model ``<name>_frames`` alone.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, 
 
 MODEL_FILE = "model.py"
 WARMUP_FOLDER = "warmup"
-KEEP_FILE = ".keep"  # Triton wants an ensemble's version folder, and git forgets empty ones
+KEEP_FILE = ".keep"  # Triton needs an ensemble's version folder, but git drops empty folders
 
 WARMUP_TASK = "warm up"
 
 
 @dataclass(frozen=True)
 class GeneratedModel:
-    """A model's configuration and files, but for its weights.
+    """A model's configuration and files, without its weights.
 
-    model_file: content of its model.py; None for an ensemble
+    model_file: content of model.py; None: an ensemble
     warmup_files: contents by name
     """
 
@@ -57,11 +57,11 @@ class GeneratedModel:
 
     @property
     def is_ensemble(self) -> bool:
-        """True if it is made of other models."""
+        """True if it consists of other models."""
         return self.model_file is None
 
     def files(self) -> dict[str, bytes]:
-        """Contents by path in the repository."""
+        """Return contents by path in the repository."""
         in_version = (KEEP_FILE, b"") if self.model_file is None else (MODEL_FILE, self.model_file)
         contents = {CONFIG_FILE: render(self.config).encode(), f"{self.version}/{in_version[0]}": in_version[1]}
         contents |= {f"{WARMUP_FOLDER}/{name}": content for name, content in self.warmup_files.items()}
@@ -70,7 +70,7 @@ class GeneratedModel:
 
 @dataclass(frozen=True)
 class Version:
-    """What the models of one exported version have in common.
+    """Settings that all models of an exported version share.
 
     num_gpus: 0: the CPU
     family: package of the checkpoint's family
@@ -85,19 +85,19 @@ class Version:
 
 
 def scorer_name(description: Description, name: str) -> str:
-    """Name of the model that has the checkpoint, of those that are served as ``name``."""
+    """Return the name of the model with the checkpoint, for an export as ``name``."""
     return frames_name(name) if description.widths is None else name
 
 
 def generated_models(
     description: Description, encoders: EncodersDescription | None, version: Version
 ) -> list[GeneratedModel]:
-    """The models of a checkpoint and its encoders, if it has some; an ensemble stands behind what it is made of."""
+    """Return the models of a checkpoint and its encoders, parts before their ensemble."""
     name, widths, cache_mb = version.settings.name, description.widths, version.settings.feature_cache_mb
     # Two small networks keep a GPU busy: one scores while the other reads.
     several = widths is not None and version.num_gpus > 0
     settings = replace(version.settings, instances=version.settings.instances or (2 if several else 1))
-    # Of several instances with a cache each would have to see all frames.
+    # With several instances, each cache would have to see all frames.
     keeps = description.keeps_features and cache_mb > 0 and settings.instances == 1
     outputs = wire.score_outputs(description.progress_bins if description.progress_bins > 1 else None)
     inputs = wire.frame_inputs(by_digest=keeps) if widths is None else wire.embedding_inputs(*widths)
@@ -117,7 +117,7 @@ def generated_models(
 
 
 def _limits(description: Description, frame_size: FrameSize | None) -> dict[str, str]:
-    """What a client may want to know before it sends a trajectory; empty: no limit."""
+    """Parameters that a client may need before it sends a trajectory; empty text: no limit."""
     limits = [n for n in (description.trained_frames, description.max_frames) if n is not None]
     padding = description.trained_padding
     return {
@@ -131,7 +131,7 @@ def _limits(description: Description, frame_size: FrameSize | None) -> dict[str,
 def _python_model(
     interface: Interface, template: str, version: Version, warmups: list[Warmup], *, keeps: bool
 ) -> GeneratedModel:
-    """keeps: it keeps what it makes of frames"""
+    """keeps: True: it keeps features of frames"""
     model_file = resources.files("rfm_export") / "templates" / template / MODEL_FILE
     files = {name: content for warmup in warmups for name, content in warmup.files().items()}
     config = python_config(interface, version.settings, version.num_gpus, version.number, warmups)
@@ -142,7 +142,7 @@ def _python_model(
 
 
 def _warmups(description: Description) -> list[Warmup]:
-    """One sample of each type that the checkpoint can score."""
+    """A sample of each type that the checkpoint can score."""
     trajectory = blank_trajectory(description.widths, task=WARMUP_TASK)
     samples: dict[str, Sample] = {"progress": ProgressSample(trajectory)}
     if description.has_preference:

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Staged models -> the repository, so that at every moment the repository can be loaded.
+"""Move staged models into the repository, which Triton can load at every moment.
 
-New version folders appear whole (written aside, then renamed) and are not served until the configurations,
-replaced one by one, name them. The order in which that happens keeps every intermediate state consistent.
+New version folders are written aside, then renamed, so they appear whole. Triton does not serve them until the
+configurations name them. The order in which these are replaced keeps every intermediate state consistent.
 
-The scratch folder lies in the repository, since nothing else need be writable, or be the same file system. Triton takes
-every folder of a repository for a model, unless its arguments name those to load. Inside a model's folder it ignores
-folders whose name is no number. So the scratch folder lies inside a model's folder. Only a repository without models
-holds it itself.
+The scratch folder lies in the repository: no other folder need be writable, or on the same file system. Triton takes
+every folder of a repository for a model, unless its arguments name the models. Inside a model's folder, Triton ignores
+folders whose name is no number. So the scratch folder lies inside a model's folder, or in a repository without models.
 
-A model has one configuration for all its versions, which names the checkpoint of the newest. So each version folder
-keeps the one that it was exported with, for the day when it is served again (``rollout``).
+A model has one configuration for all versions, which names the newest version's checkpoint. So each version folder
+keeps the configuration of its export, for a later ``rollout``.
 """
 
 from __future__ import annotations
@@ -39,14 +38,14 @@ _log = logging.getLogger(__name__)
 
 @contextmanager
 def alone(repository: Path) -> Iterator[None]:
-    """A context in which no other export or rollout changes the repository, if its file system has locks.
+    """Lock the repository against other exports and rollouts, if its file system has locks.
 
-    It removes what killed ones left. Raises ExportError while another one runs.
+    Removes scratch folders of killed processes. Raises ExportError while another export or rollout runs.
     """
     _make_writable(repository)
     descriptor = os.open(repository, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # given back when the process ends, however it ends
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released when the process ends, even if killed
     except BlockingIOError:
         os.close(descriptor)
         raise ExportError(f"{repository}: expected no other export or rollout at work, got one") from None
@@ -66,7 +65,7 @@ def alone(repository: Path) -> Iterator[None]:
 
 
 def _make_writable(repository: Path) -> None:
-    """Makes the folder, if need be. Raises ExportError for one that an export or rollout could not change."""
+    """Make the folder, if need be. Raises ExportError for a folder that an export or rollout cannot change."""
     try:
         if (repository / CONFIG_FILE).exists():
             raise ExportError(
@@ -85,10 +84,10 @@ def _make_writable(repository: Path) -> None:
 
 @contextmanager
 def staging(repository: Path, names: Sequence[str]) -> Iterator[Path]:
-    """A scratch folder in the repository, which is removed afterwards.
+    """Yield a scratch folder in the repository, and remove it after the block.
 
-    names: the models that change, as far as they are there. The folder lies in one of theirs: Triton loads a model
-        with one more folder anew if it gets a load request meanwhile.
+    names: models that change. The folder lies in an existing model of these, because a new folder makes Triton reload
+        a model at a load request.
     """
     changing = [repository / name for name in names if (repository / name / CONFIG_FILE).is_file()]
     folder = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=next(iter([*changing, *_models(repository)]), repository)))
@@ -99,32 +98,31 @@ def staging(repository: Path, names: Sequence[str]) -> Iterator[Path]:
 
 
 def _models(repository: Path) -> list[Path]:
-    """The folders of all models in the repository, sorted."""
     return sorted(file.parent for file in repository.glob(f"[!.]*/{CONFIG_FILE}"))
 
 
 def next_version(repository: Path, names: Sequence[str]) -> int:
-    """One more than the highest version of any of the models."""
+    """Return the highest version of any of the models, plus 1."""
     folders = (path for name in names for path in (repository / name).glob("*"))
     return 1 + max((int(path.name) for path in folders if path.name.isdecimal()), default=0)
 
 
 def read_config(repository: Path, name: str) -> pb.ModelConfig:
-    """The configuration that stands in the repository. Raises OSError, google.protobuf.text_format.ParseError."""
+    """Return a model's configuration in the repository. Raises OSError, google.protobuf.text_format.ParseError."""
     return parse((repository / name / CONFIG_FILE).read_text())
 
 
 def config_of(repository: Path, name: str, version: int) -> pb.ModelConfig:
-    """The configuration to serve one version of a model with. Raises OSError, ParseError."""
+    """Return the configuration that serves only this version of a model. Raises OSError, ParseError."""
     kept = repository / name / str(version) / CONFIG_FILE
     current = read_config(repository, name)
-    if version in current.version_policy.specific.versions and not kept.exists():  # of an export that kept none
+    if version in current.version_policy.specific.versions and not kept.exists():  # its export kept none
         return serving_versions(current, [version])
     return serving_versions(parse(kept.read_text()), [version])
 
 
 def replace_config(repository: Path, config: pb.ModelConfig, scratch: Path) -> None:
-    """Replaces a configuration: readers see the old or the new one, never a part.
+    """Replace a configuration in one step: readers never see a part.
 
     scratch: a folder on the same file system
     """
@@ -133,10 +131,10 @@ def replace_config(repository: Path, config: pb.ModelConfig, scratch: Path) -> N
 
 
 def publish(repository: Path, staged: Path, models: Sequence[GeneratedModel]) -> None:
-    """Moves the staged models into the repository.
+    """Move the staged models into the repository.
 
-    A model that is not there yet appears whole. One that is first serves its old and its new version, then the
-    ensembles switch to the new one, then the old one goes.
+    A new model appears whole. An existing model first serves its old and its new version, then the ensembles change to
+    the new version, then the old version goes.
     """
     replaced = [model for model in models if (repository / model.name).exists()]
     for model in models:
@@ -163,7 +161,7 @@ def publish(repository: Path, staged: Path, models: Sequence[GeneratedModel]) ->
 
 
 def _settle(staged: Path) -> None:
-    """Brings all files to the disk: a power cut leaves none of them half there. Raises ExportError for a link."""
+    """Flush all files to the disk, so that a power cut leaves no partial file. Raises ExportError for a link."""
     for path in (staged, *staged.rglob("*")):
         if path.is_symlink():
             raise ExportError(f"{path}: expected a file or folder, got a link")
@@ -175,7 +173,7 @@ def _settle(staged: Path) -> None:
 
 
 def _keep_config(repository: Path, name: str, scratch: Path) -> None:
-    """Keeps the served version's configuration in its folder, where its export kept none."""
+    """Keep the served version's configuration in its folder, if its export kept none."""
     current = read_config(repository, name)
     kept = repository / name / str(max(current.version_policy.specific.versions)) / CONFIG_FILE
     if not kept.exists():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Does an exported model give the numbers of the checkpoint that it was made from, and where is that compared?"""
+"""Compare the scores of an exported model with its checkpoint's, and choose the device that compares them."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from rfm_client.contract import (
 from rfm_client.contract.synthetic import Widths, random_trajectory
 from rfm_export.errors import ExportDiffersError, ExportError
 
-TOLERANCE = 1e-6  # same weights, same machine, same code: the numbers are the same but for rounding
+TOLERANCE = 1e-6  # same weights, machine and code: only rounding may differ
 PROBE_FRAMES = (1, 3, 8)
 PROBE_SIZE_PX = (48, 80)
 PROBE_FRAME_STEPS = 2
-WORKING_ROOM = 1.5  # of the weights' bytes: they, and what a pass over a few small samples needs
+WORKING_ROOM = 1.5  # times the weights' bytes, for weights and a pass over a few small samples
 
 
 def device_for(checkpoint: Checkpoint, dtype: torch.dtype | None, *, may_use_gpu: bool) -> torch.device:
-    """Where to compare, if nobody says: the CPU, and for a large network the GPU with most room, if that is enough.
+    """Return the default device: the CPU, for a large network the GPU with most free memory, if enough.
 
-    dtype: of the network there; None: the weights' own
+    dtype: of the network on the device; None: the weights' own
     """
     if not (checkpoint.description.is_large and may_use_gpu and torch.cuda.is_available()):
         return torch.device("cpu")
@@ -50,12 +50,12 @@ def device_for(checkpoint: Checkpoint, dtype: torch.dtype | None, *, may_use_gpu
 def _free_bytes(index: int) -> int:
     try:
         return torch.cuda.mem_get_info(index)[0]
-    except RuntimeError:  # it is too full to be asked, or belongs to another process alone
+    except RuntimeError:  # the GPU is full, or another process has it alone
         return 0
 
 
 def device_named(name: str) -> torch.device:
-    """The device of this name. Raises ExportError for one that this machine has not."""
+    """Return the device of this name. Raises ExportError if this machine does not have it."""
     there, why = ["cpu"], f": PyTorch {torch.__version__} finds no GPU; --device cpu"
     if torch.cuda.is_available():
         there, why = ["cpu", "cuda", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))], ""
@@ -66,7 +66,7 @@ def device_named(name: str) -> torch.device:
 
 @contextmanager
 def needing_room(device: torch.device) -> Iterator[None]:
-    """Raises ExportError for a network that does not fit on the device."""
+    """Raise ExportError for a network that does not fit on the device."""
     try:
         yield
     except torch.OutOfMemoryError as error:
@@ -76,9 +76,9 @@ def needing_room(device: torch.device) -> Iterator[None]:
 
 
 def probes(description: Description, *, with_encoders: bool) -> list[Sample]:
-    """Random samples of each type that the checkpoint can score, of several lengths.
+    """Return random samples of each type that the checkpoint can score, in several lengths.
 
-    with_encoders: there are encoders, so that a checkpoint that scores embeddings is compared on raw frames, too
+    with_encoders: True: for a checkpoint that scores embeddings, raw frames too
     """
     random = np.random.default_rng(0)
 
@@ -100,19 +100,19 @@ def probes(description: Description, *, with_encoders: bool) -> list[Sample]:
 
 
 def verify(original: Callable[[], Engine], exported: Callable[[], Engine], samples: Sequence[Sample]) -> None:
-    """Raises ExportDiffersError unless both engines give the same numbers for every sample; one is made at a time."""
+    """Raise ExportDiffersError unless both engines give the same scores. Only one engine exists at a time."""
     scores = [make().evaluate(samples) for make in (original, exported)]
     for index, (before, after) in enumerate(zip(*scores, strict=True)):
         expected, got = _numbers(index, "the checkpoint", before), _numbers(index, "the export", after)
         if not np.allclose(got, expected, rtol=0, atol=TOLERANCE, equal_nan=True):
-            largest = np.nanmax(np.abs(got - expected))  # NaN: success that is not predicted
+            largest = np.nanmax(np.abs(got - expected))  # NaN: success is not predicted
             raise ExportDiffersError(
                 f"probe {index}: expected the checkpoint's scores, got a difference of {largest:g}"
             )
 
 
 def _numbers(index: int, whose: str, outcome: Outcome) -> npt.NDArray[np.float64]:
-    """All scores of a probe in a row."""
+    """All scores of a probe, concatenated."""
     if isinstance(outcome, RewardError):
         raise ExportDiffersError(f"probe {index}: expected scores of {whose}, got: {outcome}") from outcome
     if isinstance(outcome, ProgressResult):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triton <-> Engine: samples of the wire contract in, their rewards out."""
+"""Triton's model of a scorer: samples of the wire contract in, their scores out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rfm_client.contract.frame_refs import ProgressSampleRefs
 
 
 class TritonPythonModel(BatchModel[Sample | ProgressSampleRefs, Result]):
-    """One instance: one engine on one device."""
+    """An instance: an engine on a device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         self.engine = Engine.from_checkpoint(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triton <-> FrameEncoders: frames and task in, the embeddings that the reward model reads out."""
+"""Triton's model of the encoders: frames and task in, embeddings for the scorer out."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rfm_client.contract.samples import EncoderSample, Float32Array
 
 
 class TritonPythonModel(BatchModel[EncoderSample | EncoderSampleRefs, EncoderSample]):
-    """One instance: one pair of encoders on one device."""
+    """An instance: a pair of encoders on a device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         self.encoders = families.encoders_of(settings.get(FAMILY_PARAMETER)).load(version).to(device)
@@ -30,7 +30,7 @@ class TritonPythonModel(BatchModel[EncoderSample | EncoderSampleRefs, EncoderSam
 
     def decode(self, tensors: wire.Tensors) -> list[EncoderSample | EncoderSampleRefs]:
         num_frames = len(tensors[wire.NUM_FRAMES]) * wire.num_positions(tensors)
-        if num_frames > self.max_frames:  # a frame may be much smaller than what is made of it, and a digest is
+        if num_frames > self.max_frames:  # small frames and digests need much more memory here
             expected = f"at most {self.max_frames} frames in a request, with padding (max_sample_tokens of this server)"
             raise InvalidSampleError.at(wire.NUM_FRAMES, expected, str(num_frames))
         return wire.decode_trajectories(tensors)
