@@ -17,7 +17,7 @@ from rfm_client.cli import command
 from rfm_client.contract.settings import ConfigError
 from rfm_export.errors import ExportError
 
-OF_A_CHECKPOINT = ("checkpoint", "image_encoder", "text_encoder", "base_model")  # settings of an export that name it
+OF_A_CHECKPOINT = ("checkpoint", "image_encoder", "text_encoder", "base_model")  # settings that name it
 
 AdminKeyFile = Annotated[
     Path | None, typer.Option(help="File with the server's admin key; else RFM_ADMIN_KEY.", show_default=False)
@@ -28,7 +28,7 @@ TritonPath = Annotated[
 
 
 class RfmCommand(command.Command):
-    """A command that ends with 1 after an expected error, on one line."""
+    """A command of ``rfm``: an expected error takes one line, and ends it with 1."""
 
     program = "rfm"
     has_codes = False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The YAML file of ``rfm``: a section for each time at which keys take effect, export, serve and gateway."""
+"""The YAML file of ``rfm``: sections export, serve and gateway, by the time at which keys take effect."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rfm_gateway.config import GatewayConfig
 
 SECTIONS: dict[str, type[Settings]] = {"export": ExportConfig, "serve": ServeConfig, "gateway": GatewayConfig}
 
-FASTAPI_KEYS = {  # keys of the FastAPI server's file, which has no sections, with their settings
+FASTAPI_KEYS = {  # keys of the FastAPI server's file, and their settings here
     "model_path": "export.checkpoint",
     "num_gpus": "export.num_gpus",
     "batch_size": "export.batch_size",

@@ -85,7 +85,7 @@ def list_models(
 @app.command(cls=RfmCommand)
 @with_options
 def load(context: typer.Context, name: ExportedName, server: Administered) -> None:
-    """Serve NAME, new or unloaded before, as its configurations say."""
+    """Serve NAME, which is new or was unloaded, as its configurations say."""
     with server.connected(context) as api:
         for model in models_of(server.repository, name):
             api.load(model)

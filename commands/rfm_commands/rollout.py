@@ -4,15 +4,15 @@
 Files and server change in step, so that a restart serves the same versions. A checkpoint with encoders has three
 models: encoder and scorer (the parts), and an ensemble, whose configuration names the version of each part. The steps:
 
-1. Each part serves the new version beside the old. Triton warms the new version up first; if it fails, it gets no
-   request.
+1. Each part serves the new version beside the old. Triton warms up the new version first; if that fails, the new
+   version gets no request.
 2. The new version of each part answers a probe that names it.
 3. The ensemble changes to the new version. Triton finishes the requests of the old version.
 4. Each part serves the new version alone. Triton again finishes the requests of the old version.
 
-If a step fails, the server loads the old versions with their own configurations again. The files of these
-configurations return even if the server is gone, so that a restart serves the old versions. A server that comes back
-within RETURN_S gets a request to load them.
+If a step fails, the server loads the old versions with their own configurations again. Their files are
+put back even if the server is gone, so that a restart serves the old versions. A server that comes back within RETURN_S
+gets a request to load them.
 
 The highest ready version answers requests without a version: the new version from step 1 on, in a rollback from step 4
 on. A model has one configuration for all its versions, so Triton in step 1 loads the old version again, with the new

@@ -64,7 +64,7 @@ def export(
 
     other_machine: True: another machine serves it, so ``num_gpus`` may exceed the GPUs of this machine
     family: package of the checkpoint's family, which the server must also be able to import; None: a built-in family
-    device: device that compares the scores; None: the CPU, for a large network a GPU with room for it
+    device: for the comparison of scores; None: the CPU, for a large network a GPU with room for it
     say: takes a line for the user: the run's config.yaml, ``rfm.families.notes``, the device of a large network
 
     Raises CheckpointError, ExportError.

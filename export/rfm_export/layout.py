@@ -131,7 +131,7 @@ def _limits(description: Description, frame_size: FrameSize | None) -> dict[str,
 def _python_model(
     interface: Interface, template: str, version: Version, warmups: list[Warmup], *, keeps: bool
 ) -> GeneratedModel:
-    """keeps: True: it keeps features of frames"""
+    """keeps: True if the model keeps features of frames"""
     model_file = resources.files("rfm_export") / "templates" / template / MODEL_FILE
     files = {name: content for warmup in warmups for name, content in warmup.files().items()}
     config = python_config(interface, version.settings, version.num_gpus, version.number, warmups)

@@ -2,11 +2,12 @@
 """Move staged models into the repository, which Triton can load at every moment.
 
 New version folders are written aside, then renamed, so they appear whole. Triton does not serve them until the
-configurations name them. The order in which these are replaced keeps every intermediate state consistent.
+configurations name them. The order of their replacement keeps every intermediate state consistent.
 
 The scratch folder lies in the repository: no other folder need be writable, or on the same file system. Triton takes
 every folder of a repository for a model, unless its arguments name the models. Inside a model's folder, Triton ignores
-folders whose name is no number. So the scratch folder lies inside a model's folder, or in a repository without models.
+folders whose name is no number. So the scratch folder lies inside a model's folder; without
+models, in the repository itself.
 
 A model has one configuration for all versions, which names the newest version's checkpoint. So each version folder
 keeps the configuration of its export, for a later ``rollout``.
@@ -86,8 +87,8 @@ def _make_writable(repository: Path) -> None:
 def staging(repository: Path, names: Sequence[str]) -> Iterator[Path]:
     """Yield a scratch folder in the repository, and remove it after the block.
 
-    names: models that change. The folder lies in an existing model of these, because a new folder makes Triton reload
-        a model at a load request.
+    names: models that change; the folder lies in the first of them that exists, because a new folder makes Triton
+        reload a model at a load request
     """
     changing = [repository / name for name in names if (repository / name / CONFIG_FILE).is_file()]
     folder = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=next(iter([*changing, *_models(repository)]), repository)))

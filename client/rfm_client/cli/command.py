@@ -154,7 +154,7 @@ class Command(TyperCommand):
 
     program = "rfm-client"
     expected: tuple[type[Exception], ...] = (errors.RewardError, OSError)
-    has_codes = True  # False: every error ends it with 1
+    has_codes = True  # False: every error ends the command with 1
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Give ``--json`` without a value the value ``-``, which the parser cannot do."""

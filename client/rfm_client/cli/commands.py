@@ -121,7 +121,7 @@ def compare(
     """Rank several videos by how well they do the task.
 
     Every two videos are compared in both orders. The rank follows the mean probability of winning against the others.
-    A video has no rank ("?") if the orders disagree about one of its pairs. The table also shows each last progress.
+    A video has no rank ("?") if the orders disagree about one of its pairs. The table also shows progress at the end.
     """
     if len(videos) < MIN_COMPARED:
         raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")

@@ -25,7 +25,7 @@ from rfm_client.labelling.scorer import Scorer
 Columns: TypeAlias = dict[str, Float32Array]
 
 PROGRESS, SUCCESS = "progress", "success"
-FRAMES_AT_A_TIME = 64  # in a request to the encoder: one forward pass of it
+FRAMES_AT_A_TIME = 64  # in a request to the encoder, as in its forward pass
 MAX_BYTES = 32 * 2**20  # of the samples in one call of the scorer
 MAX_FRAME_BYTES = 2 * 2**30  # of all workers of a process
 
@@ -40,7 +40,7 @@ class FrameMemory:
 
     @contextmanager
     def holding(self, num_bytes: int) -> Iterator[None]:
-        """Wait until ``num_bytes`` fit, and hold them during the block. A worker must not hold twice."""
+        """Wait until ``num_bytes`` fit, and hold them during the block. Nested calls can deadlock."""
         with self._changed:
             self._changed.wait_for(lambda: not self._held_bytes or self._held_bytes + num_bytes <= self._max_bytes)
             self._held_bytes += num_bytes

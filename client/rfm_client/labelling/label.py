@@ -57,7 +57,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Paths of parts and label files, without formats that are not to be written.
+    """Paths of the parts, and of the label files in the formats to write.
 
     dataset: None: only the paths of Parquet files are needed
 
@@ -169,8 +169,8 @@ def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = _DEFAULTS, w
     If an episode fails, the report names it, and no label file is written. The same call then labels only the missing
     episodes.
 
-    Raises DatasetError, before the first score, for a contradictory dataset or a label file that it may not replace;
-    RewardError if the scorer is gone; OSError for a full disk.
+    Raises DatasetError, before the first score, for a contradictory dataset or a label file that this run may not
+    replace; RewardError if the scorer is gone; OSError for a full disk.
     """
     outputs, plan = _begin(dataset, scorer, options, watch)
     failures = Run(plan, dataset, scorer, outputs.parts, watch).finish_all(options.workers)

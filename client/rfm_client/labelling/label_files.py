@@ -7,7 +7,7 @@ of each camera.
 
 ``reward_signals/<name>.parquet``: LeRobot's frame signals (schema version 1), as its open pull requests propose them.
 Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and
-those of each camera. The metadata describes each.
+those of each camera. The metadata describes each score column.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class LabelFile:
         return cls(path, flaw, told, {int(index): digest for index, digest in by_episode.items()}, read, option)
 
     def check(self, plan: Plan, dataset: Dataset, known: Mapping[int, Item]) -> Mapping[int, Item]:
-        """Return its items by episode number. Raises DatasetError if labels would be lost, or do not fit the frames.
+        """Return the file's items by episode number. Raises DatasetError if labels would be lost, or do not fit.
 
         known: items of the plan, and of label files checked before
         """

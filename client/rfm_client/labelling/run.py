@@ -98,7 +98,7 @@ class Run:
         except _StoppedError:
             return
         except RewardError as error:
-            is_of_one = isinstance(error, ProcessEndedError)  # also at the client's second try
+            is_of_one = isinstance(error, ProcessEndedError)  # at both tries of the client
             if isinstance(error, _NOT_ABOUT_ONE_EPISODE) and not is_of_one:
                 self._stop(error)
                 return

@@ -18,11 +18,11 @@ from rfm_client.data.datasets.protocol import digest_of
 
 @dataclass(frozen=True)
 class CheckpointFacts:
-    """Facts of a checkpoint: its origin, what decides its scores, and its limits.
+    """A checkpoint's origin, causes of its scores, and limits.
 
     source, revision: origin; None: unknown
     weights_digest: of the weights
-    settings_digest: of all other causes of scores: configuration, encoders, dtype, device
+    settings_digest: of all else that decides the scores: configuration, encoders, dtype, device
     max_frames: most frames of a trajectory, in training or for the network, the smaller number; None: both unknown
     frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
     encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings

@@ -15,7 +15,7 @@ from rfm_client.data.datasets.protocol import require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
 from rfm_client.labelling.label_files import read_label_table
 
-_BACKWARDS_BY = 0.01  # kappa of reward-aligned behaviour cloning; less is noise
+_BACKWARDS_BY = 0.01  # kappa of reward-aligned behaviour cloning; a smaller fall is noise
 _MOST_LISTED = 12
 
 

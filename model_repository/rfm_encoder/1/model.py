@@ -30,7 +30,7 @@ class TritonPythonModel(BatchModel[EncoderSample | EncoderSampleRefs, EncoderSam
 
     def decode(self, tensors: wire.Tensors) -> list[EncoderSample | EncoderSampleRefs]:
         num_frames = len(tensors[wire.NUM_FRAMES]) * wire.num_positions(tensors)
-        if num_frames > self.max_frames:  # small frames and digests need much more memory here
+        if num_frames > self.max_frames:  # embeddings may be larger than small frames or digests
             expected = f"at most {self.max_frames} frames in a request, with padding (max_sample_tokens of this server)"
             raise InvalidSampleError.at(wire.NUM_FRAMES, expected, str(num_frames))
         return wire.decode_trajectories(tensors)
