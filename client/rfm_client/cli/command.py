@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Annotated, Any, NoReturn, TypeAlias, get_args, get_type_hints
+from typing import Annotated, Any, NoReturn, TypeAlias, get_args
 
 import typer
 from typer.core import TyperCommand
@@ -121,7 +121,8 @@ class OptionsOf:
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """Return the command with an option for each setting of its ``Settings`` and ``OptionsOf`` parameters."""
-    hints = get_type_hints(command, include_extras=True)
+    # not typing.get_type_hints, which in Python 3.10 hides the annotation of a parameter whose default is None
+    hints = {name: each.annotation for name, each in inspect.signature(command, eval_str=True).parameters.items()}
     marked = {name: mark for name, hint in hints.items() if (mark := _mark(hint)) is not None}
     parameters: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
