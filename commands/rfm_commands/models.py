@@ -74,7 +74,7 @@ def list_models(
     context: typer.Context,
     server: Annotated[AdministeredServer, OptionsOf(AdministeredServer, only=("url", "admin_key_file"))],
 ) -> None:
-    """List each version of each model, its state, and why it is not ready."""
+    """List the versions of each model, with state and reason."""
     with server.connected(context) as api:
         rows = [_row(entry) for entry in api.index()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -85,7 +85,7 @@ def list_models(
 @app.command(cls=RfmCommand)
 @with_options
 def load(context: typer.Context, name: ExportedName, server: Administered) -> None:
-    """Serve NAME, which is new or was unloaded, as its configurations say."""
+    """Serve NAME, a new or unloaded model, as configured."""
     with server.connected(context) as api:
         for model in models_of(server.repository, name):
             api.load(model)

@@ -171,7 +171,7 @@ def status(
 def wait(
     context: typer.Context, server: Annotated[ServerOptions, OptionsOf(ServerOptions, defaults={"timeout_s": 120.0})]
 ) -> None:
-    """Wait until the model is ready on one of the servers, at most for --timeout seconds."""
+    """Wait until a server has the model ready, at most --timeout seconds."""
     with server.client(context.obj) as client:
         client.wait_ready(server.timeout_s)
 

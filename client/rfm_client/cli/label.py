@@ -103,7 +103,9 @@ def label(
     run: RunOptions,
     ray: RayOptions,
 ) -> None:
-    """Label every frame of a dataset, in files that training reads.
+    """Write a label for every frame of a dataset.
+
+    The label files have the forms that training code reads, such as LeRobot's.
 
     Run the same command again to label the missing episodes.
     """
