@@ -171,7 +171,7 @@ def status(
 def wait(
     context: typer.Context, server: Annotated[ServerOptions, OptionsOf(ServerOptions, defaults={"timeout_s": 120.0})]
 ) -> None:
-    """Wait until a server has the model ready, at most --timeout seconds."""
+    """Wait until a server has the model ready, or --timeout passes."""
     with server.client(context.obj) as client:
         client.wait_ready(server.timeout_s)
 
