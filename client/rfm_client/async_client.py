@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""AsyncRewardClient: rewards from served reward models, for asyncio. RewardClient runs this one in a thread."""
+"""AsyncRewardClient: asyncio client of served reward models, which RewardClient runs in a thread."""
 
 from __future__ import annotations
 
@@ -30,25 +30,24 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 DEFAULT_TIMEOUT_S = 60.0
-DEFAULT_IN_FLIGHT = 128  # twice the usual batch: while one is scored, the next one gathers
+DEFAULT_IN_FLIGHT = 128  # twice the usual batch: the next gathers while a batch is scored
 READY_POLL_S = 0.2
 
 
 class AsyncRewardClient(AsyncClosing, OneProcess):
-    """A connection to one or several servers of the same checkpoint, for one event loop.
+    """Client of one or several servers of the same checkpoint, for one event loop.
 
-    Arrays of samples must not change while a call is awaited: they are sent as they are when it is their turn.
+    The arrays of a sample must not change while its call is awaited: they are read when it is the request's turn.
 
-    urls: ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``, one or several. The
-        server with the fewest requests under way gets the next one. A server that fails is left out until it is
-        ready again.
-    model: name under which the checkpoint was exported; raw frames go to ``<model>_frames``
-    timeout_s: the longest that a call may take, retries included, at most 1e9; there is no endless wait
-    retry: send again what failed because a server was down, restarting or full, until the time is up
-    max_in_flight: requests under way at a time; more wait their turn
-    shared_memory: large inputs go through memory that client and server map, if both are on one host
-    ca_file, client_certificate, client_key, headers, api_key: as Credentials has them
-    transports: instead of connections to ``urls``, for tests and unusual networks
+    urls: one or several ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``. The server
+        with the fewest open requests gets the next. A server that fails is left out until it is ready again
+    model: name of the exported checkpoint; raw frames go to ``<model>_frames``
+    timeout_s: longest time of a call, retries included; at most 1e9
+    retry: True: until the time is up, retry requests that fail because a server is down, restarting or full
+    max_in_flight: most open requests; further requests wait
+    shared_memory: True: large inputs go through memory that client and server, on one host, both map
+    ca_file, client_certificate, client_key, headers, api_key: as in Credentials
+    transports: used in place of connections to ``urls``, for tests and unusual networks
     """
 
     def __init__(
@@ -78,21 +77,21 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         self._scorer = SampleScorer(model, self._servers, ConcurrencyLimiter(max_in_flight))
         self._windows = WindowScorer(model, self._scorer)
         self._is_closed = False
-        self._loop: asyncio.AbstractEventLoop | None = None  # that it was first used in
+        self._loop: asyncio.AbstractEventLoop | None = None  # of the first call
 
     async def progress(
         self, trajectory: Trajectory, *, frame_steps: int = 0, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Progress and success at each frame; ``frame_steps`` as in ProgressSample. Raises RewardError."""
+        """Return progress and success at each frame; ``frame_steps`` as in ProgressSample. Raises RewardError."""
         return cast(ProgressResult, await self.score(ProgressSample(trajectory, frame_steps=frame_steps), **options))
 
     async def preference(
         self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]
     ) -> PreferenceResult:
-        """Probability that ``first`` does its task better than ``second``. Raises RewardError.
+        """Return the probability that ``first`` does its task better than ``second``. Raises RewardError.
 
-        both_orders: the other order is asked, too, since a model's answer may depend on it; the ``preference`` is the
-            mean, and where the orders disagree there is no ``verdict``. For labels, ask so.
+        both_orders: True: ask the other order, too, since answers may depend on the order; ``preference`` is the mean,
+            and if the orders disagree, ``verdict`` is None. Recommended for labels
         """
         sample = PreferenceSample(first, second)
         if not both_orders:
@@ -107,11 +106,11 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     async def similarity(
         self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]
     ) -> SimilarityResult:
-        """Raw similarity score of ``other`` to ``reference``. Raises RewardError."""
+        """Return the raw similarity score of ``other`` to ``reference``. Raises RewardError."""
         return cast(SimilarityResult, await self.score(SimilaritySample(reference, other), **options))
 
     async def score(self, sample: Sample, **options: Unpack[CallOptions]) -> Result:
-        """The result of one sample of any type. Raises RewardError."""
+        """Return the result of one sample of any type. Raises RewardError."""
         return await self._scorer.result(sample, self._call(options))
 
     @overload
@@ -125,10 +124,10 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     async def evaluate(
         self, samples: Iterable[Sample], *, return_errors: bool = False, **options: Unpack[CallOptions]
     ) -> list[Result] | list[Result | RewardError]:
-        """The results of any number and mix of samples, in order.
+        """Return the results of any number and mix of samples, in order.
 
-        return_errors: a sample that fails gives its error in its place and the others their results; otherwise the
-            first error is raised, as ``samples[3].num_frames: expected X, got Y``
+        return_errors: True: the error of a failed sample stands in its result's place; False: raise the first error,
+            as ``samples[3].num_frames: expected X, got Y``
         """
         samples = list(samples)
         outcomes = await self._scorer.outcomes(samples, self._call(options))
@@ -142,20 +141,20 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         return cast("list[Result]", outcomes)
 
     def episode(self, task: str, *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]) -> AsyncEpisode:
-        """An episode that is scored step by step: each step sends its new frame alone, if the server keeps features.
+        """Return an episode to score step by step. A step sends only its new frame, if the server keeps features.
 
-        options: as of EpisodeOptions; ValueError for contradictory ones
-        timeout_s: the longest that a step may take; None: the client's
+        timeout_s: longest time of a step; None: the client's
+        options: fields of EpisodeOptions. Raises ValueError for contradictory options
         """
         return AsyncEpisode(self, task, EpisodeOptions(**options), timeout_s)
 
     def episodes(
         self, num: int, task: str | Sequence[str], *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]
     ) -> AsyncEpisodes:
-        """Episodes side by side, as those of vectorised environments: as few requests a step as fit.
+        """Return ``num`` parallel episodes, as in vectorised environments. A step takes as few requests as possible.
 
-        task: of all, or of each
-        others: as of ``episode``
+        task: a sentence for all episodes, or a sentence for each
+        timeout_s, options: as in ``episode``
         """
         tasks = [task] * num if isinstance(task, str) else list(task)
         if len(tasks) != num:
@@ -165,11 +164,11 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     async def score_windows(
         self, windows: Sequence[Window], *, timeout_s: float | None = None
     ) -> list[Result | RewardError]:
-        """The result or error of each window, a progress question about frames that the server may know."""
+        """Return the progress result or error of each window. Only frames that the server lacks are sent."""
         return await self._windows.outcomes(windows, self._call({"timeout_s": timeout_s}))
 
     async def score_window(self, window: Window) -> ProgressResult:
-        """The result of a window. Raises RewardError."""
+        """Return the result of a window. Raises RewardError."""
         (outcome,) = await self.score_windows([window])
         if isinstance(outcome, RewardError):
             raise outcome
@@ -178,18 +177,19 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     async def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
-        """The trajectory with embeddings of its frames and its task in place of the frames, for a checkpoint that is
-        served with encoders. A trajectory that is scored often is then encoded once. Raises RewardError.
+        """Return the trajectory with embeddings of its frames and task in place of frames, to score it often.
+
+        The checkpoint must be served with encoders. Raises RewardError.
         """
         return await self._scorer.embeddings(trajectory, self._call({"timeout_s": timeout_s, "request_id": request_id}))
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
-        """Whether a server answers and has the model ready, for embeddings or for raw frames."""
+        """True if a server answers and has the model ready, for embeddings or for raw frames."""
         left_s = self._deadline(timeout_s).remaining_s()
         return await self._servers.is_ready((self._model, frames_name(self._model)), left_s)
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """Returns as soon as ``is_ready``. Raises DeadlineExceededError."""
+        """Return as soon as ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
         deadline = self._deadline(timeout_s)
         await self._servers.check_ports()
         while not await self.is_ready(timeout_s=min(PROBE_TIMEOUT_S, deadline.remaining_s())):
@@ -202,18 +202,21 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     async def model_info(
         self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None
     ) -> ModelInfo:
-        """What the server says of its model for embeddings or, with ``frames``, for raw frames.
+        """Return the server's description of its model for embeddings or, with ``frames``, for raw frames.
 
-        refresh: request it even if it is known. It is forgotten when another version of the model answers.
+        The client remembers it until another version of the model answers.
 
-        Raises ModelNotFoundError if it is not served.
+        refresh: True: request it again
+
+        Raises ModelNotFoundError if the model is not served.
         """
         name = frames_name(self._model) if frames else self._model
         return await self._scorer.model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """What every server that answers says now of the checkpoint's models, as far as it serves them: the one for
-        embeddings, the encoder, the one for raw frames. Raises RewardError if no server answers.
+        """Return, for each served part of the checkpoint, its description by every server that answers.
+
+        Raises RewardError if no server answers.
         """
         deadline = self._deadline(timeout_s)
         names: dict[Part, str] = {
@@ -228,11 +231,11 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         return told
 
     def stop_retrying(self) -> None:
-        """Has calls that fail from now on fail at once, as ``close`` does first."""
+        """Make later failures end their calls at once, as ``close`` does first."""
         self._servers.stop_retrying()
 
     async def close(self) -> None:
-        """Closes the connections and gives shared memory back."""
+        """Close the connections and release shared memory."""
         self._is_closed = True
         await self._servers.close()
 
@@ -246,12 +249,12 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         return ""
 
     def _call(self, options: CallOptions) -> Call:
-        """The call that begins now, with these options. Raises TypeError for an unknown one."""
+        """A call that begins now. Raises TypeError for an unknown option."""
         others: dict[str, Any] = {**options}
         return Call(self._deadline(others.pop("timeout_s", None)), **others)
 
     def _deadline(self, timeout_s: float | None) -> Deadline:
-        """Deadline of a call which begins now; timeout_s: None: the client's."""
+        """Deadline of a call that begins now; timeout_s: None: the client's."""
         if self._is_closed:
             raise RuntimeError("this AsyncRewardClient is closed")
         loop = asyncio.get_running_loop()

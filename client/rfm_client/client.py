@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""RewardClient: rewards from served reward models, for any number of threads."""
+"""RewardClient: blocking client of served reward models, for any number of threads."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 
 class RewardClient(Closing, OneProcess):
-    """AsyncRewardClient without ``await``, thread-safe: its event loop runs in a thread of its own.
+    """Blocking, thread-safe client: an AsyncRewardClient whose event loop runs in a thread of its own.
 
-    Arguments and errors are AsyncRewardClient's. Closes itself as a context manager and at the interpreter's end.
-    It does not survive a fork: make one in each process.
+    Arguments and errors are AsyncRewardClient's. It closes as a context manager and at the interpreter's end.
+    It does not survive a fork: make a client in each process.
     """
 
     def __init__(
@@ -71,20 +71,20 @@ class RewardClient(Closing, OneProcess):
     def progress(
         self, trajectory: Trajectory, *, frame_steps: int = 0, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Progress and success at each frame; ``frame_steps`` as in ProgressSample. Raises RewardError."""
+        """Return progress and success at each frame; ``frame_steps`` as in ProgressSample. Raises RewardError."""
         return self._loop.wait(self._client.progress(trajectory, frame_steps=frame_steps, **options))
 
     def preference(
         self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]
     ) -> PreferenceResult:
-        """Probability that ``first`` does its task better than ``second``; ``both_orders`` as in AsyncRewardClient.
+        """Return the probability that ``first`` does its task better than ``second``. Raises RewardError.
 
-        Raises RewardError.
+        both_orders: as in AsyncRewardClient
         """
         return self._loop.wait(self._client.preference(first, second, both_orders=both_orders, **options))
 
     def similarity(self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]) -> SimilarityResult:
-        """Raw similarity score of ``other`` to ``reference``. Raises RewardError."""
+        """Return the raw similarity score of ``other`` to ``reference``. Raises RewardError."""
         return self._loop.wait(self._client.similarity(reference, other, **options))
 
     @overload
@@ -98,12 +98,11 @@ class RewardClient(Closing, OneProcess):
     def evaluate(
         self, samples: Iterable[Sample], *, return_errors: bool = False, **options: Unpack[CallOptions]
     ) -> list[Result] | list[Result | RewardError]:
-        """The results of any number and mix of samples, in order.
+        """Return the results of any number and mix of samples, in order.
 
-        return_errors: a sample that fails gives its error in its place and the others their results; otherwise the
-            first error is raised
+        return_errors: True: the error of a failed sample stands in its result's place; False: raise the first error
         """
-        samples = list(samples)  # here, since whatever makes them may take its time, or ask this client
+        samples = list(samples)  # in this thread: an iterator may be slow, or call this client
         return self._loop.wait(self._client.evaluate(samples, return_errors=return_errors, **options))
 
     @overload
@@ -113,39 +112,39 @@ class RewardClient(Closing, OneProcess):
     @overload
     def submit(self, sample: SimilaritySample, **options: Unpack[CallOptions]) -> Future[SimilarityResult]: ...
     def submit(self, sample: Sample, **options: Unpack[CallOptions]) -> Future[Any]:
-        """The result to come; returns at once. The future raises RewardError; cancelling it cancels the request.
+        """Return at once, with a future of the result. It raises RewardError; cancelling it cancels the request.
 
-        The sample's arrays are copied, so they may be written over. Of many futures ``max_in_flight`` requests are
-        sent at a time; the copies of the others stay in memory.
+        The sample's arrays are copied, so the caller may change them. At most ``max_in_flight`` requests are sent at a
+        time; the copies of the others stay in memory.
         """
         future = self._loop.start(self._client.score(snapshot(sample), **options))
-        future.add_done_callback(lambda _done: self)  # until then the client lives, even without another reference
+        future.add_done_callback(lambda _done: self)  # keeps the client alive until then
         return future
 
     def episode(self, task: str, *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]) -> Episode:
-        """An episode that is scored step by step: each step sends its new frame alone, if the server keeps features.
+        """Return an episode to score step by step. A step sends only its new frame, if the server keeps features.
 
-        options: as of EpisodeOptions; ValueError for contradictory ones
-        timeout_s: the longest that a step may take; None: the client's
+        timeout_s: longest time of a step; None: the client's
+        options: fields of EpisodeOptions. Raises ValueError for contradictory options
         """
         return Episode(self._client.episode(task, timeout_s=timeout_s, **options), self._loop, self)
 
     def episodes(
         self, num: int, task: str | Sequence[str], *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]
     ) -> Episodes:
-        """Episodes side by side, as those of vectorised environments: as few requests a step as fit.
+        """Return ``num`` parallel episodes, as in vectorised environments. A step takes as few requests as possible.
 
-        task: of all, or of each
-        others: as of ``episode``
+        task: a sentence for all episodes, or a sentence for each
+        timeout_s, options: as in ``episode``
         """
         return Episodes(self._client.episodes(num, task, timeout_s=timeout_s, **options), self._loop, self)
 
     def score_windows(self, windows: Sequence[Window], *, timeout_s: float | None = None) -> list[Result | RewardError]:
-        """The result or error of each window, a progress question about frames that the server may know."""
+        """Return the progress result or error of each window. Only frames that the server lacks are sent."""
         return self._loop.wait(self._client.score_windows(windows, timeout_s=timeout_s))
 
     def submit_window(self, window: Window) -> Future[ProgressResult]:
-        """The result of a window to come, as of ``submit``."""
+        """Return at once, with a future of the window's result, as ``submit``."""
         future = self._loop.start(self._client.score_window(window))
         future.add_done_callback(lambda _done: self)
         return future
@@ -153,39 +152,43 @@ class RewardClient(Closing, OneProcess):
     def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
-        """The trajectory with embeddings of its frames and its task in place of the frames, for a checkpoint that is
-        served with encoders. A trajectory that is scored often is then encoded once. Raises RewardError.
+        """Return the trajectory with embeddings of its frames and task in place of frames, to score it often.
+
+        The checkpoint must be served with encoders. Raises RewardError.
         """
         return self._loop.wait(self._client.encode(trajectory, timeout_s=timeout_s, request_id=request_id))
 
     def is_ready(self, *, timeout_s: float | None = None) -> bool:
-        """Whether a server answers and has the model ready, for embeddings or for raw frames."""
+        """True if a server answers and has the model ready, for embeddings or for raw frames."""
         return self._loop.wait(self._client.is_ready(timeout_s=timeout_s))
 
     def wait_ready(self, timeout_s: float) -> None:
-        """Returns as soon as ``is_ready``. Raises DeadlineExceededError."""
+        """Return as soon as ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
         self._loop.wait(self._client.wait_ready(timeout_s))
 
     def model_info(self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None) -> ModelInfo:
-        """What the server says of its model for embeddings or, with ``frames``, for raw frames.
+        """Return the server's description of its model for embeddings or, with ``frames``, for raw frames.
 
-        refresh: request it even if it is known. It is forgotten when another version of the model answers.
+        The client remembers it until another version of the model answers.
 
-        Raises ModelNotFoundError if it is not served.
+        refresh: True: request it again
+
+        Raises ModelNotFoundError if the model is not served.
         """
         return self._loop.wait(self._client.model_info(frames=frames, refresh=refresh, timeout_s=timeout_s))
 
     def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """What every server that answers says now of the checkpoint's models, as far as it serves them: the one for
-        embeddings, the encoder, the one for raw frames. Raises RewardError if no server answers.
+        """Return, for each served part of the checkpoint, its description by every server that answers.
+
+        Raises RewardError if no server answers.
         """
         return self._loop.wait(self._client.model_infos(timeout_s=timeout_s))
 
     def close(self) -> None:
-        """Cancels what is under way, closes the connections and gives shared memory back."""
+        """Cancel running calls, close the connections and release shared memory."""
         self._finalizer()
 
 
 def _close(client: AsyncRewardClient, loop: LoopThread) -> None:
-    client.stop_retrying()  # before calls are cancelled, for a connection may seem to end under them
+    client.stop_retrying()  # first: to a cancelled call the connection may seem to end
     loop.stop(client.close)

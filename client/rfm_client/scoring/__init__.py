@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""From samples to requests, and from answers to results: what both clients do in a call."""
+"""Steps of a call in both clients: samples to requests, answers to results."""

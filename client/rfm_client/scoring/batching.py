@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which samples go into one request: those that fit the same arrays, bounded in number and bytes."""
+"""Grouping of samples into requests: they fit the same arrays, within limits of number and bytes."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from itertools import groupby
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.samples import Sample, stackable
 
-MAX_REQUEST_BYTES = 8 * 2**20  # more gains nothing: Triton puts requests together
+MAX_REQUEST_BYTES = 8 * 2**20  # more gains nothing, since Triton batches requests
 
 
 def model_of(sample: Sample, model: str) -> str:
-    """Name of the model that scores the sample: that of embeddings or that of raw frames."""
+    """Return the name of the model that scores the sample, for embeddings or for raw frames."""
     return model if sample.trajectories[0].frames is None else frames_name(model)
 
 
 def groups(samples: Mapping[int, Sample], model: str) -> Iterator[tuple[str, list[int]]]:
-    """The samples in groups that fit the same arrays: the model of each group, and its indices, short ones first."""
+    """Yield groups of samples that fit the same arrays: the model's name and the indices, short samples first."""
 
     def key(index: int) -> tuple[str, list[tuple[int, ...]], tuple[int, ...]]:
         trajectories = samples[index].trajectories
@@ -32,7 +32,7 @@ def groups(samples: Mapping[int, Sample], model: str) -> Iterator[tuple[str, lis
 
 
 def parts(samples: Mapping[int, Sample], group: Sequence[int], max_batch_size: int) -> Iterator[list[int]]:
-    """A group cut into requests of at most ``max_batch_size`` samples, and MAX_REQUEST_BYTES unless one has more."""
+    """Cut a group into requests of at most ``max_batch_size`` samples and, unless one has more, MAX_REQUEST_BYTES."""
     part: list[int] = []
     longest: list[int] = []
     for index in group:
@@ -46,18 +46,18 @@ def parts(samples: Mapping[int, Sample], group: Sequence[int], max_batch_size: i
 
 
 def padded_bytes(samples: Sequence[Sample]) -> int:
-    """Bytes of the frame positions of one request of these samples, which fit the same arrays."""
+    """Return the bytes of one request's frame positions, padding included. The samples fit the same arrays."""
     longest: list[int] = [max(sizes) for sizes in zip(*map(array_bytes, samples), strict=True)]
     return len(samples) * sum(longest)
 
 
 def num_positions(sample: Sample) -> int:
-    """Number of frames of all trajectories of the sample."""
+    """Return the number of frames in all trajectories of the sample."""
     return sum(trajectory.num_frames for trajectory in sample.trajectories)
 
 
 def array_bytes(sample: Sample) -> list[int]:
-    """Bytes of the sample's frame positions in each of the arrays that hold them."""
+    """Return the bytes of the sample's frame positions in each array of the request."""
     if len(sample.trajectories) == 1:
         return [sample.trajectories[0].positions.nbytes]
     return [sum(t.positions.nbytes for t in together) for together in stackable(sample.trajectories)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How one call is made: its options, its deadline, and the ids of its requests."""
+"""The options, deadline and request ids of one call."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import TypedDict
 from rfm_client.contract import wire
 from rfm_client.transport.deadline import Deadline
 
-_ID_BYTES = 8  # of chance in the ids of a call's requests
+_ID_BYTES = 8  # random bytes in the ids of a call's requests
 
 
 class CallOptions(TypedDict, total=False):
-    """Options that every call takes.
+    """Options of every call.
 
-    timeout_s: the longest that it may take, instead of the client's
-    logits: with the raw scores of the progress bins, which only discrete checkpoints have
-    timing: with the server's time for the batch
-    subsample: of a trajectory longer than ``ModelInfo.max_frames`` so many frames are scored, evenly from the first to
-        the last, as training cuts its clips; ``frame_indices`` names them (None: all)
-    resize: frames are made as small as the checkpoint reads them before they are sent (needs Pillow); ReWiND's scores
-        differ slightly from those of the frames as they are
-    request_id: with which the ids of the call's requests begin, in errors and in the server's log (None: a random one)
+    timeout_s: longest time of the call; None: the client's
+    logits: True: add the raw scores of the progress bins (discrete checkpoints only)
+    timing: True: add the server's time for the batch
+    subsample: True: score at most ``ModelInfo.max_frames`` frames of a trajectory, evenly spaced from first to last, as
+        in training; the result's ``frame_indices`` lists them
+    resize: True: shrink frames to the checkpoint's size before they are sent (needs Pillow); ReWiND's scores then
+        differ slightly
+    request_id: start of the ids of the call's requests, in errors and in the server's log; None: random
     """
 
     timeout_s: float | None
@@ -35,10 +35,10 @@ class CallOptions(TypedDict, total=False):
 
 
 class Call:
-    """What the requests of one call share. Raises ValueError for a request id that is not allowed.
+    """Values that the requests of one call share. Raises ValueError for an invalid request id.
 
-    outputs: beside the scores that the samples ask for
-    request_ids: one for each request
+    outputs: outputs beside the scores of the samples
+    request_ids: an id for each request
     """
 
     def __init__(

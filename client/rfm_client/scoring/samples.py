@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples in, outcomes out: which requests a call makes of them, and what comes of each."""
+"""Scoring of samples: the requests of a call, and each sample's outcome."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
 
 
 class SampleScorer:
-    """Scores samples on the servers of one client, for one event loop.
+    """Scorer of samples on a client's servers, for one event loop.
 
     model: name of the model that scores embeddings
     """
@@ -44,7 +44,7 @@ class SampleScorer:
         self._infos: dict[str, ModelInfo] = {}  # until another version of the model answers
 
     async def result(self, sample: Sample, call: Call) -> Result:
-        """The result of one sample. Raises RewardError."""
+        """Return the result of one sample. Raises RewardError."""
         fit = await self._fitted(sample, call)
         (outcome,) = await self._request(model_of(fit.sample, self._model), [fit.sample], call)
         if isinstance(outcome, RewardError):
@@ -52,7 +52,7 @@ class SampleScorer:
         return with_frame_indices(outcome, fit.frame_indices)
 
     async def outcomes(self, samples: Sequence[Sample], call: Call) -> list[Outcome]:
-        """The result or error of each sample."""
+        """Return the result or error of each sample."""
         fits: dict[int, FittedSample] = {}
         outcomes: dict[int, Outcome] = {}
         for index, sample in enumerate(samples):
@@ -68,7 +68,7 @@ class SampleScorer:
         return [outcomes[index] for index in range(len(samples))]
 
     async def embeddings(self, trajectory: Trajectory, call: Call) -> Trajectory:
-        """The trajectory with embeddings in place of its frames. Raises RewardError."""
+        """Return the trajectory with embeddings in place of its frames. Raises RewardError."""
         if trajectory.frames is None:
             raise InvalidSampleError.at("trajectory", "frames", "video_embeddings")
         tensors, model = partial(wire.encode_frames, trajectory), encoder_name(self._model)
@@ -77,7 +77,7 @@ class SampleScorer:
         return wire.decode_embeddings(answer.tensors, trajectory)
 
     async def model_info(self, model: str, deadline: Deadline, *, refresh: bool = False) -> ModelInfo:
-        """What the server says of ``model``, requested once unless ``refresh``. Raises RewardError."""
+        """Return the server's description of ``model``, from memory unless ``refresh``. Raises RewardError."""
         if refresh or model not in self._infos:
             try:
                 self._infos[model] = await self._servers.model_info(model, deadline)
@@ -87,19 +87,19 @@ class SampleScorer:
         return self._infos[model]
 
     async def _fitted(self, sample: Sample, call: Call) -> FittedSample:
-        """The sample as it is sent. Raises RewardError."""
+        """The sample as the call sends it. Raises RewardError."""
         fit = whole(sample)
         if not (call.subsample or call.resize):
             return fit
         call.deadline.remaining_s()
         info = await self.model_info(model_of(sample, self._model), call.deadline)
-        # in a thread: resizing takes a while, and other calls wait for this event loop
+        # in a thread, since resizing would block the event loop
         return await asyncio.to_thread(fitted, sample, info, subsample=call.subsample, resize=call.resize)
 
     async def _scored(
         self, model: str, group: Sequence[int], samples: Mapping[int, Sample], call: Call
     ) -> Iterable[tuple[int, Outcome]]:
-        """The outcomes of a group of samples that fit the same arrays, with their indices."""
+        """Indices and outcomes of a group of samples that fit the same arrays."""
         if len(group) == 1:
             return zip(group, await self._request(model, [samples[group[0]]], call), strict=True)
         try:
@@ -111,7 +111,7 @@ class SampleScorer:
         return zip(group, itertools.chain(*answered), strict=True)
 
     async def _request(self, model: str, samples: Sequence[Sample], call: Call) -> Sequence[Outcome]:
-        """One request. It fails whole if one sample cannot be scored; then each sample is sent alone."""
+        """Send one request. An invalid sample fails the whole request; then send each sample alone."""
         request_id = next(call.request_ids)
         outputs, tensors = (*wire.outputs_for(samples), *call.outputs), partial(wire.encode_samples, samples)
         size, deadline = padded_bytes(samples), call.deadline
@@ -136,11 +136,11 @@ class SampleScorer:
         deadline: Deadline,
         request_id: str,
     ) -> Answer:
-        """The model's outputs for the tensors, which are made when it is the request's turn. Raises RewardError.
+        """Return the model's ``outputs``. Raises RewardError.
 
-        num_bytes: of the tensors
+        tensors: makes the inputs of ``num_bytes`` when it is the request's turn
         """
-        async with self._concurrency.room(num_bytes, deadline):  # tensors are made in turn, so they do not pile up
+        async with self._concurrency.room(num_bytes, deadline):  # tensors are made in turn, so that they do not pile up
             inputs = await off_loop(num_bytes, tensors)
             answer = await self._servers.infer(model, inputs, outputs, deadline, request_id=request_id)
         known = self._infos.get(model)
@@ -150,12 +150,12 @@ class SampleScorer:
 
 
 async def _together(calls: Sequence[Coroutine[Any, Any, Answered]]) -> Sequence[Answered]:
-    """What all coroutines give. A single one, as in most calls, needs no task of its own."""
+    """Await all coroutines. A single coroutine, as in most calls, needs no task of its own."""
     return [await calls[0]] if len(calls) == 1 else await asyncio.gather(*calls)
 
 
 def for_each(error: RewardError, count: int) -> list[Outcome]:
-    """One error of its own for each sample that shares the failure; they may be raised apart."""
+    """Return ``count`` copies of the error, since callers may raise them separately."""
     copies: list[Outcome] = []
     for _ in range(count):
         one = copy(error)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Tensors to a server of several and answers back: calls, deadlines, retries, shared memory."""
+"""Requests to one of several servers: calls, deadlines, retries, shared memory."""

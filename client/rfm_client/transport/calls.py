@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Named tensors to one Triton server and back, over gRPC or HTTP; the errors of both in our own tree."""
+"""Calls to one Triton server over gRPC or HTTP. All errors become RewardErrors."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from rfm_client.transport.shared_memory import Region, SharedMemory
 Answered = TypeVar("Answered")
 
 _US_PER_S = 1_000_000
-_AS_IT_IS = {"Accept-Encoding": "identity"}  # else aiohttp asks for gzip, which makes floats little smaller
-_SERVED_TIMEOUT_S = 2.0  # of what an error adds
+_AS_IT_IS = {"Accept-Encoding": "identity"}  # else aiohttp asks for gzip, which hardly shrinks floats
+_SERVED_TIMEOUT_S = 2.0  # for the names of served models in an error
 
 logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The outputs of one request, and the version of the model that gave them."""
+    """The outputs of one request, and the version of the model that answered."""
 
     tensors: Tensors
     model_version: str
@@ -52,39 +52,38 @@ class Transport(Protocol):
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
-        """The named ``outputs`` of ``model`` for ``inputs``. request_id: what the server calls the request"""
+        """Return the named ``outputs`` of ``model`` for ``inputs``. request_id: for the server's log"""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        """What the server says of ``model``. ModelNotFoundError when it is not served."""
+        """Return the server's description of ``model``. Raises ModelNotFoundError."""
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
-        """Whether the server answers and ``model`` is ready."""
+        """True if the server answers and ``model`` is ready."""
 
     async def close(self) -> None:
-        """Closes the connection to the server."""
+        """Close the connection to the server."""
 
 
 def connect(url: str, *, shared_memory: bool = False, credentials: Credentials | None = None) -> Transport:
-    """The transport for ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``.
+    """Return the transport for ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or ``https://``.
 
-    It connects when it is first used. Raises ValueError.
+    It connects at first use. Raises ValueError.
 
-    shared_memory: large inputs go through memory that the server, on the same host, maps too
-    credentials: certificates, and what is shown with each request
+    shared_memory: True: large inputs go through memory that the server, on the same host, maps too
     """
     kind = GrpcTransport if split_url(url)[0].startswith("grpc") else HttpTransport
     return kind(url, credentials or Credentials(), shared_memory=shared_memory)
 
 
 class TritonTransport:
-    """What gRPC and HTTP have in common: tritonclient's asyncio clients are the same but for a few options.
+    """Base for gRPC and HTTP: tritonclient's asyncio clients differ only in a few options.
 
-    A module of tritonclient is imported when it is first needed; a client belongs to the event loop that runs then.
+    tritonclient's module is imported at first use. Its client belongs to the event loop that runs then.
     """
 
     _module: ClassVar[str]  # of tritonclient
-    _as_json: ClassVar[dict[str, bool]] = {}  # by which its methods give dictionaries
-    _proxy: str | None = None  # as an error tells it
+    _as_json: ClassVar[dict[str, bool]] = {}  # makes its methods return dictionaries
+    _proxy: str | None = None  # for errors
 
     def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
         self.url = url
@@ -94,7 +93,7 @@ class TritonTransport:
             raise ValueError(f"url: expected grpcs:// or https:// with certificates, got {url}")
         self._shared_memory = SharedMemory(url) if shared_memory else None
         self._connection: Connection | None = None
-        self._left: list[Connection] = []  # and perhaps not closed yet
+        self._left: list[Connection] = []  # perhaps not closed yet
 
     @cached_property
     def _triton(self) -> Any:
@@ -109,7 +108,7 @@ class TritonTransport:
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         async def request(client: Any) -> ModelInfo:
             config = await client.get_model_config(model, **self._as_json)
-            return ModelInfo.from_config(config.get("config", config))  # gRPC's has it inside
+            return ModelInfo.from_config(config.get("config", config))  # nested in gRPC's answer
 
         return await self._call(request, timeout_s, bad_request=errors.ModelNotFoundError)
 
@@ -135,7 +134,7 @@ class TritonTransport:
         self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float, client: Any
     ) -> Answer:
         requested = [self._triton.InferRequestedOutput(name) for name in outputs]
-        # Triton drops a request that waits in its queue for longer, over HTTP too: no client waits for the answer.
+        # Triton drops requests that wait longer in its queue, over HTTP too: no client waits for their answers.
         waits_us = max(int(timeout_s * _US_PER_S), 1)
         largest = max(inputs, key=lambda name: inputs[name].nbytes)
         lent = nullcontext() if self._shared_memory is None else self._shared_memory.lend(client, inputs[largest])
@@ -166,9 +165,9 @@ class TritonTransport:
         *,
         bad_request: type[errors.RewardError] = errors.InvalidSampleError,
     ) -> Answered:
-        """What the server answers to ``request``, within ``timeout_s``; ``bad_request`` as of ``triton.error_from``."""
+        """Return the answer to ``request`` within ``timeout_s``; ``bad_request`` as in ``triton.error_from``."""
         try:
-            # Not by a deadline of gRPC: Triton 2.51 overlooks that one has passed, but not that a call is cancelled.
+            # Not gRPC's deadline: Triton 2.51 overlooks a deadline that has passed, but not a cancelled call.
             async with timeout(timeout_s):
                 return await self._answer(request)
         except errors.RewardError:
@@ -182,7 +181,7 @@ class TritonTransport:
             raise error from raised
 
     async def _not_served(self, error: errors.ModelNotFoundError) -> errors.ModelNotFoundError:
-        """The error with the models that are served, if the server says so in time."""
+        """The error with the names of served models, if the server tells them in time."""
         with suppress(Exception):
             async with timeout(_SERVED_TIMEOUT_S):
                 with self._connected().used() as client:
@@ -191,7 +190,7 @@ class TritonTransport:
         return error
 
     async def _answer(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:
-        """What the server answers; a connection over which nothing comes is left to those who use it already."""
+        """Return the answer. If the call is cancelled over a silent connection, later calls get a new connection."""
         connection = self._connected()
         try:
             with connection.used() as client:
@@ -199,7 +198,7 @@ class TritonTransport:
             connection.record_answer()
             return answer
         except InferenceServerException:
-            connection.record_answer()  # or gRPC knows itself that the connection has ended
+            connection.record_answer()  # or gRPC has noticed that the connection ended
             raise
         except asyncio.CancelledError:
             if connection.is_silent and connection is self._connection:
@@ -217,19 +216,19 @@ class TritonTransport:
         return self._connection
 
     def _open(self) -> Any:
-        """A client of tritonclient's, which connects when it is first used."""
+        """Return tritonclient's client, which connects at first use."""
         raise NotImplementedError
 
 
 class GrpcTransport(TritonTransport):
-    """gRPC: a call that runs out of time, or is cancelled, is cancelled on the server too (if it has not begun).
+    """gRPC transport: a cancelled or late call is cancelled on the server too, unless it has begun there.
 
-    A host name may have several addresses, such as that of a headless Service: gRPC spreads the requests over them.
+    If the host name has several addresses (a headless Service), gRPC spreads the requests over them.
     """
 
     _module = "tritonclient.grpc.aio"
     _as_json: ClassVar[dict[str, bool]] = {"as_json": True}
-    _first_process: int | None = None  # that used gRPC
+    _first_process: int | None = None  # first to use gRPC
 
     def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
         super().__init__(url, credentials, shared_memory=shared_memory)
@@ -237,7 +236,7 @@ class GrpcTransport(TritonTransport):
 
     def _open(self) -> Any:
         process = GrpcTransport._first_process = GrpcTransport._first_process or os.getpid()
-        if process != os.getpid():  # it would crash or hang
+        if process != os.getpid():  # gRPC would crash or hang
             raise RuntimeError(
                 f"gRPC was used in process {process}, which forked this one: "
                 "have multiprocessing start its processes by spawn or forkserver"
@@ -248,7 +247,7 @@ class GrpcTransport(TritonTransport):
 
 
 class HttpTransport(TritonTransport):
-    """HTTP: as many connections as there are calls at a time. Triton finishes a request that nobody waits for."""
+    """HTTP transport: one connection per concurrent call. Triton finishes a request even if its caller has left."""
 
     _module = "tritonclient.http.aio"
 
@@ -258,7 +257,7 @@ class HttpTransport(TritonTransport):
         post = client._post
 
         async def post_stream(request_uri: str, request_body: Any, headers: Any, query_params: Any) -> Any:
-            # As a stream aiohttp sends it piece by piece; in one piece it would hold the event loop, and warns.
+            # aiohttp sends a stream piece by piece. Large bytes would block the event loop, and aiohttp warns.
             is_large = isinstance(request_body, bytes) and len(request_body) >= MIN_BYTES
             body = io.BytesIO(request_body) if is_large else request_body
             return await post(request_uri, body, {**(headers or {}), **_AS_IT_IS}, query_params)

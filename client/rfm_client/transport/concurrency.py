@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How much may be under way at a time, so that neither side's memory fills up."""
+"""A limit on concurrent requests and their bytes, so that client and server stay within memory."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from contextlib import asynccontextmanager
 from rfm_client.contract.numbers import checked_count
 from rfm_client.transport.deadline import Deadline, timeout
 
-MAX_BYTES = 256 * 2**20  # of inputs; they are held several times over while they are written to a socket
+MAX_BYTES = 256 * 2**20  # of inputs; writing to a socket holds several copies of them
 
 
 class ConcurrencyLimiter:
-    """Room for ``max_requests`` requests of MAX_BYTES together, for one event loop. First come, first served."""
+    """A limit of ``max_requests`` requests and MAX_BYTES at a time, for one event loop. First come, first served."""
 
     def __init__(self, max_requests: int) -> None:
         self._free_requests = checked_count("max_in_flight", max_requests)
         self._free_bytes = MAX_BYTES
-        self._turn = asyncio.Lock()  # the next one to enter holds it
-        self._left = asyncio.Event()  # a request has ended since
+        self._turn = asyncio.Lock()  # held by the request that enters next
+        self._left = asyncio.Event()  # set when a request ends
 
     @asynccontextmanager
     async def room(self, num_bytes: int, deadline: Deadline) -> AsyncIterator[None]:
-        """A context in which a request of ``num_bytes`` is under way. One of more than MAX_BYTES is under way alone.
+        """Context manager for a request of ``num_bytes``. A request over MAX_BYTES runs alone.
 
         Raises DeadlineExceededError if there is no room in time.
         """
@@ -49,5 +49,5 @@ class ConcurrencyLimiter:
                 while not self._fits(num_bytes):
                     self._left.clear()
                     await self._left.wait()
-        except asyncio.TimeoutError:  # in Python 3.10 not the built-in one
+        except asyncio.TimeoutError:  # not the built-in class in Python 3.10
             raise deadline.exceeded() from None

@@ -17,17 +17,17 @@ SECURE_SCHEMES = ("grpcs", "https")
 AUTHORIZATION = "authorization"
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
-_VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII; blanks inside
+_VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII, with spaces inside
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """Credentials of a client. Raises ValueError for what cannot be used, without showing a key.
+    """Credentials of a client. Raises ValueError for unusable values, without showing a key.
 
-    ca_file: certificates (PEM) of the authorities that may vouch for the server; None: those of the system
-    client_certificate, client_key: files (PEM) by which a server knows this client (mutual TLS); both or none
-    headers: shown with each request, in HTTP and as gRPC's metadata
-    api_key: shown with each request as ``Authorization: Bearer KEY``
+    ca_file: certificates (PEM) of authorities that may vouch for the server; None: the system's
+    client_certificate, client_key: files (PEM) that identify this client (mutual TLS); both or neither
+    headers: sent with each request, over gRPC as metadata
+    api_key: sent with each request as ``Authorization: Bearer KEY``
     """
 
     ca_file: str | Path | None = None
@@ -45,21 +45,21 @@ class Credentials:
             if not _VALUE.fullmatch(value):
                 raise ValueError(f"{name}: expected visible ASCII characters, got others or none")
         if self.uses_tls:
-            self.ssl_context  # noqa: B018  # a file that cannot be read is an error now, not at first use
+            self.ssl_context  # noqa: B018  # reports an unreadable file now, not at first use
 
     @property
     def uses_tls(self) -> bool:
-        """Whether it has something that means nothing without TLS."""
+        """True if there are certificates, which only TLS uses."""
         return self.ca_file is not None or self.client_certificate is not None
 
     @property
     def options(self) -> dict[str, Any]:
-        """The same as keyword arguments of a client."""
+        """The credentials as keyword arguments of a client."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @property
     def shown(self) -> dict[str, str]:
-        """All headers, by name in lower case, as gRPC wants it."""
+        """All headers, their names in lower case, as gRPC requires."""
         given = {name.lower(): value for name, value in self.headers.items()}
         return given if self.api_key is None else {**given, AUTHORIZATION: f"Bearer {self.api_key}"}
 
@@ -70,12 +70,12 @@ class Credentials:
             check_authorities(self.ca_file, "ca_file")
         context = ssl.create_default_context(cafile=self.ca_file)
         if self.client_certificate is not None:
-            assert self.client_key is not None  # checked
+            assert self.client_key is not None  # by __post_init__
             load_certificate(context, self.client_certificate, self.client_key, "client_certificate, client_key")
         return context
 
     def http_options(self, scheme: str) -> dict[str, Any]:
-        """Arguments of tritonclient's HTTP clients that do not wait by asyncio."""
+        """Return arguments for tritonclient's HTTP client without asyncio."""
         if scheme not in SECURE_SCHEMES:
             return {}
         files = {"ca_certs": self.ca_file}  # None: the system's, not the library's own
@@ -84,7 +84,7 @@ class Credentials:
         return {"ssl": True, "ssl_options": files}
 
     def grpc_options(self, scheme: str) -> dict[str, Any]:
-        """Arguments of tritonclient's gRPC clients."""
+        """Return arguments for tritonclient's gRPC clients."""
         if scheme not in SECURE_SCHEMES:
             return {}
         files = {
@@ -95,7 +95,7 @@ class Credentials:
         return {"ssl": True, **files}
 
     def show_with_each_request(self, client: Any) -> None:
-        """Has one of tritonclient's clients show the headers."""
+        """Make a tritonclient client send the headers with each request."""
         shown = self.shown
         if not shown:
             return

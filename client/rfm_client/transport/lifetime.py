@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How objects that hold something end: at the end of a ``with`` block, and in the process that made them."""
+"""Bases of objects with connections: they close after a ``with`` block and stay in their process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class OneProcess:
-    """Holds a connection: cannot be pickled or copied, and says what to pass instead."""
+    """An object with a connection, which cannot be pickled or copied."""
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
@@ -23,7 +23,7 @@ class Closing:
     """A context manager that closes itself."""
 
     def close(self) -> None:
-        """Gives back what it holds."""
+        """Release the resources of this object."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
@@ -37,7 +37,7 @@ class AsyncClosing:
     """An async context manager that closes itself."""
 
     async def close(self) -> None:
-        """Gives back what it holds."""
+        """Release the resources of this object."""
         raise NotImplementedError
 
     async def __aenter__(self) -> Self:

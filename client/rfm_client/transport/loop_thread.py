@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An event loop in a thread of its own, for callers that have none."""
+"""An event loop in a thread of its own, for blocking callers."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ Returned = TypeVar("Returned")
 
 
 class LoopThread:
-    """Runs coroutines for any number of threads until it is stopped."""
+    """An event loop that runs coroutines for any number of threads, until ``stop``."""
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.new_event_loop()
         self._process_id = os.getpid()
-        self._starting = threading.Lock()  # between looking whether it is stopped and relying on the answer
+        self._starting = threading.Lock()  # _is_stopped must not change between check and use
         self._is_stopped = False
         self._thread = threading.Thread(target=self._loop.run_forever, name=name, daemon=True)
         self._thread.start()
 
     def start(self, coroutine: Coroutine[Any, Any, Returned]) -> Future[Returned]:
-        """The coroutine's result to come; cancelling it cancels the coroutine. Raises RuntimeError if it cannot run."""
+        """Return the coroutine's future, which can cancel it. Raises RuntimeError after ``stop`` and in a fork."""
         problem = None
         if os.getpid() != self._process_id:
             problem = f"was made in process {self._process_id}, which forked this one: make one in each process"
@@ -38,7 +38,7 @@ class LoopThread:
         raise RuntimeError(f"this RewardClient {problem}")
 
     def wait(self, coroutine: Coroutine[Any, Any, Returned]) -> Returned:
-        """The coroutine's result. Raises RuntimeError in the callback of a future, where it would wait for itself."""
+        """Return the coroutine's result. Raises RuntimeError in a future's callback, which would wait for itself."""
         if threading.current_thread() is self._thread:
             coroutine.close()
             raise RuntimeError("expected a call from another thread, got one from a callback of a future: use submit")
@@ -46,10 +46,10 @@ class LoopThread:
         try:
             return future.result()
         finally:
-            future.cancel()  # of a call that was interrupted; what is done stays done
+            future.cancel()  # after an interrupt; without effect on a finished future
 
     def stop(self, last: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Cancels what runs, runs ``last``, and ends the thread. Not in a fork, which has not got the thread."""
+        """Cancel all coroutines, run ``last``, and end the thread. Without effect in a fork, which lacks the thread."""
         if os.getpid() != self._process_id:
             return
         with self._starting:
@@ -57,7 +57,7 @@ class LoopThread:
                 return
             self._is_stopped = True
             ended = asyncio.run_coroutine_threadsafe(self._end(last), self._loop)
-        if threading.current_thread() is self._thread:  # the last reference was in a callback of a future
+        if threading.current_thread() is self._thread:  # a future's callback dropped the last reference
             return
         try:
             ended.result()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Work that takes a while, out of the event loop's way."""
+"""Long work in a thread, so that the event loop is not blocked."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import ParamSpec, TypeVar
 Arguments = ParamSpec("Arguments")
 Returned = TypeVar("Returned")
 
-MIN_BYTES = 2**20  # copying less takes no longer than changing threads
+MIN_BYTES = 2**20  # a smaller copy takes no longer than a change of thread
 
 
 async def off_loop(
     num_bytes: int, work: Callable[Arguments, Returned], *arguments: Arguments.args, **options: Arguments.kwargs
 ) -> Returned:
-    """What ``work`` gives, which handles so many bytes: in a thread if they are many."""
+    """Return the result of ``work``, which handles ``num_bytes``; from MIN_BYTES it runs in a thread."""
     if num_bytes < MIN_BYTES:
         return work(*arguments, **options)
     return await asyncio.to_thread(work, *arguments, **options)

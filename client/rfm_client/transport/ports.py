@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What listens at a port that was given as a server's, since each of Triton's three ports speaks another language."""
+"""Diagnosis of a wrong port: gRPC, HTTP, metrics or a gateway."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from rfm_client.contract.listening import in_url
 
 LOOK_S = 1.0
 _READ_BYTES = 4096
-_HTTP2_FRAME = "\x00\x00"  # how a gRPC server begins to answer a request that it does not understand
+_HTTP2_FRAME = "\x00\x00"  # start of a gRPC server's answer to HTTP/1.1
 
 
 _GRPC, _HTTP, _METRICS, _GATEWAY = "its gRPC port", "its HTTP port", "its metrics port", "a gateway's"
 _EXPECTED = {"grpc": (_GRPC, "Triton's gRPC port", 8001), "http": (_HTTP, "Triton's HTTP port", 8000)}
-OF_A_PORT = (  # errors of which a port may be the reason
+OF_A_PORT = (  # errors that a wrong port may cause
     errors.ServerUnavailableError,
     errors.AccessDeniedError,
     errors.InferenceFailedError,
@@ -27,7 +27,7 @@ OF_A_PORT = (  # errors of which a port may be the reason
 
 
 def wrong_port(url: str) -> str | None:
-    """What is wrong with the port of a server's URL, and the mend; None: nothing, or it cannot be seen."""
+    """Return the fault of the port in a server's URL and its remedy; None: no fault found."""
     scheme, address = split_url(url)
     protocol = scheme.removesuffix("s")
     right, expected, usual = _EXPECTED[protocol]
@@ -50,7 +50,7 @@ def wrong_port(url: str) -> str | None:
 
 
 def _port_at(address: str) -> str | None:
-    """What listens there, as a message names it; None: nothing that is known."""
+    """Kind of port, for a message; None: unknown."""
     try:
         if _read(address, "/v2").startswith(b"{"):
             return _HTTP
@@ -72,13 +72,13 @@ def _speaks_tls(address: str) -> bool:
         with socket.create_connection(place, LOOK_S) as plain, context.wrap_socket(plain):
             return True
     except ssl.SSLError as error:
-        return "ALERT" in (error.reason or "")  # it refuses this handshake in TLS
+        return "ALERT" in (error.reason or "")  # refuses the handshake, but in TLS
     except (OSError, UnicodeError):
         return False
 
 
 def _read(address: str, path: str) -> bytes:
-    """The beginning of a page; nothing of one that is not there."""
+    """The beginning of a page; empty if the page is missing."""
     connection = http.client.HTTPConnection(address, timeout=LOOK_S)
     try:
         connection.request("GET", path)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Servers of one checkpoint, and the one loop in which a request is asked of them until its deadline.
+"""Servers of one checkpoint, and the loop that retries a request until its deadline.
 
-The least busy server gets a request. One that fails is left out until it says that it is ready; the more often it
-failed, the later it is asked. A score depends on the request alone, so that sending it twice is safe:
+The least busy server gets a request. A server that fails is left out until it reports ready; after more failures, it is
+asked later. A score depends on the request alone, so a request may be sent twice:
 
-- a server is down, restarting or full: again, at once to another server or, when there is none, after growing pauses
-- a process or the connection ended, perhaps because of this request: once more, when a server can be back; then it
-  fails. So one request ends at most two processes
-- a server denies it, fails at it, or lacks the model: once to each other server
-- the sample is at fault, or the time is up: never again
+- the server is down, restarting or full: retry at once at another server, else after growing pauses
+- a process or the connection ended, perhaps because of this request: retry once, when a server can be back. So a
+  request ends at most two processes
+- the server denies access, fails, or lacks the model: try each other server once
+- the sample is at fault, or the time is up: do not retry
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ Request = Callable[[Transport, float], Awaitable[Answered]]
 
 FIRST_PAUSE_S = 0.1
 LONGEST_PAUSE_S = 2.0
-LONGEST_REST_S = 30.0  # of a server that says that it is ready and fails again and again
-RESTART_S = 15.0  # longer than `rfm serve` takes to notice that a process has ended, and to start Triton again
-SPREAD_S = 1.0  # over which requests come back, so that one that ends its process again takes few others with it
+LONGEST_REST_S = 30.0  # of a server that reports ready but keeps failing
+RESTART_S = 15.0  # longer than `rfm serve` takes to notice that a process ended and to restart Triton
+SPREAD_S = 1.0  # spread of retries, so that a request that ends its process again takes few others with it
 PROBE_TIMEOUT_S = 2.0
 _POLL_S = 0.2
 
@@ -52,11 +52,11 @@ logger = logging.getLogger("rfm_client")
 
 
 class KnownServer:
-    """One server of several: its transport, its load and its failures.
+    """One of several servers: its transport, load and failures.
 
-    failures: how often it was left out since the last success
-    has_answered: it has ever had a success
-    comeback: ends when the server says that it is ready again; None: it was never left out
+    failures: number of times that the server was left out since its last success
+    has_answered: True after the first success
+    comeback: ends when the server reports ready again; None: never left out
     """
 
     def __init__(self, transport: Transport) -> None:
@@ -69,11 +69,11 @@ class KnownServer:
 
     @property
     def is_left_out(self) -> bool:
-        """Whether the server gets no requests until it says that it is ready."""
+        """True if the server gets no requests until it reports ready."""
         return self.comeback is not None and not self.comeback.done()
 
     async def answer(self, request: Request[Answered], moment: int, left_s: float) -> Answered:
-        """What it answers to the request of this moment."""
+        """Return the server's answer. moment: number of the request, which breaks ties between servers"""
         self.outstanding += 1
         self.last_request = moment
         try:
@@ -82,7 +82,7 @@ class KnownServer:
             self.outstanding -= 1
 
     async def rested(self, model: str) -> None:
-        """Return when a server that failed says that it is ready, not at once."""
+        """Return when the failed server reports ready, after a pause that grows with its failures."""
         await asyncio.sleep(pause_s(self.failures - 1, LONGEST_REST_S))
         for attempt in itertools.count():
             if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
@@ -92,7 +92,7 @@ class KnownServer:
     async def back(self, model: str, *, was_down: bool) -> None:
         """Return when the server is ready again after a process or the connection ended.
 
-        Triton 2.51 says that a dead model is ready, so it must have said the opposite before, for RESTART_S at most.
+        Triton 2.51 reports a dead model as ready. So wait for RESTART_S, or until the server has reported the opposite.
         """
         until_s = time.monotonic() + RESTART_S
         while True:
@@ -110,7 +110,7 @@ class KnownServer:
 
 
 class Servers:
-    """Sends each request to one of several servers, for one event loop. retry: whether anything is asked again"""
+    """Several servers that share the requests, for one event loop. retry: False: never send a request again"""
 
     def __init__(self, transports: Sequence[Transport], *, retry: bool) -> None:
         if not transports:
@@ -125,7 +125,7 @@ class Servers:
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], deadline: Deadline, *, request_id: str
     ) -> Answer:
-        """The named ``outputs`` of ``model`` for ``inputs``. Raises RewardError, which names the request."""
+        """Return the named ``outputs`` of ``model`` for ``inputs``. Raises RewardError with the request's id."""
 
         def request(server: Transport, left_s: float) -> Awaitable[Answer]:
             return server.infer(model, inputs, outputs, left_s, request_id=request_id)
@@ -137,15 +137,15 @@ class Servers:
             raise
 
     async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
-        """What a server says of ``model``. Raises RewardError."""
+        """Return a server's description of ``model``. Raises RewardError."""
         return await self._request(model, lambda server, left_s: server.model_info(model, left_s), deadline)
 
     async def model_infos(self, model: str, deadline: Deadline) -> list[ModelInfo]:
-        """What each server says of ``model``. Left out are those that do not answer, for they score nothing either.
+        """Return the descriptions of ``model`` by all servers that answer. Raises RewardError if none answers.
 
-        Raises RewardError if none answers.
+        The description that came first may be there twice.
         """
-        infos = [await self.model_info(model, deadline)]  # as soon as one is there
+        infos = [await self.model_info(model, deadline)]  # waits until a server answers
         if len(self._servers) > 1:
             others = [server.transport for server in self._servers if not server.is_left_out]
             left_s = deadline.remaining_s()
@@ -158,7 +158,7 @@ class Servers:
         return infos
 
     async def is_ready(self, models: Sequence[str], timeout_s: float) -> bool:
-        """Whether at least one server has one of the models ready. The first that has is enough."""
+        """True as soon as a server has one of the models ready; False if none has."""
         probes = [
             asyncio.ensure_future(server.transport.is_ready(model, timeout_s))
             for server in self._servers
@@ -174,17 +174,17 @@ class Servers:
                 probe.cancel()
 
     async def check_ports(self) -> None:
-        """Raises ServerUnavailableError if every URL has a wrong port, which no wait mends."""
+        """Raise ServerUnavailableError if every URL has a wrong port: waiting would not help."""
         named = await self._wrong_ports()
         if named and named[0] is not None and all(named):
             raise ServerUnavailableError(named[0])
 
     def stop_retrying(self) -> None:
-        """Has calls that fail from now on fail at once, and without a word in the log."""
+        """Make later failures end their calls at once, without a message in the log."""
         self._retry = False
 
     async def close(self) -> None:
-        """Closes the connections to all servers."""
+        """Close the connections to all servers."""
         self.stop_retrying()
         await asyncio.gather(*(server.close() for server in self._servers))
 
@@ -198,20 +198,20 @@ class Servers:
             raise
 
     async def _until_answered(self, model: str, request: Request[Answered], deadline: Deadline) -> Answered:
-        """The loop that the module describes."""
+        """Run the loop that the module describes."""
         refusals: dict[KnownServer, RewardError] = {}
         failures: dict[KnownServer, ServerUnavailableError] = {}
-        has_ended = False  # a process, or the connection, under this request
+        has_ended = False  # True: a process or the connection, during this request
         for attempt in itertools.count():
             server = self._least_busy(refusals)
             left_s = deadline.remaining_s()
             try:
                 answer = await server.answer(request, next(self._moments), left_s)
-            except DeadlineExceededError as error:  # perhaps it hangs
+            except DeadlineExceededError as error:  # the server may hang
                 self._leave_out(server, model, error)
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
-                    raise failed from failed.__cause__  # the reason for most of the time
+                    raise failed from failed.__cause__  # the reason for most of the lost time
                 where = error.message.rpartition(f": {LATE}")[0] or server.transport.url
                 raise deadline.exceeded(where) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
@@ -244,10 +244,10 @@ class Servers:
                     raise
             else:
                 server.failures, server.has_answered = 0, True
-                for other, refusal in refusals.items():  # not before: what all refuse is not one server's fault
+                for other, refusal in refusals.items():  # not before: if all refuse, no server is at fault
                     self._leave_out(other, model, refusal)
                 return answer
-        raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # which says the least
+        raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # says least
 
     def _least_busy(self, avoided: Collection[KnownServer]) -> KnownServer:
         def rank(server: KnownServer) -> tuple[bool, bool, int, int]:
@@ -256,9 +256,9 @@ class Servers:
         return min(self._servers, key=rank)
 
     def _leave_out(self, server: KnownServer, model: str, error: RewardError) -> None:
-        """Leave a server out until it is ready. To the only one requests are sent all the same."""
+        """Leave the server out until it is ready. A single server still gets requests."""
         if server.is_left_out:
-            return  # it is the same failure
+            return  # the same failure
         server.failures += 1
         if error.may_have_ended_server:
             was_down = not isinstance(error, ProcessEndedError)
@@ -267,12 +267,12 @@ class Servers:
             server.comeback = asyncio.create_task(server.rested(model))
 
     async def _wrong_ports(self) -> list[str | None]:
-        """What is wrong with the port of each server."""
+        """Fault of each server's port; None: no fault found."""
         ours = [server.transport.url for server in self._servers if isinstance(server.transport, TritonTransport)]
         return [await asyncio.to_thread(wrong_port, url) for url in ours]
 
 
 def pause_s(attempt: int, longest_s: float) -> float:
-    """Doubles from try to try; half of it is chance, so that callers do not come back all at once."""
+    """Return a pause that doubles with each try; up to half is random, so that callers do not return together."""
     pause_s = min(longest_s, FIRST_PAUSE_S * 2.0 ** min(attempt, 16))
     return random.uniform(pause_s / 2, pause_s)

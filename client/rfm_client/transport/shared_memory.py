@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""System shared memory: large inputs reach a server on the same host without passing through a socket.
+"""System shared memory: large inputs reach a server on the same host without a socket.
 
-A pool: a region is created, registered with the server, and used by one request after another. Its name leaves /dev/shm
-as soon as the server has mapped it, so a crash of this process leaves no data there; what it leaves is the server's
-mapping, until that is started again. Not ``tritonclient.utils.shared_memory``: its regions are sparse, so that a full
-/dev/shm kills the process that writes to them (SIGBUS), and keep their names.
+Requests use the regions of a pool in turn. A region is registered with the server, and its name leaves /dev/shm once
+the server has mapped it. So a crash of this process leaves no data there, only the server's mapping until a restart.
+
+Not ``tritonclient.utils.shared_memory``: its regions keep their names, and they are sparse, so that a full /dev/shm
+kills the process that writes (SIGBUS).
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ from rfm_client.transport.deadline import timeout
 from rfm_client.transport.off_loop import off_loop
 
 FOLDER = Path("/dev/shm")
-MIN_SHARED_BYTES = 64 * 2**10  # smaller inputs are quicker in the request itself
+MIN_SHARED_BYTES = 64 * 2**10  # smaller inputs are faster in the request itself
 MIN_REGION_BYTES = 2**20
 CLOSE_TIMEOUT_S = 2.0  # for the server to unmap all regions, some perhaps in use
-IN_USE_PAUSE_S = 0.02  # between two tries to have a region unmapped that a request still uses
+IN_USE_PAUSE_S = 0.02  # between tries to unmap a region that a request still uses
 
 logger = logging.getLogger("rfm_client")
 
 
 class Region:
-    """Memory that a server maps too. generation: of the server's mappings, which a restart ends"""
+    """Memory that the server maps too. generation: number of server restarts noticed before"""
 
     def __init__(self, name: str, byte_size: int, generation: int) -> None:
         self.name, self.byte_size, self.generation = name, byte_size, generation
@@ -53,18 +54,18 @@ class Region:
             os.close(descriptor)
 
     def write(self, array: npt.NDArray[Any]) -> None:
-        """Copies ``array`` to the start."""
+        """Copy ``array`` to the region's start."""
         np.frombuffer(self._memory, array.dtype, array.size).reshape(array.shape)[...] = array
 
     def unlink(self) -> None:
-        """Takes the name away; the memory lives while it is mapped."""
+        """Remove the name; the memory lives while it is mapped."""
         (FOLDER / self.name).unlink(missing_ok=True)
 
 
 class SharedMemory:
     """The regions that this process shares with the server at ``url``, for one event loop.
 
-    ``client`` is one of tritonclient's asyncio clients of that server.
+    ``client`` is a tritonclient asyncio client of that server.
     """
 
     def __init__(self, url: str) -> None:
@@ -77,7 +78,7 @@ class SharedMemory:
 
     @asynccontextmanager
     async def lend(self, client: Any, array: npt.NDArray[Any]) -> AsyncIterator[Region | None]:
-        """A region that holds ``array``; None if the array is small, or the server cannot share memory."""
+        """Lend a region with a copy of ``array``; None: the array is small, or the server cannot share memory."""
         is_large = array.nbytes >= MIN_SHARED_BYTES
         region = await self._take(client, array.nbytes) if self._is_usable and is_large else None
         if region is None:
@@ -89,18 +90,18 @@ class SharedMemory:
             yield region
         except InferenceServerException as error:
             if triton.LOST_REGION in (error.message() or "") and region.generation == self._generation:
-                self._generation += 1  # the server was started anew, and knows none of them
+                self._generation += 1  # the server was restarted, and knows no region
                 self._free.clear()
             raise
         finally:
-            # After a call that is cancelled the server may still read it, for an answer that is dropped.
+            # After a cancelled call the server may still read the region, but its answer is dropped.
             if writing.done():
                 self._give_back(region)
             else:  # a thread still writes
                 writing.add_done_callback(lambda _: self._give_back(region))
 
     async def close(self, client: Any) -> None:
-        """Has the server unmap all regions. One that a cancelled request uses for longer stays mapped."""
+        """Make the server unmap all regions. A region that a request still uses after CLOSE_TIMEOUT_S stays mapped."""
         with suppress(asyncio.TimeoutError):
             async with timeout(CLOSE_TIMEOUT_S):
                 while self._registered:
@@ -115,7 +116,7 @@ class SharedMemory:
             region = min(fitting, key=lambda region: region.byte_size)
             self._free.remove(region)
             return region
-        if self._free:  # all too small; so there are no more regions than requests at a time
+        if self._free:  # all too small: replace a region, so that regions never outnumber concurrent requests
             await self._unregister(client, self._free.pop().name)
         try:
             size = max(MIN_REGION_BYTES, 1 << (byte_size - 1).bit_length())
@@ -123,7 +124,7 @@ class SharedMemory:
         except OSError as error:
             self._give_up(str(error))
             return None
-        self._registered.add(region.name)  # from now on: a call that is cancelled may have it mapped all the same
+        self._registered.add(region.name)  # now, since a cancelled call may still map it
         try:
             await client.register_system_shared_memory(region.name, f"/{region.name}", size)
         except InferenceServerException as error:
@@ -147,7 +148,7 @@ class SharedMemory:
             self._free.append(region)
 
     async def _unregister(self, client: Any, name: str) -> None:
-        """Has the server unmap a region. It stays in ``_registered`` while a request uses it."""
+        """Make the server unmap a region. While a request uses it, it stays in ``_registered``."""
         try:
             await client.unregister_system_shared_memory(name)
         except InferenceServerException as error:

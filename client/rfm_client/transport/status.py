@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The state of a Triton server: its models, what they have done, and the machine. Read-only.
+"""The state of a Triton server: its models, their work, and its devices. Read-only.
 
-Where the repository's index needs a key (``rfm serve``), the models are those that are loaded.
+Where the repository's index needs a key (``rfm serve``), only loaded models are listed.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_
 _REQUESTS_METRIC = "nv_inference_request_success_total"
 _COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
 _BATCH_SAMPLES_METRIC = "rfm_batch_samples"
-_SAMPLES_METRIC, _REFUSED = "rfm_samples_total", "refused"  # by outcome
+_SAMPLES_METRIC, _REFUSED = "rfm_samples_total", "refused"  # a value of the label ``outcome``
 _SCORING_METRICS = ("rfm_collate_seconds", "rfm_forward_seconds")
 _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
-_SAMPLING_S = 2.5  # Triton looks at the machine every two seconds; until the first time it reports zeros
+_SAMPLING_S = 2.5  # Triton measures devices every two seconds; before, it reports zeros
 _POLL_S = 0.2
 _REASON_CHARACTERS = 120
 _NS_PER_MS = 1e6
@@ -49,10 +49,10 @@ _Version: TypeAlias = tuple[str, str]  # name and version of a model
 
 @dataclass(frozen=True)
 class Batches:
-    """The batches in which a model has scored callers' requests, as it tells itself; all its instances together.
+    """The batches of callers' requests that a model reports, over all its instances.
 
-    count, samples: of batches, and of the samples in them
-    scoring_ms: of all batches, in which they were collated and forward passes ran
+    count, samples: numbers of batches, and of samples in them
+    scoring_ms: time for collating and forward passes, of all batches
     """
 
     count: int
@@ -64,16 +64,15 @@ class Batches:
 class ModelStatus:
     """One version of a model.
 
-    A model that prepares ahead makes batches itself, of which only ``batches`` tell.
+    Triton counts from the load of the model, warm-up included. The model counts ``batches`` and ``samples_refused``
+    from Triton's start. A model that prepares ahead forms its own batches, which only ``batches`` counts.
 
-    requests_pending: requests that wait in Triton's queue now; None: the metrics do not say
-    requests_succeeded, requests_failed, last_used_s and the next two lines: since the model was loaded, warm-up
-        included
-    samples, executions: of all requests together, as Triton has handed them over
-    queue_ms, compute_ms: of all requests in Triton's queue, of all that Triton has handed over until it could go on
-    last_used_s: Unix time of the last request; None: there was none
-    batches, samples_refused: since Triton was started, whenever the model was loaded; None: the metrics do not say
-    samples_refused: that cannot be scored, the fault of those who sent them
+    requests_pending: requests in Triton's queue now; None: not in the metrics
+    samples, executions: numbers of samples and batches that Triton handed over
+    queue_ms, compute_ms: time of all requests in Triton's queue, and of all executions until Triton could go on
+    last_used_s: Unix time of the last request; None: no request yet
+    batches: None: not in the metrics
+    samples_refused: invalid samples, their senders' fault; None: not in the metrics
     """
 
     name: str
@@ -93,37 +92,38 @@ class ModelStatus:
 
     @property
     def batch_count(self) -> int:
-        """How many batches there were: callers', or before the first of these whatever Triton has handed over."""
+        """Number of callers' batches; before the first, number of executions."""
         return self.batches.count if self.batches and self.batches.count else self.executions
 
     @property
     def samples_per_batch(self) -> float | None:
-        """How well requests share batches; None before the first."""
+        """Mean number of samples in a batch; None: no batch yet."""
         samples = self.batches.samples if self.batches and self.batches.count else self.samples
         return samples / self.batch_count if self.batch_count else None
 
     @property
     def queue_ms_per_request(self) -> float | None:
-        """How long a request waits in Triton's queue. None before the first."""
+        """Mean time of a request in Triton's queue; None: no request yet."""
         return self.queue_ms / self.requests_succeeded if self.requests_succeeded else None
 
     @property
     def compute_ms_per_batch(self) -> float | None:
-        """How long a batch takes; None before the first."""
+        """Mean time of a batch; None: no batch yet."""
         total_ms = self.batches.scoring_ms if self.batches and self.batches.count else self.compute_ms
         return total_ms / self.batch_count if self.batch_count else None
 
     @property
     def busy_ms(self) -> float:
-        """How long the model was at work, on all devices. Triton does not know of work that it did not wait for."""
+        """Time of the model's work on all devices. Triton omits work for which it did not wait."""
         return max(self.compute_ms, self.batches.scoring_ms if self.batches else 0.0)
 
 
 @dataclass(frozen=True)
 class Device:
-    """The processor (``CPU``), or a GPU by its UUID. utilization: 0..1. What Triton does not report is None.
+    """The processor (``CPU``), or a GPU by its UUID. Values that Triton does not report are None.
 
-    work: what each model has done there, by its name
+    utilization: 0..1
+    work: each model's work there, by name of the model
     """
 
     name: str
@@ -135,10 +135,10 @@ class Device:
 
 @dataclass(frozen=True)
 class DeviceWork:
-    """The work of one model on one device, all its versions together.
+    """The work of all versions of one model on one device.
 
-    requests: number of requests answered; compute_s: seconds of computation, in which a batch counts once for each of
-    its requests
+    requests: number of answered requests
+    compute_s: seconds of computation; a batch counts once for each of its requests
     """
 
     requests: int
@@ -147,7 +147,7 @@ class DeviceWork:
 
 @dataclass(frozen=True)
 class ServerStatus:
-    """A server that answers. metrics_error: why ``devices`` is empty and nothing is known of pending requests."""
+    """State of a server that answers. metrics_error: why ``devices`` and all other metrics are missing; None: read"""
 
     url: str
     version: str
@@ -170,14 +170,13 @@ class _Metrics:
 def read_status(
     url: str, *, metrics_url: str | None = None, timeout_s: float = 60.0, credentials: Credentials | None = None
 ) -> ServerStatus:
-    """The state of the server at ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``.
+    """Return the state of a server at ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or ``https://``.
 
-    metrics_url: where it shows its metrics; None: port METRICS_PORT of the same host. What only they contain is missing
-        if they cannot be read.
-    credentials: certificates, and what is shown with each request, but not to the metrics
+    metrics_url: URL of its metrics; None: port METRICS_PORT of the same host. Unreadable metrics are left out
+    credentials: used for the server, not for its metrics
 
-    Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for what is no
-    Triton server.
+    Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for an answer that
+    is not Triton's.
     """
     scheme, address = split_url(url)
     metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
@@ -203,7 +202,7 @@ def read_status(
 def _read_server(
     scheme: str, address: str, timeout_s: float, credentials: Credentials
 ) -> tuple[str, bool, list[dict[str, Any]], list[dict[str, Any]]]:
-    """Triton's version, whether it is ready, its index and statistics, as its HTTP endpoints write them."""
+    """Triton's version, readiness, index and statistics, as its HTTP endpoints write them."""
     is_grpc = scheme.startswith("grpc")
     limited = {"client_timeout": timeout_s} if is_grpc else {}
     as_json = {"as_json": True, **limited} if is_grpc else {}
@@ -230,7 +229,7 @@ def _read_server(
 def _index(
     client: Any, statistics: list[dict[str, Any]], as_json: dict[str, Any], limited: dict[str, Any]
 ) -> list[dict[str, Any]]:
-    """The repository's index; where only a key would give it, that of the models which are loaded."""
+    """The repository's index or, if that needs a key, an index of the loaded models."""
     try:
         index = client.get_model_repository_index(**as_json)
         return list(index.get("models", []) if as_json else index)
@@ -275,7 +274,7 @@ def _models(index: list[dict[str, Any]], statistics: list[dict[str, Any]], metri
 
 
 def _whole(statistics: Mapping[str, Any], name: str, key: str) -> int:
-    """gRPC leaves zeros out and writes the others as text."""
+    """A count: gRPC omits zeros and writes others as text."""
     return int(statistics.get(name, {}).get(key, 0))
 
 
@@ -297,7 +296,7 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
     return _Metrics(
         devices=_devices(samples),
         pending={version: int(count) for version, count in _totals(samples, PENDING_METRIC).items()},
-        batches={  # of each version that tells of them: not of models that are not ours, or older
+        batches={  # foreign models and older exports report none
             version: Batches(int(count), int(num_samples[version]), scoring_s[version] * _MS_PER_S)
             for version, count in _totals(samples, f"{_BATCH_SAMPLES_METRIC}_count").items()
         },
@@ -314,7 +313,7 @@ def _scrape(url: str, timeout_s: float) -> list[Any]:
 
 
 def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
-    """The sum of these metrics for each version of a model, over its instances."""
+    """The sum of these metrics over the instances of each version."""
     totals: dict[_Version, float] = {}
     for sample in samples:
         if sample.name in names:
@@ -324,7 +323,7 @@ def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
 
 
 def _devices(samples: list[Any]) -> tuple[Device, ...]:
-    """The devices by name, and what each model has done there. A count without a GPU is the processor's."""
+    """The devices and each model's work there. A count without a GPU is the processor's."""
     values: dict[str, dict[str, float]] = {}
     work: dict[str, dict[str, DeviceWork]] = {}
     for sample in samples:

@@ -123,7 +123,7 @@ def encode_refs(trajectories: Sequence[TrajectoryRefs], sent: Sequence[UInt8Arra
 
 
 def encode_trajectories(encoded: Sequence[EncoderSample], num_positions: int, outputs: Collection[str]) -> Tensors:
-    """Return the encoder's requested outputs, float32 [B, P, D] padded with zeros and [B, Dt]; P = ``num_positions``."""
+    """Return the encoder's requested outputs, float32 [B, P, D] (zero padding) and [B, Dt]; P = ``num_positions``."""
     rows = [[trajectory.positions for trajectory in encoder_sample.trajectories] for encoder_sample in encoded]
     texts = [encoder_sample.trajectories[0].text_embedding for encoder_sample in encoded]
     embeddings = {
