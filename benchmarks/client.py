@@ -60,7 +60,7 @@ def episodes(arguments: argparse.Namespace) -> None:
     with TemporaryDirectory(prefix="rfm-bench-") as name, ExitStack() as stack:
         ways = {}
         for way in ("windows", "episodes", "episodes, resized"):
-            cache = {"feature_cache_mb": 0} if way == "windows" else {}  # as before there were episodes
+            cache = {"feature_cache_mib": 0} if way == "windows" else {}  # as before there were episodes
             settings = ExportConfig(num_gpus=0, **DEMO_ENCODERS, **cache)
             repository = Path(name) / way.replace(", ", "_")  # Triton takes no path with spaces
             export(DEMO / "rfm" / "1" / "checkpoint", repository, settings)

@@ -160,7 +160,7 @@ def preparation(arguments: argparse.Namespace) -> None:
     from transformers import AutoImageProcessor
 
     checkpoint = families.load(VLM_CHECKPOINT, base_model=str(VLM_BASE))
-    predictor = Engine.of(checkpoint, feature_cache_mb=ExportConfig().feature_cache_mb).predictor
+    predictor = Engine.of(checkpoint, feature_cache_mib=ExportConfig().feature_cache_mib).predictor
     processor = AutoImageProcessor.from_pretrained(VLM_BASE, use_fast=False)
     numbers = itertools.count()
 

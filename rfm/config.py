@@ -73,9 +73,9 @@ class ExportConfig(Settings):
     queue_timeout_ms: int | None = setting(
         None, "Longest that a request waits before it is rejected, if it asks for no less; else any time.", **_COUNT
     )
-    feature_cache_mb: int = setting(
+    feature_cache_mib: int = setting(
         DEFAULT_FEATURE_CACHE_MB,
-        "MiB of what a device keeps of frames: ReWiND's embeddings, vision towers' features. 0: none.",
+        "MiB for the features of frames on each device: ReWiND's embeddings, vision towers' features. 0: none.",
         least=0,
         most=MAX_INT32,
     )

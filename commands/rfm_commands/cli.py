@@ -87,9 +87,11 @@ def export(
             "vision-language checkpoint a GPU with room for it."
         ),
     ] = None,
-    check: Annotated[bool, typer.Option("--check", help="Write nothing; compare with what would be written.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Write nothing; compare the files with those that would be written.")
+    ] = False,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Write nothing; print what decides each setting of the checkpoint.")
+        bool, typer.Option("--explain", help="Write nothing; print the source of each setting of the checkpoint.")
     ] = False,
 ) -> None:
     """Write a checkpoint into a model repository, as a new version."""

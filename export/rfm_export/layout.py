@@ -93,12 +93,12 @@ def generated_models(
     description: Description, encoders: EncodersDescription | None, version: Version
 ) -> list[GeneratedModel]:
     """Return the models of a checkpoint and its encoders, parts before their ensemble."""
-    name, widths, cache_mb = version.settings.name, description.widths, version.settings.feature_cache_mb
+    name, widths, cache_mib = version.settings.name, description.widths, version.settings.feature_cache_mib
     # Two small networks keep a GPU busy: one scores while the other reads.
     several = widths is not None and version.num_gpus > 0
     settings = replace(version.settings, instances=version.settings.instances or (2 if several else 1))
     # With several instances, each cache would have to see all frames.
-    keeps = description.keeps_features and cache_mb > 0 and settings.instances == 1
+    keeps = description.keeps_features and cache_mib > 0 and settings.instances == 1
     outputs = wire.score_outputs(description.progress_bins if description.progress_bins > 1 else None)
     inputs = wire.frame_inputs(by_digest=keeps) if widths is None else wire.embedding_inputs(*widths)
     about = {**_limits(description, description.frame_size), **version.about}
@@ -107,12 +107,12 @@ def generated_models(
     models = [_python_model(scorer, "rfm", version, _warmups(description), keeps=keeps)]
     if encoders is None or widths is None:
         return models
-    inputs, about = wire.encoder_inputs(by_digest=cache_mb > 0), about_encoders(encoders, version.about)
+    inputs, about = wire.encoder_inputs(by_digest=cache_mib > 0), about_encoders(encoders, version.about)
     encoder = Interface(encoder_name(name), inputs, wire.encoder_outputs(*widths), about)
-    of_encoder = replace(version, settings=replace(settings, instances=1)) if cache_mb else version
+    of_encoder = replace(version, settings=replace(settings, instances=1)) if cache_mib else version
     models.append(_python_model(encoder, "rfm_encoder", of_encoder, [_encoder_warmup()], keeps=True))
     about = {**_limits(description, encoders.frame_size), **version.about}
-    frames = Interface(frames_name(name), wire.frame_inputs(by_digest=cache_mb > 0), outputs, about)
+    frames = Interface(frames_name(name), wire.frame_inputs(by_digest=cache_mib > 0), outputs, about)
     return [*models, GeneratedModel(ensemble_config(frames, settings, version.number, encoder, scorer), version.number)]
 
 
@@ -137,7 +137,7 @@ def _python_model(
     config = python_config(interface, version.settings, version.num_gpus, version.number, warmups)
     config.parameters[FAMILY_PARAMETER].string_value = version.family
     if keeps:
-        config.parameters[FEATURE_CACHE_PARAMETER].string_value = str(version.settings.feature_cache_mb)
+        config.parameters[FEATURE_CACHE_PARAMETER].string_value = str(version.settings.feature_cache_mib)
     return GeneratedModel(config, version.number, model_file.read_bytes(), files)
 
 

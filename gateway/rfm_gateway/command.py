@@ -45,7 +45,7 @@ def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
     except (ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from None
     if api_key is None and not is_loopback(host):
-        logger.warning("%s is no loopback address, and no key is required: whoever reaches it may use it", host)
+        logger.warning("%s is no loopback address, and no key is required: every host that reaches it can use it", host)
     if config.viewer:
         logger.info("look at rewards in the browser: %s", page_link(config))
     uvicorn.run(

@@ -13,7 +13,7 @@ import numpy as np
 from rfm_client.contract import RewardError
 from rfm_client.contract.samples import Float32Array
 
-BYTES_PER_MB = 2**20
+BYTES_PER_MIB = 2**20
 _ENTRY_BYTES = 256  # of a key, the array's header and the entry in the ordered dict
 
 

@@ -18,7 +18,7 @@ from rfm import families
 from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
 from rfm.engine.device import memory_errors
 from rfm.engine.execution import Execution
-from rfm.engine.feature_cache import BYTES_PER_MB, FeatureCache
+from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.engine.layers import keep_float32
 from rfm.engine.predictor import Predictor, RowScores
 from rfm.family import Checkpoint, FrameEncoders
@@ -88,7 +88,7 @@ class Engine:
         dtype: torch.dtype | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
-        feature_cache_mb: int = 0,
+        feature_cache_mib: int = 0,
     ) -> Engine:
         """Return the engine for a checkpoint's folder or Hugging Face id.
 
@@ -102,7 +102,7 @@ class Engine:
             dtype=dtype,
             token_budget=token_budget,
             max_sample_tokens=max_sample_tokens,
-            feature_cache_mb=feature_cache_mb,
+            feature_cache_mib=feature_cache_mib,
         )
 
     @classmethod
@@ -115,18 +115,18 @@ class Engine:
         dtype: torch.dtype | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
-        feature_cache_mb: int = 0,
+        feature_cache_mib: int = 0,
     ) -> Engine:
         """Return the engine for a checkpoint in memory.
 
         dtype: of the network; None: float32, or a vision-language checkpoint's own on a GPU
-        feature_cache_mb: MiB for features of raw frames; 0: no cache
+        feature_cache_mib: MiB for features of raw frames; 0: no cache
         others: as in the class
         Raises CheckpointError.
         """
         keep_float32()
         on = torch.device(device)
-        cache = FeatureCache[Any](feature_cache_mb * BYTES_PER_MB) if feature_cache_mb else None
+        cache = FeatureCache[Any](feature_cache_mib * BYTES_PER_MIB) if feature_cache_mib else None
         predictor = checkpoint.predictor(on, dtype, cache)
         encoders = None if encoders is None else encoders.to(on)
         return cls(predictor, encoders=encoders, token_budget=token_budget, max_sample_tokens=max_sample_tokens)

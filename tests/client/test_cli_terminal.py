@@ -47,7 +47,7 @@ def test_the_state_of_a_server_fits_a_terminal_and_says_what_its_words_mean(demo
     heads = {"model", "v", "state", "requests", "failed", "refused", "pending", "batches", "samples", "queue", "ms"}
     assert heads | {"rfm", "rfm_encoder", "rfm_frames"} <= words
     told = " ".join(" ".join(lines).split())
-    assert "failed: answered with an error, whoever is to blame" in told
+    assert "failed: answered with an error;" in told
     assert "refused: samples that cannot be scored, the caller's fault" in told
 
 

@@ -157,7 +157,7 @@ def test_score_reads_videos_behind_urls(served: Served, video: Path) -> None:
     assert remote["frame_times_s"] is None
 
 
-NO_TASK = 'task: expected a sentence with frames, got none: add --task "what is to be done"'
+NO_TASK = 'task: expected a sentence with frames, got none: add --task "SENTENCE"'
 SEVERAL = "video: expected a video of one episode, got a LeRobot v3.0 file that holds 10 episodes: label the dataset "
 REFUSED: dict[str, tuple[list[object], str]] = {
     "no frame left out": (

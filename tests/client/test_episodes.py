@@ -346,9 +346,11 @@ def test_a_model_that_is_not_served_and_tasks_that_are_too_few_are_told(served: 
 def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
     """An ``rfm serve`` of MODEL without a cache, and of IMAGES, whose process a test may kill."""
     repository = tmp_path_factory.mktemp("own") / "model_repository"
-    for name, cache_mb in ((MODEL, 0), (IMAGES, 64)):
+    for name, cache_mib in ((MODEL, 0), (IMAGES, 64)):
         config = goldens.config(name)
-        rfm_export.export(config.checkpoint, repository, replace(serve_config(config, name), feature_cache_mb=cache_mb))
+        rfm_export.export(
+            config.checkpoint, repository, replace(serve_config(config, name), feature_cache_mib=cache_mib)
+        )
     with serving(repository) as server:
         server.wait_ready()
         yield server

@@ -188,7 +188,7 @@ def test_a_model_may_gain_an_optional_input_and_lose_none(tmp_path: Path) -> Non
         forget_input(tmp_path, name, wire.SECOND_FRAMES)
     assert export(FRAMES, tmp_path) == 2
     assert wire.SECOND_FRAMES in dims(read(tmp_path, "rfm_frames").input)
-    assert export(FRAMES, tmp_path, feature_cache_mb=0) == 3
+    assert export(FRAMES, tmp_path, feature_cache_mib=0) == 3
     assert wire.FRAME_DIGESTS not in dims(read(tmp_path, "rfm_frames").input)
     config = read(tmp_path, "rfm_encoder")
     config.input.add(name="third_frames", data_type=pb.TYPE_UINT8, dims=[1], optional=True)

@@ -26,11 +26,11 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
         yield seen
 
 
-def engine_there(name: str, feature_cache_mb: int = 0) -> Engine:
+def engine_there(name: str, feature_cache_mib: int = 0) -> Engine:
     """The engine of a reference checkpoint on the device."""
     config = goldens.config(name)
     checkpoint = families.load(config.checkpoint, **config.sources)
-    options = {"device": CUDA, "dtype": torch.float32, "feature_cache_mb": feature_cache_mb}
+    options = {"device": CUDA, "dtype": torch.float32, "feature_cache_mib": feature_cache_mib}
     with torch.inference_mode():  # what is made in it needs no views that count versions
         return Engine.of(checkpoint, encoders=checkpoint.encoders(), **options)
 
@@ -77,7 +77,7 @@ MIXED: list[Sample] = [
 @pytest.mark.parametrize("name", [PLAIN, "q25_video_avg_disc10", "smol_mean_disc10"])
 @pytest.mark.slow
 def test_batches_that_are_collated_while_others_are_scored_have_the_cpu_s_scores(seen: Seen, name: str) -> None:
-    engine = engine_there(name, feature_cache_mb=1)
+    engine = engine_there(name, feature_cache_mib=1)
     engine.token_budget = 100
     for _ in range(2):  # the second time, what was made of frames is kept on the device
         for result, expected in zip(engine.evaluate(MIXED), load_engine(name).evaluate(MIXED), strict=True):

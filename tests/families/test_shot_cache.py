@@ -13,7 +13,7 @@ import torch
 
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
-from rfm.engine.feature_cache import BYTES_PER_MB, FeatureCache
+from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.vlm.predictor import VlmPredictor
 from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs, frame_digest
@@ -39,7 +39,7 @@ def engine(name: str, cache: FeatureCache[Any] | None = None) -> Engine:
 
 def of_both(name: str, cache: FeatureCache[Any] | None = None) -> tuple[Engine, Engine]:
     """An engine with a cache, by default one that holds all, and one without."""
-    return engine(name, FeatureCache(64 * BYTES_PER_MB) if cache is None else cache), engine(name)
+    return engine(name, FeatureCache(64 * BYTES_PER_MIB) if cache is None else cache), engine(name)
 
 
 def predictor_of(cached: Engine) -> VlmPredictor:
@@ -108,7 +108,7 @@ def test_a_cache_that_holds_nothing_changes_no_score(name: str) -> None:
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_a_cache_that_evicts_at_every_step_changes_no_score(name: str) -> None:
-    cache = FeatureCache[Any](3 * 56 * 84 * 3 + 2 * BYTES_PER_MB // 100)
+    cache = FeatureCache[Any](3 * 56 * 84 * 3 + 2 * BYTES_PER_MIB // 100)
     frames, unknown = frames_of(2, 8), 0
     cached, plain = of_both(name, cache)
     for stop in range(4, 9):
@@ -153,7 +153,7 @@ def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> None:
     """The last tokens of a video may stand behind all that is read."""
-    cache, frames = FeatureCache[Any](BYTES_PER_MB), frames_of(12, 4)
+    cache, frames = FeatureCache[Any](BYTES_PER_MIB), frames_of(12, 4)
     cached = engine(name, cache)
 
     def spoil(_module: Any, _inputs: Any, output: torch.Tensor) -> torch.Tensor:
@@ -180,7 +180,11 @@ def test_a_frame_that_comes_many_times_is_brought_to_size_once(name: str) -> Non
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_black_frames_with_pixels_are_always_encoded(name: str) -> None:
     """A server probes itself with them: it is to see whether the vision tower works."""
-    cached, black, execution = engine(name, FeatureCache(BYTES_PER_MB)), np.zeros((2, 56, 84, 3), np.uint8), Execution()
+    cached, black, execution = (
+        engine(name, FeatureCache(BYTES_PER_MIB)),
+        np.zeros((2, 56, 84, 3), np.uint8),
+        Execution(),
+    )
     for _ in range(2):
         (expected,) = cached.evaluate([whole(black)], execution)
     assert_close(ask(cached, named(black, ()), execution), expected, TOLERANCE)
@@ -188,7 +192,7 @@ def test_black_frames_with_pixels_are_always_encoded(name: str) -> None:
 
 
 def test_a_pass_without_memory_empties_the_cache_and_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    cache, frames, execution = FeatureCache[Any](BYTES_PER_MB), frames_of(16, 4), Execution()
+    cache, frames, execution = FeatureCache[Any](BYTES_PER_MIB), frames_of(16, 4), Execution()
     cached, plain = of_both(MODELS[0], cache)
     cached.evaluate([whole(frames[:2])])
     network, sizes = predictor_of(cached).network, list[int]()
@@ -211,7 +215,7 @@ def test_a_pass_without_memory_empties_the_cache_and_is_tried_again(monkeypatch:
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_frames_that_were_evicted_are_kept_again_though_all_their_shots_are_kept(name: str) -> None:
-    cache, frames, execution = FeatureCache[Any](BYTES_PER_MB), frames_of(17, 4), Execution()
+    cache, frames, execution = FeatureCache[Any](BYTES_PER_MIB), frames_of(17, 4), Execution()
     cached, plain = of_both(name, cache)
     cached.evaluate([whole(frames)])
     (row,) = predictor_of(cached).rows(whole(frames))
@@ -226,7 +230,7 @@ def test_frames_that_were_evicted_are_kept_again_though_all_their_shots_are_kept
 
 def test_what_is_kept_holds_on_to_no_request() -> None:
     """A frame of a large request would keep all of it."""
-    cache, frames = FeatureCache[Any](BYTES_PER_MB), frames_of(10, 3)
+    cache, frames = FeatureCache[Any](BYTES_PER_MIB), frames_of(10, 3)
     ask(engine(MODELS[0], cache), named(frames, frames))
     kept = cache.found([frame_digest(frame) for frame in frames])
     assert len(kept) == 3

@@ -212,7 +212,7 @@ def test_what_is_missing_or_broken_is_named_and_the_others_are_scored(page: Page
     page.browser.write("tasks", " ")
     page.drop("broken", "success")
     submit.click()
-    assert page.browser["errors"].text == "task: expected what is to be done, as a sentence, got none"
+    assert page.browser["errors"].text == "task: expected a sentence, got none"
     assert page.browser.cells("#curves tr") == []
     page.browser.write("tasks", TASK)
     submit.click()

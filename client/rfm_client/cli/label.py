@@ -54,7 +54,7 @@ class EpisodeTexts(Settings):
 
     TITLE: ClassVar[str] = "Dataset"
 
-    task: str | None = setting(None, "What is to be done in the episodes that do not say it, as a sentence.")
+    task: str | None = setting(None, "Task sentence of the episodes that have none.")
     override_task: bool = setting(False, "Put --task in the place of the tasks that episodes have.")
     orient: Texts = setting(
         (),
@@ -167,7 +167,7 @@ class LabelCommand:
                     return label_dataset(dataset, scorer, self.labels, watch)
         except (RewardError, OSError, KeyboardInterrupt):
             if watch.num_begun:
-                self.say("what is finished stays: the same command goes on with the rest")
+                self.say("finished episodes stay: run the same command again for the rest")
             raise
 
     def _try(self) -> None:

@@ -115,7 +115,7 @@ class VideoOptions(Settings):
 
     TITLE: ClassVar[str] = "Videos"
 
-    task: str = setting("", "What is to be done, as a sentence.")
+    task: str = setting("", "The task, as a sentence.")
     fps: float = setting(3.0, "Frames a second that are taken from a video.", least=0.001)
     max_frames: int | None = setting(None, "Score at most so many frames, evenly.", least=1)
     subsample: bool = setting(True, "Score no more frames than the checkpoint was trained on, evenly spaced; else all.")

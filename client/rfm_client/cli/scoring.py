@@ -64,7 +64,7 @@ class Source:
         fps = None if are_arrays else video.fps
         trajectory = load_trajectory(name, task=video.task, fps=fps, orient=video.orient)
         if trajectory.frames is not None and not trajectory.task.strip():
-            raise InvalidSampleError.at("task", "a sentence with frames", 'none: add --task "what is to be done"')
+            raise InvalidSampleError.at("task", "a sentence with frames", 'none: add --task "SENTENCE"')
         # A video from a URL is not kept, so its times cannot be read.
         has_times = not are_arrays and not is_url(name)
         return cls(name, trajectory, frame_times_s(name, trajectory.num_frames) if has_times else None)

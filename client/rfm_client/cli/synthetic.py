@@ -52,7 +52,7 @@ class SyntheticSamples(Settings):
 
     TITLE: ClassVar[str] = "Samples"
 
-    sample_type: SampleType = setting("progress", "What a sample asks.")
+    sample_type: SampleType = setting("progress", "Type of the samples.")
     num_samples: int = setting(4, "Samples to make up.", least=1, most=10_000)
     num_frames: Sequence[int] = setting(
         (8,),

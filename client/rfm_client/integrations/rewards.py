@@ -197,7 +197,9 @@ class EpisodeRewarder:
 
     def __init__(self, client: ClientSource, options: RewardOptions) -> None:
         if not (isinstance(client, RewardClient) or callable(client)):
-            raise TypeError(f"client: expected a RewardClient or what makes one, got {type(client).__name__}")
+            raise TypeError(
+                f"client: expected a RewardClient or a function that makes one, got {type(client).__name__}"
+            )
         self._source = client
         self._options = options
         self._made: RewardClient | None = None

@@ -76,7 +76,7 @@ class LabelOptions(Settings):
     cameras: Sequence[str] = setting(
         (), "Cameras to score; else all but depth ones.", metavar="KEY[,KEY...]", parse=_names
     )
-    fuse: Fuse = setting("mean", "How the scores of several cameras become one.")
+    fuse: Fuse = setting("mean", "How the scores of several cameras are fused.")
     sampling: Rule | None = setting(
         None, "Rule by which frame t's prefix is sampled; else that of the checkpoint's training."
     )
@@ -128,7 +128,7 @@ class RayOptions(Settings):
 
     TITLE: ClassVar[str] = "With --engine ray"
 
-    address: str | None = setting(None, "Ray cluster; else one that is found, or made here.")
+    address: str | None = setting(None, "Ray cluster; else a running cluster, or a new one on this machine.")
     actors: int = setting(1, "Ray actors, each with a scorer.", least=1)
     num_gpus_per_actor: float = setting(0.0, "GPUs of its node that a Ray actor takes.", least=0)
 

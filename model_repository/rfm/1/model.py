@@ -34,7 +34,7 @@ class TritonPythonModel(BatchModel[Sample | ProgressSampleRefs, Result]):
             dtype=getattr(torch, settings[DTYPE_PARAMETER]) if settings[DTYPE_PARAMETER] else None,
             token_budget=int(settings[BUDGET_PARAMETER]),
             max_sample_tokens=int(settings[SAMPLE_TOKENS_PARAMETER]),
-            feature_cache_mb=int(settings.get(FEATURE_CACHE_PARAMETER) or 0),
+            feature_cache_mib=int(settings.get(FEATURE_CACHE_PARAMETER) or 0),
         )
 
     def decode(self, tensors: wire.Tensors) -> list[Sample | ProgressSampleRefs]:

@@ -11,7 +11,7 @@ import torch
 from rfm import families
 from rfm.config import DEFAULT_SAMPLE_TOKENS
 from rfm.engine.execution import Execution
-from rfm.engine.feature_cache import BYTES_PER_MB, FeatureCache
+from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER, SAMPLE_TOKENS_PARAMETER
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client.contract import InvalidSampleError, RewardError, wire
@@ -24,8 +24,8 @@ class TritonPythonModel(BatchModel[EncoderSample | EncoderSampleRefs, EncoderSam
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         self.encoders = families.encoders_of(settings.get(FAMILY_PARAMETER)).load(version).to(device)
-        cache_mb = int(settings.get(FEATURE_CACHE_PARAMETER) or 0)
-        self.cache = FeatureCache[Float32Array](cache_mb * BYTES_PER_MB) if cache_mb else None
+        cache_mib = int(settings.get(FEATURE_CACHE_PARAMETER) or 0)
+        self.cache = FeatureCache[Float32Array](cache_mib * BYTES_PER_MIB) if cache_mib else None
         self.max_frames = int(settings.get(SAMPLE_TOKENS_PARAMETER) or DEFAULT_SAMPLE_TOKENS)
 
     def decode(self, tensors: wire.Tensors) -> list[EncoderSample | EncoderSampleRefs]:

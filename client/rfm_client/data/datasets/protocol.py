@@ -205,7 +205,7 @@ class TaskOverride:
             return self.text
         if is_missing or not isinstance(own, str):
             got = "none" if not own else repr(own)
-            raise DatasetError.at(where, "a task as a sentence", f'{got}: add --task "what is to be done"')
+            raise DatasetError.at(where, "a task as a sentence", f'{got}: add --task "SENTENCE"')
         return own
 
     def check_used(self, episodes: Sequence[DatasetEpisode]) -> None:

@@ -82,7 +82,7 @@ class VideoFolder(Dataset):
 
 def _table_in(folder: Path) -> Path:
     found = [folder / name for name in TABLES if (folder / name).is_file()]
-    all_of_one = f'(cd {folder}; (echo video; ls *.mp4) > tasks.csv) and --task "what is to be done"'
+    all_of_one = f'(cd {folder}; (echo video; ls *.mp4) > tasks.csv) and --task "SENTENCE"'
     got = "both" if found else f"none: write it, or, if all videos have one task, {all_of_one}"
     require(folder, len(found) == 1, f"one of {' and '.join(TABLES)} with the task of each video", got)
     return found[0]

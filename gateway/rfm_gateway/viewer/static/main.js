@@ -116,7 +116,7 @@ function scoreAll() {
   page.errors.replaceChildren();
   const missing = [
     [!videos.all.length, "video: expected a file, got none: drop one"],
-    [!tasks().length, "task: expected what is to be done, as a sentence, got none"],
+    [!tasks().length, "task: expected a sentence, got none"],
     [!page.model.value, "model: expected one that is served, got none"],
   ].find(([isMissing]) => isMissing);
   if (missing) {
@@ -160,7 +160,7 @@ async function comparePair() {
   page.errors.replaceChildren();
   page.compare.disabled = true;
   try {
-    if (!tasks().length) throw new Error("task: expected what is to be done, as a sentence, got none");
+    if (!tasks().length) throw new Error("task: expected a sentence, got none");
     if (second.orient !== orient) throw new Error(`orient: expected the same of both videos, got ${orient} and ${second.orient}`);
     for (const task of tasks()) {
       const data = form({ task, model, fps, orient, resize }, { first: first.file, second: second.file });
