@@ -27,8 +27,9 @@ GAP = "  "  # between columns of a ``StreamedTable``
 STATUS_LEGEND = (
     "since load: since the model was loaded, warm-up included, as Triton's statistics count; since start: since Triton "
     "was started, as the model's metrics count, which go on where a model is loaded again. requests: answered with "
-    "scores; failed: answered with an error; refused: samples that cannot be scored, the caller's fault. batches: since start of callers' samples, since load of all; queue ms: until a request's turn, on average "
-    "in Triton since load and in the model since start. The server's log has the reason of each."
+    "scores; failed: answered with an error; refused: samples that cannot be scored, the caller's fault. batches: "
+    "since start of callers' samples, since load of all; queue ms: until a request's turn, on average in Triton since "
+    "load and in the model since start. The server's log has the reason of each failure."
 )
 
 _GIB = 2**30
