@@ -19,7 +19,7 @@ from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import as_array
 from rfm_client.data.sampling import Sampling
 from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, StepScores, copied
-from rfm_client.episodes.windows import FrameRef
+from rfm_client.episodes.windows import EpisodeFrame
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.lifetime import AsyncClosing, Closing, OneProcess
 
@@ -114,11 +114,13 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         info = await self._client.model_info(frames=True, timeout_s=_left_s(deadline))
         return self._options.sampling_for(info), info.frame_size if self._options.resize else None
 
-    async def _checked(self, frames: Any, indices: Sequence[int], size: FrameSize | None) -> list[tuple[FrameRef, ...]]:
+    async def _checked(
+        self, frames: Any, indices: Sequence[int], size: FrameSize | None
+    ) -> list[tuple[EpisodeFrame, ...]]:
         """Check the new frames of these episodes, in as many threads as processors."""
         given = self._given(frames, indices)
 
-        def checked(some: Sequence[int]) -> list[tuple[FrameRef, ...]]:
+        def checked(some: Sequence[int]) -> list[tuple[EpisodeFrame, ...]]:
             return [self._episodes[index].checked(given[index], size) for index in some]
 
         count = max(1, math.ceil(len(indices) / (os.cpu_count() or 1)))

@@ -26,7 +26,7 @@ from rfm_client.data.camera_fusion import FUSES, Fuse
 from rfm_client.data.orientation import Orient, Orientation, turned
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Rule, Sampling, of_frames
-from rfm_client.episodes.windows import FrameRef, Window
+from rfm_client.episodes.windows import EpisodeFrame, Window
 
 if TYPE_CHECKING:
     from rfm_client.episodes.live import LiveEpisode, LiveView
@@ -177,7 +177,7 @@ class EpisodeFrames:
         self.task = task
         self._options, self._index, self._where = options, index, where
         self._orientations = options.orientations
-        self._frames: list[tuple[FrameRef, ...]] = []  # by step and camera
+        self._frames: list[tuple[EpisodeFrame, ...]] = []  # by step and camera
         self._live: LiveEpisode | None = None
 
     @property
@@ -185,7 +185,7 @@ class EpisodeFrames:
         """Number of the newest frame, from 0; -1: none yet."""
         return len(self._frames) - 1
 
-    def checked(self, frame: Any, size: FrameSize | None = None) -> tuple[FrameRef, ...]:
+    def checked(self, frame: Any, size: FrameSize | None = None) -> tuple[EpisodeFrame, ...]:
         """Return a copy of the next frame of each camera, upright. Raises InvalidSampleError.
 
         frame: uint8 [H, W, 3]; with cameras, a dict of these
@@ -204,12 +204,12 @@ class EpisodeFrames:
                     expected = f"uint8 {list(first.pixels.shape)}, as the episode's first"
                     expected += "" if size is None else ", or a reset"  # another checkpoint may be served by now
                     raise InvalidSampleError.at(where, expected, f"uint8 {list(pixels.shape)}")
-                kept.append(FrameRef(pixels))
+                kept.append(EpisodeFrame(pixels))
         except InvalidSampleError as error:
             raise self.located(error) from None
         return tuple(kept)
 
-    def append(self, frame: tuple[FrameRef, ...]) -> None:
+    def append(self, frame: tuple[EpisodeFrame, ...]) -> None:
         """Add the frames that ``checked`` returned."""
         self._frames.append(frame)
 

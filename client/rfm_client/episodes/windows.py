@@ -32,7 +32,7 @@ _OUTPUTS = (wire.PROGRESS, wire.SUCCESS)
 
 
 @dataclass(frozen=True, eq=False)
-class FrameRef:
+class EpisodeFrame:
     """A frame, uint8 [H, W, 3], that must not change, and its digest."""
 
     pixels: UInt8Array
@@ -47,7 +47,7 @@ class FrameRef:
 class Window:
     """Frames of one size with their task, to be scored for progress. Raises InvalidSampleError for an invalid task."""
 
-    frames: tuple[FrameRef, ...]
+    frames: tuple[EpisodeFrame, ...]
     task: str
 
     def __post_init__(self) -> None:
