@@ -24,6 +24,7 @@ from rfm_client.cli.command import (
     usage_errors,
     with_options,
 )
+from rfm_client.cli.evaluate import evaluate
 from rfm_client.cli.label import label
 from rfm_client.cli.options import CredentialFiles, OutputOptions, PrefixOptions, ServerOptions, VideoOptions
 from rfm_client.cli.show import StreamedTable, print_tables, scores_table, status_tables
@@ -222,6 +223,7 @@ def bench_input(
 
 
 app.command(cls=Command, epilog=EXIT_CODES)(label)
+app.command(cls=Command, epilog=EXIT_CODES)(evaluate)
 
 
 def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:

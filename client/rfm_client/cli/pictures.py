@@ -18,6 +18,7 @@ from rfm_client.contract.samples import Float32Array, UInt8Array
 if TYPE_CHECKING:
     from matplotlib.figure import SubFigure
 
+    from rfm_client.labelling.evaluation import LabelComparison
     from rfm_client.labelling.summary import Summary
 
 STRIP_FRAMES = 8
@@ -140,4 +141,28 @@ def draw_summary(file: Path, summary: Summary) -> None:
     )
     backwards.hist(100 * summary.backwards, bins=BINS, color="tab:orange")
     backwards.set(xlabel="steps on which progress falls (%)", ylabel="episodes")
+    figure.savefig(file, dpi=SUMMARY_DOTS_PER_IN)
+
+
+def draw_evaluation(file: Path, comparison: LabelComparison) -> None:
+    """Draw a histogram of final progress for each label file, successes and failures apart."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH_IN, SUMMARY_HEIGHT_IN * len(comparison.evaluations) * 0.75), layout="constrained")
+    axes = figure.subplots(len(comparison.evaluations), 1, sharex=True, squeeze=False)
+    for ax, each in zip(axes.flat, comparison.evaluations, strict=True):
+        parts = {"episodes": each.final_progress}
+        if comparison.is_success is not None:
+            parts = {
+                "successes": each.final_progress[comparison.is_success],
+                "failures": each.final_progress[~comparison.is_success],
+            }
+        colours = ["tab:green", "tab:red"] if len(parts) > 1 else ["tab:blue"]
+        ax.hist([*parts.values()], bins=BINS, range=(0, 1), color=colours, label=[*parts], stacked=True)
+        told = "" if each.spearman is None else f"   VOC {each.spearman:.2f}"
+        told += "" if each.by_progress is None else f"   AUROC of progress {each.by_progress.auroc:.2f}"
+        told += "" if each.by_success is None else f"   AUROC of success {each.by_success.auroc:.2f}"
+        ax.set(title=f"{each.name}{told}", ylabel="episodes")
+        ax.legend(loc="upper left")
+    axes.flat[-1].set_xlabel("progress at the last frame")
     figure.savefig(file, dpi=SUMMARY_DOTS_PER_IN)

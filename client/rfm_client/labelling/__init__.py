@@ -9,6 +9,7 @@ with RewardClient("grpc://localhost:8001") as client:
 """
 
 from rfm_client.data.datasets import Dataset, DatasetEpisode, DatasetError, Orient, iter_episodes, open_dataset
+from rfm_client.labelling.evaluation import Evaluation, LabelComparison, evaluate_labels, read_outcomes
 from rfm_client.labelling.label import Report, label, label_with_ray
 from rfm_client.labelling.label_files import EpisodeLabels, find_label_files, read_episode_labels
 from rfm_client.labelling.options import LabelOptions, RayOptions, parse_episodes
@@ -23,6 +24,8 @@ __all__ = [
     "DatasetEpisode",
     "DatasetError",
     "EpisodeLabels",
+    "Evaluation",
+    "LabelComparison",
     "LabelOptions",
     "Orient",
     "RayOptions",
@@ -30,6 +33,7 @@ __all__ = [
     "Scorer",
     "Summary",
     "Watch",
+    "evaluate_labels",
     "find_label_files",
     "iter_episodes",
     "label",
@@ -37,5 +41,6 @@ __all__ = [
     "open_dataset",
     "parse_episodes",
     "read_episode_labels",
+    "read_outcomes",
     "summarise",
 ]

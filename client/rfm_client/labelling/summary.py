@@ -15,7 +15,7 @@ from rfm_client.data.datasets.protocol import require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
 from rfm_client.labelling.label_files import read_label_table
 
-_BACKWARDS_BY = 0.01  # kappa of reward-aligned behaviour cloning; a smaller fall is noise
+BACKWARDS_BY = 0.01  # kappa of reward-aligned behaviour cloning; a smaller fall is noise
 _MOST_LISTED = 12
 
 
@@ -79,7 +79,7 @@ def summary_of(labels: Any) -> Summary:
         cameras = [table[name].to_numpy() for name in table.column_names if name.startswith(f"{PROGRESS}.")]
         numbers.append(episodes[start])
         final.append(progress[-1])
-        backwards.append(np.mean(np.diff(progress) < -_BACKWARDS_BY) if len(progress) > 1 else 0.0)
+        backwards.append(np.mean(np.diff(progress) < -BACKWARDS_BY) if len(progress) > 1 else 0.0)
         if SUCCESS in table.column_names:
             best.append(table[SUCCESS].to_numpy().max())
         if cameras:
