@@ -31,6 +31,7 @@ from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajector
 from rfm_client.cli.commands import app
 from rfm_client.contract import wire
 from rfm_client.contract.settings import Setting, settings_of
+from rfm_client.labelling import open_dataset
 from rfm_commands.cli import app as rfm
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 
@@ -84,6 +85,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ):  # fmt: skip
         clip.write(tmp_path / name)
     shutil.copytree(LEROBOT / "toy_v21", tmp_path / "my_dataset")
+    outcomes = "".join(f"{episode.index},1\n" for episode in open_dataset(tmp_path / "my_dataset").episodes)
+    (tmp_path / "outcomes.csv").write_text(f"episode,success\n{outcomes}")
     np.savez(tmp_path / "episode.npz", frames=pictures(0), task="stack the cups")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -139,6 +142,8 @@ def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: 
         return
     for shown, served in SERVED_AS.items():
         command = command.replace(shown, served)
+    if command.startswith("rfm-client evaluate"):
+        command = f"rfm-client label my_dataset && {command}"
     environment = {
         **os.environ,
         "RFM_URL": demo_server.grpc_url,
