@@ -85,6 +85,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ):  # fmt: skip
         clip.write(tmp_path / name)
     shutil.copytree(LEROBOT / "toy_v21", tmp_path / "my_dataset")
+    shutil.copytree(ROOT / "tests" / "videos", tmp_path / "tests" / "videos")
     outcomes = "".join(f"{episode.index},1\n" for episode in open_dataset(tmp_path / "my_dataset").episodes)
     (tmp_path / "outcomes.csv").write_text(f"episode,success\n{outcomes}")
     np.savez(tmp_path / "episode.npz", frames=pictures(0), task="stack the cups")
