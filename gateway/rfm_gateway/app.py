@@ -68,7 +68,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
     new_client = partial(
         AsyncRewardClient,
         config.triton_url,
-        timeout_s=config.timeout,
+        timeout_s=config.timeout_s,
         retry=False,  # the caller gets the error at once, and decides
         max_in_flight=config.max_in_flight,
         **credentials.options,
@@ -93,16 +93,16 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
             allow_headers=["*"],
             expose_headers=[REQUEST_ID_HEADER],
         )
-    limits = BodyLimits(config.max_body_mib * MIB, config.timeout)
+    limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
     max_decoded_bytes = DECODED_PER_BODY * limits.max_bytes
     state = TritonState(client, config.triton_url, config.metrics_url, model, credentials)
     guards = [] if api_key is None else [Depends(_key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
-    _add_evaluations(guarded, limits, Evaluator(client, config.timeout, folder, max_decoded_bytes), metrics)
+    _add_evaluations(guarded, limits, Evaluator(client, config.timeout_s, folder, max_decoded_bytes), metrics)
     _add_reports(guarded, state, metrics)
     if config.viewer:
         guarded.include_router(viewer_routes(config, new_client, limits, max_decoded_bytes, metrics))
-        guarded.include_router(dataset_routes(config.shown_datasets(), config.timeout, max_decoded_bytes))
+        guarded.include_router(dataset_routes(config.shown_datasets(), config.timeout_s, max_decoded_bytes))
         guarded.include_router(live_routes(limits))
     app.include_router(guarded)
 

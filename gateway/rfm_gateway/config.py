@@ -49,11 +49,12 @@ class GatewayConfig(Settings):
     triton_key: Path | None = setting(None, "That certificate's key (PEM).")
     cors_origin: Texts = setting((), "Origin from which browsers may ask. Again for more.")
     allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
-    timeout: float = setting(
+    timeout_s: float = setting(
         120.0,
         "Seconds that a request may wait, then take to arrive, then to be scored.",
         least=_SHORTEST_S,
         most=_LONGEST_S,
+        flag="--timeout",
     )
     max_body_mib: int = setting(512, "Largest request.", least=1)
     max_in_flight: int = setting(256, "Evaluations at a time; others wait.", least=1)

@@ -128,7 +128,7 @@ class RequestMiddleware:
             return False
         self._waiting += 1
         try:
-            with self._metrics.waiting.track_inprogress(), anyio.move_on_after(self._config.timeout):
+            with self._metrics.waiting.track_inprogress(), anyio.move_on_after(self._config.timeout_s):
                 return await self._room.acquire()
             return False
         finally:

@@ -36,7 +36,7 @@ serve:
   grpc_key: key.pem
 gateway:
   port: 8100
-  timeout: 60
+  timeout_s: 60
   api_key_file: key.txt
   cors_origin: [http://a.example, http://b.example]
 """
@@ -53,7 +53,7 @@ def test_a_file_has_a_section_for_each_lifetime(tmp_path: Path) -> None:
     tls = {"grpc_certificate": Path("certificate.pem"), "grpc_key": Path("key.pem")}
     assert config.serve == ServeConfig(host="127.0.0.1", http_port=8010, **tls)
     origins = ("http://a.example", "http://b.example")
-    assert config.gateway == GatewayConfig(8100, timeout=60.0, api_key_file=Path("key.txt"), cors_origin=origins)
+    assert config.gateway == GatewayConfig(8100, timeout_s=60.0, api_key_file=Path("key.txt"), cors_origin=origins)
 
 
 def test_the_fastapi_servers_file_is_accepted(tmp_path: Path) -> None:
@@ -93,8 +93,8 @@ BAD = {  # text, and what the message says behind the file's name
     "true for a number": ("num_gpus: true", "num_gpus: expected int or null, got True"),
     "a number for a file": ("serve: {grpc_key: 1}", r"serve\.grpc_key: expected str or null, got 1"),
     "numbers for texts": ("gateway: {cors_origin: [1]}", r"gateway\.cors_origin: expected list of str, got \[1\]"),
-    "no number": ("gateway: {timeout: .nan}", r"gateway\.timeout: expected a finite number, got nan"),
-    "a number for ever": ("gateway: {timeout: 1.0e+300}", r"gateway\.timeout: expected at most 86400\.0, got 1e\+300"),
+    "no number": ("gateway: {timeout_s: .nan}", r"gateway\.timeout_s: expected a finite number, got nan"),
+    "a number for ever": ("gateway: {timeout_s: 1.0e+300}", r"gateway\.timeout_s: expected at most 86400\.0, got 1e\+300"),
     "another dtype": ("export: {dtype: int8}", r"export\.dtype: expected one of float32, bfloat16, float16 or null, got 'int8'"),
     "too small": ("batch_size: 0", "batch_size: expected at least 1, got 0"),
     "a truth that is a number": ("gateway: {viewer: 1}", r"gateway\.viewer: expected bool, got 1"),
@@ -125,8 +125,8 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 
 def test_options_win_over_the_file(tmp_path: Path) -> None:
-    config = read(tmp_path, SECTIONED).with_options(serve={"http_port": 9000}, gateway={"timeout": 5.0})
-    assert (config.serve.http_port, config.serve.host, config.gateway.timeout) == (9000, "127.0.0.1", 5.0)
+    config = read(tmp_path, SECTIONED).with_options(serve={"http_port": 9000}, gateway={"timeout_s": 5.0})
+    assert (config.serve.http_port, config.serve.host, config.gateway.timeout_s) == (9000, "127.0.0.1", 5.0)
     with pytest.raises(ConfigError, match=r"^gateway\.certificate, key: expected both or none, got one"):
         config.with_options(gateway={"key": Path("key.pem")})
     with pytest.raises(ConfigError, match=r"^ports: expected different ones, got"):
@@ -184,7 +184,7 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path
         "api_key_file": str(tmp_path / "key.txt"),
         "cors_origin": "http://lab.example",
         "allow_folder": str(tmp_path),
-        "timeout": "90.0",
+        "timeout_s": "90.0",
         "max_body_mib": "1",
         "max_in_flight": "3",
         "max_waiting": "0",
@@ -192,8 +192,8 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path
     }
     files = {"certificate", "key", "triton_ca_file", "triton_certificate", "triton_key"}  # which a gateway would read
     assert given.keys() | files | {"viewer"} == settings_of(GatewayConfig).keys()
-    words = [word for name, value in given.items() for word in (f"--gateway-{name.replace('_', '-')}", value)]
-    options = {f"--{name.replace('_', '-')}": [value] for name, value in given.items()}
+    options = {settings_of(GatewayConfig)[name].option: [value] for name, value in given.items()}
+    words = [f"--gateway-{option.removeprefix('--')}={value}" for option, (value,) in options.items()]
     for switch in ("viewer", "no-viewer"):
         assert started(*words, f"--gateway-{switch}") == {**options, f"--{switch}": []}
 

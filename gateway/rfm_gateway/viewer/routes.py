@@ -112,11 +112,11 @@ def viewer_routes(
     ) -> tuple[ShownVideo, ...]:
         taken = Decoded(max_decoded_bytes)
         try:
-            with anyio.move_on_after(config.timeout):
+            with anyio.move_on_after(config.timeout_s):
                 return tuple([await question.video(uploads, name, taken) for name in names])
         finally:
             taken.end()
-        raise invalid((names[0],), f"expected videos that are read within {config.timeout:g} s, got longer ones")
+        raise invalid((names[0],), f"expected videos that are read within {config.timeout_s:g} s, got longer ones")
 
     async def events(asked: _Asked) -> AsyncIterator[str]:
         """The events of one curve. What goes wrong is the last of them: the status of the answer has been sent."""
