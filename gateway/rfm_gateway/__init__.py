@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""The HTTP surface of the FastAPI evaluation server, before a Triton server. A distribution of its own.
+"""The FastAPI evaluation server's HTTP endpoints, in front of a Triton server.
 
-A request becomes samples (``body``, ``schema``), is scored through ``AsyncRewardClient`` (``scoring``), and the answer
-is written in the evaluation server's shape. It holds no model and no queue. ``app`` joins the endpoints.
+``body`` and ``schema`` turn a request into samples, ``scoring`` scores them through ``AsyncRewardClient`` and writes
+the answer in the evaluation server's shape, ``app`` joins the endpoints. The gateway holds no model and no queue.
 """

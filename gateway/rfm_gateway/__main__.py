@@ -9,6 +9,6 @@ from rfm_client.cli.command import Command
 from rfm_gateway.command import gateway
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, rich_markup_mode=None)  # without tables that cut the names of options off
+    app = typer.Typer(add_completion=False, rich_markup_mode=None)  # Rich's tables cut off option names
     app.command(cls=Command)(gateway)
     app()

@@ -39,14 +39,14 @@ from rfm_gateway.viewer.dataset_routes import dataset_routes
 from rfm_gateway.viewer.live import live_routes
 from rfm_gateway.viewer.routes import viewer_routes
 
-DECODED_PER_BODY = 2  # files of a request may become so many times as large as a body may be
+DECODED_PER_BODY = 2  # limit of decoded files, as a multiple of the body's limit
 
-_KEY_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # FastAPI looks annotations up in the module
+_KEY_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # at module level, where FastAPI resolves annotations
 _KEY_BEARER = HTTPBearer(auto_error=False)
 
 _REFERENCE = "#/components/schemas/{model}"
 _MODELS = (schema.EvaluateBatchRequest, schema.InvalidRequest, schema.Failure)
-_STATUS_OF = {  # of an answer, by what went wrong behind it
+_STATUS_OF = {  # HTTP status, by the client's error
     errors.ServerUnavailableError: 503,
     errors.ModelNotFoundError: 503,
     errors.DeadlineExceededError: 504,
@@ -58,10 +58,11 @@ logger = logging.getLogger("rfm_gateway")
 
 
 def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
-    """The application.
+    """Return the application.
 
-    api_key: what requests must show, but for those of health and documentation; None: nothing
-    Raises OSError for a folder that is not there, ValueError for a malformed URL or files that cannot be used.
+    api_key: key that requests must show, except for health and documentation; None: no key
+
+    Raises OSError for a missing folder, ValueError for a malformed URL or an unusable file.
     """
     folder = None if config.allow_folder is None else config.allow_folder.resolve(strict=True)
     model, credentials, metrics = config.model or DEFAULT_MODEL, config.credentials, GatewayMetrics()
@@ -69,7 +70,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
         AsyncRewardClient,
         config.triton_url,
         timeout_s=config.timeout_s,
-        retry=False,  # the caller gets the error at once, and decides
+        retry=False,  # the caller gets the error at once, and decides whether to retry
         max_in_flight=config.max_in_flight,
         **credentials.options,
     )
@@ -108,7 +109,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
 
     @app.get("/health", responses=_failures(502, 503, 504))
     async def health() -> schema.Health:
-        """Healthy if every model has just scored something."""
+        """Healthy if every model answers a probe or is busy."""
         return await state.health()
 
     pages.add_docs(app)
@@ -119,8 +120,6 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
 
 
 def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator, metrics: GatewayMetrics) -> None:
-    """The endpoints that score samples."""
-
     async def answer(request: Request, reading: Awaitable[Batch]) -> Response:
         batch = await reading
         found = await while_connected(request, evaluator.evaluate(batch, request.state.request_id))
@@ -135,7 +134,7 @@ def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator
         openapi_extra=_body("application/json", {"$ref": _REFERENCE.format(model="EvaluateBatchRequest")}),
     )
     async def evaluate_batch(request: Request) -> Response:
-        """Score samples that come as JSON."""
+        """Score samples in JSON."""
         return await answer(request, read_json(limits, request))
 
     @router.post(
@@ -145,23 +144,23 @@ def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator
         openapi_extra=_body("multipart/form-data", _MULTIPART),
     )
     async def evaluate_batch_npy(request: Request) -> Response:
-        """Score samples whose arrays come as .npy files: fields `sample_0`, `sample_1`, ... hold each sample as JSON,
-        in which `{"__numpy_file__": name}` stands for the array in the part of that name.
+        """Score samples whose arrays are .npy files.
+
+        The fields `sample_0`, `sample_1`, ... hold a sample each, as JSON. In it `{"__numpy_file__": name}` stands for
+        the array in the part of that name.
         """
         return await answer(request, read_multipart(limits, request))
 
 
 def _add_reports(router: APIRouter, state: TritonState, metrics: GatewayMetrics) -> None:
-    """The endpoints that tell what is served, and how."""
-
     @router.get("/gpu_status", responses=_failures(502, 503, 504))
     async def gpu_status() -> schema.GpuStatus:
-        """What the devices do that models run on."""
+        """State of the devices that models run on."""
         return await state.gpu_status()
 
     @router.get("/model_info", responses=_failures(502, 503, 504))
     async def model_info() -> schema.ModelInformation:
-        """Which checkpoint the server serves."""
+        """The served checkpoint."""
         return await state.model_info()
 
     @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
@@ -190,7 +189,7 @@ def _failures(*codes: int) -> dict[int | str, dict[str, Any]]:
 
 
 def _key_check(key: str) -> Callable[..., None]:
-    """A dependency that refuses requests without the key."""
+    """Return a dependency that refuses requests without the key."""
     expected = key.encode()
 
     def check(
@@ -198,7 +197,7 @@ def _key_check(key: str) -> Callable[..., None]:
         in_bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_KEY_BEARER)],
     ) -> None:
         given = (in_header or "", in_bearer.credentials if in_bearer is not None else "")
-        matches = [secrets.compare_digest(each.encode(), expected) for each in given]  # both, in the same time
+        matches = [secrets.compare_digest(each.encode(), expected) for each in given]  # both, in constant time
         if not any(matches):
             raise HTTPException(
                 401,
@@ -210,7 +209,7 @@ def _key_check(key: str) -> Callable[..., None]:
 
 
 def _handlers() -> dict[Any, Any]:
-    """Every error is answered as JSON, and none of bad input is a 500."""
+    """Return handlers that answer every error as JSON, and never answer bad input with 500."""
 
     def fixed(code: int, detail: str, **headers: str) -> Callable[..., Awaitable[JSONResponse]]:
         async def handler(_request: Request, _error: Exception) -> JSONResponse:
@@ -228,15 +227,15 @@ def _handlers() -> dict[Any, Any]:
 
     return {
         TimeoutError: fixed(408, "body: expected all of it in time, got a part", Connection="close"),
-        ClientDisconnect: fixed(400, "body: expected all of it, got a part"),  # which nobody reads
-        CallerLeftError: fixed(CALLER_LEFT, "the caller has hung up"),  # which nobody reads
+        ClientDisconnect: fixed(400, "body: expected all of it, got a part"),  # the caller is gone
+        CallerLeftError: fixed(CALLER_LEFT, "the caller has hung up"),  # for the log and the metrics
         errors.RewardError: failed,
         Exception: unexpected,
     }
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document with the schemas of bodies, which are read from the stream and no declared parameters."""
+    """Return the OpenAPI document, with the schemas of bodies: endpoints read those from the stream, undeclared."""
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
         _, models = models_json_schema([(model, "validation") for model in _MODELS], ref_template=_REFERENCE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From the body of a request to samples: JSON, or multipart with arrays as files. Nothing beyond the limits is read."""
+"""Read the samples of a request's body, JSON or multipart with arrays as files, within limits."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from rfm_gateway import schema
 
 MAX_PARTS = 10_000  # files, and fields, of one multipart request
 MAX_SAMPLES = 10_000  # of one request
-MAX_JSON_BYTES = 32 * 2**20  # arrays have a better way
-MAX_ERRORS = 1000  # that one answer lists
+MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files
+MAX_ERRORS = 1000  # listed in an answer
 
 _format: Any = np.lib.format  # numpy declares no types for it
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
@@ -36,7 +36,7 @@ _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _STEPS_FIELD = "use_frame_steps"
 _FLAGS = {"true": True, "1": True, "false": False, "0": False, "": False}
 _FORM_FLAGS = {**_FLAGS, "1": False}  # as the evaluation server reads forms
-_EXPECTED = {  # pydantic's kind of error, and what a field of it is
+_EXPECTED = {  # the expected value, by pydantic's kind of error
     "string_type": "text",
     "dict_type": "an object",
     "model_type": "an object",
@@ -57,8 +57,8 @@ Parts: TypeAlias = tuple[dict[str, str], dict[str, UploadFile]]  # fields and fi
 class Batch:
     """The samples of one request, at least one.
 
-    use_frame_steps: whether progress samples are scored frame by frame
-    num_bytes: of the body
+    use_frame_steps: True: progress samples are scored frame by frame
+    num_bytes: size of the body
     """
 
     samples: list[schema.Sample]
@@ -67,13 +67,14 @@ class Batch:
 
 
 def invalid(loc: tuple[str | int, ...], message: str, kind: str = "value_error") -> RequestValidationError:
-    """The error at a field of the body, in the form of FastAPI's own errors."""
+    """Return an error at a field of the body, in the form of FastAPI's own errors."""
     return RequestValidationError([{"type": kind, "loc": ["body", *loc], "msg": message}])
 
 
 def field_errors(error: ValidationError) -> list[dict[str, Any]]:
-    """pydantic's errors in the form of this gateway's own: ``expected X, got Y`` at a path. Raises
-    RequestValidationError with their number alone if they are very many.
+    """Return pydantic's errors in the gateway's form, ``expected X, got Y`` at a path.
+
+    Raises RequestValidationError with only their number if there are more than MAX_ERRORS.
     """
     if error.error_count() > MAX_ERRORS:
         raise invalid((), f"expected no faulty fields, got {error.error_count()}")
@@ -82,25 +83,25 @@ def field_errors(error: ValidationError) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class BodyLimits:
-    """How large a request's body may be, of JSON at most MAX_JSON_BYTES, and within which time it must have come.
+    """Limits of a request's body: its size, of JSON at most MAX_JSON_BYTES, and its time of arrival.
 
-    Reading raises HTTPException 413 as soon as too much is announced or has come, and TimeoutError.
+    Reading raises HTTPException 413 as soon as the announced or received size is too large, and TimeoutError.
     """
 
     max_bytes: int
     timeout_s: float
 
     async def read(self, request: Request, max_bytes: int = MAX_JSON_BYTES) -> bytes:
-        """The whole body, of which JSON is made."""
+        """Return the whole body."""
         with anyio.fail_after(self.timeout_s):
             return b"".join([chunk async for chunk in _chunks(request, min(self.max_bytes, max_bytes))])
 
     @asynccontextmanager
     async def form(self, request: Request) -> AsyncIterator[Parts]:
-        """Fields and files of a multipart request by name; the files are there as long as the context lasts.
+        """Yield fields and files of a multipart request by name. The files exist until the context ends.
 
-        Raises RequestValidationError for two of one name, HTTPException: 415 for no multipart body, 400 for one that is
-        malformed, or does not end as it must: what was cut off may be a sample.
+        Raises RequestValidationError for two parts of the same name, HTTPException 415 for another content type and 400
+        for a malformed or incomplete body, which may lack a sample.
         """
         kind, options = parse_options_header(request.headers.get("content-type", ""))
         if kind != b"multipart/form-data" or not options.get(b"boundary"):
@@ -116,7 +117,7 @@ class BodyLimits:
         try:
             with anyio.fail_after(self.timeout_s):
                 form = await parser.parse()
-        except (MultiPartException, ValueError) as error:  # ValueError: of the charset, or of the parser below
+        except (MultiPartException, ValueError) as error:  # ValueError: the charset, or python_multipart
             raise HTTPException(400, f"body: expected multipart/form-data, got: {error}") from None
         try:
             if not parser.has_ended:
@@ -136,7 +137,7 @@ class BodyLimits:
 
 
 class _Form(MultiPartParser):
-    """Starlette's parser, which here notes whether the last boundary has come."""
+    """Starlette's parser, with a flag for the last boundary."""
 
     has_ended = False
 
@@ -158,34 +159,34 @@ async def _chunks(request: Request, max_bytes: int) -> AsyncGenerator[bytes, Non
 
 
 class Decoded:
-    """What the files of one request become in memory, counted before it is taken: at most ``max_bytes``."""
+    """A budget of ``max_bytes`` for the decoded files of one request, taken before they are decoded."""
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
         self._left_bytes: float = max_bytes
 
     def take(self, num_bytes: int) -> None:
-        """Counts ``num_bytes`` more. Raises HTTPException 413 if that is too much."""
+        """Take ``num_bytes``. Raises HTTPException 413 if less is left."""
         self._left_bytes -= num_bytes
         if self._left_bytes < 0:
             limit = f"files of at most {self._max_bytes} bytes in one request, when they are decoded"
             raise HTTPException(413, f"body: expected {limit}, got more")
 
     def end(self) -> None:
-        """Lets a thread fail that still decodes for a request whose caller has left."""
+        """Make every later ``take`` fail, so that threads stop decoding for a caller who has left."""
         self._left_bytes = float("-inf")
 
 
 async def read_json(limits: BodyLimits, request: Request) -> Batch:
-    """The samples of a JSON request. Raises RequestValidationError, and as ``limits``."""
+    """Return the samples of a JSON request. Raises RequestValidationError and the errors of ``limits``."""
     body = await limits.read(request)
     return await off_loop(len(body), _of_json, body)
 
 
 async def read_multipart(limits: BodyLimits, request: Request) -> Batch:
-    """The samples of a multipart request, whose files lie on disk, but for small ones, until they are arrays.
+    """Return the samples of a multipart request. Large files lie on disk until they are decoded.
 
-    Raises RequestValidationError, and as ``limits``.
+    Raises RequestValidationError and the errors of ``limits``.
     """
     async with limits.form(request) as (fields, uploads):
         for name in uploads:
@@ -205,12 +206,12 @@ def _of_json(body: bytes) -> Batch:
 
 def _of_form(fields: Mapping[str, str], uploads: Mapping[str, UploadFile], num_bytes: int) -> Batch:
     samples = [_parsed(fields[name], (name,)) for name in _sample_fields(fields)]
-    arrays = {name: cache(partial(_read_npy, upload)) for name, upload in uploads.items()}  # of each one, however often
+    arrays = {name: cache(partial(_read_npy, upload)) for name, upload in uploads.items()}  # each file is decoded once
     return Batch(_checked(samples, arrays), _flag(fields.get(_STEPS_FIELD), _FORM_FLAGS), num_bytes)
 
 
 def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
-    """The array of numbers in a .npy file. No pickle, and nothing behind the array. Raises ValueError."""
+    """Return the numbers in a .npy file. Raises ValueError, also for pickle and for bytes behind the array."""
     upload.file.seek(0)
     try:
         array: np.ndarray[Any, Any] = _format.read_array(upload.file, allow_pickle=False)
@@ -224,7 +225,7 @@ def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
 
 
 def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool:
-    """A boolean as JSON or, with its own ``flags``, a form writes it. Raises RequestValidationError."""
+    """Return a boolean from JSON or, with _FORM_FLAGS, from a form. Raises RequestValidationError."""
     if value is None:
         return False
     if isinstance(value, (bool, int, str)) and str(value).strip().lower() in flags:
@@ -235,12 +236,12 @@ def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool:
 def _parsed(text: bytes | str, loc: tuple[str, ...]) -> Any:
     try:
         return from_json(text)
-    except (ValueError, TypeError) as error:  # TypeError: letters that no UTF-8 has
+    except (ValueError, TypeError) as error:  # TypeError: text that is no UTF-8
         raise invalid(loc, f"expected JSON, got: {error}", "json_invalid") from None
 
 
 def _unwrapped(document: Any) -> tuple[list[Any], bool]:
-    """The samples of each form that the evaluation server took or was said to take, and use_frame_steps."""
+    """Return samples and use_frame_steps, from every form that the evaluation server takes or documents."""
     use_frame_steps = False
     if isinstance(document, dict):
         use_frame_steps = _flag(document.get(_STEPS_FIELD))
@@ -259,7 +260,7 @@ def _unwrapped(document: Any) -> tuple[list[Any], bool]:
 
 
 def _sample_fields(fields: Mapping[str, str]) -> list[str]:
-    """The fields ``sample_0``, ``sample_1`` and so on. A gap is refused: it would shift later answers."""
+    """Return the names ``sample_0``, ``sample_1`` and so on. Raises for a gap, which would shift later answers."""
     numbers = []
     for name in filter(_ANY_SAMPLE_FIELD.fullmatch, fields):
         if not _SAMPLE_FIELD.fullmatch(name):

@@ -61,7 +61,7 @@ def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
 
 
 def gateway_command(config: GatewayConfig) -> list[str]:
-    """A command line that serves a gateway as ``gateway`` does, in a process of its own."""
+    """Return a command line that runs this gateway in another process."""
     words = []
     for name, each in settings_of(GatewayConfig).items():
         value = getattr(config, name)
@@ -74,7 +74,7 @@ def gateway_command(config: GatewayConfig) -> list[str]:
 
 
 def page_link(config: GatewayConfig) -> str:
-    """Where a browser on this machine, or one that may reach the address, finds the page."""
+    """Return the page's URL for browsers that can reach the address."""
     host = config.host or DEFAULT_HOST
     scheme = "http" if config.certificate is None else "https"
     return f"{scheme}://{in_url(from_here(host))}:{config.port or DEFAULT_PORT}/"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a gateway is told: the section ``gateway`` of ``rfm serve``'s YAML file, and the options of ``rfm gateway``."""
+"""Settings of a gateway: section ``gateway`` of ``rfm serve``'s YAML file, and options of ``rfm gateway``."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _SHORTEST_S, _LONGEST_S = 0.001, 86_400.0  # a day
 
 @dataclass(frozen=True)
 class GatewayConfig(Settings):
-    """Where a gateway listens, whom it asks and lets in, and what it takes on; see docs/reference/gateway.md.
+    """Settings of a gateway: addresses, credentials, limits. docs/reference/gateway.md explains them.
 
-    Where it listens and whom it asks may be None: ``rfm serve`` and ``rfm gateway`` have different defaults for that.
+    Addresses may be None, because ``rfm serve`` and ``rfm gateway`` have different defaults for them.
     """
 
     TITLE: ClassVar[str] = "Gateway (section gateway of the file)"
@@ -69,26 +69,26 @@ class GatewayConfig(Settings):
 
     @property
     def triton_url(self) -> str:
-        """Where Triton is. Raises ConfigError for none."""
+        """URL of Triton. Raises ConfigError if there is none."""
         if self.triton is None:
             raise ConfigError("triton", "expected the URL of a Triton, got none")
         return self.triton
 
     @property
     def credentials(self) -> Credentials:
-        """What Triton is shown. Raises ValueError for files that cannot be used."""
+        """Credentials for Triton. Raises ValueError for unusable files."""
         return Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key)
 
     @property
     def tls(self) -> dict[str, Any]:
-        """Arguments of uvicorn. Raises ValueError for files that it could not serve with."""
+        """Arguments of uvicorn for TLS. Raises ValueError for unusable files."""
         if self.certificate is None or self.key is None:
             return {}
         check_certificate(self.certificate, self.key, "certificate, key")
         return {"ssl_certfile": self.certificate, "ssl_keyfile": self.key}
 
     def api_key(self, environment: Mapping[str, str]) -> str | None:
-        """The key that requests must show; None: they need none. Raises ConfigError."""
+        """Return the key that requests must show, or None. Raises ConfigError."""
         try:
             key = environment.get(GATEWAY_KEY_VARIABLE) if self.api_key_file is None else self.api_key_file.read_text()
         except (OSError, UnicodeDecodeError) as error:
@@ -98,7 +98,7 @@ class GatewayConfig(Settings):
         return None if key is None else key.strip()
 
     def shown_datasets(self) -> list[ShownDataset]:
-        """The datasets that the page shows. Raises ConfigError for a folder that holds none that can be shown."""
+        """Return the datasets that the page shows. Raises ConfigError for a folder without such a dataset."""
         if not (self.dataset and self.viewer):
             return []
         from rfm_gateway.viewer.datasets import ShownDataset
@@ -106,7 +106,7 @@ class GatewayConfig(Settings):
         return [ShownDataset.open(folder) for folder in self.dataset]
 
     def check(self, environment: Mapping[str, str]) -> None:
-        """Raises ValueError or OSError for what a gateway would not start with."""
+        """Raise ValueError or OSError for settings with which a gateway would not start."""
         split_url(self.triton_url)
         if self.host is not None and self.port is not None:
             options = {"port_option": "--gateway-port", "host_option": "--gateway-host"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files that requests name: none, unless the operator allows a folder; then those in it alone, and no pickle."""
+"""Read the files that requests name, only from a folder that the operator allows, and no pickle."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RequestFiles:
-    """The files that one request names. They are counted before they are read.
+    """The files of one request. Their decoded size is taken from ``decoded`` before they are read.
 
-    folder: where they are, without links on the way to it; None: requests may name none
-    Its methods raise InvalidSampleError, and HTTPException as Decoded.
+    folder: the allowed folder, with links resolved; None: no file is read
+
+    Its methods raise InvalidSampleError, and HTTPException if ``decoded`` is used up.
     """
 
     folder: Path | None
     decoded: Decoded
 
     def frames(self, names: Sequence[str]) -> UInt8Array:
-        """uint8 [T, H, W, 3], the images of these names."""
+        """Return the T named images as uint8 [T, H, W, 3], RGB."""
         with self._image(names[0], "frames.0") as first:
             shape = (len(names), first.height, first.width, 3)
         self.decoded.take(math.prod(shape))
@@ -47,14 +48,14 @@ class RequestFiles:
         return frames
 
     def embeddings(self, name: str) -> Trajectory:
-        """The embeddings in a .npy or .npz file."""
+        """Return the embeddings in a .npy or .npz file."""
         file = self._file(name, "embeddings_path")
         if file.suffix.lower() not in ARRAY_SUFFIXES:
             raise InvalidSampleError.at("embeddings_path", " or ".join(ARRAY_SUFFIXES), name)
         try:
             self.decoded.take(_unpacked_bytes(file))
             trajectory = load_trajectory(file)
-        except (OSError, ValueError, BadZipFile):  # InvalidSampleError among them, which shows the whole path
+        except (OSError, ValueError, BadZipFile):  # also InvalidSampleError, whose message has the whole path
             raise InvalidSampleError.at("embeddings_path", "a file of embeddings [T, D]", name) from None
         if trajectory.video_embeddings is None:
             raise InvalidSampleError.at("embeddings_path", "a file of embeddings", "frames")
@@ -78,8 +79,8 @@ class RequestFiles:
             raise InvalidSampleError.at(where, "an array (this gateway reads no files)", "the name of a file")
         try:
             file = (self.folder / name).resolve()
-            is_in_folder = file.is_relative_to(self.folder) and file.is_file()  # links are followed before
-        except (OSError, ValueError, RuntimeError):  # no name of a file, or links in a circle
+            is_in_folder = file.is_relative_to(self.folder) and file.is_file()  # resolve() has followed links
+        except (OSError, ValueError, RuntimeError):  # an impossible name, or links in a circle
             is_in_folder = False
         if not is_in_folder:
             raise InvalidSampleError.at(where, "a file in the allowed folder", name)
@@ -87,7 +88,7 @@ class RequestFiles:
 
 
 def _unpacked_bytes(file: Path) -> int:
-    """Bytes of the unpacked arrays in a .npy or .npz file."""
+    """Return the size of the unpacked arrays in a .npy or .npz file."""
     if file.suffix.lower() == ".npz":
         with ZipFile(file) as archive:
             return sum(entry.file_size for entry in archive.infolist())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Requests under way: how many are let in at a time, what is counted of them in Prometheus' terms, and who hangs up."""
+"""Limit concurrent evaluations, count requests for Prometheus, and cancel the work of callers who hang up."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Returned = TypeVar("Returned")
 
 EVALUATIONS = ("/evaluate_batch", "/evaluate_batch_npy", "/viewer/score", "/viewer/compare")
 ENDPOINTS = (*EVALUATIONS, "/gpu_status", "/health", "/model_info", "/metrics")
-CALLER_LEFT = 499  # as other servers log it; nobody reads the answer
+CALLER_LEFT = 499  # as nginx logs it
 REJECTIONS = {
     401: "key",
     408: "slow",
@@ -38,7 +38,7 @@ REJECTIONS = {
 
 REQUEST_ID_HEADER = "X-Request-ID"
 RETRY_AFTER = {"Retry-After": "1"}
-_ID_BYTES = 8  # of chance, where a request comes without an id
+_ID_BYTES = 8  # random, for a request without an id
 
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
 
@@ -68,20 +68,20 @@ class GatewayMetrics:
         self.waiting = Gauge("rfm_gateway_requests_waiting", "Evaluations not begun.", registry=self._registry)
 
     def count(self, path: str, code: int, duration_s: float) -> None:
-        """Counts a request that was answered with the status ``code``."""
-        endpoint = path if path in ENDPOINTS else "other"  # not any path that a caller makes up
+        """Count a request that was answered with the status ``code``."""
+        endpoint = path if path in ENDPOINTS else "other"  # callers choose the path, and each label value takes memory
         self.requests.labels(endpoint, str(code)).inc()
         self.durations.labels(endpoint).observe(duration_s)
         if path in EVALUATIONS and code >= 400:
             self.rejections.labels(REJECTIONS.get(code, "other")).inc()
 
     def text(self) -> bytes:
-        """The metrics in the text format of Prometheus."""
+        """Return the metrics in the text format of Prometheus."""
         return generate_latest(self._registry)
 
 
 class RequestMiddleware:
-    """ASGI middleware: names, times and counts every request, and lets in as many evaluations as ``config`` says."""
+    """ASGI middleware that gives requests ids, times and counts them, and limits concurrent evaluations."""
 
     def __init__(self, app: ASGIApp, metrics: GatewayMetrics, config: GatewayConfig) -> None:
         self._app = app
@@ -91,14 +91,14 @@ class RequestMiddleware:
         self._waiting = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serves a request, and counts it with its answer."""
+        """Serve a request, and count it with its answer."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         started_s = time.perf_counter()
         request_id = _request_id(scope)
         scope.setdefault("state", {})["request_id"] = request_id
-        code = 500  # if nothing is answered
+        code = 500  # unless an answer begins
 
         async def send_counted(message: Message) -> None:
             nonlocal code
@@ -123,7 +123,7 @@ class RequestMiddleware:
             self._metrics.count(scope["path"], code, time.perf_counter() - started_s)
 
     async def _has_entered(self) -> bool:
-        """Whether there is room in time, first come, first served."""
+        """Wait for room, first come, first served; True if there was room in time."""
         if self._room.locked() and self._waiting >= self._config.max_waiting:
             return False
         self._waiting += 1
@@ -136,9 +136,9 @@ class RequestMiddleware:
 
 
 def _request_id(scope: Scope) -> str:
-    """The caller's request id, or a new one.
+    """Return the caller's request id, or a random id.
 
-    A new one replaces an id that no log could hold, or that would hide the request from metrics.
+    A random id replaces an id that breaks log lines, or that would make metrics take the request for a probe.
     """
     given = Headers(scope=scope).get(REQUEST_ID_HEADER, "")
     if REQUEST_ID.fullmatch(given) and not given.startswith(PROBE_PREFIX):
@@ -147,13 +147,13 @@ def _request_id(scope: Scope) -> str:
 
 
 class CallerLeftError(Exception):
-    """The caller has hung up before the answer was there."""
+    """The caller hung up before the answer was ready."""
 
 
 async def while_connected(request: Request, work: Coroutine[Any, Any, Returned]) -> Returned:
-    """What ``work`` gives. If the caller hangs up, it is cancelled with its requests to Triton: CallerLeftError.
+    """Return the result of ``work``. Read the request's body before.
 
-    The body of the request must have been read.
+    If the caller hangs up, cancels ``work`` with its requests to Triton and raises CallerLeftError.
     """
     working = asyncio.create_task(work)
     leaving = asyncio.create_task(_disconnected(request))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The files of the page and of the documentation of endpoints. All come with the gateway: no network is needed."""
+"""Serve the files of the page and of Swagger UI. They come with the gateway, so they need no network."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fastapi import FastAPI, Request, Response
 from starlette.staticfiles import StaticFiles
 
 _PACKAGE = Path(__file__).parent
-_POLICY = (  # where a page may take from what; no script and no style of its own text, nothing of elsewhere
+_POLICY = (  # nothing from other hosts, no inline scripts or styles
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
@@ -18,7 +18,7 @@ _HEADERS = {
     "Content-Security-Policy": _POLICY,
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-cache",  # asked for again, and answered with 304 as long as it is the same
+    "Cache-Control": "no-cache",  # browsers ask again, and get 304 for an unchanged file
 }
 
 
@@ -32,12 +32,12 @@ class _Files(StaticFiles):
 
 
 def add_viewer(app: FastAPI) -> None:
-    """The page at ``/``, and its parts."""
+    """Add the page at ``/``, and its files."""
     _add(app, "/", "/viewer", _PACKAGE / "viewer" / "static", uplot=_PACKAGE / "vendored" / "uplot")
 
 
 def add_docs(app: FastAPI) -> None:
-    """Swagger UI at ``/docs``, and its parts."""
+    """Add Swagger UI at ``/docs``, and its files."""
     _add(app, "/docs", "/docs", _PACKAGE / "docs", **{"swagger-ui": _PACKAGE / "vendored" / "swagger-ui"})
 
 

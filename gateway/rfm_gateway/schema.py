@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Requests and answers of the evaluation server, as its clients write and read them.
+"""Requests and answers of the evaluation server.
 
-Field names are those of ``dataset_types.py`` of reward_fm and robometer; what is not named here is ignored, as there.
+Field names are those of ``dataset_types.py`` of reward_fm and robometer. Other fields are ignored, as upstream does.
 T frames, H x W pixels, D width of a frame embedding, Dt width of a text embedding.
 """
 
@@ -45,7 +45,7 @@ def _array_schema(description: str, depth: int, *others: dict[str, Any]) -> With
 
 
 def _array(value: Any, info: ValidationInfo) -> Any:
-    """An array from nested lists, or from the upload that it names."""
+    """Return an array from nested lists, or from the named upload."""
     if value is None or isinstance(value, np.ndarray):
         return value
     if isinstance(value, Mapping):
@@ -63,7 +63,7 @@ def _array(value: Any, info: ValidationInfo) -> Any:
 
 
 def _check_leaves(array: list[Any]) -> None:
-    """Checks the leaves before numpy sees them: with words, numpy would make every element as wide as the longest."""
+    """Check the leaves before numpy reads them: with a text, it would make every element as wide as the longest."""
     for axis in range(MAX_AXES):
         values: Iterable[Any] = array
         for _ in range(axis):
@@ -79,7 +79,7 @@ def _check_leaves(array: list[Any]) -> None:
 
 
 def _frames(value: Any, info: ValidationInfo) -> Any:
-    """The frames as ``_array`` reads them, or a list of names of image files."""
+    """Return an array of frames, or the list of names of image files."""
     if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
         return value
     return _array(value, info)
@@ -95,7 +95,7 @@ def _uploaded(value: Mapping[str, Any], uploads: Mapping[str, Callable[[], Any]]
 
 
 class TrajectoryInput(BaseModel):
-    """Frames, or their embeddings, of one episode, and its task."""
+    """Frames or embeddings of an episode, and its task."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -127,19 +127,19 @@ class _Sample(BaseModel):
 
     @property
     def named_trajectories(self) -> dict[str, TrajectoryInput]:
-        """The trajectories by field name, in the order in which they are scored."""
+        """The trajectories by field name, in the order of scoring."""
         return {name: value for name, value in self if isinstance(value, TrajectoryInput)}
 
 
 class ProgressInput(_Sample):
-    """How far has the trajectory come at each frame?"""
+    """Score the progress of a trajectory at each frame."""
 
     sample_type: Literal["progress"]
     trajectory: TrajectoryInput
 
 
 class PreferenceInput(_Sample):
-    """Which trajectory does the chosen one's task better?"""
+    """Score which trajectory does the task of the chosen trajectory better."""
 
     sample_type: Literal["preference"]
     chosen_trajectory: TrajectoryInput
@@ -147,7 +147,7 @@ class PreferenceInput(_Sample):
 
 
 class SimilarityInput(_Sample):
-    """How similar is ``sim_trajectory`` to ``ref_trajectory``? ``diff_trajectory`` is ignored, as it was."""
+    """Score the similarity of ``sim_trajectory`` to ``ref_trajectory``. ``diff_trajectory`` is ignored."""
 
     sample_type: Literal["similarity"]
     ref_trajectory: TrajectoryInput = Field(validation_alias=AliasChoices("ref_trajectory", "reference_trajectory"))
@@ -161,7 +161,7 @@ SAMPLES: TypeAdapter[list[Sample]] = TypeAdapter(list[_ByType])
 
 
 class EvaluateBatchRequest(BaseModel):
-    """A bare list of samples, a single sample, and an object whose one value is the list, are read too."""
+    """Samples. A bare list, a single sample, or an object whose only value is the list is read, too."""
 
     samples: list[_ByType] = Field(min_length=1)
     use_frame_steps: bool = Field(
@@ -170,27 +170,27 @@ class EvaluateBatchRequest(BaseModel):
 
 
 class PreferenceOutputs(BaseModel):
-    """One entry a preference sample, in order."""
+    """An entry for each preference sample, in order."""
 
-    predictions: list[int] = Field(description="1: the chosen trajectory is preferred, 0: the rejected one.")
+    predictions: list[int] = Field(description="1: the chosen trajectory is preferred; 0: the rejected trajectory is.")
     prediction_probs: list[float] | None = Field(description="Probability that the chosen trajectory is preferred.")
-    preference_labels: list[float] = Field(description="What is true: 1, the chosen one.")
+    preference_labels: list[float] = Field(description="The truth: 1, the chosen trajectory.")
 
 
 class ProgressOutputs(BaseModel):
-    """One entry a progress sample, in order."""
+    """An entry for each progress sample, in order."""
 
     progress_pred: list[list[float]] = Field(description="0..1, for each frame.")
 
 
 class SuccessOutputs(BaseModel):
-    """One entry a progress sample, in order."""
+    """An entry for each progress sample, in order."""
 
     success_probs: list[list[float]] = Field(description="0..1, for each frame.")
 
 
 class SimilarityOutputs(BaseModel):
-    """One entry a similarity sample, in order."""
+    """An entry for each similarity sample, in order."""
 
     sim_score_ref_sim: list[float] = Field(description="Raw score of sim_trajectory against ref_trajectory.")
     task: list[str | None]
@@ -200,7 +200,7 @@ class SimilarityOutputs(BaseModel):
 
 
 class EvaluateBatchAnswer(BaseModel):
-    """Null where no sample of that type was sent, and where the checkpoint does not predict success."""
+    """Scores by type; null without samples of the type, or if the checkpoint does not predict success."""
 
     outputs_preference: PreferenceOutputs | None = None
     outputs_progress: ProgressOutputs | None = None
@@ -209,7 +209,7 @@ class EvaluateBatchAnswer(BaseModel):
 
 
 class FieldError(BaseModel):
-    """What is wrong with a field of a request."""
+    """The error at a field of a request."""
 
     type: str
     loc: list[str | int] = Field(description="Path of the field.")
@@ -223,13 +223,13 @@ class InvalidRequest(BaseModel):
 
 
 class Failure(BaseModel):
-    """Every other answer that is no success."""
+    """Body of every other error."""
 
     detail: str
 
 
 class GpuStats(BaseModel):
-    """One device that models run on; a server without GPUs has one, its CPU."""
+    """A device that models run on; a server without GPUs has its CPU alone."""
 
     device: str = Field(description="UUID of the GPU, or CPU.")
     status: Literal["ready", "processing"] = Field(description="processing: requests wait for their turn.")
@@ -245,27 +245,27 @@ class GpuStatus(BaseModel):
     """Fields of the evaluation server, from Triton's metrics and statistics."""
 
     total_gpus: int = Field(description="Devices that models run on.")
-    available_gpus: int = Field(description="Those at which no request waits.")
-    max_workers: int = Field(description="Batches that are computed at a time: model instances.")
+    available_gpus: int = Field(description="Devices without a waiting request.")
+    max_workers: int = Field(description="Model instances: batches that are computed at a time.")
     pool_size: int = Field(description="As total_gpus.")
     gpu_stats: dict[str, GpuStats] = Field(description='By number, from "0".')
 
 
 class Health(BaseModel):
-    """A server whose every model has answered a request just now."""
+    """The state of a server whose models all answer a probe or are busy."""
 
     status: Literal["healthy"]
-    available_gpus: int | None = Field(description="Those at which no request waits.")
+    available_gpus: int | None = Field(description="Devices without a waiting request.")
     total_gpus: int | None = Field(description="Devices that models run on; null: Triton's metrics cannot be read.")
 
 
 class ModelInformation(BaseModel):
-    """What the gateway knows of the served checkpoint."""
+    """Facts about the served checkpoint."""
 
-    model_path: str | None = Field(description="Hub id, or name of the folder, that was exported.")
+    model_path: str | None = Field(description="Hub id or folder name of the exported checkpoint.")
     model_version: str | None = Field(description="Version in the model repository.")
     num_gpus: int | None
     experiment_config: dict[str, Any] = Field(
-        description="config.yaml of the training run, without secrets; of a checkpoint without one, the network's."
+        description="config.yaml of the training run, without secrets; else the network's configuration."
     )
     model_architecture: dict[str, Any] = Field(description="Class and numbers of parameters.")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples of a request -> the client's samples -> results -> the evaluation server's answer."""
+"""Convert a request's samples for the client, score them, and write the evaluation server's answer."""
 
 from __future__ import annotations
 
@@ -41,24 +41,26 @@ from rfm_gateway.folder import RequestFiles
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 PREFERRED = 0.5
-CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the first trajectory, which is the chosen one, is better
+CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
 RGB_CHANNELS, RGBA_CHANNELS = 3, 4
 
-_TEXT_FRAME_PX = 32  # of the blank frame that goes with a task, where only the task's embedding is wanted
-_SIDES = {  # what the client calls them
+_TEXT_FRAME_PX = 32  # of the blank frame that is sent with a task to get only the task's embedding
+_SIDES = {  # the gateway's fields, by the client's names
     "first": "chosen_trajectory",
     "second": "rejected_trajectory",
     "reference": "ref_trajectory",
     "other": "sim_trajectory",
 }
-Texts: TypeAlias = Mapping[str, Float32Array | InvalidSampleError]  # by task; why one cannot be encoded
+Texts: TypeAlias = Mapping[
+    str, Float32Array | InvalidSampleError
+]  # by task: its embedding, or the error of the encoder
 
 
 class Evaluator:
     """Scores batches with the server behind ``client``.
 
-    folder: whose files samples may name, without links on the way to it; None: none
-    max_decoded_bytes: of the files that one request names, when they are decoded
+    folder: folder of files that samples may name, with links resolved; None: no files
+    max_decoded_bytes: limit of the decoded files of one request
     """
 
     def __init__(
@@ -70,15 +72,15 @@ class Evaluator:
         self._max_decoded_bytes = max_decoded_bytes
 
     async def evaluate(self, batch: Batch, request_id: str) -> schema.EvaluateBatchAnswer:
-        """The answer to a batch, whole: one that lacked a sample would shift the others', or be read as a reward of 0.
+        """Return the answer to a whole batch. A missing sample would shift later scores, or be read as a reward of 0.
 
-        Raises RequestValidationError for samples that cannot be scored, all of them listed, HTTPException for named
-        files that become too large, and ServerError.
+        Raises RequestValidationError that lists all invalid samples, HTTPException for files that are too large, and
+        ServerError.
         """
         deadline = Deadline(self._timeout_s)
         try:
             return await self._evaluate(batch, deadline, request_id)
-        except DeadlineExceededError as error:  # its message names the time of one of several calls
+        except DeadlineExceededError as error:  # its message has the time limit of one call, not of all
             raise deadline.exceeded("Triton") from error
 
     async def _evaluate(self, batch: Batch, deadline: Deadline, request_id: str) -> schema.EvaluateBatchAnswer:
@@ -97,12 +99,14 @@ class Evaluator:
             raise _refused(unfit)
         for error in failed.values():
             raise error
-        results = [outcome for outcome in outcomes if not isinstance(outcome, RewardError)]  # all of them
+        results = [
+            outcome for outcome in outcomes if not isinstance(outcome, RewardError)
+        ]  # no outcome is an error here
         group = 1 if served.frames is None or batch.use_frame_steps else await self._frames_per_value(results, deadline)
         return _answer(batch.samples, results, group)
 
     async def _frames_per_value(self, results: Sequence[Result], deadline: Deadline) -> int:
-        """How many frames share a value. Asks again if another version has answered than the client knows."""
+        """Return how many frames share a value. Raises ServerUnavailableError while another version is loaded."""
         info = await self._client.model_info(frames=True, timeout_s=deadline.remaining_s())
         unknown = {str(result.model_version) for result in results} - set(info.versions)
         if info.versions and unknown:
@@ -112,10 +116,10 @@ class Evaluator:
         return info.frames_per_value
 
     async def _served(self, samples: Sequence[schema.Sample], deadline: Deadline) -> _Served:
-        """The models that may score the samples.
+        """Return the models that can score the samples.
 
-        It reads the model for frames only if a sample may need it: the client does not remember that a model is not
-        served, and would send a request every time.
+        Asks about the model for frames only if a sample may need it, because the client does not cache that a model is
+        missing and would send a request each time.
         """
         trajectories = [t for sample in samples for t in sample.named_trajectories.values()]
         needs_embeddings = any(map(_has_embeddings, trajectories))
@@ -123,7 +127,7 @@ class Evaluator:
         has_frames = any(trajectory.frames is not None for trajectory in trajectories)
         needs_frames = has_frames and not (embeddings is not None and all(map(_has_embeddings, trajectories)))
         frames = await self._model_info(deadline, frames=True) if needs_frames else None
-        if embeddings is None and frames is None:  # is the other one served, or none at all?
+        if embeddings is None and frames is None:  # raises ModelNotFoundError if the other model is missing, too
             await self._client.model_info(frames=not needs_frames, timeout_s=deadline.remaining_s())
         return _Served(embeddings, frames)
 
@@ -136,7 +140,7 @@ class Evaluator:
     async def _texts(
         self, samples: Sequence[schema.Sample], served: _Served, deadline: Deadline, request_id: str
     ) -> Texts:
-        """Embeddings of the tasks that come without one, by task; empty if there is no encoder."""
+        """Return embeddings by task, for tasks without an embedding; empty without an encoder."""
         tasks = {
             first.task
             for first, *_ in (tuple(sample.named_trajectories.values()) for sample in samples)
@@ -156,7 +160,7 @@ class Evaluator:
             encoded = await self._client.encode(
                 Trajectory(frames=blank, task=task), timeout_s=deadline.remaining_s(), request_id=request_id
             )
-        except InvalidSampleError as error:  # of one task; the others' samples have errors of their own
+        except InvalidSampleError as error:  # of this task alone
             return error
         assert encoded.text_embedding is not None
         return encoded.text_embedding
@@ -164,7 +168,7 @@ class Evaluator:
 
 @dataclass(frozen=True)
 class _Served:
-    """What is served of the checkpoint: for embeddings, and for raw frames; None: it is not."""
+    """The checkpoint's models for embeddings and for raw frames; None: not served."""
 
     embeddings: ModelInfo | None
     frames: ModelInfo | None
@@ -172,9 +176,11 @@ class _Served:
 
 @dataclass(frozen=True)
 class _Conversion:
-    """Converts the samples of one request.
+    """Conversion of one request's samples.
 
-    texts: embeddings of tasks; files: those that the samples name; frame_steps: of progress samples
+    texts: embeddings of tasks
+    files: the files that samples name
+    frame_steps: of progress samples
     """
 
     served: _Served
@@ -183,9 +189,9 @@ class _Conversion:
     frame_steps: int
 
     def samples(self, samples: Sequence[schema.Sample]) -> list[Sample]:
-        """The samples as the client takes them.
+        """Return the client's samples.
 
-        Raises RequestValidationError that lists all that cannot be scored, and HTTPException as RequestFiles does.
+        Raises RequestValidationError that lists all invalid samples, and HTTPException as ``RequestFiles`` does.
         """
         converted: list[Sample] = []
         errors: dict[int, InvalidSampleError] = {}
@@ -252,16 +258,15 @@ class _Conversion:
 
 
 def _has_embeddings(trajectory: schema.TrajectoryInput) -> bool:
-    """Whether the trajectory has embeddings: its own, or those of a file where it has no frames."""
+    """True if the trajectory has embeddings, or a file of embeddings and no frames."""
     in_file = trajectory.embeddings_path is not None and trajectory.frames is None
     return trajectory.video_embeddings is not None or in_file
 
 
 def _uint8(frames: Any) -> UInt8Array:
-    """uint8 [T, H, W, C], as the evaluation server made images.
+    """Return frames as uint8 [T, H, W, C], converted as the evaluation server does.
 
-    Whole numbers stay as they are, floats are clipped and truncated. One frame is a video of one. Of RGBA the colours
-    count.
+    Floats are clipped and truncated. A single frame becomes a video of one frame. RGBA loses its alpha channel.
     """
     array = as_array(frames)
     if array.ndim == 3:
@@ -274,7 +279,7 @@ def _uint8(frames: Any) -> UInt8Array:
         if array.min() < 0 or array.max() > 255:
             raise InvalidSampleError.at("frames", "values in 0..255", f"{array.min()}..{array.max()}")
         return array.astype(np.uint8)
-    return array  # Trajectory checks the rest
+    return array  # Trajectory refuses all other types and shapes
 
 
 def _check_width(where: str, array: Float32Array, width: int | None) -> None:
@@ -284,7 +289,7 @@ def _check_width(where: str, array: Float32Array, width: int | None) -> None:
 
 
 def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:
-    """One error that lists all samples that cannot be scored, each at its field as the caller named it."""
+    """Return an error that lists all invalid samples, under the caller's field names."""
     details: list[Any] = []
     for index, error in errors.items():
         where, _, message = error.message.partition(": ")
@@ -294,9 +299,9 @@ def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError
 
 
 def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: int) -> schema.EvaluateBatchAnswer:
-    """The evaluation server's answer for these results.
+    """Return the evaluation server's answer for these results.
 
-    group: number of frames that share a value; the evaluation server gave one value a group
+    group: number of frames that share a value, of which the answer has one value
     """
     progress = [result for result in results if isinstance(result, ProgressResult)]
     preferences = [result.preference for result in results if isinstance(result, PreferenceResult)]

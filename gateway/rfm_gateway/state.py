@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What ``/gpu_status``, ``/health`` and ``/model_info`` answer, from Triton's metrics, statistics and configuration."""
+"""Answers of ``/gpu_status``, ``/health`` and ``/model_info``, from Triton's metrics, statistics and configuration."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.status import Device, ServerStatus, read_status
 from rfm_gateway import schema
 
-HEALTH_TIMEOUT_S = 3.5  # of all probes; with HEALTH_KEPT_S less than the 5 s within which it is to be true
-PROBE_TIMEOUT_S = 1.5  # of that: a model that takes longer may be busy
-STALL_S = 30.0  # a busy model that finishes nothing for so long is not healthy
-HEALTH_KEPT_S = 1.0  # so that probes, which need no key, do not keep the models busy
+HEALTH_TIMEOUT_S = 3.5  # of all probes; with HEALTH_KEPT_S less than the promised 5 s
+PROBE_TIMEOUT_S = 1.5  # of one probe; a slower model may be busy
+STALL_S = 30.0  # a model with late probes that finishes no request for so long is not healthy
+HEALTH_KEPT_S = 1.0  # an answer is kept, since requests without a key must not load the models
 STATUS_TIMEOUT_S = 5.0
 MS_PER_S = 1e3
 
@@ -36,7 +36,7 @@ MS_PER_S = 1e3
 class TritonState:
     """The state of ``model`` on the server at ``url``, whose metrics are at ``metrics_url``.
 
-    clock_s: gives the time in seconds
+    clock_s: returns the time in seconds
     """
 
     def __init__(
@@ -56,16 +56,17 @@ class TritonState:
         self._clock_s = clock_s
         self._refreshing = asyncio.Lock()
         self._refreshed_s = float("-inf")
-        self._health: schema.Health | str = ""  # a text: what is wrong
-        self._late: dict[str, tuple[int, float]] = {}  # models: requests finished, since when it is that number
+        self._health: schema.Health | str = ""  # a text: the fault
+        self._late: dict[str, tuple[int, float]] = {}  # by model: finished requests, and the time of the last change
 
     async def gpu_status(self) -> schema.GpuStatus:
-        """The answer of ``/gpu_status``, from Triton's metrics. Raises ServerError."""
+        """Return the answer of ``/gpu_status``. Raises ServerError."""
         return _gpu_status(await self._status(STATUS_TIMEOUT_S), self._model)
 
     async def health(self) -> schema.Health:
-        """The answer of ``/health``, within HEALTH_TIMEOUT_S. Raises ServerUnavailableError when a model does not
-        answer.
+        """Return the answer of ``/health`` within HEALTH_TIMEOUT_S.
+
+        Raises ServerUnavailableError if a model neither answers nor is busy.
         """
         async with self._refreshing:
             if self._clock_s() - self._refreshed_s >= HEALTH_KEPT_S:
@@ -77,7 +78,7 @@ class TritonState:
         return found
 
     async def model_info(self) -> schema.ModelInformation:
-        """The answer of ``/model_info``, from the model's configuration. Raises ServerError."""
+        """Return the answer of ``/model_info``. Raises ServerError."""
         deadline = Deadline(STATUS_TIMEOUT_S)
         info = (await self._infos(deadline))[0]
         devices = await self._devices(deadline)
@@ -104,7 +105,7 @@ class TritonState:
         )
 
     async def _devices(self, deadline: Deadline) -> schema.GpuStatus | None:
-        """State of the devices; None where the metrics cannot be read: scoring does not need them."""
+        """Return the state of the devices; None if the metrics cannot be read, since scoring does not need them."""
         try:
             with anyio.move_on_after(deadline.remaining_s()):
                 return await self.gpu_status()
@@ -113,7 +114,7 @@ class TritonState:
         return None
 
     async def _infos(self, deadline: Deadline) -> list[ModelInfo]:
-        """What is known of the models for embeddings and for raw frames, as far as they are served now."""
+        """Return facts about the models for embeddings and for raw frames that are served now."""
         infos = []
         missing = None
         for frames in (False, True):
@@ -128,7 +129,7 @@ class TritonState:
         return infos
 
     async def _probe_all(self, deadline: Deadline) -> schema.Health | str:
-        """Probes every model with a blank sample. A text is the reason of the first that neither answers nor works."""
+        """Probe every model. Returns a text with the reason if a model neither answers nor is busy."""
         try:
             infos = await self._infos(deadline)
             late = [name for name in await asyncio.gather(*map(self._late_name, infos)) if name is not None]
@@ -145,7 +146,7 @@ class TritonState:
         )
 
     async def _late_name(self, info: ModelInfo) -> str | None:
-        """The model's name if it has no score in time. Raises RewardError."""
+        """Probe a model; return its name if the answer is late. Raises RewardError."""
         blank = blank_trajectory(info.widths)
         try:
             await self._client.progress(blank, timeout_s=PROBE_TIMEOUT_S, request_id=PROBE_PREFIX)
@@ -154,7 +155,7 @@ class TritonState:
         return None
 
     async def _stall(self, late: Sequence[str], deadline: Deadline) -> str | None:
-        """Why late models do not work; None: they are busy, or may be. Raises RewardError."""
+        """Return why late models count as failed; None: they may be busy. Raises RewardError."""
         status = await self._status(deadline.remaining_s()) if late else None
         now_s, known, self._late = self._clock_s(), self._late, {}
         for name in late:
@@ -170,7 +171,7 @@ class TritonState:
 
 def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
     served = {name for device in status.devices for name in device.work}
-    # An ensemble's work is that of its parts: it is left out, and a request counted where it is scored.
+    # An ensemble is left out, since its parts count its requests.
     scorer = model if model in served else frames_name(model)
     parts = {scorer, encoder_name(model)}
     devices = [device for device in status.devices if parts & device.work.keys()] or list(status.devices)
@@ -202,7 +203,7 @@ def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
 
 
 def _busy_s(status: ServerStatus, device: Device, model: str) -> float:
-    """Seconds that a model's batches took on one device: the share of Triton's total that its requests had there."""
+    """Return the seconds that a model computed on a device: Triton's total, by the device's share of the requests."""
     on_all = sum(each.work[model].compute_s for each in status.devices if model in each.work)
     if model not in device.work or not on_all:
         return 0.0

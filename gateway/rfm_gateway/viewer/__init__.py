@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the page in the browser asks: videos and their reward curves, datasets, running episodes."""
+"""Endpoints of the page in the browser: reward curves of videos, datasets, running episodes."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from collections.abc import Iterable
 
 
 def numbers_or_null(scores: Iterable[float]) -> list[float | None]:
-    """Scores as JSON has them: null for one that the checkpoint does not predict, or that is not there."""
+    """Return scores for JSON, with null for a missing or not predicted score."""
     return [None if math.isnan(score) else score for score in scores]

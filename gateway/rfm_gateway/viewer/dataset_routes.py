@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What the page asks of datasets: their episodes, an episode's curves, and its video as each camera filmed it.
+"""The page's endpoints for datasets: episodes, an episode's curves, and its video from each camera.
 
-A request names a dataset, an episode and a camera by number, and labels by one of the names that it was told.
+A request names a dataset, an episode and a camera by number, and labels by a name from an earlier answer.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ _HEADERS = {"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
 
 
 def dataset_routes(datasets: Sequence[ShownDataset], timeout_s: float, max_video_bytes: int) -> APIRouter:
-    """The endpoints of the page's datasets. They are its own, and not those of the evaluation server."""
+    """Return the endpoints of the page's datasets. The evaluation server has no such endpoints."""
     router = APIRouter(include_in_schema=False)
 
     async def read(request: Request, number: int, reading: Callable[[ShownDataset], Read]) -> Read:
-        """What is read of a dataset, in a thread. Raises HTTPException: 404 for what is not there, 500 for a broken
-        dataset, 504 if it takes too long.
+        """Read from a dataset in a thread, and return the result.
+
+        Raises HTTPException 404 for a missing part, 500 for a broken dataset, 504 if reading takes too long.
         """
         if not 0 <= number < len(datasets):
             raise HTTPException(404, f"dataset: expected one of {len(datasets)}, got {number}")

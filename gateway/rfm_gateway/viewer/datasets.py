@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The datasets that the page shows: LeRobot's, in folders that the operator names, with labels or without.
+"""LeRobot datasets for the page, in folders that the operator names, with or without labels. Needs pyarrow.
 
-Their files are read where they are. A dataset with a link that leaves its folder is refused: whoever made it might have
-named files of this machine. Needs pyarrow. T frames of an episode.
+A dataset with a link that leaves its folder is refused, since its author could show other files of this machine.
+T frames of an episode.
 """
 
 from __future__ import annotations
@@ -40,15 +40,17 @@ from rfm_client.labelling.label_files import (
 from rfm_client.labelling.summary import Summary, summarise
 from rfm_gateway.viewer import numbers_or_null
 
-NUM_BINS = 20  # of the final progress, from 0 to 1
-_SUMMARIES_AT_A_TIME = 8  # that are kept in memory
+NUM_BINS = 20  # of final progress, 0 to 1
+_SUMMARIES_AT_A_TIME = 8  # summaries in memory
 
 
 @dataclass(frozen=True)
 class ShownDataset:
-    """A dataset that the page shows. root: its folder, without links on the way to it
+    """A dataset for the page.
 
-    Its methods raise DatasetError for a broken dataset, HTTPException 404 for what it does not have.
+    root: its folder, with links resolved
+
+    Its methods raise DatasetError for a broken dataset, HTTPException 404 for a part that it lacks.
     """
 
     root: Path
@@ -56,7 +58,7 @@ class ShownDataset:
 
     @classmethod
     def open(cls, folder: str) -> ShownDataset:
-        """The dataset in a folder. Raises ConfigError for another folder, a broken dataset, or links that leave it."""
+        """Open the dataset in a folder. Raises ConfigError for any other folder, or links that leave it."""
         try:
             import pyarrow  # noqa: F401
         except ImportError:
@@ -74,12 +76,12 @@ class ShownDataset:
 
     @property
     def about(self) -> dict[str, Any]:
-        """What it is, and which labels are there now."""
+        """Return the dataset's facts and the names of its labels."""
         names = [self._name_of(file) for file in find_label_files(self.root)]
         return {"name": self.dataset.source, "kind": self.dataset.kind, "labels": names}
 
     def table(self, labels: str | None) -> dict[str, Any]:
-        """Every episode, with what these labels say of it at a glance."""
+        """Return a row for each episode, with a summary of its labels."""
         file = self._labels(labels)
         summary = None if file is None else _summary(file, file.stat().st_mtime_ns)
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
@@ -102,7 +104,7 @@ class ShownDataset:
         }
 
     def curves(self, number: int, labels: str | None) -> dict[str, Any]:
-        """An episode's curves over the time in it."""
+        """Return an episode's curves over time."""
         episode, file = self._episode(number), self._labels(labels)
         times_s = self.dataset.times_s(episode)
         times_s = times_s - times_s[0]
@@ -117,14 +119,14 @@ class ShownDataset:
         }
 
     def video(self, number: int, camera: int, take: Callable[[int], object]) -> bytes:
-        """The frames of an episode as an MP4 file of their own. take: told how many bytes are taken, before they are"""
+        """Return an episode's video as an MP4 file. take: called with a number of bytes before they are allocated"""
         cameras = self.dataset.info.videos
         if not 0 <= camera < len(cameras):
             raise HTTPException(404, f"camera: expected one of {len(cameras)} with videos, got {camera}")
         return _cut(self.dataset.span(self._episode(number), cameras[camera]), take)
 
     def without_folder(self, message: str) -> str:
-        """A message for people elsewhere, whom the place of the dataset on this machine does not concern."""
+        """Return a message without the folder's path, for users on other machines."""
         return message.replace(str(self.root), self.dataset.source)
 
     def _episode(self, number: int) -> DatasetEpisode:
@@ -134,7 +136,7 @@ class ShownDataset:
         return episodes[number]
 
     def _labels(self, name: str | None) -> Path | None:
-        """The file of labels of this name, by default the first; None: there are no labels."""
+        """Return the label file of this name, by default the first; None: no labels."""
         files = {self._name_of(file): file for file in find_label_files(self.root)}
         if name is None:
             name = next(iter(files), None)
@@ -147,12 +149,12 @@ class ShownDataset:
 
 
 def _orientations(file: Path | None) -> Mapping[str, str]:
-    """How the pictures of each camera that was turned were turned for these labels."""
+    """Return the orientation that each turned camera had when these labels were made."""
     from pyarrow import parquet
 
     metadata = {} if file is None else parquet.read_schema(file).metadata or {}
     provenance = json.loads(metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY, b"{}")))
-    found = provenance.get("orientations", {})  # labels of version 0.1.0 have none
+    found = provenance.get("orientations", {})  # older labels have none
     return {camera: orientation for camera, orientation in found.items() if orientation in ORIENTATIONS}
 
 
@@ -162,7 +164,7 @@ def _summary(file: Path, _changed_ns: int) -> Summary:
 
 
 def _rows(summary: Summary) -> list[dict[str, Any]]:
-    """What a summary says of each episode."""
+    """Return a row of the summary for each episode."""
     columns: dict[str, Sequence[Any]] = {
         "final_progress": numbers_or_null(summary.final_progress.tolist()),
         "backwards": numbers_or_null(summary.backwards.tolist()),
@@ -177,20 +179,20 @@ def _rows(summary: Summary) -> list[dict[str, Any]]:
 
 
 def _bins(summary: Summary) -> dict[str, list[float]]:
-    """How many episodes end with which progress."""
+    """Return a histogram of final progress."""
     final = summary.final_progress[np.isfinite(summary.final_progress)]
     counts, edges = np.histogram(np.clip(final, 0, 1), NUM_BINS, (0, 1))
     return {"edges": edges.tolist(), "counts": counts.tolist()}
 
 
 def _curves(labels: EpisodeLabels, num_frames: int) -> list[dict[str, Any]]:
-    """The curve that training reads, which is no camera's, and then each camera's."""
+    """Return the fused curve, which training reads, then the curve of each camera."""
     curves = [(None, labels.fused), *labels.cameras.items()]
     return [{"camera": camera, **_scores(curve, labels.frames, num_frames)} for camera, curve in curves]
 
 
 def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dict[str, Any]:
-    """A score of every frame, where some may have no label. frames: the numbers of those that have"""
+    """Return scores for all frames, null for frames without a label. frames: numbers of the labelled frames"""
     scores: dict[str, Any] = {"progress": None, "success": None}
     for name in scores:
         labelled = getattr(curve, name)
@@ -202,7 +204,7 @@ def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dic
 
 
 def _check_links(root: Path) -> None:
-    """Raises DatasetError for a link in a folder that leads out of it."""
+    """Raise DatasetError for a link that leads out of the folder."""
     for folder, folders, files in os.walk(root):
         for path in (Path(folder, name) for name in (*folders, *files)):
             try:
@@ -216,13 +218,15 @@ def _check_links(root: Path) -> None:
 
 
 def _cut(span: Span, take: Callable[[int], object]) -> bytes:
-    """The frames of a span as an MP4 file, the first at 0 s. Nothing is encoded anew: the frames are equal.
+    """Return a span of a video as an MP4 file that begins at 0 s. Packets are copied, so frames stay equal.
 
-    Frames before the episode that others need are in the file, which tells players to leave them out.
+    The file also holds earlier frames that decoding needs, marked so that players skip them.
     """
     clip = io.BytesIO()
     try:
-        with av.open(str(span.file), format="mov") as video:  # a play list would be read as what it names
+        with av.open(
+            str(span.file), format="mov"
+        ) as video:  # without format=, FFmpeg would open the files that a play list names
             stream = video_stream(video)
             packets = _packets(video, stream, span, take)
             zero = min(packet.pts for packet in packets if packet.pts * stream.time_base > _begin_s(span))
@@ -245,7 +249,7 @@ def _begin_s(span: Span) -> float:
 
 
 def _packets(video: Any, stream: Any, span: Span, take: Callable[[int], object]) -> list[Any]:
-    """The packets of an episode, and those before it that it needs, in the order of decoding."""
+    """Return the packets that decoding an episode needs, in the order of decoding."""
     begin_s, end_s = _begin_s(span), float(span.times_s[-1]) + span.tolerance_s
     video.seek(max(round(begin_s / stream.time_base), 0), stream=stream)
     packets: list[Any] = []
@@ -256,7 +260,7 @@ def _packets(video: Any, stream: Any, span: Span, take: Callable[[int], object])
             break
         take(packet.size)
         if packet.is_keyframe and packet.pts * stream.time_base <= begin_s + 1.5 * span.tolerance_s:
-            packets = []  # the episode does not need what is before
+            packets = []  # decoding starts at this key frame
         packets.append(packet)
     shown_s = [float(packet.pts * stream.time_base) for packet in packets]
     while shown_s and shown_s[-1] > end_s:

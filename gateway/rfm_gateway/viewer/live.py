@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The episodes that clients report while they run, as the page shows them. They are in memory alone, and few.
+"""Running episodes that clients report, for the page: at most MOST_EPISODES, in memory.
 
-Reports are checked to the last field, since nobody vouches for them. The page asks a few times a second what is new,
-and is answered at once: an answer that stays open would keep the gateway from stopping as long as somebody looks at it.
+Every field of a report is checked. The page polls a few times a second. Answers are not held open, since an open answer
+would keep the gateway from stopping while a page is shown.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from rfm_client.transport.off_loop import off_loop
 from rfm_gateway.body import BodyLimits, field_errors
 
 MOST_BODY_BYTES = 4 * 2**20
-MOST_EPISODES = 128  # first those go that have ended, then those that have been silent for longest
-MOST_POINTS = 1000  # of one curve: the newest
+MOST_EPISODES = 128  # ended episodes are forgotten first, then the longest silent
+MOST_POINTS = 1000  # of a curve; the newest are kept
 FORGOTTEN_AFTER_S = 300.0  # of silence
 MOST_FRAME_BYTES = 128 * 2**10
 MOST_FRAME_PX = 1024  # on each side
 _MOST_FRAMES = 64
-_MOST_STEPS = 2000  # of one report of our client; so each of its episodes has so many at most, too
+_MOST_STEPS = 2000  # of a report by our client
 _MOST_LETTERS = 2000
-_MOST_NUMBER = 10**9  # a chart's axis goes further than to whole numbers
+_MOST_NUMBER = 10**9  # the limit of a step's number
 _MOST_DIGITS = 15  # of a cursor's number
 _HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 
 
 def _jpeg(text: Any) -> bytes:
-    """The file in a text of base64. Raises ValueError. Only its head is read here: it is not decoded."""
+    """Return the JPEG file in base64. Checks its header and does not decode it. Raises ValueError."""
     if not isinstance(text, str):
         raise ValueError(f"expected base64, got {type(text).__name__}")
     if len(text) > MOST_FRAME_BYTES * 4 // 3:
@@ -92,14 +92,14 @@ class _ReportedEpisode(_Strict):
 
 
 class LiveReport(_Strict):
-    """What one report says: steps in their order, and JPEG files by the episodes' ids."""
+    """A report: steps in order, and JPEG files by episode id."""
 
     episodes: Annotated[list[_ReportedEpisode], FailFast(), Field(max_length=_MOST_STEPS)]
     frames: Annotated[dict[_Id, Annotated[bytes, BeforeValidator(_jpeg)]], Field(max_length=_MOST_FRAMES)]
 
     @classmethod
     def read(cls, body: bytes) -> LiveReport:
-        """The report in JSON. Raises RequestValidationError for a field that is not allowed."""
+        """Read a report from JSON. Raises RequestValidationError for an invalid field."""
         try:
             return cls.model_validate_json(body)
         except ValidationError as error:
@@ -108,11 +108,11 @@ class LiveReport(_Strict):
 
 @dataclass
 class _KeptEpisode:
-    """What is known of an episode.
+    """A reported episode.
 
     about: its name, env, task and threshold
-    changed, frame_changed: number of the report that brought the newest of it
-    points: the newest, each with the number of the report that brought it
+    changed, frame_changed: number of the report with the newest change, and with the newest frame
+    points: the newest points, each with the number of its report
     """
 
     about: dict[str, Any]
@@ -124,7 +124,7 @@ class _KeptEpisode:
     frame_changed: int = 0
 
     def since(self, known: int) -> dict[str, Any]:
-        """What is new since the report of a number."""
+        """Return the changes since a report, by its number."""
         if self.changed <= known:
             return {}
         new = [point for _, point in itertools.takewhile(lambda each: each[0] > known, reversed(self.points))][::-1]
@@ -142,19 +142,19 @@ class _KeptEpisode:
 class LiveEpisodes:
     """The newest episodes, each with its newest frame and points. For one thread.
 
-    Each answer has a cursor. Asked with it, the next answer has only what is new.
+    Each answer has a cursor. With it, the next answer has only changes.
 
-    clock_s: gives the time in seconds
+    clock_s: returns the time in seconds
     """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
-        self._episodes: dict[str, _KeptEpisode] = {}  # first the one that has been silent for longest
+        self._episodes: dict[str, _KeptEpisode] = {}  # the longest silent first
         self._changed = 0
-        self._life = secrets.token_hex(8)  # a cursor of an earlier gateway is none of this one
+        self._life = secrets.token_hex(8)  # makes cursors of an earlier gateway invalid
 
     def take(self, report: LiveReport) -> None:
-        """Takes a report over. Of an episode that is not known, an end or a frame alone is left out."""
+        """Add a report. An end or a frame of an unknown episode without steps is ignored."""
         self._changed += 1
         for told in report.episodes:
             if not told.steps and told.id not in self._episodes:
@@ -164,7 +164,7 @@ class LiveEpisodes:
             episode.heard_s, episode.changed = self._clock_s(), self._changed
             episode.has_ended |= told.ended
             for step in told.steps:
-                if not episode.points or step.step > episode.points[-1][1]["step"]:  # a report may come twice
+                if not episode.points or step.step > episode.points[-1][1]["step"]:  # a client may send a report twice
                     episode.points.append((self._changed, step.model_dump()))
             self._episodes[told.id] = episode
         for key, frame in report.frames.items():
@@ -174,9 +174,9 @@ class LiveEpisodes:
         self._forget()
 
     def since(self, cursor: str) -> dict[str, Any]:
-        """All episodes, and of those that have changed since a cursor what is new. The answer has the next cursor.
+        """Return all episodes, with the changes since a cursor, and the next cursor.
 
-        cursor: of an earlier answer; any other text: nothing is known yet
+        cursor: from an earlier answer; any other text: everything counts as a change
         """
         self._forget()
         life, _, number = cursor.partition(".")
@@ -193,7 +193,7 @@ class LiveEpisodes:
         }
 
     def frame(self, key: str) -> bytes | None:
-        """The newest frame of an episode, a JPEG file; None: there is none."""
+        """Return the newest frame of an episode as a JPEG file, or None."""
         episode = self._episodes.get(key)
         return None if episode is None else episode.frame
 
@@ -207,13 +207,13 @@ class LiveEpisodes:
 
 
 def live_routes(limits: BodyLimits) -> APIRouter:
-    """The endpoints of running episodes. They are the page's, and not those of the evaluation server."""
+    """Return the endpoints of running episodes. The evaluation server has no such endpoints."""
     router, episodes = APIRouter(include_in_schema=False), LiveEpisodes()
 
     @router.post("/live/reports", status_code=204)
     async def report(request: Request) -> None:
         kind = request.headers.get("content-type", "").partition(";")[0].strip()
-        if kind != "application/json":  # which no page of elsewhere may send unasked
+        if kind != "application/json":  # pages of other origins cannot send this type without a preflight
             raise HTTPException(415, f"content-type: expected application/json, got {reprlib.repr(kind)}")
         body = await limits.read(request, MOST_BODY_BYTES)
         episodes.take(await off_loop(len(body), LiveReport.read, body))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What the page asks about videos: the fields of its forms, and uploaded videos -> frames.
+"""The page's requests about videos: form fields, and frames of uploaded videos.
 
-Nobody vouches for the videos. So they are read as one of a few formats, by how they begin, and never as what they look
-like to the decoder: a play list or a session description names other files or addresses, which the decoder would open.
+Uploads are not trusted. Their first bytes choose one of a few formats. FFmpeg does not choose, because it would open
+the files and addresses that a play list or a session description names.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rfm_client.data.sampling import Rule, Sampling
 from rfm_client.data.video import frame_times_s, read_video
 from rfm_gateway.body import Decoded, field_errors, invalid
 
-DEFAULT_FPS = 3.0  # as rfm-client score has it
+DEFAULT_FPS = 3.0  # the default of rfm-client score
 KINDS = "MP4, MOV, WebM, Matroska, Ogg or AVI"
 
 _BEGINNING_BYTES = 12
@@ -39,19 +39,19 @@ _EBML, _OGG, _RIFF, _AVI = b"\x1a\x45\xdf\xa3", b"OggS", b"RIFF", b"AVI "
 
 @dataclass(frozen=True, eq=False)
 class ShownVideo:
-    """A video of a task. times_s: float64 [T], when each frame is shown; None: unknown"""
+    """A video with its task. times_s: float64 [T], time of each frame; None: unknown"""
 
     trajectory: Trajectory
     times_s: npt.NDArray[np.float64] | None
 
 
 class VideoRequest(BaseModel):
-    """How videos are scored: the fields of a form, of which those that are empty count as not there.
+    """Form fields that say how videos are scored. An empty field counts as missing.
 
-    fps: frames a second that are taken of a video
-    rule, frames: of each point's prefix; None: as the checkpoint was trained
-    resize: frames are made as small as the checkpoint reads them
-    orient: how frames are turned before
+    fps: frames a second to read
+    rule, frames: sampling of each prefix; None: the checkpoint's default
+    resize: frames are shrunk to the checkpoint's input size
+    orient: how frames are turned first
     """
 
     task: Annotated[str, StringConstraints(strip_whitespace=True)]
@@ -64,7 +64,7 @@ class VideoRequest(BaseModel):
 
     @classmethod
     def of(cls, fields: Mapping[str, str], default_model: str) -> VideoRequest:
-        """The question of a form. Raises RequestValidationError for a field that is not allowed."""
+        """Read the fields of a form. Raises RequestValidationError for an invalid field."""
         given = {name: text for name, text in fields.items() if text.strip()}
         try:
             return cls.model_validate({"model": default_model, **given})
@@ -72,7 +72,7 @@ class VideoRequest(BaseModel):
             raise RequestValidationError(field_errors(error)) from None
 
     def sampling(self, info: ModelInfo) -> Sampling:
-        """The rule with its frames. Raises RequestValidationError for a number that the rule does not take."""
+        """Return the sampling. Raises RequestValidationError for a number of frames that the rule does not take."""
         try:
             return Sampling.of(self.rule, self.frames, info.max_frames, trained_padding=info.trained_padding)
         except ValueError as error:
@@ -80,7 +80,7 @@ class VideoRequest(BaseModel):
             raise invalid((where,), message) from None
 
     async def video(self, uploads: Mapping[str, UploadFile], name: str, decoded: Decoded) -> ShownVideo:
-        """The video of this name. Raises RequestValidationError, HTTPException as ``decoded``."""
+        """Read the uploaded video of this name. Raises RequestValidationError, and HTTPException as ``decoded``."""
         if name not in uploads:
             raise invalid((name,), "expected a video file, got none")
         try:
@@ -109,7 +109,7 @@ class VideoRequest(BaseModel):
 
 
 def _container(beginning: bytes) -> str | None:
-    """FFmpeg's name of the format of a video that begins so; None: it is none of KINDS."""
+    """Return FFmpeg's name of the format, by a video's first bytes; None: none of KINDS."""
     if beginning[4:8] in _MP4_BOXES:
         return "mov"
     if beginning.startswith(_EBML):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What the page asks: which models are served, the curve of a video, which of two videos does a task better.
+"""The page's endpoints for videos: served models, the curve of a video, the comparison of two videos.
 
-A curve comes as server-sent events: ``video`` tells its frames, ``scores`` some points, ``done`` or ``failed`` the end.
+A curve comes as server-sent events: ``video`` has its frames, ``scores`` some points, ``done`` or ``failed`` ends it.
 Each frame is scored on its prefix, a few prefixes at a time.
 """
 
@@ -40,10 +40,10 @@ from rfm_gateway.observe import GatewayMetrics, while_connected
 from rfm_gateway.viewer import numbers_or_null
 from rfm_gateway.viewer.questions import DEFAULT_FPS, ShownVideo, VideoRequest
 
-MOST_PREFIXES = 32  # of one video at a time
-MOST_BYTES = 64 * 2**20  # of the frames of these
+MOST_PREFIXES = 32  # in a request
+MOST_BYTES = 64 * 2**20  # of the frames in a request
 STATUS_TIMEOUT_S = 5.0
-_AS_THEY_COME = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # the second for proxies that gather answers
+_AS_THEY_COME = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # the second tells proxies not to buffer
 _FRAMES_ENDING = frames_name("")
 
 logger = logging.getLogger("rfm_gateway")
@@ -51,7 +51,7 @@ logger = logging.getLogger("rfm_gateway")
 
 @dataclass(frozen=True)
 class _Asked:
-    """A question, the model that answers it, and the videos that it is about."""
+    """A request with its model and its videos."""
 
     question: VideoRequest
     sampling: Sampling
@@ -67,10 +67,10 @@ def viewer_routes(
     max_decoded_bytes: int,
     metrics: GatewayMetrics,
 ) -> APIRouter:
-    """The endpoints of the page. They are its own, and not those of the evaluation server.
+    """Return the page's endpoints for videos. The evaluation server has no such endpoints.
 
-    new_client: makes a client for the model of a name
-    max_decoded_bytes: of the videos of one request
+    new_client: returns a client for a model's name
+    max_decoded_bytes: limit of the decoded videos of one request
     """
     router = APIRouter(include_in_schema=False)
     default_model = config.model or DEFAULT_MODEL
@@ -96,8 +96,9 @@ def viewer_routes(
         return JSONResponse(answer)
 
     async def read(request: Request, *names: str) -> _Asked:
-        """What a request asks of its videos of these names. Raises RequestValidationError, HTTPException and
-        RewardError.
+        """Read a request with the videos of these names.
+
+        Raises RequestValidationError, HTTPException and RewardError.
         """
         async with limits.form(request) as (fields, uploads):
             question = VideoRequest.of(fields, default_model)
@@ -119,7 +120,7 @@ def viewer_routes(
         raise invalid((names[0],), f"expected videos that are read within {config.timeout_s:g} s, got longer ones")
 
     async def events(asked: _Asked) -> AsyncIterator[str]:
-        """The events of one curve. What goes wrong is the last of them: the status of the answer has been sent."""
+        """Yield the events of a curve. An error is the last event, since the status has been sent already."""
         (video,) = asked.videos
         num_frames, began_s, version = video.trajectory.num_frames, time.monotonic(), None
         times_s = None if video.times_s is None else video.times_s.tolist()
@@ -144,7 +145,7 @@ def viewer_routes(
 
 
 async def _infos(config: GatewayConfig, new_client: Callable[..., AsyncRewardClient]) -> list[tuple[str, ModelInfo]]:
-    """What is served now for raw frames, by the names under which checkpoints were exported. Raises RewardError."""
+    """Return the served models for raw frames, by the name of their export. Raises RewardError."""
     status = await asyncio.to_thread(
         read_status,
         config.triton_url,
@@ -158,7 +159,7 @@ async def _infos(config: GatewayConfig, new_client: Callable[..., AsyncRewardCli
         try:
             async with new_client(model=name) as client:
                 infos.append((name, await client.model_info(frames=True, timeout_s=STATUS_TIMEOUT_S)))
-        except ModelNotFoundError:  # unloaded since it was listed
+        except ModelNotFoundError:  # unloaded in the meantime
             continue
     return infos
 
@@ -170,7 +171,7 @@ def _told_of(name: str, info: ModelInfo) -> dict[str, Any]:
 
 
 def _frames_of(rule: Rule) -> int | str | None:
-    """The number of frames that a rule has of its own, "any" where the caller says it, None where there is none."""
+    """Return a rule's own number of frames, "any" if the caller chooses it, None if the rule has no such number."""
     try:
         return Sampling(rule).frames
     except ValueError:
@@ -178,7 +179,7 @@ def _frames_of(rule: Rule) -> int | str | None:
 
 
 async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Asked) -> AsyncIterator[dict[str, Any]]:
-    """The points of a curve, in order. The first come alone, then twice as many, so that none waits long.
+    """Yield the points of a curve, in order. Requests double in size, so that the first point comes soon.
 
     Raises RewardError.
     """
@@ -204,7 +205,7 @@ async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Aske
 
 
 async def _preferences(client: AsyncRewardClient, asked: _Asked) -> dict[str, Any]:
-    """What the model prefers when it is asked in one order and in the other. Raises RewardError."""
+    """Return the model's preference in both orders. Raises RewardError."""
     first, second = (video.trajectory for video in asked.videos)
     preferred = partial(client.preference, subsample=True, resize=asked.question.resize, request_id=asked.request_id)
     try:
