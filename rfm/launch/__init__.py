@@ -4,8 +4,8 @@
 - ``repository_folder`` is what Triton reads.
 - ``process`` is one tritonserver, from an ``installation``, with ``triton_options``; ``temporary`` has one for a while.
 - Who reaches it: its ``endpoints``, with TLS if need be, and the ``admin_key`` of its restricted APIs.
-- ``ending`` ends processes, with the one that started them if need be; ``cleanup`` removes what a killed server left.
-- What speaks with one that runs: ``http``, and over gRPC the ``repository_api``, which loads and unloads models.
+- ``ending`` ends processes, with their parent if need be; ``cleanup`` removes what a killed server left.
+- Calls to a running Triton: ``http``, and over gRPC the ``repository_api``, which loads and unloads models.
 
 What watches and heals a Triton is ``rfm.supervise``, which builds on this.
 """

@@ -2,8 +2,8 @@
 """The key without which a server's models, logging and tracing cannot be changed.
 
 ``rfm serve`` always restricts these APIs of Triton. Shared memory stays open: clients on the same host use it, and a
-region is named by who made it. Triton takes the key among its arguments alone, so that whoever may read this user's
-``/proc`` (the user, and root) can see it; it is in no log, message or environment of a process started here.
+region has its maker's name. Triton takes the key only as an argument, so this user and root can see it in ``/proc``. It
+is in no log, message or environment of a process started here.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ _LOCK = "lock"
 class Claim:
     """What one server has in shared memory: the backend's regions, and a folder for ``Installation``.
 
-    A lock is held as long as a process lives that has ``lock_file``: this one, and those that inherit it. A process id
+    A lock is held while a process with ``lock_file`` lives: this process, and those that inherit it. A process id
     would prove nothing: another container may share the memory, or have left it.
     """
 

@@ -17,7 +17,10 @@ from rfm_client.contract.addresses import check_authorities, check_certificate, 
 from rfm_client.contract.listening import check_free, in_url
 
 PORTS = range(20_000, 32_000)  # below the ports that Linux gives to outgoing connections
-SECURITY_FLOOR = (2, 71)  # NVIDIA's container 26.07; earlier ones have remote vulnerabilities: docs/guides/secure.md
+SECURITY_FLOOR = (
+    2,
+    71,
+)  # NVIDIA's container 26.07; earlier versions have remote vulnerabilities: docs/guides/secure.md
 
 _given: deque[int] = deque(maxlen=256)  # ports of servers that may not listen yet
 

@@ -24,7 +24,7 @@ _STUB = "triton_python_backend_stub"
 
 
 class ServerStartError(Exception):
-    """tritonserver cannot be started: the reason in one line. model: that which is to blame; None: none is"""
+    """tritonserver cannot be started: the reason in one line. model: the model at fault; None: no model is"""
 
     def __init__(self, reason: str, model: str | None = None) -> None:
         super().__init__(reason)
@@ -55,7 +55,7 @@ class Installation:
 
 
 def find_installation(executable: Path | None = None) -> Installation:
-    """The explicit ``executable``, else the one in PATH, else the wheel's. Raises ServerStartError."""
+    """The explicit ``executable``, else that in PATH, else the wheel's. Raises ServerStartError."""
     if executable is not None:
         if not (executable.is_file() and os.access(executable, os.X_OK)):
             raise ServerStartError(f"tritonserver: expected a program at {executable}, got none")

@@ -165,7 +165,7 @@ class InstanceMetrics:
 
     def _show(self, *, is_served: bool) -> None:
         self._kept_metric.set(self._kept_bytes)
-        # Every time: after a reload the old instance sets 0 after the new one has set 1.
+        # Every time: after a reload the old instance sets 0 after the new instance has set 1.
         self._checkpoint_metric.set(float(is_served))
 
     def _log_once(self) -> None:

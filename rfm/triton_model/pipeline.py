@@ -109,7 +109,7 @@ class Pipeline:
         self._scored.put(None)
 
     def _next_batch(self) -> list[Request[Any]]:
-        """Wait for the first request; return it with the next ones that are prepared and fit into its batch."""
+        """Wait for the first request; return it with the next requests that are prepared and fit into its batch."""
         self._waiting[0][1].exception()  # waits; an error of preparing comes again in its turn
         with self._changed:
             batch = [self._waiting.popleft()[0]]
