@@ -160,7 +160,7 @@ def _add_reports(router: APIRouter, state: TritonState, metrics: GatewayMetrics)
 
     @router.get("/model_info", responses=_failures(502, 503, 504))
     async def model_info() -> schema.ModelInformation:
-        """The served checkpoint."""
+        """Facts about the served checkpoint."""
         return await state.model_info()
 
     @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
