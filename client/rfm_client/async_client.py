@@ -177,9 +177,9 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     async def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
-        """Return the trajectory with embeddings of its frames and task in place of frames, to score it often.
+        """Return the trajectory with embeddings in place of frames, for repeated scoring. Raises RewardError.
 
-        The checkpoint must be served with encoders. Raises RewardError.
+        The checkpoint must be served with encoders.
         """
         return await self._scorer.embeddings(trajectory, self._call({"timeout_s": timeout_s, "request_id": request_id}))
 
@@ -204,9 +204,7 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     ) -> ModelInfo:
         """Return the server's description of its model for embeddings or, with ``frames``, for raw frames.
 
-        The client remembers it until another version of the model answers.
-
-        refresh: True: request it again
+        refresh: True: request it again; False: use the known description, until another version of the model answers
 
         Raises ModelNotFoundError if the model is not served.
         """
@@ -214,7 +212,7 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         return await self._scorer.model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """Return, for each served part of the checkpoint, its description by every server that answers.
+        """Return the descriptions of each served part of the checkpoint, by all servers that answer.
 
         Raises RewardError if no server answers.
         """

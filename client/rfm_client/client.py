@@ -112,10 +112,11 @@ class RewardClient(Closing, OneProcess):
     @overload
     def submit(self, sample: SimilaritySample, **options: Unpack[CallOptions]) -> Future[SimilarityResult]: ...
     def submit(self, sample: Sample, **options: Unpack[CallOptions]) -> Future[Any]:
-        """Return at once, with a future of the result. It raises RewardError; cancelling it cancels the request.
+        """Send the sample and return a future of its result, at once.
 
-        The sample's arrays are copied, so the caller may change them. At most ``max_in_flight`` requests are sent at a
-        time; the copies of the others stay in memory.
+        The future raises RewardError; cancelling it cancels the request. The sample's arrays are copied,
+        so the caller may change them. At most ``max_in_flight`` requests are sent at a time; the copies of the others
+        stay in memory.
         """
         future = self._loop.start(self._client.score(snapshot(sample), **options))
         future.add_done_callback(lambda _done: self)  # keeps the client alive until then
@@ -144,7 +145,7 @@ class RewardClient(Closing, OneProcess):
         return self._loop.wait(self._client.score_windows(windows, timeout_s=timeout_s))
 
     def submit_window(self, window: Window) -> Future[ProgressResult]:
-        """Return at once, with a future of the window's result, as ``submit``."""
+        """Send the window and return a future of its result, as ``submit`` does."""
         future = self._loop.start(self._client.score_window(window))
         future.add_done_callback(lambda _done: self)
         return future
@@ -152,9 +153,9 @@ class RewardClient(Closing, OneProcess):
     def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
-        """Return the trajectory with embeddings of its frames and task in place of frames, to score it often.
+        """Return the trajectory with embeddings in place of frames, for repeated scoring. Raises RewardError.
 
-        The checkpoint must be served with encoders. Raises RewardError.
+        The checkpoint must be served with encoders.
         """
         return self._loop.wait(self._client.encode(trajectory, timeout_s=timeout_s, request_id=request_id))
 
@@ -169,16 +170,14 @@ class RewardClient(Closing, OneProcess):
     def model_info(self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None) -> ModelInfo:
         """Return the server's description of its model for embeddings or, with ``frames``, for raw frames.
 
-        The client remembers it until another version of the model answers.
-
-        refresh: True: request it again
+        refresh: True: request it again; False: use the known description, until another version of the model answers
 
         Raises ModelNotFoundError if the model is not served.
         """
         return self._loop.wait(self._client.model_info(frames=frames, refresh=refresh, timeout_s=timeout_s))
 
     def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """Return, for each served part of the checkpoint, its description by every server that answers.
+        """Return the descriptions of each served part of the checkpoint, by all servers that answer.
 
         Raises RewardError if no server answers.
         """

@@ -27,11 +27,11 @@ RUN_CONFIG_PARAMETER = "run_config"
 class ModelInfo:
     """A served model.
 
-    versions: versions that its configuration asks the server to serve; empty: the latest
+    versions: versions that its configuration demands; empty: the latest
     max_batch_size: most samples in a request
-    by_digest: True if the model keeps features of frames, and takes digests in place of these frames
-    instances: number of instances on a server; 0 for an ensemble, whose parts have the instances
-    max_frames: most frames of a trajectory, in training or for the network, the smaller number; None: both unknown
+    by_digest: True if the model accepts frame references
+    instances: number on a server; 0: an ensemble, whose parts have instances
+    max_frames: most frames of a trajectory: the smaller limit of training and network; None: both unknown
     trained_padding: True if training padded shorter trajectories with their last frame, as upstream does, or if unknown
     frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
     video_dim, text_dim: widths D and Dt of embeddings that the model reads, or writes as an encoder; None: neither
@@ -40,8 +40,8 @@ class ModelInfo:
     source: Hub id of the exported checkpoint, or the end of its path; None: unknown
     revision: exported commit of the Hub; None: the checkpoint was a folder
     weights_digest: 16 hex digits, digest of the exported weights; None: unknown
-    settings_digest: 16 hex digits, digest of all else that decides scores: the files beside the weights (configuration,
-        tokenizer, image processor), the dtype and the kind of device; None: unknown
+    settings_digest: 16 hex digits, digest of all else that decides scores: files beside the weights (configuration,
+        tokenizer, image processor), dtype, kind of device; None: unknown
     network: ``class``, ``config``, and the number of weights of each part (``parameters``)
     run_config: config.yaml of the training run, without secrets; empty: the checkpoint has none
     """

@@ -78,10 +78,10 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class ProgressSample:
-    """The question for progress and success at each frame of ``trajectory``.
+    """Question: how far is ``trajectory`` at each frame, and has it succeeded?
 
     frame_steps: 0 scores the trajectory as a whole. N >= 2 is dense mode: frame t is scored on its prefix 0..t alone,
-        sampled to N frames, as an RL loop sees it at that step.
+        sampled to N frames, as an RL loop sees it at that step
     """
 
     trajectory: Trajectory
@@ -99,7 +99,7 @@ class ProgressSample:
 
 @dataclass(frozen=True, eq=False)
 class PreferenceSample:
-    """The question for the trajectory that does the task of ``first`` better."""
+    """Question: which trajectory does the task of ``first`` better?"""
 
     first: Trajectory
     second: Trajectory
@@ -115,14 +115,14 @@ class PreferenceSample:
 
     @property
     def swapped(self) -> PreferenceSample:
-        """The same question with ``second`` first; the task remains the task of ``first``."""
+        """The question with ``second`` in first place, still about the task of ``first``."""
         asked = self.first
         return PreferenceSample(replace(self.second, task=asked.task, text_embedding=asked.text_embedding), asked)
 
 
 @dataclass(frozen=True, eq=False)
 class SimilaritySample:
-    """The question for the similarity of ``other`` to ``reference`` in doing the task of ``reference``."""
+    """Question: how similar is ``other`` to ``reference`` in doing the task of ``reference``?"""
 
     reference: Trajectory
     other: Trajectory
@@ -144,8 +144,7 @@ Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
 class EncoderSample:
     """The trajectories of one sample, for an encoder.
 
-    The encoder reads trajectories with frames, and the first trajectory's task. It returns trajectories with embeddings
-    of the frames and of that task.
+    The encoder reads frames and the first trajectory's task. It returns trajectories with embeddings of both.
     """
 
     trajectories: tuple[Trajectory, ...]

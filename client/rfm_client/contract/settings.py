@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Settings: frozen dataclasses whose fields have a help text and bounds, for files, command lines and documents."""
+"""Settings: frozen dataclasses whose fields have a help text and bounds, for files and command lines."""
 
 from __future__ import annotations
 

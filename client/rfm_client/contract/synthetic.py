@@ -37,7 +37,7 @@ def random_trajectory(
     task: str,
     size_px: tuple[int, int] = (SIDE_PX, SIDE_PX),
 ) -> Trajectory:
-    """Return normally distributed embeddings, or frames of noise with ``task``. size_px: height and width of frames"""
+    """Return normally distributed embeddings, or noise frames with ``task`` and ``size_px`` = (height, width)."""
     if widths is None:
         return Trajectory(frames=random.integers(0, 256, (num_frames, *size_px, 3), np.uint8), task=task)
     video_dim, text_dim = widths

@@ -67,7 +67,7 @@ def error_from(
     proxy: str | None = None,
     bad_request: type[errors.RewardError] = errors.InvalidSampleError,
 ) -> errors.RewardError | None:
-    """Translate an exception of tritonclient or of a library below it; None: of no such library.
+    """Translate an exception of tritonclient or of a library below it; None: another exception.
 
     proxy: proxy of the call (``grpc_proxy``)
     bad_request: error for the status INVALID_ARGUMENT, which Triton also gives for an unknown model

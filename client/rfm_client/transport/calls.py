@@ -52,7 +52,7 @@ class Transport(Protocol):
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
-        """Return the named ``outputs`` of ``model`` for ``inputs``. request_id: for the server's log"""
+        """Return the named ``outputs`` of ``model`` for ``inputs``. request_id: id in the server's log"""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         """Return the server's description of ``model``. Raises ModelNotFoundError."""
@@ -221,7 +221,7 @@ class TritonTransport:
 
 
 class GrpcTransport(TritonTransport):
-    """gRPC transport: a cancelled or late call is cancelled on the server too, unless it has begun there.
+    """gRPC transport: a late or cancelled call is cancelled on the server, too, unless scoring has begun.
 
     If the host name has several addresses (a headless Service), gRPC spreads the requests over them.
     """

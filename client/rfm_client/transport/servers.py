@@ -110,7 +110,7 @@ class KnownServer:
 
 
 class Servers:
-    """Several servers that share the requests, for one event loop. retry: False: never send a request again"""
+    """Several servers that share the requests, for one event loop. retry: True: send failed requests again"""
 
     def __init__(self, transports: Sequence[Transport], *, retry: bool) -> None:
         if not transports:
@@ -141,9 +141,9 @@ class Servers:
         return await self._request(model, lambda server, left_s: server.model_info(model, left_s), deadline)
 
     async def model_infos(self, model: str, deadline: Deadline) -> list[ModelInfo]:
-        """Return the descriptions of ``model`` by all servers that answer. Raises RewardError if none answers.
+        """Return the descriptions of ``model`` by all servers that answer; the first may appear twice.
 
-        The description that came first may be there twice.
+        Raises RewardError if no server answers.
         """
         infos = [await self.model_info(model, deadline)]  # waits until a server answers
         if len(self._servers) > 1:

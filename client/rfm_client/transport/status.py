@@ -71,8 +71,7 @@ class ModelStatus:
     samples, executions: numbers of samples and batches that Triton handed over
     queue_ms, compute_ms: time of all requests in Triton's queue, and of all executions until Triton could go on
     last_used_s: Unix time of the last request; None: no request yet
-    batches: None: not in the metrics
-    samples_refused: invalid samples, their senders' fault; None: not in the metrics
+    batches, samples_refused: batches of callers, and their invalid samples; None: not in the metrics
     """
 
     name: str
@@ -147,7 +146,10 @@ class DeviceWork:
 
 @dataclass(frozen=True)
 class ServerStatus:
-    """State of a server that answers. metrics_error: why ``devices`` and all other metrics are missing; None: read"""
+    """State of a server that answers.
+
+    metrics_error: why ``devices`` and other metrics are missing; None: they are not
+    """
 
     url: str
     version: str

@@ -60,7 +60,7 @@ def decode_results(
 def decode_progress(
     tensors: Mapping[str, npt.NDArray[Any]], row: int, num_frames: int, model_version: str | None = None
 ) -> ProgressResult:
-    """Return the result of the progress sample ``row``, of ``num_frames`` frames. Raises InferenceFailedError."""
+    """Return the result of the progress sample in ``row``, of ``num_frames``. Raises InferenceFailedError."""
     scores = _scores_between(tensors, row, slice(0, num_frames))
     return ProgressResult(
         progress=scores.progress,

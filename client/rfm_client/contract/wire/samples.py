@@ -54,7 +54,7 @@ _SAMPLE_TYPES = {
 
 
 def encode_samples(samples: Sequence[Sample]) -> Tensors:
-    """Return one request. The samples' positions need equal shapes behind the time axis, trajectory by trajectory."""
+    """Return one request. All samples need positions of equal shapes behind the time axis."""
     tensors: Tensors = {
         SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
         NUM_FRAMES: np.array([_lengths(sample) for sample in samples], np.int32),
