@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Calls to one Triton server over gRPC or HTTP. All errors become RewardErrors."""
+"""Calls to one Triton server over gRPC or HTTP. Their errors become RewardErrors."""
 
 from __future__ import annotations
 

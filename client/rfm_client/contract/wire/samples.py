@@ -54,7 +54,7 @@ _SAMPLE_TYPES = {
 
 
 def encode_samples(samples: Sequence[Sample]) -> Tensors:
-    """Return one request. All samples need positions of equal shapes behind the time axis."""
+    """Return one request. Samples need equal shapes behind the time axis, first and second trajectories apart."""
     tensors: Tensors = {
         SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
         NUM_FRAMES: np.array([_lengths(sample) for sample in samples], np.int32),
