@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
+import torch
 from safetensors import SafetensorError
 
 from rfm import families
@@ -33,19 +34,21 @@ class EngineScorer:
     notes: lines for the user, from ``rfm.families.notes`` for progress and success
     """
 
-    def __init__(self, source: str, *, device: str = "cpu", **options: Any) -> None:
+    def __init__(self, source: str, *, device: str = "cpu", dtype: torch.dtype | None = None, **options: Any) -> None:
         """Load a checkpoint folder or Hugging Face id. Raises CheckpointError, or ExportError for a missing device.
 
+        dtype: of the network; None: float32 on the CPU, else the checkpoint's own
         options: as in ``rfm.families.load``
         """
         on = device_named(device)
         self._checkpoint = families.load(source, **options)
         self._encoders = self._checkpoint.encoders()
         told = {"device": on.type, **{name: _named(value) for name, value in options.items()}}
+        told |= {} if dtype is None else {"dtype": str(dtype)}
         folders = _folders(source, options)
         self._facts = _facts(source, self._checkpoint, self._encoders, folders, told)
         self.notes = families.notes(folders[0], self._checkpoint, (PROGRESS, SUCCESS))
-        self._device = on
+        self._device, self._dtype = on, dtype
         self._lock = threading.Lock()
 
     def checkpoint(self) -> CheckpointFacts:
@@ -69,7 +72,7 @@ class EngineScorer:
 
     @cached_property
     def _engine(self) -> Engine:
-        return Engine.of(self._checkpoint, encoders=self._encoders, device=self._device)
+        return Engine.of(self._checkpoint, encoders=self._encoders, device=self._device, dtype=self._dtype)
 
 
 def _facts(

@@ -15,11 +15,13 @@ from rfm_client.cli.label import DatasetArgument, EpisodeTexts, LabelCommand, Ru
 from rfm_client.labelling import LabelOptions, RayOptions, Scorer
 from rfm_commands.command import OF_A_CHECKPOINT, say
 
+_OPTIONS = (*OF_A_CHECKPOINT, "dtype")
+
 
 @with_options
 def label(
     dataset: DatasetArgument,
-    given: Annotated[Given, OptionsOf(ExportConfig, only=OF_A_CHECKPOINT, required=("checkpoint",))],
+    given: Annotated[Given, OptionsOf(ExportConfig, only=_OPTIONS, required=("checkpoint",))],
     texts: EpisodeTexts,
     labels: LabelOptions,
     run: RunOptions,
@@ -33,7 +35,9 @@ def label(
     def connect() -> Iterator[Scorer]:
         from rfm_commands.engine_scorer import EngineScorer
 
-        scorer = EngineScorer(str(checkpoint), device=device, **dict(zip(OF_A_CHECKPOINT[1:], encoders, strict=True)))
+        dtype = ExportConfig(dtype=given.get("dtype")).torch_dtype
+        options = dict(zip(OF_A_CHECKPOINT[1:], encoders, strict=True))
+        scorer = EngineScorer(str(checkpoint), device=device, dtype=dtype, **options)
         for note in scorer.notes:
             say(note)
         yield scorer
