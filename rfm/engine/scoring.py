@@ -59,8 +59,8 @@ class Engine:
 
     predictor: the network, with the collation of its batches
     encoders: on the same device, for samples of raw frames if the network scores embeddings
-    token_budget: most tokens, with padding, in a forward pass of several rows; a larger row runs alone
-    max_sample_tokens: most tokens in a row; a sample with a larger row is refused
+    token_budget: maximum tokens, with padding, of a forward pass of several rows; a larger row runs alone
+    max_sample_tokens: maximum tokens of one row; a sample with a larger row is refused
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Engine:
     ) -> Engine:
         """Return the engine for a checkpoint's folder or Hugging Face id.
 
-        source, family, base_model: as in ``rfm.families.load``; the others as in ``of``
+        source, family, base_model: as in ``rfm.families.load``; others: as in ``of`` and the class
         Raises CheckpointError.
         """
         return cls.of(
@@ -136,8 +136,8 @@ class Engine:
 
         execution: the batch's costs are added to it
 
-        InvalidSampleError: this checkpoint cannot score the sample.
-        InferenceFailedError: a score is not finite, or the sample does not fit in memory.
+        Errors, returned and not raised: InvalidSampleError if this checkpoint cannot score the sample,
+        InferenceFailedError if a score is not finite or the sample does not fit in memory.
         """
         execution = execution or Execution()
         before = replace(execution)
@@ -147,7 +147,7 @@ class Engine:
         return self._results(prepared, execution, before)
 
     def prepare(self, sample: Sample | ProgressSampleRefs) -> Prepared:
-        """Do the first half of ``evaluate``, without a forward pass; may run while another thread scores.
+        """Make the rows of a sample, without encoders or a forward pass; may run while another thread scores.
 
         sample: in the form that the network reads; the encoders are not used
         """
@@ -159,12 +159,12 @@ class Engine:
         return self.predictor.works_ahead
 
     def work_ahead(self, prepared: Prepared) -> None:
-        """Do slow work before ``score``, which otherwise does it; thread-safe."""
+        """Do the slow part of ``score`` early; thread-safe and optional."""
         if not isinstance(prepared.rows, RewardError):
             self.predictor.work_ahead(prepared.rows)
 
     def score(self, prepared: Sequence[Prepared], execution: Execution) -> list[Outcome]:
-        """Do the second half of ``evaluate``: forward passes."""
+        """Return the results of prepared samples, from forward passes."""
         return self._results(prepared, execution, replace(execution))
 
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
@@ -228,7 +228,7 @@ class Engine:
             return
         with ThreadPoolExecutor(1) as collating:
             for part, following in zip(parts, [*parts[1:], None], strict=True):
-                steps = copy_context()  # so that an observer of this thread's steps also sees the other thread's
+                steps = copy_context()  # the collating thread has this thread's context variables
                 coming = collating.submit(steps.run, self._collate, [rows[i] for i in following]) if following else None
                 yield part, batch
                 batch = coming.result() if coming is not None else None
@@ -242,7 +242,7 @@ class Engine:
             return None
 
     def _score(self, rows: Sequence[Any], batch: Any, execution: Execution) -> Sequence[RowScores | RewardError]:
-        """Return the scores of each row from one forward pass.
+        """Return the scores of each row from one forward pass, or several if memory is short.
 
         batch: of all rows; None: it did not fit in memory, and is made again here
         """

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What starts one Triton, secures it, and leaves nothing of it behind.
+"""Start a Triton, secure it, and leave nothing behind.
 
-- ``repository_folder`` is what Triton reads.
-- ``process`` is one tritonserver, from an ``installation``, with ``triton_options``; ``temporary`` has one for a while.
-- Who reaches it: its ``endpoints``, with TLS if need be, and the ``admin_key`` of its restricted APIs.
-- ``ending`` ends processes, with their parent if need be; ``cleanup`` removes what a killed server left.
-- Calls to a running Triton: ``http``, and over gRPC the ``repository_api``, which loads and unloads models.
+- ``repository_folder``: the models that Triton reads.
+- ``triton_server``: a tritonserver process, from an ``installation``, with ``triton_options``; ``temporary``: the
+  same for the time of a context.
+- Access: ``endpoints``, optionally with TLS, and the ``admin_key`` of restricted APIs.
+- ``ending`` ends processes; ``cleanup`` removes the shared memory of killed servers; ``process_table`` reads /proc.
+- Calls to a running Triton: ``http``, and over gRPC ``repository_api``, which loads and unloads models.
 
-What watches and heals a Triton is ``rfm.supervise``, which builds on this.
+``rfm.supervise`` builds on this package: it watches Triton and restarts it.
 """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The key without which a server's models, logging and tracing cannot be changed.
+"""The key that protects a server's models, logging and tracing against changes.
 
-``rfm serve`` always restricts these APIs of Triton. Shared memory stays open: clients on the same host use it, and a
-region has its maker's name. Triton takes the key only as an argument, so this user and root can see it in ``/proc``. It
-is in no log, message or environment of a process started here.
+``rfm serve`` always restricts these APIs of Triton. Shared memory stays open, because clients on the same host use it.
+Triton takes the key only as an argument, so its user and root can read it in ``/proc``. No log, message or environment
+of a child process holds the key.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ MIN_CHARACTERS = 16
 _GRPC_PREFIX = "triton-grpc-protocol-"  # Triton puts it before the name
 _RESTRICTED = "model-repository,logging,trace"
 _RANDOM_BYTES = 32
-_VISIBLE = re.compile("[!-~]*")  # what a header can carry as it is
+_VISIBLE = re.compile("[!-~]*")  # characters that a header can carry unchanged
 
 
 class AdminKeyError(Exception):
-    """A key that cannot be used: where it stands and what was expected, never the key."""
+    """An unusable key. The message names its source and the expected form, never the key."""
 
 
 def new_key() -> str:
-    """A new random key, as text that fits in a URL."""
+    """Return a new random key, as URL-safe text."""
     return secrets.token_urlsafe(_RANDOM_BYTES)
 
 
 def take_key(file: Path | None, environment: MutableMapping[str, str]) -> str | None:
-    """The key in ``file``, else that of ``environment``; None if there is neither.
+    """Return the key in ``file``, else the key in ``environment``, else None. Raises AdminKeyError.
 
-    It is taken out of ``environment``, so that no process that is started has it. Raises AdminKeyError.
+    Removes the key from ``environment``, so that no child process gets it.
     """
     given = environment.pop(VARIABLE, None)
     if file is not None:
@@ -47,26 +47,26 @@ def take_key(file: Path | None, environment: MutableMapping[str, str]) -> str | 
 
 
 def restrictions(key: str) -> list[str]:
-    """Arguments of tritonserver that refuse administrative requests without ``key``."""
+    """Return arguments of tritonserver that refuse administrative requests without ``key``."""
     return [
         f"--{option}={_RESTRICTED}:{HEADER}={key}" for option in ("http-restricted-api", "grpc-restricted-protocol")
     ]
 
 
 def http_headers(key: str | None) -> Mapping[str, str]:
-    """What an HTTP request to a restricted API shows."""
+    """Return the headers of an HTTP request to a restricted API."""
     return {} if key is None else {HEADER: key}
 
 
 def grpc_metadata(key: str | None) -> Mapping[str, str]:
-    """What a gRPC request to a restricted API shows."""
+    """Return the metadata of a gRPC request to a restricted API."""
     return {} if key is None else {f"{_GRPC_PREFIX}{HEADER}": key}
 
 
 def _read(file: Path) -> str:
-    """The key in a file whose permissions are as strict as PostgreSQL's of a private key.
+    """Return the key in a file with permissions as strict as PostgreSQL demands of a private key.
 
-    The owner alone; a file of root's may be read by its group too, which is how containers are handed a secret.
+    Only the owner may read it. The group may also read a file that root owns, since containers get secrets that way.
     """
     try:
         status = file.stat()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What ``rfm serve`` would leave in shared memory if it is killed with -9."""
+"""Remove the shared memory that ``rfm serve`` leaves behind when SIGKILL ends it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from rfm.launch.installation import ServerStartError
 
 SHARED_MEMORY = Path("/dev/shm")
-# The Python backend's regions have this name. Newer Tritons let no client map a region with it.
+# Beginning of the names of the Python backend's regions. Newer Tritons let no client map a region with this name.
 REGION_PREFIX = "triton_python_backend_shm_region_rfm"
 NEEDS_ROOM = "free some (a container has more of /dev/shm with --shm-size)"
 
@@ -20,14 +20,14 @@ _LOCK = "lock"
 
 
 class Claim:
-    """What one server has in shared memory: the backend's regions, and a folder for ``Installation``.
+    """A server's shared memory: the Python backend's regions, and a folder for ``Installation``.
 
-    A lock is held while a process with ``lock_file`` lives: this process, and those that inherit it. A process id
-    would prove nothing: another container may share the memory, or have left it.
+    This process and its children hold a lock through ``lock_file``, which ends with the last of them. A process id
+    would prove nothing, because containers with process ids of their own may share the memory.
     """
 
     def __init__(self) -> None:
-        """Takes it. Raises ServerStartError where nothing can be written."""
+        """Create the lock and the folder. Raises ServerStartError if they cannot be written."""
         name = f"{os.getpid()}_{secrets.token_hex(4)}"
         self.region_prefix = f"{REGION_PREFIX}_{name}_"
         self.backends = SHARED_MEMORY / f"{self.region_prefix}backends"
@@ -36,7 +36,7 @@ class Claim:
         try:
             self.lock_file = os.open(new_lock, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
             fcntl.flock(self.lock_file, fcntl.LOCK_EX)
-            new_lock.rename(self._lock)  # under this name it has always been locked
+            new_lock.rename(self._lock)  # renamed once locked, so that ``clear`` never finds it unlocked
             self.backends.mkdir(0o700)
         except OSError as error:
             raise ServerStartError(
@@ -44,13 +44,13 @@ class Claim:
             ) from error
 
     def release(self) -> None:
-        """Removes the regions, the folder and the lock."""
+        """Remove the regions, the folder and the lock."""
         _remove(self._lock)
         os.close(self.lock_file)
 
 
 def clear() -> list[Path]:
-    """Removes what servers left of which no process lives, and gives its paths."""
+    """Remove the shared memory of servers without a living process. Return the removed paths."""
     locks = [lock for lock in SHARED_MEMORY.glob(f"{REGION_PREFIX}_*_{_LOCK}") if _is_free(lock)]
     return [path for lock in locks for path in _remove(lock)]
 
@@ -65,7 +65,7 @@ def _is_free(lock: Path) -> bool:
 
 
 def _remove(lock: Path) -> list[Path]:
-    """Removes what a lock protects, and gives its paths. The lock goes last, so that a later attempt can finish."""
+    """Remove the paths that a lock protects, and return them. The lock goes last, so that a later call can finish."""
     removed = [path for path in lock.parent.glob(f"{lock.name.removesuffix(_LOCK)}*") if path != lock]
     try:
         for path in (*removed, lock):

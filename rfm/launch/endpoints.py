@@ -22,12 +22,12 @@ SECURITY_FLOOR = (
     71,
 )  # NVIDIA's container 26.07; earlier versions have remote vulnerabilities: docs/guides/secure.md
 
-_given: deque[int] = deque(maxlen=256)  # ports of servers that may not listen yet
+_given: deque[int] = deque(maxlen=256)  # ports whose servers may not listen yet
 
 
 @dataclass(frozen=True)
 class GrpcTls:
-    """PEM files for gRPC with TLS. client_ca: authorities of client certificates, which clients then need"""
+    """PEM files for gRPC with TLS. client_ca: authorities of client certificates; None: clients need no certificate"""
 
     certificate: Path
     key: Path
@@ -43,7 +43,7 @@ class GrpcTls:
             raise ServerStartError(str(error)) from None
 
     def arguments(self) -> list[str]:
-        """Arguments of tritonserver for gRPC with TLS."""
+        """Return arguments of tritonserver for gRPC with TLS."""
         files = [f"--grpc-server-cert={self.certificate}", f"--grpc-server-key={self.key}"]
         if self.client_ca is None:
             return ["--grpc-use-ssl=true", *files]
@@ -52,7 +52,7 @@ class GrpcTls:
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Addresses of one server. grpc_tls: gRPC uses TLS; HTTP, which cannot, then listens on 127.0.0.1 only"""
+    """Addresses of a server. grpc_tls: TLS for gRPC; Triton has no TLS for HTTP, which then listens on 127.0.0.1 only"""
 
     host: str = DEFAULT_HOST
     http_port: int = 8000
@@ -62,7 +62,7 @@ class Endpoints:
 
     @classmethod
     def of(cls, config: ServeConfig) -> Endpoints:
-        """Endpoints of a configuration."""
+        """Return the endpoints of a configuration."""
         tls = None
         if config.grpc_certificate is not None and config.grpc_key is not None:
             tls = GrpcTls(config.grpc_certificate, config.grpc_key, config.grpc_client_ca)
@@ -70,7 +70,7 @@ class Endpoints:
 
     @classmethod
     def free(cls) -> Endpoints:
-        """Loopback endpoints on free ports."""
+        """Return loopback endpoints on free ports."""
         http_port, grpc_port, metrics_port = free_ports(3)
         return cls(DEFAULT_HOST, http_port, grpc_port, metrics_port)
 
@@ -81,21 +81,21 @@ class Endpoints:
 
     @property
     def http_url(self) -> str:
-        """URL at which RewardClient reaches the server over HTTP."""
+        """URL of the server over HTTP, for RewardClient."""
         return f"http://{in_url(self.http_host)}:{self.http_port}"
 
     @property
     def grpc_url(self) -> str:
-        """URL at which RewardClient reaches the server over gRPC."""
+        """URL of the server over gRPC, for RewardClient."""
         return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{in_url(self.host)}:{self.grpc_port}"
 
     @property
     def metrics_url(self) -> str:
-        """URL of the metrics that Prometheus scrapes."""
+        """URL of Triton's metrics, for Prometheus."""
         return f"http://{in_url(self.host)}:{self.metrics_port}/metrics"
 
     def arguments(self) -> list[str]:
-        """Arguments of tritonserver for these addresses."""
+        """Return arguments of tritonserver for these addresses."""
         return [
             f"--http-address={_of_http_server(self.http_host)}",
             f"--http-port={self.http_port}",
@@ -122,7 +122,7 @@ class Endpoints:
 
 
 def check_version(host: str, version: str, *, accepted: bool) -> None:
-    """Raises ServerStartError for a vulnerable Triton on an address beyond loopback, unless ``accepted``."""
+    """Raise ServerStartError for a vulnerable Triton on an address beyond loopback, unless ``accepted``."""
     match = re.match(r"(\d+)\.(\d+)", version)
     is_safe = match is not None and (int(match[1]), int(match[2])) >= SECURITY_FLOOR
     if is_safe or accepted or is_loopback(host):
@@ -136,7 +136,7 @@ def check_version(host: str, version: str, *, accepted: bool) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Free ports of the loopback address. Raises OSError if there are too few."""
+    """Return free ports of the loopback address. Raises OSError if there are too few."""
     tried = random.SystemRandom().sample(PORTS, len(PORTS))
     ports = list(islice((port for port in tried if port not in _given and _is_free(port)), count))
     if len(ports) < count:
@@ -154,5 +154,5 @@ def _is_free(port: int) -> bool:
 
 
 def _of_http_server(host: str) -> str:
-    """Address in the form of Triton's HTTP servers, which need a prefix before IPv6."""
+    """Return the address for Triton's HTTP servers, which need a prefix before IPv6."""
     return f"ipv6:{host}" if ":" in host else host

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""HTTP requests to a Triton on this machine, each with a connection and a time limit of its own."""
+"""HTTP requests to a Triton on this machine, each with its own connection and time limit."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-PROBE_TIMEOUT_S = 1.0  # for answers that need no model
+PROBE_TIMEOUT_S = 1.0  # for answers without a model
 
 
 class UnreadableAnswerError(Exception):
-    """An answer that is not JSON, or has another status than 200."""
+    """An answer with a status other than 200, or without JSON."""
 
 
 NO_ANSWER = (OSError, http.client.HTTPException, UnreadableAnswerError)

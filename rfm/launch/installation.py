@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Where tritonserver is and what it needs to run: an explicit path, PATH, or the nvidia-pytriton wheel.
+"""Find tritonserver: an explicit path, PATH, or the nvidia-pytriton wheel.
 
-The wheel is used as a distribution of the binary. It lacks what an installed Triton has around it: a backend
-directory with the stub of the running Python, and the search path of its libraries and of libpython.
+From the wheel only the binary is used. It lacks a backend directory with the stub of the running Python, and the
+search path of its libraries and of libpython. This module adds both.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pathlib import Path
 
 EXECUTABLE = "tritonserver"
 WHEEL = "nvidia-pytriton"
-WHEEL_VERSION = "2.51.0"  # of its Triton
+WHEEL_VERSION = "2.51.0"  # Triton's version in it
 _BACKEND_FILES = ("libtriton_python.so", "triton_python_backend_utils.py")
 _STUB = "triton_python_backend_stub"
 
 
 class ServerStartError(Exception):
-    """tritonserver cannot be started: the reason in one line. model: the model at fault; None: no model is"""
+    """tritonserver cannot start. Its message is one line. model: the model at fault; None: no model"""
 
     def __init__(self, reason: str, model: str | None = None) -> None:
         super().__init__(reason)
@@ -33,9 +33,10 @@ class ServerStartError(Exception):
 
 @dataclass(frozen=True)
 class Installation:
-    """A tritonserver that can be run.
+    """A tritonserver that can run.
 
-    wheel: the wheel's ``tritonserver`` folder; None for a Triton that knows its own surroundings
+    environment: variables to set for it
+    wheel: the wheel's ``tritonserver`` folder; None: an installed Triton, which finds its own backends
     """
 
     executable: Path
@@ -43,7 +44,7 @@ class Installation:
     wheel: Path | None = None
 
     def lay_out_backends(self, folder: Path) -> list[str]:
-        """Fills the empty ``folder`` if need be, and gives the arguments that point at it."""
+        """Link the wheel's backend into the empty ``folder``. Return arguments that name it; none without a wheel."""
         if self.wheel is None:
             return []
         backend = folder / "python"
@@ -55,7 +56,7 @@ class Installation:
 
 
 def find_installation(executable: Path | None = None) -> Installation:
-    """The explicit ``executable``, else that in PATH, else the wheel's. Raises ServerStartError."""
+    """Return the installation of ``executable``, else of PATH, else of the wheel. Raises ServerStartError."""
     if executable is not None:
         if not (executable.is_file() and os.access(executable, os.X_OK)):
             raise ServerStartError(f"tritonserver: expected a program at {executable}, got none")
@@ -72,7 +73,7 @@ def _wheel_installation() -> Installation:
     wheel = Path(package.submodule_search_locations[0]) / EXECUTABLE
     numpy_version = importlib.metadata.version("numpy")
     if int(numpy_version.partition(".")[0]) >= 2:
-        # With numpy 2 the stub of this release answers with empty outputs and no error.
+        # With numpy 2, this release's stub returns empty outputs without an error.
         raise ServerStartError(
             f"numpy: expected < 2 with the Triton of {WHEEL}, got {numpy_version}: pip install 'numpy<2'"
         )
@@ -96,7 +97,7 @@ def _stub(wheel: Path) -> Path:
 
 
 def _libpython() -> Path:
-    """The shared library that the stub is linked against."""
+    """Return the shared library that the stub links to. Raises ServerStartError."""
     name = f"libpython{sys.version_info.major}.{sys.version_info.minor}.so.1.0"
     folders = [sysconfig.get_config_var("LIBDIR"), str(Path(sys.base_prefix, "lib"))]
     for folder in folders:

@@ -17,7 +17,7 @@ _STATE, _PARENT, _GROUP, _USER, _SYSTEM = 0, 1, 2, 11, 12  # fields of /proc/PID
 
 @dataclass(frozen=True)
 class ProcessStat:
-    """Name (at most 15 characters), state, parent, group and CPU time of a process. A zombie has them, too"""
+    """Name (at most 15 characters), state, parent, group and CPU time of a process, zombies included."""
 
     name: str
     state: str
@@ -27,14 +27,14 @@ class ProcessStat:
 
 
 def all_pids() -> list[int]:
-    """Ids of all processes."""
+    """Return the ids of all processes."""
     return [int(folder.name) for folder in _PROC.glob("[0-9]*")]
 
 
 def children_of(pid: int) -> list[int]:
-    """Child processes of a process, zombies included.
+    """Return the child processes of a process, zombies included.
 
-    Reads the kernel's lists of children where they exist, since a machine may have thousands of processes.
+    Reads the kernel's lists of children if they exist, since a machine may have thousands of processes.
     """
     threads = _PROC / str(pid) / "task"
     if not (threads / str(pid) / "children").exists():
@@ -47,7 +47,7 @@ def children_of(pid: int) -> list[int]:
 
 
 def arguments_of(pid: int) -> list[str]:
-    """Program and arguments of a process; empty for a zombie or an unknown id."""
+    """Return program and arguments of a process; empty for a zombie or an unknown id."""
     try:
         content = (_PROC / str(pid) / "cmdline").read_bytes()
     except (FileNotFoundError, ProcessLookupError):
@@ -56,7 +56,7 @@ def arguments_of(pid: int) -> list[str]:
 
 
 def stat_of(pid: int) -> ProcessStat | None:
-    """State of a process; None for an unknown id."""
+    """Return the state of a process; None for an unknown id."""
     try:
         head, _, tail = (_PROC / str(pid) / "stat").read_text().rpartition(")")
     except (FileNotFoundError, ProcessLookupError):
@@ -69,5 +69,5 @@ def stat_of(pid: int) -> ProcessStat | None:
 
 
 def cpu_s_of_group(group: int) -> float:
-    """CPU time of a process group, in seconds."""
+    """Return the CPU time of a process group, in seconds."""
     return sum(stat.cpu_s for pid in all_pids() if (stat := stat_of(pid)) is not None and stat.group == group)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The model-repository API of a running server: index, load, unload, and a probe of one version.
+"""The model-repository API of a running server: index, load, unload, and a probe of a version.
 
-Over gRPC, since a load over HTTP blocks all connections of Triton's HTTP thread until the model is loaded.
+Uses gRPC, since a load over HTTP blocks all connections of Triton's HTTP thread until the model is loaded.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rfm_client.contract.wire import Tensors
 INDEX_PATH = "/v2/repository/index"  # over HTTP
 READY, LOADING, UNLOADING = "READY", "LOADING", "UNLOADING"
 POLL_S = 0.1
-ANSWER_S = 1800.0  # for one request; a load answers after the warm-up
+ANSWER_S = 1800.0  # for a request; a load answers after the warm-up
 FINISH_S = 600.0  # for requests in flight on an old version
 
 _CHANNEL = [
@@ -34,7 +34,7 @@ _CHANNEL = [
 ]
 _OF_SERVER = (*triton.UNAVAILABLE, *triton.OUT_OF_TIME, *triton.CANCELLED)
 _GOING = (READY, UNLOADING)
-_NOT_LOADED = "not loaded"  # our name where Triton gives no state
+_NOT_LOADED = "not loaded"  # this project's name for a missing state
 _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
 
 
@@ -44,7 +44,7 @@ class RepositoryApiError(Exception):
 
 @dataclass(frozen=True)
 class ModelVersion:
-    """One version in the server's index. version: None: not loaded yet; state: READY, UNAVAILABLE, ..."""
+    """A version in the server's index. version: None: not loaded yet; state: READY, UNAVAILABLE, ..."""
 
     name: str
     version: int | None
@@ -53,19 +53,20 @@ class ModelVersion:
 
     @property
     def is_ready(self) -> bool:
-        """True if the server calls it ready."""
+        """True if its state is READY."""
         return self.state == READY
 
     @property
     def is_unloaded(self) -> bool:
-        """True if it was unloaded on request; a version that failed to load has another reason."""
+        """True if it was unloaded on request or never loaded; False if it failed to load."""
         return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)
 
 
 class RepositoryApi:
     """The server at ``url``: grpc://host:port, or grpcs:// with TLS. A context manager.
 
-    options: options of tritonclient's gRPC client, such as those of Credentials
+    options: for tritonclient's gRPC client, such as the options of Credentials
+
     The constructor and the methods raise RepositoryApiError.
     """
 
@@ -85,17 +86,17 @@ class RepositoryApi:
         self._client = tritonclient.grpc.InferenceServerClient(address, channel_args=channel, **given)
 
     def index(self) -> list[ModelVersion]:
-        """All versions in the repository, sorted by name and version."""
+        """Return all versions in the repository, sorted by name and version."""
         answer = self._request(self._client.get_model_repository_index)
         return versions_of(MessageToDict(entry) for entry in answer.models)
 
     def ready_versions(self, model: str) -> list[int]:
-        """Versions of ``model`` that are ready."""
+        """Return the ready versions of ``model``."""
         ready = (entry for entry in self.index() if entry.name == model and entry.is_ready)
         return [entry.version for entry in ready if entry.version is not None]
 
     def load(self, model: str) -> None:
-        """Load the versions that the model's configuration names. If that fails, the served versions stay."""
+        """Load the versions in the model's configuration. If a load fails, the served versions stay."""
         self._request(self._client.load_model, model)
 
     def unload(self, model: str) -> None:
@@ -103,7 +104,7 @@ class RepositoryApi:
         self._request(self._client.unload_model, model)
 
     def wait_gone(self, model: str, kept: Collection[int] = ()) -> None:
-        """Wait until no version of the model but ``kept`` has a request in flight."""
+        """Wait until every version of the model, except ``kept``, is unloaded."""
         deadline_s = time.monotonic() + FINISH_S
         while time.monotonic() < deadline_s:
             going = [entry for entry in self.index() if entry.name == model and entry.state in _GOING]
@@ -113,7 +114,7 @@ class RepositoryApi:
         raise RepositoryApiError(f"{model}: expected its old versions to finish within {FINISH_S:g} s, got no end")
 
     def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
-        """Outputs of one version for a probe. Its request id tells it from callers' requests in logs."""
+        """Return the outputs of a version for a probe, whose request id distinguishes it from callers' requests."""
         tensors = []
         for name, array in inputs.items():
             tensors.append(tritonclient.grpc.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
@@ -151,7 +152,7 @@ class RepositoryApi:
 
 
 def versions_of(index: Iterable[Mapping[str, str]]) -> list[ModelVersion]:
-    """Entries of a server's index, sorted by name and version."""
+    """Return the versions in a server's index, sorted by name and version."""
     versions = [
         ModelVersion(
             entry["name"],
@@ -165,5 +166,5 @@ def versions_of(index: Iterable[Mapping[str, str]]) -> list[ModelVersion]:
 
 
 def one_line(reason: str) -> str:
-    """First line of an error message; the others are its traceback."""
+    """Return the first line of an error message, without its traceback."""
     return reason.strip().partition("\n")[0].strip()

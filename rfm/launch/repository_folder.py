@@ -13,14 +13,14 @@ _LEVELS_ABOVE = 4  # from MODEL/VERSION/checkpoint up to the repository
 
 
 def models_in(repository: Path) -> list[str]:
-    """Sorted names of the models in a repository; empty for the folder of a model."""
+    """Return the sorted names of a repository's models; empty for the folder of a model."""
     if (repository / CONFIG_FILE).exists():
         return []
     return sorted(file.parent.name for file in repository.glob(f"*/{CONFIG_FILE}"))
 
 
 def no_models(repository: Path) -> str:
-    """Error message for a folder without models, with the remedy."""
+    """Return the error message for a folder without models, with the remedy."""
     got, remedy = _found(repository)
     return f"repository: expected a folder of models, got {repository}, {got}: {remedy}"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A server that runs as long as a context."""
+"""A server for the time of a context."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rfm.launch.triton_server import TritonServer
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Context manager in which a stop signal raises SystemExit, so that context managers clean up."""
+    """Context manager in which a stop signal raises SystemExit, so that inner contexts clean up."""
 
     def leave(number: int, _frame: FrameType | None) -> NoReturn:
         raise SystemExit(128 + number)

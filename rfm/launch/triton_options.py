@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Options of tritonserver that users may give behind ``--``, and the largest HTTP request."""
+"""Options of tritonserver that users may add behind ``--``, and the largest HTTP request."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 from rfm.launch.installation import Installation, ServerStartError
 
-MAX_HTTP_BYTES = 256 * 2**20  # of a request's body; over gRPC Triton takes 2 GiB
+MAX_HTTP_BYTES = 256 * 2**20  # of a request's body; gRPC takes 2 GiB
 
-# Refused besides the options that rfm serve sets: their other names, and options that break a start.
+# Also refused, besides the options that rfm serve sets: their aliases, and options that break a start.
 _KEPT = {
     "--model-store",
     "--backend-directory",
@@ -28,14 +28,14 @@ _KEPT = {
     "--grpc-server-key",
     "--grpc-root-cert",
 }
-# May be given again for other APIs. Triton refuses to start with two keys for one API.
+# Users may repeat these for other APIs. Triton refuses to start with two keys for the same API.
 _REPEATED = {"--http-restricted-api", "--grpc-restricted-protocol"}
 _SIZE_OPTION = "http-max-input-size"
 _ARGUMENT = re.compile(r"(--[a-z][a-z0-9-]+)=.*")
 
 
 def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
-    """Raises ServerStartError for an option of ``own``, also abbreviated, and for anything but ``--option=value``."""
+    """Raise ServerStartError for an option of ``own``, also abbreviated, and for anything but ``--option=value``."""
     kept = {argument.partition("=")[0] for argument in own} - _REPEATED | _KEPT
     for argument in more:
         match = _ARGUMENT.fullmatch(argument)
@@ -46,14 +46,14 @@ def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
 
 
 def size_limits(installation: Installation, given: Sequence[str]) -> list[str]:
-    """Arguments that limit a request's size. Empty if they are given, or this tritonserver (such as 2.51) has none."""
+    """Return the option that limits a request's size; empty if ``given`` has it, or tritonserver (2.51) lacks it."""
     if any(argument.startswith(f"--{_SIZE_OPTION}=") for argument in given):
         return []
     return [f"--{_SIZE_OPTION}={MAX_HTTP_BYTES}"] if _knows(installation.executable, _SIZE_OPTION) else []
 
 
 def _knows(program: Path, option: str) -> bool:
-    """True if the option's name stands in the program file. ``--help`` would start Triton."""
+    """True if the program file contains the option's name. ``--help`` would start Triton."""
     try:
         with program.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             return content.find(option.encode()) >= 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One tritonserver process: starts it, waits until it is ready, stops it, and leaves nothing behind."""
+"""Run a tritonserver process: start it, wait until it is ready, and stop it without a trace."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
-STALLED_S, WORK_S = 60.0, 0.05  # a start that uses less CPU time than WORK_S in STALLED_S is stuck
+STALLED_S, WORK_S = 60.0, 0.05  # a start with less CPU time than WORK_S in STALLED_S is stuck
 LOAD_S = 1800.0
-ANSWER_TIMEOUT_S = 10.0  # of a server that starts
+ANSWER_TIMEOUT_S = 10.0  # while the server starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # else a version's folder changes, and a `load` reloads all versions
-SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that Triton and the model processes do not get
-_REMEDIES = {  # remedy by a pattern of the reason why a model is not loaded
+SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables withheld from Triton and the model processes
+_REMEDIES = {  # by a pattern of the reason why a model is not loaded
     "unsupported gpu id|KIND_GPU|compiled with CUDA|no NVIDIA driver": (
         "the models were exported for GPUs that this machine lacks: rfm export again here (--num-gpus 0: for the CPU)"
     ),
@@ -51,23 +51,23 @@ Config = Mapping[str, Any]  # a model's configuration in Triton's JSON
 
 
 def short_spin(environment: Mapping[str, str]) -> dict[str, str]:
-    """Environment variables that let OpenMP's threads spin for 0.1 ms; empty if the environment sets this itself.
+    """Return variables that limit spinning of OpenMP's threads to 0.1 ms; empty if the environment sets a limit.
 
-    libgomp's default of 3 ms makes a forward pass several times slower on a busy machine; no spinning makes it 1.5
-    times slower on a quiet one.
+    A forward pass is several times slower with libgomp's default of 3 ms on a busy machine, and 1.5 times slower
+    without spinning on a quiet machine.
     """
     return {} if {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & environment.keys() else {"GOMP_SPINCOUNT": "10000"}
 
 
 class SpoiltStartError(ServerStartError):
-    """Triton lost a model process during loading, and ended or waits for ever.
+    """Triton lost a model process during loading, and ended or hangs.
 
-    Triton 2.51 does so when the machine stands still for a second.
+    With Triton 2.51 this happens when the machine stands still for a second.
     """
 
 
 class TritonServer:
-    """A tritonserver on ``repository`` with all its models loaded. A context manager that stops it.
+    """A tritonserver with all models of ``repository``. The context manager starts and stops it.
 
     The kernel kills it when the thread that started it ends.
 
@@ -119,7 +119,7 @@ class TritonServer:
 
     @property
     def exit_status(self) -> int | None:
-        """Exit status of the process; None: it runs."""
+        """Exit status of the process; None while it runs."""
         assert self._process is not None  # started
         return self._process.poll()
 
@@ -136,8 +136,9 @@ class TritonServer:
     def start_ready(self, served: Mapping[str, Config] | None = None) -> None:
         """Start the process and wait until every model is ready. Repeat a spoilt start once.
 
-        served: configurations of the models to serve, which may name other versions than their files; None: all models
-            as in their files
+        served: configurations of the models to serve, which may name other versions than their files do; None: all
+            models, as in their files
+
         Raises ServerStartError.
         """
         try:
@@ -152,7 +153,7 @@ class TritonServer:
         if self._process is not None:
             end(self._process)
             status = self._process.wait()
-            self._kill_group()  # model processes that Triton ran out of time to end
+            self._kill_group()  # model processes that Triton did not end in time
         if self._claim is not None:
             self._claim.release()
             self._claim = None
@@ -172,17 +173,17 @@ class TritonServer:
         self.stop()
 
     def _start_ready(self, served: Mapping[str, Config] | None) -> None:
-        """As ``start_ready``: Triton loads the models whose files are up to date, and is asked to load the others."""
+        """Start Triton with the models whose files are up to date, then load the others with their configurations."""
         there = self.models
         if not there:
             raise ServerStartError(no_models(self.repository))
-        if len(str(self.repository).split()) > 1:  # Triton's Python backend gives its path to a shell as it is
+        if len(str(self.repository).split()) > 1:  # Triton's Python backend passes the path to a shell unquoted
             where = "repository: expected a path without spaces, such as a link (ln -s)"
             raise ServerStartError(f"{where}, got {self.repository}")
         as_in_file = there
         if served is not None:
             as_in_file = [name for name in served if _names_the_same_versions(self.repository, name, served[name])]
-            if len(as_in_file) < len(served):  # an ensemble loads its parts with it, as their files say
+            if len(as_in_file) < len(served):  # an ensemble would load its parts from their files
                 as_in_file = []
         self._start(sorted(as_in_file))
         self._wait_ready(as_in_file)
@@ -212,7 +213,7 @@ class TritonServer:
                 stderr=self._log,
                 preexec_fn=ending_with_parent(),
                 pass_fds=[self._claim.lock_file],
-                start_new_session=True,  # a Ctrl-C in the terminal reaches it once, through us
+                start_new_session=True,  # so that only this process passes on a Ctrl-C in the terminal
             )
         except OSError as error:
             self._claim.release()
@@ -222,7 +223,7 @@ class TritonServer:
             self._process.send_signal(self._signal)
 
     def _wait_ready(self, models: Collection[str]) -> None:
-        """Wait until ``models`` are ready. Raises ServerStartError with the reason of a model that is not."""
+        """Wait until ``models`` are ready. Raises ServerStartError with the reasons of the models that failed."""
         assert self._process is not None  # started
         started_s = worked_s = time.monotonic()
         cpu_s = 0.0
@@ -230,7 +231,7 @@ class TritonServer:
             try:
                 version = self._http.json("/v2", ANSWER_TIMEOUT_S).get("version", "")
                 index = self._http.json(INDEX_PATH, ANSWER_TIMEOUT_S, "POST")
-            except NO_ANSWER:  # Triton gives none while it loads
+            except NO_ANSWER:  # usual while Triton loads
                 now_s, used_s = time.monotonic(), cpu_s_of_group(self.pid)
                 if used_s - cpu_s > WORK_S:
                     cpu_s, worked_s = used_s, now_s
@@ -250,7 +251,7 @@ class TritonServer:
         raise kind(f"tritonserver: expected to run, got exit status {self._process.returncode}")
 
     def _load(self, name: str, config: Config) -> None:
-        """Ask Triton to load a model with this configuration, over HTTP: its gRPC port may ask for a certificate."""
+        """Load a model with this configuration, over HTTP, since the gRPC port may demand a certificate."""
         body = json.dumps({"parameters": {"config": json.dumps(config)}}).encode()
         path = f"/v2/repository/models/{quote(name, safe='')}/load"
         try:
@@ -270,7 +271,7 @@ class TritonServer:
             "--model-control-mode=explicit",
             *(f"--load-model={model}" for model in models),
             "--disable-auto-complete-config",
-            "--strict-readiness=false",  # else a version that fails to load keeps all models from being ready
+            "--strict-readiness=false",  # else a failed version makes the whole server not ready
             "--exit-on-error=false",  # keeps the reason of each failed model readable
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
             *self.endpoints.arguments(),
@@ -289,7 +290,7 @@ def _remedy(reasons: str) -> str:
 
 
 def _names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
-    """True if the model's file names the versions of ``config``, or no versions."""
+    """True if the model's file names the same versions as ``config``, or no versions."""
     try:
         file = text_format.Parse((repository / model / CONFIG_FILE).read_text(), ModelConfig())
     except (OSError, UnicodeDecodeError, text_format.ParseError):

@@ -31,7 +31,7 @@ from rfm_client.contract.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, 
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import Tensors
 
-GIVEN_UP_S = 0.1  # after a longer batch, ask whether clients cancelled; Triton 2.51 still hands over their requests
+GIVEN_UP_S = 0.1  # after a longer batch, skip requests that were cancelled; Triton 2.51 hands them over all the same
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
@@ -39,7 +39,8 @@ Scored: TypeAlias = list[tuple[Sequence[Request[Question]], Execution]]  # reque
 
 
 class BatchModel(Generic[Question, Answer]):
-    """Adapter between Triton and a function from questions to answers. A request holds one or more questions.
+    """Adapter between Triton and a function from questions to answers. A question is a sample, or an
+    encoder's sample; a request holds one or more.
 
     A subclass reads the tensors of a request (``decode``), checks and prepares each question (``prepare``), answers
     questions (``answer``), and writes the answers of a request (``encode``).
@@ -98,7 +99,7 @@ class BatchModel(Generic[Question, Answer]):
         raise NotImplementedError
 
     def prepare(self, question: Question) -> tuple[Any, int]:
-        """The input of ``answer`` for a question, and its number of tokens, which ``token_budget`` bounds. Cheap.
+        """The input of ``answer`` for a question, and its number of tokens (see ``token_budget``). Must be fast.
 
         Raises RewardError for a question that cannot be answered.
         """
@@ -121,7 +122,7 @@ class BatchModel(Generic[Question, Answer]):
         pipeline = self._pipeline
         if pipeline is None:
             return self._responses(batch, self._score)
-        if len(batch) == 1 and pipeline.is_idle:  # cheaper than the pipeline
+        if len(batch) == 1 and pipeline.is_idle:  # without the queue and the copies
             return self._responses(batch, pipeline.run)
         for request, inference in zip(batch, requests, strict=True):
             request.outlive(inference)
@@ -148,7 +149,7 @@ class BatchModel(Generic[Question, Answer]):
 
     def _read(self, request: Request[Question]) -> None:
         """Decode and prepare the questions of a request, or note its error."""
-        if self._num_warmups and not request.request_id:  # Triton warms up before it admits callers
+        if self._num_warmups and not request.request_id:  # warm-ups come first, and have no id
             self._num_warmups -= 1
             request.is_counted = False
         if request.error is not None:
@@ -169,7 +170,7 @@ class BatchModel(Generic[Question, Answer]):
             request.fail(error)
 
     def _work_ahead(self, request: Request[Question]) -> None:
-        """Do the slow part of a request while others are scored. An error comes again in its turn."""
+        """Do the slow part of a request while others are scored. Errors are dropped: scoring raises them again."""
         with suppress(Exception):
             for prepared in request.prepared:
                 self.work_ahead(prepared)
@@ -228,7 +229,7 @@ class BatchModel(Generic[Question, Answer]):
             _tell(self._metrics.add, part, execution)
 
     def _score_blank(self) -> None:
-        """Score the blank sample. Raises the errors of a broken device, not those of a refused sample."""
+        """Score the sample of ``probe_request``. Raises errors of a broken device, not those of a refused sample."""
         try:
             questions = [self.prepare(question)[0] for question in self.decode(self._blank_tensors)]
         except InvalidSampleError:  # a checkpoint may refuse blank frames

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The predictor of a vision-language reward model: samples of raw frames in, scores of conversations out."""
+"""The predictor of a vision-language reward model: samples of raw frames in, scores of rows (conversations) out."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from rfm_client.contract.frame_refs import ProgressSampleRefs
 class VlmPredictor:
     """A vision-language reward model on a device.
 
-    cache: of shots' features on the device, and of frames, to which samples may then refer; None: no cache
+    cache: holds features of shots, and frames, so that samples may send frame references; None: no cache
     """
 
     works_ahead = True
@@ -59,7 +59,7 @@ class VlmPredictor:
         return row.num_tokens
 
     def work_ahead(self, rows: Sequence[VlmRow]) -> None:
-        """Resize each frame once, and start its copy to the device."""
+        """Resize the frames whose features are not cached, and start their copy to the device."""
         for video in (video for row in rows for video in row.videos):
             if video.sized is None:
                 sized = self.collator.to_size(video, self.cache)
@@ -72,7 +72,7 @@ class VlmPredictor:
         return batch.pinned() if self._copies.pins else batch
 
     def count(self, batch: VlmBatch, execution: Execution) -> None:
-        """Count tokens, without and with padding, and the frames of shots that are encoded and that are cached."""
+        """Count tokens, without and with padding, the encoded frames, and the frames with cached features."""
         execution.add_tokens(batch.num_tokens, batch.inputs["input_ids"].numel())
         execution.num_encoded += 0 if batch.pixels is None else batch.pixels.num_shown
         execution.num_found += 0 if batch.layout is None else len(batch.layout.kept) * self.collator.frames_per_shot
@@ -119,7 +119,7 @@ class VlmPredictor:
         return replace(sample, trajectory=replace(named, pixels=pixels))
 
     def _keep(self, rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
-        """Cache the rows' frames and their shots' features, except of a video that alone exceeds the cache."""
+        """Cache each video's frames and its new features; skip a video that is larger than the cache."""
         if self.cache is None:
             return
         for video in dict.fromkeys(video for row in rows for video in row.videos):
@@ -141,7 +141,7 @@ class VlmPredictor:
 
 
 def _read(output: VlmOutput) -> tuple[FrameScores, list[float], list[float], bool]:
-    """Return scores of all frames, preferences, similarities, and True if all new features are finite.
+    """Return scores of all frames, preferences, similarities, and True if this pass's new features are finite.
 
     A single copy from the device reads them all.
     """

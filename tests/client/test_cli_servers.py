@@ -318,7 +318,17 @@ def test_every_command_and_option_has_help_and_exit_codes_are_documented() -> No
     for code in ExitCode:
         assert re.search(rf"\b{code.value} ", EXIT_CODES), code
     commands = get_command(app).commands  # type: ignore[attr-defined]
-    assert commands.keys() == {"score", "compare", "status", "wait", "sample", "bench-input", "gateway", "label"}
+    assert commands.keys() == {
+        "score",
+        "compare",
+        "status",
+        "wait",
+        "sample",
+        "bench-input",
+        "gateway",
+        "label",
+        "evaluate",
+    }
     for name, command in commands.items():
         assert name in general
         assert command.help, name

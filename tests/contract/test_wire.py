@@ -247,7 +247,7 @@ def request(lengths: tuple[int, int], kind: int, steps: int = 0, stray: int = 0)
         (request((5, 0), 0), r"num_frames: expected at most the 4 frames in video_embeddings, got 5"),
         (
             request((1, 0), 0, stray=1),
-            "video_embeddings: expected zeros behind the 1 frames that num_frames tells, got .*",
+            "video_embeddings: expected zeros behind the 1 frames that num_frames states, got .*",
         ),
         (request((2, 3), 1), r"num_frames: expected at most the 4 frames in video_embeddings, got 5"),
     ],

@@ -50,7 +50,7 @@ class ShownDataset:
 
     root: its folder, with links resolved
 
-    Its methods raise DatasetError for a broken dataset, HTTPException 404 for a part that it lacks.
+    Its methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
     """
 
     root: Path
@@ -58,7 +58,7 @@ class ShownDataset:
 
     @classmethod
     def open(cls, folder: str) -> ShownDataset:
-        """Open the dataset in a folder. Raises ConfigError for any other folder, or links that leave it."""
+        """Open the dataset in a folder. Raises ConfigError for any other folder, a broken dataset or links out of it."""
         try:
             import pyarrow  # noqa: F401
         except ImportError:
@@ -76,7 +76,7 @@ class ShownDataset:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Return the dataset's facts and the names of its labels."""
+        """The dataset's name and kind, and the names of its label files."""
         names = [self._name_of(file) for file in find_label_files(self.root)]
         return {"name": self.dataset.source, "kind": self.dataset.kind, "labels": names}
 
@@ -154,7 +154,7 @@ def _orientations(file: Path | None) -> Mapping[str, str]:
 
     metadata = {} if file is None else parquet.read_schema(file).metadata or {}
     provenance = json.loads(metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY, b"{}")))
-    found = provenance.get("orientations", {})  # older labels have none
+    found = provenance.get("orientations", {})  # labels of version 0.1.0 have none
     return {camera: orientation for camera, orientation in found.items() if orientation in ORIENTATIONS}
 
 
@@ -226,7 +226,7 @@ def _cut(span: Span, take: Callable[[int], object]) -> bytes:
     try:
         with av.open(
             str(span.file), format="mov"
-        ) as video:  # without format=, FFmpeg would open the files that a play list names
+        ) as video:  # without format=, FFmpeg would open the files in a play list
             stream = video_stream(video)
             packets = _packets(video, stream, span, take)
             zero = min(packet.pts for packet in packets if packet.pts * stream.time_base > _begin_s(span))

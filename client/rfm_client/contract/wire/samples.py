@@ -220,7 +220,7 @@ def _unpadded(row: Row, name: str, total: int) -> npt.NDArray[Any]:
     if total > len(positions):
         raise InvalidSampleError.at(NUM_FRAMES, f"at most the {len(positions)} frames in {name}", str(total))
     if positions[total:].any():
-        raise InvalidSampleError.at(name, f"zeros behind the {total} frames that num_frames tells", "other values")
+        raise InvalidSampleError.at(name, f"zeros behind the {total} frames that num_frames states", "other values")
     return positions[:total]
 
 
