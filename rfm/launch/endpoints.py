@@ -52,7 +52,7 @@ class GrpcTls:
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Addresses of a server. grpc_tls: TLS for gRPC; Triton has no TLS for HTTP, which then listens on 127.0.0.1 only"""
+    """Addresses of a server. grpc_tls: for gRPC; Triton has no TLS for HTTP, which then listens on 127.0.0.1 only"""
 
     host: str = DEFAULT_HOST
     http_port: int = 8000

@@ -58,7 +58,7 @@ class ShownDataset:
 
     @classmethod
     def open(cls, folder: str) -> ShownDataset:
-        """Open the dataset in a folder. Raises ConfigError for any other folder, a broken dataset or links out of it."""
+        """Open the dataset in a folder. Raises ConfigError for any other folder, or links out of it."""
         try:
             import pyarrow  # noqa: F401
         except ImportError:
