@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""What runs beside Triton, which ``rfm.launch`` has started. Every fault has one cure: Triton is started again.
+"""Supervise the Triton that ``rfm.launch`` starts. A restart is the cure of every fault.
 
-``watch`` finds faults and knows what is served: by Triton's answers, by its processes, and by a ``probe`` of each
-model. The ``supervisor`` starts Triton again, and the gateway. ``status`` is what others see of it.
+``watch`` finds faults from Triton's answers, its processes and a ``probe`` of each model, and tracks the served
+versions. The ``supervisor`` restarts Triton and the gateway. ``status`` reports their state over HTTP.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Health probes: one synthetic request to a model every few seconds."""
+"""Health probes: a synthetic request to a model every few seconds."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from rfm.probe_request import probe_request
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
 
-BROKEN_COUNT, BROKEN_S = 3, 30.0  # failed probes in a row, over this time, make a model broken
+BROKEN_COUNT, BROKEN_S = 3, 30.0  # a model is broken after so many failed probes in a row, over so long
 SHARE = 0.1  # largest share of a model's time
 
 _OUTPUTS = (wire.PROGRESS, wire.VIDEO_EMBEDDINGS)
 
 
 class Probe:
-    """Probes a model in a thread of its own, every ``interval_s`` or less often if answers take long.
+    """Probes a model in its own thread, every ``interval_s`` or less often if answers take long.
 
     hang_s: seconds without an answer after which the model counts as hung
     observe: called with the seconds that each answer took
@@ -47,10 +47,10 @@ class Probe:
         self._closed.set()
 
     def fault(self, progress_s: float) -> str | None:
-        """Reason to restart the model; None: it is healthy.
+        """Return the reason to restart the model; None: it is healthy.
 
-        progress_s: time (monotonic) of the last answer or forward pass that Triton counted. A busy model answers probes
-            late
+        progress_s: monotonic time of the last answer or forward pass in Triton's counts; a busy model may answer
+            probes late
         """
         fails_s = time.monotonic() - self._succeeded_s
         if self._num_failures is not None and self._num_failures >= BROKEN_COUNT and fails_s >= BROKEN_S:
@@ -83,7 +83,7 @@ class Probe:
         self._observe(took_s)
         if status < HTTPStatus.INTERNAL_SERVER_ERROR:
             self._num_failures, self._succeeded_s = 0, time.monotonic()
-        elif self._num_failures is not None:  # a model may refuse every blank sample
+        elif self._num_failures is not None:  # counted only after a success: some models fail on any blank sample
             self._num_failures += 1
 
     def _request(self) -> bytes:

@@ -41,7 +41,7 @@ class Status:
         self.restarts = Counter("rfm_serve_restarts", told, ["what"], registry=self._registry)
 
     def record(self, reasons: Mapping[str, str]) -> None:
-        """Record the state of all models: the reason why a model is not ready, or NO_REASON."""
+        """Record the state of all models. reasons: why each model is not ready, or NO_REASON"""
         gone, before, self._reasons = self._reasons.keys() - reasons.keys(), self._reasons, dict(reasons)
         for model, reason in before.items():
             if reason not in (NO_REASON, reasons.get(model)):
@@ -59,19 +59,19 @@ class Status:
 
     @property
     def ready(self) -> tuple[bool, dict[str, Any]]:
-        """Whether all models are ready, and the body of ``/ready``."""
+        """True if all models are ready, and the body of ``/ready``."""
         reasons = self._reasons
         is_ready = bool(reasons) and all(reason == NO_REASON for reason in reasons.values())
         models = {model: {"ready": reason == NO_REASON, "reason": reason} for model, reason in reasons.items()}
         return is_ready, {"ready": is_ready, "models": models}
 
     def metrics(self) -> bytes:
-        """Metrics in the text format of Prometheus."""
+        """Return the metrics in the text format of Prometheus."""
         return generate_latest(self._registry)
 
 
 class StatusServer(ThreadingHTTPServer):
-    """HTTP server of a Status: ``/live``, ``/ready``, ``/metrics``. Raises ServerStartError for a taken port."""
+    """HTTP server with ``/live``, ``/ready`` and ``/metrics``. Raises ServerStartError for a taken port."""
 
     daemon_threads = True
 
@@ -91,7 +91,7 @@ class StatusServer(ThreadingHTTPServer):
         self.server_close()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log nothing for callers that leave without an answer."""
+        """Log no error of a caller who left before the answer."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
 

@@ -20,13 +20,13 @@ from rfm.supervise.status import Status, StatusServer
 from rfm.supervise.watch import TRITON, TritonWatch, parts_of
 
 GATEWAY = "gateway"
-STEADY_S = 60.0  # a process that ran longer is not in a crash loop
+STEADY_S = 60.0  # after a longer run, a process is not in a crash loop
 MOST = 5  # restarts in a row
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 
 
 class CrashLoopError(ServerStartError):
-    """A process ended too often to start it again."""
+    """A process ended too often in a row to restart it."""
 
 
 class BackOff:
@@ -54,7 +54,7 @@ class BackOff:
 
 
 class GatewayProcess:
-    """The gateway as a child process. ``look`` must be called often; it restarts an ended gateway."""
+    """The gateway as a child process. Call ``look`` often: it restarts an ended gateway."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
@@ -70,7 +70,7 @@ class GatewayProcess:
         self._back_off.started()
 
     def look(self) -> str | None:
-        """Restart an ended gateway. Return why it had ended; None: no restart. Raises CrashLoopError."""
+        """Restart an ended gateway. Return why it ended; None: no restart. Raises CrashLoopError."""
         if self._process is None or self._process.poll() is None:
             return None
         why = f"exit status {self._process.returncode}"
@@ -91,7 +91,7 @@ class GatewayProcess:
 class Supervisor:
     """Serves until a stop signal. For the main thread.
 
-    gateway: command line of a gateway to run beside the server; None: no gateway
+    gateway: command line of a gateway beside the server; None: no gateway
     status_port: port of the status server, on Triton's host; None: no status server
     probe_s, hang_s, triton_silent_s: see TritonWatch
     say: prints a line about an event
@@ -121,7 +121,7 @@ class Supervisor:
         self._back_off = self._new_back_off()
         self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
-        self._left_out: dict[str, str] = {}  # reasons by model that kept ending Triton
+        self._left_out: dict[str, str] = {}  # reasons by model, of models that kept ending Triton
 
     def run(self) -> int:
         """Serve. Return Triton's exit status. Raises ServerStartError for a failed start or a crash loop."""
@@ -154,14 +154,14 @@ class Supervisor:
                 raise
         finally:
             self._status.record_down("it is stopping")
-            if self._gateway is not None:  # before the server stops, so that its requests in flight are answered
+            if self._gateway is not None:  # before the server, so that requests in flight get answers
                 self._gateway.stop()
             self._close_watch()
             status = self._server.stop()
         return status
 
     def _start(self) -> None:
-        """Start Triton with the versions that it served before, and watch it. Raises ServerStartError."""
+        """Start Triton with the versions served before, and watch it. Raises ServerStartError."""
         self._server.start_ready(self._served)
         if self._is_to_stop.is_set():
             return

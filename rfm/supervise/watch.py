@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Watch a running Triton: which models it serves, which are ready, and which fault it has.
+"""Watch a running Triton: its served models, their readiness, and its faults.
 
-| fault | seen by |
+| fault | found by |
 |---|---|
-| Triton answers nothing | no answer of ``/metrics`` |
+| Triton is silent | no answer of ``/metrics`` |
 | a model process is dead or stopped | ``ModelProcesses`` |
 | a model hangs outside of a batch, or its requests fail before they reach model.py | its ``probe`` |
 
-A process that hangs in a batch, or whose device is broken, ends itself (``rfm.triton_model.watchdog``).
+A process with a hung batch or a broken device ends itself (``rfm.triton_model.watchdog``).
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from rfm.supervise.probe import Probe, can_be_probed
 from rfm.supervise.status import NO_REASON, Status
 
 LOOK_S = 0.5
-LOOKS = 3  # least number of looks without an answer before a restart
+LOOKS = 3  # a restart needs at least so many looks without an answer
 
 _TIMEOUT_S = 1.5
 _INDEX_TIMEOUT_S = 5.0
-_PROGRESS = re.compile(  # counts that grow while a model makes progress
+_PROGRESS = re.compile(  # counts that grow with a model's progress
     r'^(?:nv_inference_request_success|rfm_forward_passes_total)\{[^}]*\bmodel="(?P<model>[^"]+)".*\} (?P<count>\S+)$',
     re.MULTILINE,
 )
@@ -51,9 +51,9 @@ logger = logging.getLogger(__name__)
 
 
 class ModelProcesses:
-    """Model processes of one Triton, one for each instance, from /proc.
+    """The model processes of a Triton, one for each instance, from /proc.
 
-    Triton notices a dead process only at its next request, and keeps it as a zombie until then.
+    Triton notices a dead process only at the next request to it, and keeps a zombie until then.
     """
 
     def __init__(self, triton_pid: int) -> None:
@@ -62,7 +62,7 @@ class ModelProcesses:
         self._suspects: set[int] = set()
 
     def fault(self, settled: Collection[str]) -> tuple[str, str] | None:
-        """A model of ``settled`` and the fault of its process: dead or stopped at this look and the last one."""
+        """Return a model of ``settled`` and the fault of its process: dead or stopped in this and the previous call."""
         states = self._states()
         suspects = {pid for pid, state in states.items() if state in _STATES and self._models[pid] in settled}
         confirmed = suspects & self._suspects
@@ -70,7 +70,7 @@ class ModelProcesses:
         return next(((self._models[pid], _STATES[states[pid]]) for pid in sorted(confirmed)), None)
 
     def _states(self) -> dict[int, str]:
-        """State of each model process. Notes which model each runs."""
+        """Return the state of each model process, and note its model."""
         states = {}
         for pid in children_of(self._triton_pid):
             stat = stat_of(pid)
@@ -88,12 +88,12 @@ class ModelProcesses:
 
 
 class TritonWatch:
-    """Looks at Triton every LOOK_S in a thread of its own, until it is closed.
+    """Looks at Triton every LOOK_S in its own thread, until ``close``.
 
     probe_s: seconds between the probes of a model
     hang_s: seconds without an answer after which a model counts as hung
     silent_s: seconds without an answer after which Triton counts as silent
-    served: configurations of the models that the server should serve; others are found
+    served: configurations of the models to serve; the watch adds those it finds
     """
 
     def __init__(
@@ -150,10 +150,10 @@ class TritonWatch:
             num_failed, answered_s = 0, time.monotonic()
             try:
                 self._note_progress(text)
-                with suppress(*NO_ANSWER):  # Triton's HTTP threads may wait for a load
+                with suppress(*NO_ANSWER):  # a load may block Triton's HTTP threads
                     self._keep_up()
                 self.fault = self._dead() or self._probed()
-            except Exception:  # the next look may succeed; without looks no fault is healed
+            except Exception:  # the next look may succeed; without looks, no fault leads to a restart
                 logger.exception("an unexpected error")
 
     def _note_progress(self, metrics: str) -> None:
@@ -211,7 +211,7 @@ class TritonWatch:
             self._probes.pop(model).close()
 
     def _reason(self, model: str, versions: Collection[ModelVersion]) -> str:
-        """Reason why the model is not ready; NO_REASON if it is."""
+        """Return the reason why the model is not ready, or NO_REASON."""
         if model not in self._ready:
             told = [entry.reason for entry in versions if entry.name == model and entry.reason]
             return next(iter(told), "it is not loaded")
@@ -223,10 +223,10 @@ class TritonWatch:
 
 
 def parts_of(config: Config) -> list[str]:
-    """Models of an ensemble; empty for other models."""
+    """Return the models of an ensemble; empty for other models."""
     return [step["model_name"] for step in config.get("ensemble_scheduling", {}).get("step", [])]
 
 
 def serving_just(config: Config, versions: Sequence[int]) -> Config:
-    """A model's configuration for these versions only."""
+    """Return a model's configuration for these versions only."""
     return {**config, "version_policy": {"specific": {"versions": list(versions)}}}

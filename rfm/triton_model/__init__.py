@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What runs inside Triton's model process.
+"""The code inside Triton's model process.
 
-``batch_model`` is the base of every model.py: each ``request`` is decoded and prepared, all are answered together, and
-each answer is encoded. A model whose frames take long to prepare has a ``pipeline``. ``placement`` says on which device
-and with how many threads. ``watchdog`` ends a process that hangs or is broken. ``metrics`` and the ``request_log`` say
-what happened. ``weights`` are checked before they are loaded.
+``batch_model`` is the base of every model.py. It decodes and prepares each ``request``, answers a batch together, and
+encodes each answer. A ``pipeline`` serves models whose frames take long to prepare. ``placement`` sets device and
+threads. ``watchdog`` ends a hung or broken process. ``metrics`` and ``request_log`` report outcomes. ``weights`` checks
+the weights before they are loaded.
 """

@@ -31,7 +31,7 @@ from rfm_client.contract.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, 
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import Tensors
 
-GIVEN_UP_S = 0.1  # after a longer batch, skip requests that were cancelled; Triton 2.51 hands them over all the same
+GIVEN_UP_S = 0.1  # after a longer batch, skip cancelled requests, which Triton 2.51 still hands over
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
@@ -95,13 +95,13 @@ class BatchModel(Generic[Question, Answer]):
         return False
 
     def decode(self, tensors: Tensors) -> list[Question]:
-        """Questions of one request. Raises InvalidSampleError."""
+        """Return the questions of a request. Raises InvalidSampleError."""
         raise NotImplementedError
 
     def prepare(self, question: Question) -> tuple[Any, int]:
-        """The input of ``answer`` for a question, and its number of tokens (see ``token_budget``). Must be fast.
+        """Return the input of ``answer`` for a question, and its number of tokens (see ``token_budget``). Must be fast.
 
-        Raises RewardError for a question that cannot be answered.
+        Raises RewardError for a question without an answer.
         """
         return question, 0
 
@@ -109,15 +109,15 @@ class BatchModel(Generic[Question, Answer]):
         """Do the slow part of a prepared question before its turn. Called in any thread, or never."""
 
     def answer(self, questions: Sequence[Any], execution: Execution) -> Sequence[Answer | RewardError]:
-        """One answer or error for each prepared question. ``execution`` records their cost."""
+        """Return an answer or an error for each prepared question. ``execution`` records their cost."""
         raise NotImplementedError
 
     def encode(self, answers: Sequence[Answer], tensors: Tensors, outputs: Collection[str]) -> Tensors:
-        """Output tensors of one request. tensors: its inputs; outputs: names of the outputs to return"""
+        """Return the output tensors of a request. tensors: its inputs; outputs: names of the requested outputs"""
         raise NotImplementedError
 
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
-        """Called by Triton with requests. Return their responses; None: the pipeline sends them later."""
+        """Take requests from Triton. Return their responses; None: the pipeline sends them later."""
         batch: list[Request[Question]] = [Request.of(inference) for inference in requests]
         pipeline = self._pipeline
         if pipeline is None:
@@ -238,7 +238,7 @@ class BatchModel(Generic[Question, Answer]):
 
 
 def _tell(tell: Callable[..., None], *what: Any) -> None:
-    """Call a function that logs or counts; print its errors, since requests must be answered all the same."""
+    """Call a function that logs or counts. Print its errors, since requests need their answers all the same."""
     try:
         tell(*what)
     except Exception:  # noqa: BLE001
@@ -246,24 +246,24 @@ def _tell(tell: Callable[..., None], *what: Any) -> None:
 
 
 def _first_error(answers: Sequence[Any]) -> RewardError | None:
-    """First error of a request, with the index of its question if there are several."""
+    """Return the first error of a request, with the index of its question if there are several."""
     errors = ((answer, index) for index, answer in enumerate(answers) if isinstance(answer, RewardError))
     return next((_located(*error, len(answers)) for error in errors), None)
 
 
 def _located(error: RewardError, index: int, count: int) -> RewardError:
-    """An error with the index of its question, if the request has several."""
+    """Return an error with the index of its question, if the request has several."""
     return error.inside(f"samples[{index}]") if isinstance(error, InvalidSampleError) and count > 1 else error
 
 
 def _sample_types(input_names: Sequence[str]) -> list[str]:
-    """Sample types that a model with these inputs scores."""
+    """Return the sample types that a model with these inputs scores."""
     of_samples = wire.SAMPLE_TYPE in input_names
     kinds = {name: not issubclass(kind, (EncoderSample, EncoderSampleRefs)) for kind, name in SAMPLE_TYPES.items()}
     return [name for name, is_sample in kinds.items() if is_sample == of_samples]
 
 
 def _checkpoint(settings: Mapping[str, str]) -> dict[str, str]:
-    """Labels of the served checkpoint: source, revision, digest, and the class of its network."""
+    """Return labels of the served checkpoint: source, revision, digest, and the class of its network."""
     origin = {name: settings.get(name, "") for name in (SOURCE_PARAMETER, REVISION_PARAMETER, DIGEST_PARAMETER)}
     return {**origin, "network": json.loads(settings.get(NETWORK_PARAMETER) or "{}").get("class", "")}

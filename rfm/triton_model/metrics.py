@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The ``rfm_*`` metrics of a model instance, on Triton's metrics endpoint.
 
-An update is a call to Triton's process, of some 20 us. So requests only add up, and a thread reports the sums every
-FLUSH_INTERVAL_S.
+An update is a call to Triton's process and takes some 20 us. Requests therefore only add to sums, and a thread reports
+the sums every FLUSH_INTERVAL_S.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FRAMES, RETRIES = "frames_total", "out_of_memory_retries_total"
 BATCH_SAMPLES, BATCH_PADDING = "batch_samples", "batch_padding_ratio"
 COLLATE_SECONDS, FORWARD_SECONDS = "collate_seconds", "forward_seconds"
 ENCODED, FOUND, MISSED = "frames_encoded_total", "feature_cache_hits_total", "feature_cache_misses_total"
-PASSES = "forward_passes_total"  # progress, by which ``rfm serve`` tells a long batch from a hang
+PASSES = "forward_passes_total"  # shows progress, by which ``rfm serve`` tells a long batch from a hang
 
 _TOTALS = {
     FRAMES: "Frames scored.",
@@ -45,7 +45,7 @@ _HISTOGRAMS = {
 
 
 class InstanceMetrics:
-    """Metrics of one instance. Must be closed. Errors of metrics are logged once and fail no request.
+    """Metrics of an instance. Must be closed. Their first error is logged; no error fails a request.
 
     labels: labels of the instance
     checkpoint: labels of rfm_checkpoint_info
@@ -104,14 +104,14 @@ class InstanceMetrics:
                 ]
 
     def close(self) -> None:
-        """Report the last sums, and that the checkpoint is no longer served."""
+        """Report the last sums, and the end of the checkpoint's service."""
         if self._thread is not None:
             self._closing.set()
             self._thread.join()
             self._flush(is_served=False)
 
     def _make_all(self, labels: dict[str, str], checkpoint: Mapping[str, str], sample_types: Collection[str]) -> None:
-        """Create the metrics in Triton's process. They outlive this process and continue after a reload."""
+        """Create the metrics in Triton's process, where they outlive this process and continue after a reload."""
         samples = self._family("samples_total", "COUNTER", "Samples, by the outcome of their request.")
         self._sample_metrics = {  # all at once, so that the first failure is an increase
             (sample_type, outcome): samples.Metric(labels={**labels, "sample_type": sample_type, "outcome": outcome})
@@ -165,7 +165,7 @@ class InstanceMetrics:
 
     def _show(self, *, is_served: bool) -> None:
         self._kept_metric.set(self._kept_bytes)
-        # Every time: after a reload the old instance sets 0 after the new instance has set 1.
+        # Set again each time: after a reload, the old instance sets 0 after the new instance has set 1.
         self._checkpoint_metric.set(float(is_served))
 
     def _log_once(self) -> None:

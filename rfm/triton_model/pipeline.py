@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A pipeline that prepares, scores and answers requests at the same time. Independent of Triton.
 
-For models whose samples take long to prepare: while the device scores, the next batch is prepared. Other models score
+For models whose samples take long to prepare: it prepares the next batch while the device scores. Other models score
 in ``execute``, which takes half of the CPU time for a request.
 """
 
@@ -23,10 +23,11 @@ from rfm.triton_model.watchdog import end
 class Pipeline:
     """Scores prepared requests in their order, as soon as they are ready. Must be closed.
 
-    prepare: does the slow part of one request, in one of the placement's threads; its errors are ignored
+    prepare: does the slow part of a request, in a preparing thread; its errors are ignored
     score: scores a batch, always in the same thread, since libgomp keeps a team of threads for each computing thread
     reply: sends the results of ``score``
-    max_samples, max_tokens: bounds of a batch; a larger request is a batch of its own
+    max_samples, max_tokens: limits of a batch; a larger request is its own batch
+
     An exception of ``score`` or ``reply`` ends the process.
     """
 
@@ -61,7 +62,7 @@ class Pipeline:
             return not (self._is_scoring or self._waiting)
 
     def put(self, requests: Iterable[Request[Any]]) -> None:
-        """Add requests. Returns when less than one batch waits."""
+        """Add requests. Return when less than a full batch waits."""
         with self._changed:
             self._waiting += [(request, self._preparing.submit(self._prepare, request)) for request in requests]
             self._changed.notify_all()
@@ -86,7 +87,7 @@ class Pipeline:
         self._preparing.shutdown()
 
     def _has_room(self) -> bool:
-        """True if less than a batch waits."""
+        """True if less than a full batch waits."""
         num_samples = sum(request.num_samples for request, _ in self._waiting)
         num_tokens = sum(request.num_tokens for request, _ in self._waiting)
         return not self._waiting or (num_samples < self._max_samples and num_tokens < self._max_tokens)
@@ -110,7 +111,7 @@ class Pipeline:
 
     def _next_batch(self) -> list[Request[Any]]:
         """Wait for the first request; return it with the next requests that are prepared and fit into its batch."""
-        self._waiting[0][1].exception()  # waits; an error of preparing comes again in its turn
+        self._waiting[0][1].exception()  # waits; ``score`` meets an error of preparing again
         with self._changed:
             batch = [self._waiting.popleft()[0]]
             num_samples, num_tokens = batch[0].num_samples, batch[0].num_tokens

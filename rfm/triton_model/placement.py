@@ -24,19 +24,19 @@ class Placement:
 
     @property
     def num_preparing(self) -> int:
-        """Threads that prepare samples beside the scoring: all of them on a GPU, else one."""
+        """Number of threads that prepare samples during scoring: all with a GPU, else 1."""
         return self.num_threads if self.device.type == "cuda" else 1
 
     @classmethod
     def of(cls, args: Mapping[str, str], config: Mapping[str, Any], settings: Mapping[str, str]) -> Placement:
-        """Placement of an instance, from the arguments of ``initialize``. Instances share the machine's cores."""
+        """Return an instance's placement, from the arguments of ``initialize``. Instances share the machine's cores."""
         on_gpu = args["model_instance_kind"] == "GPU"
         num_threads = int(settings[THREADS_PARAMETER]) or max(torch.get_num_threads() // num_instances(config), 1)
         device = torch.device("cuda", int(args["model_instance_device_id"])) if on_gpu else torch.device("cpu")
         return cls(device, num_threads)
 
     def apply(self) -> None:
-        """Apply the settings to the calling thread. Every thread that computes must call it."""
+        """Apply the settings to the calling thread. Every computing thread must call it."""
         use_threads(self.num_threads)
         keep_float32()
         use(self.device)
@@ -51,10 +51,10 @@ class Placement:
 
 def use_threads(number: int) -> None:
     """Set the number of PyTorch's threads for the calling thread."""
-    torch.get_num_threads()  # else the first use takes over the number of another thread
+    torch.get_num_threads()  # else the first use takes the number of another thread
     torch.set_num_threads(number)
 
 
 def num_instances(config: Mapping[str, Any]) -> int:
-    """Number of instances of a model on all its devices. config: the model's configuration from Triton"""
+    """Return the number of a model's instances on all devices. config: the model's configuration from Triton"""
     return sum(group["count"] * max(len(group.get("gpus", [])), 1) for group in config["instance_group"])

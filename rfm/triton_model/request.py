@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One request of Triton: its questions, and their answers or its error."""
+"""A request of Triton: its questions, and their answers or its error."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class Request(Generic[Question]):
 
     request_id: the client's id of the request; may be empty
     outputs: names of the requested outputs
-    is_cancelled: asks Triton whether the client cancelled, in 0.1 ms
+    is_cancelled: asks Triton if the client cancelled; takes 0.1 ms
     is_counted: False for warm-ups and probes, which metrics leave out
     sender: Triton's response sender; None: ``execute`` returns the response
     num_tokens: tokens of all samples; 0 before they are prepared
-    questions, prepared, answers: equally long, or still empty
-    error: reason why there is no answer; None: answered, or not yet scored
+    questions, prepared, answers: of equal length, or still empty
+    error: reason for a missing answer; None: answered, or not yet scored
     """
 
     request_id: str
@@ -69,7 +69,7 @@ class Request(Generic[Question]):
 
     @classmethod
     def of(cls, inference: Any) -> Request[Question]:
-        """The request of Triton's ``inference``. Its tensors are views of Triton's memory."""
+        """Return the request of Triton's ``inference``. Its tensors are views of Triton's memory."""
         request_id = inference.request_id()
         is_counted = not request_id.startswith(PROBE_PREFIX)
         request = cls(request_id, inference.requested_output_names(), inference.is_cancelled, is_counted)
@@ -81,7 +81,7 @@ class Request(Generic[Question]):
         return request
 
     def outlive(self, inference: Any) -> None:
-        """Copy the tensors and take a response sender, for an answer after ``execute`` returned."""
+        """Copy the tensors and take a response sender, so that an answer can follow after ``execute``."""
         self.sender = inference.get_response_sender()
         self.is_cancelled = self.sender.is_cancelled
         try:
@@ -90,18 +90,18 @@ class Request(Generic[Question]):
             self.fail(error)
 
     def fail(self, cause: Exception) -> None:
-        """Set a neutral error; the cause goes to the log."""
+        """Set an error without details; the cause goes to the log."""
         self.error = InferenceFailedError("scoring failed; the server's log has the reason")
         self.error.__cause__ = cause
 
     def response(self, outputs: wire.Tensors) -> Any:
-        """Triton's response with these tensors."""
+        """Return Triton's response with these tensors."""
         import triton_python_backend_utils as pb_utils
 
         return pb_utils.InferenceResponse([pb_utils.Tensor(name, array) for name, array in outputs.items()])
 
     def error_response(self) -> Any:
-        """Triton's response with the error."""
+        """Return Triton's response with the error."""
         import triton_python_backend_utils as pb_utils
 
         kinds = pb_utils.TritonError
@@ -123,12 +123,12 @@ class Request(Generic[Question]):
 
     @property
     def num_frames(self) -> int:
-        """Frames of all trajectories."""
+        """Number of frames of all trajectories."""
         return sum(trajectory.num_frames for question in self.questions for trajectory in question.trajectories)  # type: ignore[attr-defined]  # all questions have trajectories
 
     @property
     def outcome(self) -> str:
-        """Outcome of the request, one of OUTCOMES."""
+        """Outcome of the request, from OUTCOMES."""
         if self.error is None:
             return SCORED
         if isinstance(self.error, CancelledError):

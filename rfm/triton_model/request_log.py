@@ -14,21 +14,21 @@ from rfm.triton_model.request import FAILED, Request
 class RequestLog:
     """Writes entries with ``labels``, which name the model.
 
-    Failures are errors. Refused and cancelled requests need Triton's verbose log, so that no client can fill the log.
+    Failures are errors. Refused and cancelled requests go to Triton's verbose log, so that clients cannot fill the log.
     """
 
     def __init__(self, labels: Mapping[str, str]) -> None:
         self._labels = dict(labels)
 
     def report(self, request: Request[Any]) -> None:
-        """Log a request that has an error."""
+        """Log a request with an error."""
         assert request.error is not None
         sample_types = ",".join(sorted(request.sample_types))
         fields = {"request_id": request.request_id, "sample_type": sample_types, "error": str(request.error)}
         self._write(f"request_{request.outcome}", fields, request.error.__cause__, is_error=request.outcome == FAILED)
 
     def report_batch(self, batch: Sequence[Request[Any]], error: Exception) -> None:
-        """Log requests that failed together; each is scored alone afterwards."""
+        """Log requests that failed in a batch, before each is scored alone."""
         fields = {"request_ids": [request.request_id for request in batch], "error": repr(error)}
         self._write("batch_failed", fields, error, is_error=True)
 

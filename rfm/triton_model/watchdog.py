@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The watchdog of a model process: ends it when Triton ended, a batch hangs, or the device is broken.
+"""The watchdog of a model process: ends it if Triton has ended, a batch hangs, or the device is broken.
 
 ``rfm serve`` notices the end and restarts Triton.
 """
@@ -23,7 +23,7 @@ _STDERR = 2
 
 
 class Watchdog:
-    """Watches the process in a thread of its own, and ends it after a fault.
+    """Watches the process in its own thread, and ends it after a fault.
 
     hang_s: longest time of a batch without progress; a forward pass is progress
     is_working: returns True while there is a batch
@@ -47,7 +47,7 @@ class Watchdog:
     def look_at(self, batch: Iterable[Request[Any]], score_blank: Callable[[], None]) -> None:
         """End the process if FAILED_BATCHES batches in a row failed and the blank sample fails, too.
 
-        The blank sample decides, because inputs may cause failures. Callers of the last batch ask again.
+        The blank sample decides, because inputs may cause failures. Callers of the last batch must repeat their requests.
 
         score_blank: scores the blank sample; raises its errors
         """

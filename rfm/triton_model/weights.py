@@ -14,10 +14,10 @@ from rfm_client.contract.model_info import DIGEST_PARAMETER
 
 
 def check_digest(version: Path, expected: str) -> None:
-    """Raises CheckpointError if the weights in the folder ``version`` changed after the export.
+    """Raise CheckpointError if the weights in the folder ``version`` changed after the export.
 
-    expected: digest in the model's configuration; may be empty. The configuration in the version folder wins, since the
-    model's may be of a newer version
+    expected: digest in the model's configuration; may be empty. The configuration in the version folder takes
+        precedence, since the model's may belong to a newer version
     """
     kept = version / "config.pbtxt"
     if is_there(kept):
@@ -29,7 +29,7 @@ def check_digest(version: Path, expected: str) -> None:
 
 
 def _digest_in(file: Path) -> str:
-    """Digest of the weights in an exported configuration; may be empty."""
+    """Return the digest of the weights in an exported configuration; may be empty."""
     try:
         config = text_format.Parse(file.read_text(), pb.ModelConfig())
     except (OSError, ValueError, text_format.ParseError) as error:
