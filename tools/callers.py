@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Callers of ``make chaos``: they ask a server on and on, compare every answer, and count what became of each call."""
+"""Callers of ``make chaos``: send requests without end, check every answer, count the outcomes of all calls."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from rfm_client import (
 )
 from trajectories import random_trajectory
 
-TOLERANCE = 1e-5  # of numbers up to 1; of a larger one, which only similarity can be, this share of it
+TOLERANCE = 1e-5  # absolute up to 1; relative above, where only similarity can be
 PATIENCE_S = 60.0
-PAUSE_S = 0.1  # of a caller that was refused
+PAUSE_S = 0.1  # after a failed call
 WIDTHS = (64, 32)  # of the demo's checkpoint
 
 Numbers = np.ndarray[Any, np.dtype[np.float32]]
@@ -37,19 +37,19 @@ Ask = Callable[[Sample], Numbers]
 
 
 class RefusedError(Exception):
-    """The gateway told the caller at once that this call is not answered."""
+    """The gateway refused a call at once, with 503."""
 
 
 @dataclass(frozen=True)
 class Exam:
-    """Samples, and what the engine answers without a server."""
+    """Samples, and the engine's scores of them without a server."""
 
     samples: Sequence[Sample]
     expected: Sequence[Numbers]
 
     @classmethod
     def of(cls, checkpoint: Path, *, mixed: bool, count: int = 48) -> Exam:
-        """Of several lengths; mixed: of all types, else progress alone."""
+        """Return samples of 1 to 8 frames. mixed: True: samples of all types, else only progress samples"""
         samples: list[Sample] = []
         for index in range(count):
             first, second = (random_trajectory(2 * index + i, 1 + (5 * index + i) % 8, *WIDTHS) for i in (0, 1))
@@ -58,7 +58,7 @@ class Exam:
         return cls(samples, [numbers(outcome) for outcome in Engine.from_checkpoint(checkpoint).evaluate(samples)])
 
     def is_right(self, number: int, got: Numbers) -> bool:
-        """Whether an answer is the engine's; NaN never is."""
+        """True if an answer agrees with the engine's; an answer with NaN never does."""
         expected = self.expected[number]
         if got.shape != expected.shape:
             return False
@@ -66,7 +66,7 @@ class Exam:
 
 
 def numbers(result: object) -> Numbers:
-    """All scores of a result, one after the other."""
+    """Return all scores of a result as a float array [N]. Raises the result if it is a RewardError."""
     if isinstance(result, RewardError):
         raise result
     if isinstance(result, ProgressResult):
@@ -77,12 +77,12 @@ def numbers(result: object) -> Numbers:
 
 
 def direct(client: RewardClient) -> Ask:
-    """The client as it is by default."""
+    """Return a caller with the client's default settings."""
     return lambda sample: numbers(client.evaluate([sample])[0])
 
 
 def through_gateway(session: httpx.Client) -> Ask:
-    """A caller of the FastAPI server: progress samples as JSON. A 503 is a refusal."""
+    """Return a caller of the evaluation server's endpoint: progress samples as JSON. Raises RefusedError for a 503."""
 
     def ask(sample: Sample) -> Numbers:
         (asked,) = sample.trajectories
@@ -101,9 +101,10 @@ def through_gateway(session: httpx.Client) -> Ask:
 
 @dataclass
 class Callers:
-    """So many threads, each with one call at a time, within a context; and what became of their calls.
+    """A context with ``count`` threads that call, each with one call at a time, and the outcomes of their calls.
 
-    pause_s: between two calls of a caller. Latencies are of answered calls, in seconds.
+    pause_s: time between two calls of a thread
+    latencies_s: of answered calls only
     """
 
     ask: Ask
@@ -141,7 +142,7 @@ class Callers:
             began_s, got, error = time.perf_counter(), None, None
             try:
                 got = self.ask(self.exam.samples[number])
-            except Exception as raised:  # noqa: BLE001  whatever it is, it is counted
+            except Exception as raised:  # noqa: BLE001  every error is counted
                 error = raised
             with self._lock:
                 self.asked += 1
@@ -160,7 +161,7 @@ class Callers:
                 self._stop.wait(PAUSE_S)
 
     def wait_for_all(self) -> None:
-        """Returns when each has been answered twice more: the second answer is to a question asked from now on."""
+        """Wait until each thread has two more answers, the second to a request sent after now. Raises TimeoutError."""
         before, until_s = list(self._answered), time.monotonic() + PATIENCE_S
         while not all(now > then + 1 for now, then in zip(self._answered, before, strict=True)):
             if time.monotonic() > until_s:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""``make chaos``: cause faults while callers ask, compare every answer, and tell what became of each call.
+"""``make chaos``: cause faults under load, check every answer, and report the outcomes of all calls.
 
     chaos.py faults     processes killed, stopped and hung, a crash loop
     chaos.py rollout    two versions take turns on one server
-    chaos.py requests   malformed requests: schemathesis against the gateway, spoilt tensors against Triton
-    chaos.py soak       no fault: at half of what can be served, memory and latency stay the same
+    chaos.py requests   malformed requests: schemathesis against the gateway, spoilt messages against Triton
+    chaos.py soak       no fault: at half of the possible rate, memory and latency stay constant
 
-Without a word: all but soak. Everything is on loopback and this program's own. Status 1: a bound was broken.
+The default is all parts except soak. The program starts its own servers on loopback. Status 1: a bound was broken.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from rfm.config import ExportConfig
 from rfm_serve import MODEL
 
 ENCODERS = ROOT / "model_repository" / "rfm_encoder" / "1"
-MOST_MIB_PER_MIN = 1e6 / 2**20  # of a soak
-MOST_RISE = 0.25  # of its p99, where that is more than chance (two standard errors)
+MOST_MIB_PER_MIN = 1e6 / 2**20  # largest growth of memory in a soak
+MOST_RISE = 0.25  # of p99 in a soak, as a share of its median; two standard errors or less are chance
 
 
 def all_faults(folder: Path, arguments: argparse.Namespace) -> list[Row]:
@@ -50,7 +50,7 @@ def all_faults(folder: Path, arguments: argparse.Namespace) -> list[Row]:
 
 
 def take_turns(folder: Path, arguments: argparse.Namespace) -> list[Row]:
-    """Rollout and rollback in turn, callers over gRPC and HTTP, who retry nothing. Each answer names its version."""
+    """Alternate rollout and rollback under calls over gRPC and HTTP without retry. Each answer names its version."""
     other, samples = rollout.other_checkpoint(folder / "other"), rollout.questions()
     checkpoints = {"1": rollout.WITH_ENCODERS.checkpoint, "2": other}
     expected = {version: rollout.answers(checkpoint, samples) for version, checkpoint in checkpoints.items()}
@@ -92,7 +92,7 @@ def requests(folder: Path, arguments: argparse.Namespace) -> list[Row]:
 
 
 def soak(folder: Path, arguments: argparse.Namespace) -> list[Row]:
-    """Half of the rate that can be served, in 30 windows; the first fifth warms up."""
+    """Load a server at half of its rate for 30 windows. The first fifth of them warms up."""
     minutes, course = [], []
     with site(folder / "soak") as served:
         with served.callers(6) as alone:
@@ -120,7 +120,7 @@ def soak(folder: Path, arguments: argparse.Namespace) -> list[Row]:
 
 @contextmanager
 def tried(name: str, rows: list[Row]) -> Iterator[None]:
-    """Whatever breaks in it is a row, and the others are tried all the same."""
+    """Turn an exception into a row, so that the remaining parts still run."""
     try:
         yield
     except Exception as error:  # noqa: BLE001
@@ -132,7 +132,7 @@ PARTS = {"faults": all_faults, "rollout": take_turns, "requests": requests, "soa
 
 
 def main() -> int:
-    """1 if a bound was broken."""
+    """Run the chosen parts and print a table. Returns 1 if a bound was broken."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", default="all", choices=["all", *PARTS], metavar="PART")
     parser.add_argument("--minutes", type=float, default=None, help="of a soak (30), of rollouts (1)")

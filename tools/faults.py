@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Faults that a running ``rfm serve`` must survive while callers ask, and what ``make chaos`` tells of each."""
+"""Faults that ``rfm serve`` must survive under load, and the row of ``make chaos`` for each."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from rfm_serve import MODEL, RFM, Serving, children, serving, wait_for
 
 CHECKPOINT = ROOT / "model_repository" / "rfm" / "1" / "checkpoint"
 TRITON, OTHER = "triton", f"{MODEL}_b"
-HEALED_S = 10.0  # from a fault to readiness, beside what a start takes, and the time until the fault can be noticed
+HEALED_S = 10.0  # from a fault to readiness, without the time of a start and the time to detect the fault
 CALLERS = 16
 HANG_S = 10
-SILENT_S = 10.0  # as rfm serve has it by default
-LOOP_S = 120.0  # six starts of Triton and more, with back-off
+SILENT_S = 10.0  # the default of rfm serve
+LOOP_S = 120.0  # six or more starts of Triton, with back-off
 MODEL_FAULTS = """
 
 _answer = TritonPythonModel.answer
@@ -58,7 +58,13 @@ TritonPythonModel.answer = answer
 
 @dataclass
 class Row:
-    """What became of the calls under one fault; healed_s: from the fault to readiness; broken: bounds that were."""
+    """Outcomes of the calls under one fault.
+
+    healed_s: seconds from the fault to readiness
+    may_lose: number of calls that may fail
+    may_break_off: True: calls may be refused, or lose their connection
+    broken: messages about broken bounds
+    """
 
     name: str
     calls: Callers | None = None
@@ -76,7 +82,7 @@ class Row:
             self.expect(self.may_break_off or not untold, f"{untold} calls were refused or broken off")
 
     def expect(self, is_so: bool, otherwise: str) -> None:
-        """Notes a bound that was broken."""
+        """Note a broken bound, with the message ``otherwise``, unless ``is_so``."""
         if not is_so:
             self.broken.append(otherwise)
 
@@ -91,7 +97,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Site:
-    """``rfm serve`` with a gateway and two models; start_s: what it took to be ready."""
+    """``rfm serve`` with a gateway, and the expected scores. start_s: seconds from start to readiness"""
 
     served: Serving
     gateway_url: str
@@ -102,7 +108,7 @@ class Site:
 
     @contextmanager
     def callers(self, count: int = CALLERS, *, url: str = "", pause_s: float = 0.0) -> Iterator[Callers]:
-        """With the client as it is by default, about samples of all types."""
+        """Call with the client's default settings and samples of all types."""
         with (
             RewardClient(url or self.served.endpoints.grpc_url) as client,
             Callers(direct(client), self.mixed, count, pause_s) as callers,
@@ -111,7 +117,7 @@ class Site:
 
     @contextmanager
     def gateway_callers(self, count: int = CALLERS // 2, *, pause_s: float = 0.0) -> Iterator[Callers]:
-        """About progress, as JSON."""
+        """Call the gateway with progress samples in JSON."""
         with (
             httpx.Client(base_url=self.gateway_url, timeout=60) as session,
             Callers(through_gateway(session), self.progress, count, pause_s) as callers,
@@ -119,7 +125,7 @@ class Site:
             yield callers
 
     def trigger(self, fault: str, model: str = MODEL) -> Path:
-        """A file with which ``model`` begins to ``hang``, ``break`` or ``die``."""
+        """Create and return the file that makes ``model`` ``hang``, ``break`` or ``die``."""
         file = self.folder / f"{fault}.{model}"
         file.touch()
         return file
@@ -128,7 +134,7 @@ class Site:
         return self.served.metric("rfm_serve_restarts_total", what=what)
 
     def models(self, command: str, *words: str) -> None:
-        """``rfm models COMMAND``. Raises RuntimeError if it fails."""
+        """Run ``rfm models COMMAND``. Raises RuntimeError if it fails."""
         options = [f"--url={self.served.endpoints.grpc_url}", f"--admin-key-file={self.folder / 'key'}"]
         options += [] if command == "list" else [f"--repository={self.folder / 'model_repository'}"]
         line = [str(RFM), "models", command, *words, *options]
@@ -142,7 +148,7 @@ class Site:
         return psutil.Process(pid)
 
     def wait_healthy(self) -> float:
-        """Seconds until the gateway says that it is healthy."""
+        """Wait until the gateway is healthy; return the seconds that passed."""
 
         def is_healthy() -> bool:
             with suppress(httpx.TransportError):
@@ -154,7 +160,7 @@ class Site:
 
 @contextmanager
 def site(folder: Path, export: Callable[[Path], object] | None = None) -> Iterator[Site]:
-    """A server of a fault's own: six restarts in a row would be a crash loop."""
+    """Start a server for one fault. A server for all faults would reach six restarts in a row, a crash loop."""
     folder.mkdir()
     repository, key_file, config = folder / "model_repository", folder / "key", folder / "serve.yaml"
     (export or (lambda repository: export_faulty(repository, folder)))(repository)
@@ -171,7 +177,7 @@ def site(folder: Path, export: Callable[[Path], object] | None = None) -> Iterat
 
 
 def export_faulty(repository: Path, folder: Path) -> None:
-    """The demo's checkpoint twice, whose models have faults when they are told to."""
+    """Export the demo's checkpoint as two models, with faults that files in ``folder`` trigger."""
     for name in (MODEL, OTHER):
         settings = ExportConfig(name=name, num_gpus=0, torch_threads=1, instances=2 - (name == OTHER))
         rfm_export.export(CHECKPOINT, repository, settings)
@@ -182,9 +188,11 @@ def export_faulty(repository: Path, folder: Path) -> None:
 def healed(
     name: str, fault: Callable[[Site], object], what: str, noticed_s: float = 0.0, may_lose: int = 0
 ) -> Callable[[Site], list[Row]]:
-    """A fault because of which Triton is restarted once.
+    """Return a test of a fault that Triton must be restarted for exactly once.
 
-    what: is to blame; noticed_s: until it can be noticed; may_lose: so many calls, which are told that they failed
+    what: the process or model that the supervisor blames
+    noticed_s: seconds until the fault can be detected
+    may_lose: number of calls that may fail
     """
 
     def cause(site: Site) -> list[Row]:
@@ -204,7 +212,7 @@ def healed(
 
 
 def crash_loop(site: Site) -> list[Row]:
-    """One model of two ends Triton again and again: it is left out, and a person takes it in again."""
+    """End Triton repeatedly by one of two models, until the supervisor leaves the model out. Then load it again."""
     with site.callers() as callers:
         trigger = site.trigger("die", OTHER)
         took_s = wait_for(lambda: site.served.reasons().get(OTHER, "").startswith("it is left out"), LOOP_S)
@@ -219,7 +227,7 @@ def crash_loop(site: Site) -> list[Row]:
 
 
 def kill_gateway(site: Site) -> list[Row]:
-    """Its callers are told by a connection that breaks; others do not notice."""
+    """Kill the gateway. Its callers lose their connection; callers of Triton are not affected."""
     process = site.gateway
     with site.callers(CALLERS // 2) as beside, site.gateway_callers() as callers:
         process.kill()
@@ -244,7 +252,7 @@ FAULTS: tuple[Callable[[Site], list[Row]], ...] = (
     healed("kill -9 of Triton", signalled(TRITON, signal.SIGKILL), TRITON),
     healed("SIGSTOP of Triton", signalled(TRITON, signal.SIGSTOP), TRITON, noticed_s=SILENT_S),
     healed(f"a batch hangs (hang_s: {HANG_S})", lambda site: site.trigger("hang"), MODEL, noticed_s=1.1 * HANG_S),
-    # The callers of its first two batches are told that they failed.
+    # Three failed batches in a row end the model process; callers of the first two get errors.
     healed("a broken context (simulated)", lambda site: site.trigger("break"), MODEL, may_lose=2 * CALLERS),
     kill_gateway,
     crash_loop,

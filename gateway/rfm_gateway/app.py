@@ -70,7 +70,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
         AsyncRewardClient,
         config.triton_url,
         timeout_s=config.timeout_s,
-        retry=False,  # the caller gets the error at once, and decides whether to retry
+        retry=False,  # the caller gets the error at once, and may retry
         max_in_flight=config.max_in_flight,
         **credentials.options,
     )

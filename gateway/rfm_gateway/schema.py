@@ -113,7 +113,7 @@ class TrajectoryInput(BaseModel):
     text_embedding: Annotated[
         Any,
         BeforeValidator(_array),
-        _array_schema("[Dt], of the task; where it is missing the task is encoded, if an encoder is served", 1),
+        _array_schema("[Dt], the embedding of the task; if it is missing, a served encoder encodes the task", 1),
     ] = None
     embeddings_path: str | None = Field(
         None, description="Name of a .npy or .npz file of embeddings in the folder that the gateway may read."
@@ -161,7 +161,7 @@ SAMPLES: TypeAdapter[list[Sample]] = TypeAdapter(list[_ByType])
 
 
 class EvaluateBatchRequest(BaseModel):
-    """Samples. A bare list, a single sample, or an object whose only value is the list is read, too."""
+    """At least one sample. A bare list, a single sample, or an object whose only value is the list is also read."""
 
     samples: list[_ByType] = Field(min_length=1)
     use_frame_steps: bool = Field(
@@ -245,8 +245,8 @@ class GpuStatus(BaseModel):
     """Fields of the evaluation server, from Triton's metrics and statistics."""
 
     total_gpus: int = Field(description="Devices that models run on.")
-    available_gpus: int = Field(description="Devices without a waiting request.")
-    max_workers: int = Field(description="Model instances: batches that are computed at a time.")
+    available_gpus: int = Field(description="0 while requests wait for their turn, else as total_gpus.")
+    max_workers: int = Field(description="As total_gpus.")
     pool_size: int = Field(description="As total_gpus.")
     gpu_stats: dict[str, GpuStats] = Field(description='By number, from "0".')
 
@@ -255,7 +255,7 @@ class Health(BaseModel):
     """The state of a server whose models all answer a probe or are busy."""
 
     status: Literal["healthy"]
-    available_gpus: int | None = Field(description="Devices without a waiting request.")
+    available_gpus: int | None = Field(description="0 while requests wait for their turn, else as total_gpus.")
     total_gpus: int | None = Field(description="Devices that models run on; null: Triton's metrics cannot be read.")
 
 

@@ -180,7 +180,7 @@ class _Conversion:
 
     texts: embeddings of tasks
     files: the files that samples name
-    frame_steps: of progress samples
+    frame_steps: frames to which each prefix of a progress sample is sampled; 0: no dense mode
     """
 
     served: _Served
@@ -301,7 +301,7 @@ def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError
 def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: int) -> schema.EvaluateBatchAnswer:
     """Return the evaluation server's answer for these results.
 
-    group: number of frames that share a value, of which the answer has one value
+    group: number of frames that share a value; the answer has each value once
     """
     progress = [result for result in results if isinstance(result, ProgressResult)]
     preferences = [result.preference for result in results if isinstance(result, PreferenceResult)]
