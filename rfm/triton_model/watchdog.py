@@ -47,7 +47,8 @@ class Watchdog:
     def look_at(self, batch: Iterable[Request[Any]], score_blank: Callable[[], None]) -> None:
         """End the process if FAILED_BATCHES batches in a row failed and the blank sample fails, too.
 
-        The blank sample decides, because inputs may cause failures. Callers of the last batch must repeat their requests.
+        The blank sample decides, because inputs may cause failures. The last batch's callers must repeat their
+        requests.
 
         score_blank: scores the blank sample; raises its errors
         """
