@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The servers that are measured side by side, each with callers in a process of their own, and the bare engine."""
+"""The measured servers, each with a separate process of callers, and the bare engine."""
 
 from __future__ import annotations
 
@@ -50,7 +50,11 @@ DEFAULT_SIZE = RewindConfig(  # upstream's defaults
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint and its export. threads: of torch, in every server; widths: of its embeddings, 0: it takes frames"""
+    """A checkpoint and its export.
+
+    threads: threads of torch in every server
+    widths: widths of a frame embedding and a text embedding; 0: the checkpoint takes frames
+    """
 
     folder: Path
     repository: Path
@@ -59,7 +63,11 @@ class Checkpoint:
 
 
 def checkpoint(size: str, folder: Path) -> Checkpoint:
-    """``small``: the demo's, as it is served there; ``default``: random weights; ``vlm``: a tiny one on Qwen3-VL."""
+    """Export and return a checkpoint.
+
+    size: ``small``: the demo's checkpoint and settings; ``default``: upstream's default size, random weights;
+        ``vlm``: a tiny checkpoint on Qwen3-VL
+    """
     repository, threads = folder / f"repository_{size}", torch.get_num_threads()
     settings = ExportConfig(num_gpus=0, torch_threads=threads)
     if size == "small":
@@ -76,9 +84,11 @@ def checkpoint(size: str, folder: Path) -> Checkpoint:
 
 
 class Contestant:
-    """A server that runs, and its callers in a process of their own. A context manager.
+    """A context with a running server and a separate process of its callers.
 
-    server: gives its address; way: how it is asked
+    way: how callers reach the server, see load.py
+    server: context that yields the server's address
+    widths: widths of a frame embedding and a text embedding
     """
 
     def __init__(self, way: str, server: AbstractContextManager[str], widths: tuple[int, int]) -> None:
@@ -97,7 +107,7 @@ class Contestant:
         self._server.__exit__(None, None, None)
 
     def measure(self, load: Load) -> dict[str, float]:
-        """Rates, latencies, and microseconds of CPU a sample. Raises RuntimeError if the callers' process ends."""
+        """Return rates, latencies, and CPU microseconds a sample. Raises RuntimeError if the callers' process ends."""
         assert self._callers.stdin is not None and self._callers.stdout is not None
         before_s = _cpu_s(self._processes), _cpu_s([psutil.Process(self._callers.pid)])
         self._callers.stdin.write(json.dumps(asdict(load)) + "\n")
@@ -117,13 +127,13 @@ def _cpu_s(processes: Sequence[psutil.Process] | set[psutil.Process]) -> float:
 
 
 class BareEngine:
-    """``Engine.evaluate`` in this process, one batch after the other: what no server around it can beat."""
+    """``Engine.evaluate`` in this process, batch after batch: the upper bound for a server around it."""
 
     def __init__(self, measured: Checkpoint) -> None:
         self._engine, self._widths = Engine.from_checkpoint(measured.folder), measured.widths
 
     def measure(self, load: Load, batch_size: int) -> dict[str, float]:
-        """Of the load's samples; two batches warm up."""
+        """Return rates and latencies for the load's samples. Two batches warm up."""
         asked, latencies_s, started_s = samples(load, *self._widths), [], 0.0
         for number in range(1_000_000):
             if number == 2:
@@ -141,7 +151,7 @@ class BareEngine:
 
 @contextmanager
 def peer(name: str, options: Mapping[str, object], log: Path) -> Iterator[str]:
-    """Address of a peer with these options, from when it answers."""
+    """Start a peer with these options; yield its address as soon as it answers."""
     port = Endpoints.free().http_port
     words = [f"--{option}={value}" for option, value in {**options, "port": port}.items()]
     with running([sys.executable, str(HERE / "peers" / PEERS[name]), *words], port, log):
@@ -150,7 +160,7 @@ def peer(name: str, options: Mapping[str, object], log: Path) -> Iterator[str]:
 
 @contextmanager
 def running(command: Sequence[str], port: int, log: Path) -> Iterator[None]:
-    """A server, from when it answers."""
+    """Run a server, and yield as soon as it answers. Raises RuntimeError if it ends or does not answer in START_S."""
     with log.open("wb") as lines:
         process = subprocess.Popen(command, stdout=lines, stderr=lines)
         try:
@@ -169,7 +179,7 @@ def _answers(port: int) -> bool:
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=1):
             return True
-    except urllib.error.HTTPError:  # it does, if not this
+    except urllib.error.HTTPError:  # an error status is an answer, too
         return True
     except OSError:
         return False

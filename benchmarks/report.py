@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a benchmark writes: all rows as JSON, and medians of the rounds as a Markdown table."""
+"""Results of a benchmark: all rows as JSON, and medians over the rounds as a Markdown table."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Row = Mapping[str, Any]
 
 
 def machine() -> dict[str, object]:
-    """What the results are of."""
+    """Return the CPU, packages, commit and date of the results."""
     cpu = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")), "")
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False).stdout
     return {
@@ -47,10 +47,12 @@ def _version(package: str) -> str | None:
 def write(
     name: str, told: str, rows: Sequence[Row], by: Sequence[str], ratio: str = "", folder: Path = RESULTS
 ) -> None:
-    """NAME.json and NAME.md, which is shown, too.
+    """Write NAME.json and NAME.md, and print the latter.
 
-    rows: measurements, each with the number of its ``round``; by: the columns that name what was measured, the last of
-    them the way; ratio: a column, of which each way is compared with the first way of the same round
+    told: a title line, then lines of explanation
+    rows: measurements, each with the number of its ``round``
+    by: columns that identify a measurement; the last is the way
+    ratio: column whose values are divided by the first way's in the same round; empty: none
     """
     of = machine()
     folder.mkdir(parents=True, exist_ok=True)
@@ -64,7 +66,7 @@ def write(
 
 
 def table(rows: Sequence[Row], by: Sequence[str], ratio: str = "") -> list[str]:
-    """Lines of Markdown: medians of the rounds of each way, and of its ratios within a round."""
+    """Return lines of Markdown: for each way, medians over the rounds, also of its ratio within a round."""
     columns = [name for name in rows[0] if name not in (*by, "round")]
     head = [*by, *columns, *(["ratio"] if ratio else [])]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]

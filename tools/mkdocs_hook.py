@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A hook of MkDocs: links to files outside of ``docs/`` become their names, since the site does not have them."""
+"""A MkDocs hook that replaces links to files outside ``docs/`` by their names, since the site lacks those files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LINK = re.compile(r"\[([^\]]+)\]\(((?:\.\./)+[^)#\s]+)(?:#[^)\s]*)?\)")
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """The page's Markdown without links that lead out of ``docs/``."""
+    """Return the page's Markdown without links that lead out of ``docs/``."""
     depth = len(PurePosixPath(page.file.src_uri).parts) - 1
 
     def kept(link: re.Match[str]) -> str:

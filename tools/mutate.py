@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""``make mutate``: do the tests see small faults of the code that scores come from? By cosmic-ray.
+"""``make mutate``: test whether the tests catch small faults in the code that computes scores. Uses cosmic-ray.
 
-A random share of all mutants of each part is tried, in a clone of the last commit. It ends with status 1 if fewer than
-95 % are caught. Why some of the others cannot be caught: mutants_that_survive.yaml.
+Tries the same random share of each part's mutants, in a clone of the last commit. Ends with status 1 if the tests
+catch fewer than 95 %. mutants_that_survive.yaml explains known survivors.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from cosmic_ray.work_item import WorkerOutcome, WorkItem, WorkResult
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 CAUGHT = 0.95
-# Changed files, and the tests of which one must fail.
+# Mutated files, and their tests: at least one test must fail.
 PARTS = {
     "client/rfm_client/contract/wire/*.py": "contract/test_*.py families/test_properties.py",
     "rfm/engine/layers.py": "families/test_linear.py families/test_precision.py families/test_rewind.py",
@@ -44,11 +44,11 @@ name = "local"
 
 [cosmic-ray.filters.operators-filter]
 exclude-operators = ["core/ReplaceBinaryOperator_BitOr_.*", "core/RemoveDecorator", "core/ExceptionReplacer"]
-"""  # "|" stands in annotations
+"""  # "|" is in annotations
 
 
 def start(pattern: str, folder: Path) -> Path:
-    """A clone with a cosmic-ray session of all mutants of a part. Raises RuntimeError if there is no such file."""
+    """Return a clone with a cosmic-ray session of a part's mutants. Raises RuntimeError if no file matches."""
     subprocess.run(["git", "clone", "--quiet", "--shared", ROOT, folder], check=True)
     modules = [str(file.relative_to(folder)) for file in sorted(folder.glob(pattern)) if file.name != "__init__.py"]
     if not modules:
@@ -62,7 +62,7 @@ def start(pattern: str, folder: Path) -> Path:
 
 
 def run(folder: Path, program: str, *words: str) -> str:
-    """What a program of cosmic-ray prints. Tests import the clone."""
+    """Run a program of cosmic-ray, and return its output. Tests import the packages of the clone."""
     imported = [folder / name for name in (".", "client", "gateway", "export", "commands")]
     own = {"PYTHONPATH": os.pathsep.join(map(str, imported)), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
     words = (str(BIN / program), *words)
@@ -72,7 +72,7 @@ def run(folder: Path, program: str, *words: str) -> str:
 
 
 def sample(folder: Path, database: WorkDB, share: float, seed: int) -> None:
-    """Leaves out all but a share of the mutants, and those of assertions and of what is raised."""
+    """Skip all but a random share of the mutants, and every mutant of an assert or raise statement."""
     pending: list[WorkItem] = list(database.pending_work_items)
     sources = {
         path: (folder / path).read_text().splitlines() for path in {one.mutations[0].module_path for one in pending}
@@ -90,7 +90,7 @@ def sample(folder: Path, database: WorkDB, share: float, seed: int) -> None:
 
 
 def main() -> int:
-    """Prints what survives; 1 if that is too much."""
+    """Print surviving mutants. Returns 1 if too many survive."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=200, help="mutants to try")
     parser.add_argument("--seed", type=int, default=0, help="which ones")

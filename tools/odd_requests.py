@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``make chaos``: requests as they should not be. The servers live, and their callers are served."""
+"""Malformed requests of ``make chaos``. The servers must survive, and answer other callers."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ DATATYPES = {"uint8": "UINT8", "int32": "INT32", "float32": "FP32", "object": "B
 
 
 def against_gateway(url: str, examples: int, seed: int) -> bool:
-    """Requests that schemathesis makes of the OpenAPI document; False if one was blamed on the server or came late."""
+    """Send requests that schemathesis derives from the OpenAPI document. Returns False for a 5xx or a late answer."""
     options = ["--phases=coverage,fuzzing", f"--max-examples={examples}", f"--seed={seed}", "--no-color"]
     options += ["--checks=not_a_server_error", f"--request-timeout={DEADLINE_S:g}", "--continue-on-failure"]
     return subprocess.run([SCHEMATHESIS, "run", f"{url}/openapi.json", *options]).returncode == 0
 
 
 def messages(widths: tuple[int, int]) -> list[bytes]:
-    """Whole requests over gRPC: embeddings, a pair of them, and frames."""
+    """Return valid gRPC requests: progress of embeddings, a preference, and progress of frames."""
     frames = np.random.default_rng(0).integers(0, 256, (2, 24, 24, 3), np.uint8)
     first, second = random_trajectory(0, 4, *widths), random_trajectory(1, 5, *widths)
     filmed = Trajectory(frames=frames, task="stack the cups")
@@ -47,7 +47,7 @@ def messages(widths: tuple[int, int]) -> list[bytes]:
 
 
 def spoilt(message: bytes, choose: random.Random) -> bytes:
-    """The bytes with a few of them changed, added or missing."""
+    """Return the message with some bytes changed, added or removed."""
     changed = bytearray(message)
     for _ in range(choose.choice((1, 2, 8))):
         at, length = choose.randrange(len(changed)), choose.choice((0, 1, 8, 64))
@@ -56,7 +56,7 @@ def spoilt(message: bytes, choose: random.Random) -> bytes:
 
 
 def against_triton(url: str, widths: tuple[int, int], count: int, seed: int) -> Counter[str]:
-    """Codes of the answers to so many spoilt messages. (Tensors that are whole but odd: tests/families.)"""
+    """Send ``count`` spoilt messages; return how often each status came. tests/families has valid but odd tensors."""
     choose, codes, whole = random.Random(seed), Counter[str](), messages(widths)
     with grpc.insecure_channel(url.removeprefix("grpc://")) as channel:
         call = channel.unary_unary("/inference.GRPCInferenceService/ModelInfer")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``make parity``: every reference case through a real Triton, and how far its scores are from the original's."""
+"""``make parity``: score every reference case with Triton, and compare the scores with upstream's."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rfm_client import RewardClient
 
 
 def main() -> int:
-    """Prints the table; 1 if a case is outside its tolerance."""
+    """Print the differences. Returns 1 if a case is outside its tolerance."""
     table = Table(title="largest difference from the original", title_justify="left")
     for column in ("case", "raw scores", "probabilities", "allowed"):
         table.add_column(column)

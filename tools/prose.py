@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``make prose``: counts that tell whether the code and the documents can be read once. It fails nothing."""
+"""``make prose``: count words that make code and documents hard to read. Informs only; never fails."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ WORDS = {"what": r"what", "one": r"ones?", "that": r"that", "nobody, somebody": 
 
 
 def tracked(*patterns: str) -> list[Path]:
-    """The files of git that match."""
+    """Return tracked files that match."""
     names = subprocess.run(["git", "ls-files", "--", *patterns], cwd=ROOT, check=True, capture_output=True, text=True)
     return [ROOT / name for name in names.stdout.splitlines()]
 
 
 def prose(file: Path) -> Iterator[str]:
-    """The docstrings and comments of a Python file."""
+    """Yield the docstrings and comments of a Python file."""
     source = file.read_text()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
@@ -35,7 +35,7 @@ def prose(file: Path) -> Iterator[str]:
 
 
 def frequencies(texts: Iterator[str]) -> str:
-    """How many words, and how often the counted ones stand in a thousand."""
+    """Return the number of words, and the frequency of each counted word in a thousand."""
     words = re.findall(r"[A-Za-z']+", "\n".join(texts).lower())
     shares = (
         f"{name} {1000 * sum(re.fullmatch(pattern, word) is not None for word in words) / max(1, len(words)):.1f}"
@@ -45,7 +45,7 @@ def frequencies(texts: Iterator[str]) -> str:
 
 
 def main() -> None:
-    """Prints the counts."""
+    """Print the counts of code and documents."""
     code = [file for file in tracked("*.py") if file.relative_to(ROOT).parts[0] in PRODUCT]
     for package in PRODUCT:
         files = [file for file in code if file.relative_to(ROOT).parts[0] == package]
