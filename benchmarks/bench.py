@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""This server beside what one would take instead: same weights, same samples, one run.
+"""Compare this server with alternatives: same weights, same samples, one run.
 
     bench.py servers          the bare engine, the FastAPI server's design, LitServe and mosec; --full: all loads
-    bench.py accelerator      does an accelerator ever wait? each server before one whose forward passes only sleep
+    bench.py accelerator      how busy each server keeps a simulated accelerator, whose forward passes only sleep
     bench.py commits --server before=OTHER_VENV/bin/python --server after=.venv/bin/python
-                              this server at other commits, each served by the environment in which it is installed
+                              this server at several commits, each from the environment where it is installed
 
-Rounds are interleaved: in each, every contestant is measured once, so that a machine that drifts hits all alike; ratios
-within a round are what is compared. Callers run on the same cores.
+Each round measures every contestant once, so that drift of the machine affects all alike. Ratios are within a round.
+Callers run on the same cores as the servers.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from engines import SIMULATION, Ledger
 UNIFORM, MIXED, AS_LONG_AS_MIXED = (16, 16), (1, 16), (8, 9)
 OURS = ("gRPC", "HTTP", SHARED_MEMORY, "gateway")
 ONE, MANY = Load(1, 0, UNIFORM), Load(32, 0, UNIFORM)
-SCENARIOS = {  # name: load, ways of this server, whether the peers are measured
+SCENARIOS = {  # name: load, ways to reach this server, True: also the peers
     "1 caller": (ONE, ("gRPC",), True),
     "32 callers": (MANY, ("gRPC", "gateway"), True),
     "32 callers, 8 or 9 frames": (replace(MANY, frames=AS_LONG_AS_MIXED), ("gRPC",), False),
@@ -70,7 +70,7 @@ with temporary_server(Path(folder) / "repository", Path(folder) / "log") as endp
     print(endpoints.grpc_url, flush=True)
     sys.stdin.readline()
 """
-BATCH_S, ROW_S, VLM_ROW_S = 4e-3, 0.5e-3, 30e-3  # of the simulated accelerator's forward passes
+BATCH_S, ROW_S, VLM_ROW_S = 4e-3, 0.5e-3, 30e-3  # sleep for a batch, a sample, a sample of frames
 SIMULATED = """
 
 import sys
@@ -93,7 +93,7 @@ TritonPythonModel.load = load
 
 
 def servers(arguments: argparse.Namespace, folder: Path) -> None:
-    """This server's ways, the bare engine and the peers, for both sizes of a checkpoint."""
+    """Measure all ways to reach this server, the bare engine and the peers, for each size of a checkpoint."""
     rows: list[Row] = []
     for size in arguments.sizes:
         measured = checkpoint(size, folder)
@@ -116,7 +116,7 @@ def servers(arguments: argparse.Namespace, folder: Path) -> None:
                 asked = [way for way in made if way in ways or (with_peers and way in PEERS)]
                 batches = (
                     () if load.frame_px else (1,) if load.callers == 1 else (1, 8, 32)
-                )  # it takes embeddings alone
+                )  # it measures embeddings alone
                 alone = replace(load, rate_per_s=0, seconds=arguments.seconds)
                 for number in range(arguments.rounds):
                     of_bare = {f"bare engine, batch {batch}": bare.measure(alone, batch) for batch in batches}
@@ -129,7 +129,7 @@ def servers(arguments: argparse.Namespace, folder: Path) -> None:
 
 
 def commits(arguments: argparse.Namespace, folder: Path) -> None:
-    """This server at several commits, and mosec."""
+    """Measure this server at several commits, and mosec for embeddings."""
     rows: list[Row] = []
     for size in arguments.sizes:
         measured = checkpoint(size, folder)
@@ -154,7 +154,11 @@ def commits(arguments: argparse.Namespace, folder: Path) -> None:
 
 
 def accelerator(arguments: argparse.Namespace, folder: Path) -> None:
-    """Embeddings to all servers, frames to a vision-language checkpoint; preparing frames is as real as ever."""
+    """Measure servers with a simulated accelerator.
+
+    All servers get embeddings. This server also gets frames, for a vision-language checkpoint, and prepares them for
+    real.
+    """
     source = DEMO / "rfm" / "1" / "checkpoint"
     config = ExportConfig(num_gpus=0, torch_threads=1)
     of_vlm = replace(config, base_model=str(VLM_BASE))
@@ -198,7 +202,7 @@ def accelerator(arguments: argparse.Namespace, folder: Path) -> None:
 
 
 def _rows(of: Row, number: int, measured: Mapping[str, Row]) -> list[Row]:
-    """A row a way, shown as it comes."""
+    """Return a row for each way, and print the rates."""
     rows = [{**of, "way": way, "round": number, **figures} for way, figures in measured.items()]
     rates = ", ".join(f"{row['way']} {row['samples_per_s']:.0f}" for row in rows)
     print(f"{', '.join(map(str, of.values()))}, round {number + 1}: {rates} samples/s", flush=True)
@@ -206,7 +210,7 @@ def _rows(of: Row, number: int, measured: Mapping[str, Row]) -> list[Row]:
 
 
 def _path(way: str) -> str:
-    """Triton takes none with spaces."""
+    """Return a folder name without spaces, which Triton does not accept."""
     return way.replace(" ", "_")
 
 
@@ -218,7 +222,7 @@ def _ours(place: Path) -> Iterator[str]:
 
 @contextmanager
 def _commit(words: list[str]) -> Iterator[str]:
-    # Not here, from where Python would import this commit's packages.
+    # In another folder: from this folder, Python would import this commit's packages.
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=gettempdir())
     assert process.stdout is not None
     try:
@@ -230,7 +234,7 @@ def _commit(words: list[str]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Measures, writes and shows."""
+    """Run the chosen benchmark, then write and print its results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     programs = {each.__name__: each for each in (servers, accelerator, commits)}
     parser.add_argument("what", choices=programs, nargs="?", default="servers")

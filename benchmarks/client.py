@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""What a client costs, and what a served checkpoint answers. But for ``episodes``, the server runs already.
+"""Measure the cost of a client, and the rate of a served checkpoint. All parts but ``episodes`` need a running server.
 
     client.py cost        CPU of the client's process a call: asyncio tasks or threads, gRPC or HTTP
-    client.py episodes    a step of an RL loop: whole windows, episodes, episodes that resize; starts its own servers
-    client.py throughput  samples/s of frames, 1, 8 and 32 samples asked together; how busy a GPU is
+    client.py episodes    a step of an RL loop: whole windows, episodes, resized episodes; starts its own servers
+    client.py throughput  samples/s of frames, with 1, 8 and 32 samples a call; GPU utilisation
 
-Rounds are interleaved: in each, every way is measured once, so that a machine that drifts hits all alike.
+Each round measures every way once, so that drift of the machine affects all alike.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TASK = "put the red block on the plate"
 
 
 def cost(arguments: argparse.Namespace) -> None:
-    """Calls about one sample of 16 frames with embeddings, each way in a process of its own that stays connected."""
+    """Calls with one sample, the embeddings of 16 frames. Each way has its own process, which stays connected."""
     rows = []
     with RewardClient(arguments.grpc) as client:
         info = client.model_info()
@@ -43,7 +43,7 @@ def cost(arguments: argparse.Namespace) -> None:
             for style, way in (("asyncio", protocol), ("threads", THREADS)):
                 contestant = Contestant(way, nullcontext(url), (info.video_dim or 1, info.text_dim or 1))
                 ways[f"{protocol}, {style}"] = stack.enter_context(contestant)
-        for number in range(arguments.rounds + 1):  # the first one warms up
+        for number in range(arguments.rounds + 1):  # round 0 warms up
             for callers in (1, 32):
                 for way, contestant in ways.items():
                     told = contestant.measure(Load(callers, arguments.seconds, (16, 16)))
@@ -54,15 +54,15 @@ def cost(arguments: argparse.Namespace) -> None:
 
 
 def episodes(arguments: argparse.Namespace) -> None:
-    """Random pixels of vectorised environments, the demo's checkpoint. sent_kb: on the loopback, in both directions."""
+    """Measure environment steps with random pixels and the demo's checkpoint. sent_kb: loopback, both directions."""
     rows, kept = [], []
     random = np.random.default_rng(0)
     with TemporaryDirectory(prefix="rfm-bench-") as name, ExitStack() as stack:
         ways = {}
         for way in ("windows", "episodes", "episodes, resized"):
-            cache = {"feature_cache_mib": 0} if way == "windows" else {}  # as before there were episodes
+            cache = {"feature_cache_mib": 0} if way == "windows" else {}  # windows alone, as before episodes existed
             settings = ExportConfig(num_gpus=0, **DEMO_ENCODERS, **cache)
-            repository = Path(name) / way.replace(", ", "_")  # Triton takes no path with spaces
+            repository = Path(name) / way.replace(", ", "_")  # Triton accepts no path with spaces
             export(DEMO / "rfm" / "1" / "checkpoint", repository, settings)
             ends = stack.enter_context(temporary_server(repository, repository.with_suffix(".log")))
             client = stack.enter_context(RewardClient(ends.grpc_url))
@@ -81,16 +81,16 @@ def episodes(arguments: argparse.Namespace) -> None:
                 else:
                     growing.add(frames)
                 took_ms, sent = (time.perf_counter() - began_s) * 1e3, _loopback_bytes() - before
-                if number >= arguments.frames:  # whose windows are full
+                if number >= arguments.frames:  # from here on, windows are full
                     rows.append({"way": way, "round": number, "ms": took_ms, "sent_kb": sent / 1e3})
-        time.sleep(1)  # in which a model tells Triton what it has counted
+        time.sleep(1)  # until models have reported their counts to Triton
         told = {way: (_encoded(url) - encoded[way]) / arguments.rounds for way, (*_, url) in ways.items()}
     about = f"A step of {arguments.envs} environments\nWindows of {arguments.frames}. Encoded a step: {told}."
     report.write("episodes", f"{about} Ratio: of ms.", rows, ("way",), "ms", arguments.output)
 
 
 def throughput(arguments: argparse.Namespace) -> None:
-    """One caller. gpu_busy: after the last call, as the server tells it."""
+    """One caller. gpu_busy: GPU utilisation after the last call, from Triton's metrics."""
     rows = []
     with Contestant("gRPC", nullcontext(arguments.grpc), (0, 0)) as caller:
         for number in range(arguments.rounds):
@@ -118,7 +118,7 @@ def _metric(url: str, name: str) -> list[float]:
 
 
 def main() -> None:
-    """Measures, writes and shows."""
+    """Run the chosen benchmark, then write and print its results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     programs = {each.__name__: each for each in (cost, episodes, throughput)}
     parser.add_argument("what", choices=programs)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""The engine without a server.
+"""Measure the engine without a server.
 
-    engine.py forward      its forward beside the original's; options; dense mode; more frames; wider networks
-    engine.py preparation  CPU time to prepare frames for a vision-language checkpoint, beside transformers' processor
-    engine.py loading      memory of the host to load a vision-language checkpoint of 0.6B parameters (takes 9 GB)
+    engine.py forward      forward passes, ours and upstream's; options; dense mode; more frames; wider networks
+    engine.py preparation  CPU time to prepare frames for a vision-language checkpoint, ours and transformers'
+    engine.py loading      host memory to load a vision-language checkpoint of 0.6B parameters (takes 9 GB)
     engine.py checkpoint FOLDER --base-model DIR_OR_ID
                            writes a Qwen3-VL reward checkpoint of 4B parameters with random weights
 
-Weights are random. What is compared is measured in turn, round after round.
+Weights are random. Each round measures all ways in turn.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ Row = dict[str, Any]
 
 @torch.inference_mode()
 def forward(arguments: argparse.Namespace) -> None:
-    """Of the default ReWiND, but for what a row varies. difference: of progress, the largest from the first way's."""
+    """The default ReWiND as varied by each row. difference: largest deviation of progress from the first way."""
     ours, original = RewindTransformer(DEFAULT_SIZE).eval(), UpstreamRewind(DEFAULT_SIZE).eval()
     original.load_state_dict(ours.state_dict())
     halved = RewindTransformer(DEFAULT_SIZE).eval()
@@ -82,8 +82,8 @@ def forward(arguments: argparse.Namespace) -> None:
     if shutil.which("c++"):
         from torch._inductor import config as inductor
 
-        inductor.freezing = True  # it packs weights only then
-        torch.backends.mha.set_fastpath_enabled(False)  # a compiler sees one opaque operation in it
+        inductor.freezing = True  # weights are packed only when frozen
+        torch.backends.mha.set_fastpath_enabled(False)  # the compiler cannot optimise this opaque operation
         compiled = torch.compile(original, dynamic=False)
     rows: list[Row] = []
     for batch_size in (1, 2, 4, 8, 16, 32, 64):
@@ -123,7 +123,7 @@ def _last(results: list[Any]) -> torch.Tensor:
 
 
 def _timed(of: Row, ways: Mapping[str, Callable[[], torch.Tensor]], rounds: int) -> list[Row]:
-    """Milliseconds of each way in each round, after two that warm up, and how far its scores are from the first's."""
+    """Return milliseconds for each way and round, after two warm-up calls, and the deviation from the first way."""
     scores = {way: call().float() for way, call in ways.items()}
     first = next(iter(scores.values()))
     rows = []
@@ -153,9 +153,9 @@ def _trajectory(config: RewindConfig, num_frames: int, seed: int = 0) -> Traject
 
 
 def preparation(arguments: argparse.Namespace) -> None:
-    """CPU milliseconds of all threads for 8 new frames: checked, named by digests, brought to size, laid out.
+    """CPU milliseconds of all threads to prepare 8 new frames: check, digest, resize and lay out.
 
-    A task that was asked before, as in an RL loop, and a new one. The processor also normalises and cuts into patches.
+    The task is known, as in an RL loop, or new. The processor also normalises frames and cuts them into patches.
     """
     from transformers import AutoImageProcessor
 
@@ -187,7 +187,7 @@ def preparation(arguments: argparse.Namespace) -> None:
 
 
 def loading(arguments: argparse.Namespace) -> None:
-    """Peak (VmHWM) of a process that loads it, less that of one that loads a tiny one. share: of the weights' size."""
+    """Peak memory (VmHWM) to load the checkpoint, minus that of a tiny checkpoint. share: of the weights' size."""
     if arguments.one:
         print(_peak_bytes(arguments.one, arguments.folder))
         return
@@ -204,7 +204,10 @@ def loading(arguments: argparse.Namespace) -> None:
 
 
 def _peak_bytes(what: str, checkpoint: Path) -> int:
-    """The most memory that this process has had at a time, after what it is to do."""
+    """Export or load the checkpoint; return this process's peak memory.
+
+    what: ``export``, or the dtype to load
+    """
     if what == "export":
         import rfm_export
 
@@ -214,18 +217,22 @@ def _peak_bytes(what: str, checkpoint: Path) -> int:
     else:
         loaded = families.load(checkpoint, base_model=str(VLM_BASE))
         for weights in Engine.of(loaded, dtype=getattr(torch, what)).predictor.network.parameters():
-            weights.sum()  # reads it from the file, as copying it to a GPU does
+            weights.sum()  # reads the weights from the file, as a copy to a GPU does
     (peak_kib,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     return int(peak_kib) * 1024
 
 
 def checkpoint(arguments: argparse.Namespace) -> None:
-    """Writes one of 4B parameters."""
+    """Write a checkpoint of 4B parameters."""
     write_checkpoint(arguments.folder, arguments.base_model)
 
 
 def write_checkpoint(folder: Path, base_model: str, layers: int = ALL_LAYERS) -> None:
-    """Writes model.safetensors, config.json and config.yaml. base_model: folder or id whose tokenizer is used"""
+    """Write model.safetensors, config.json and config.yaml.
+
+    base_model: folder or Hub id of the model with the tokenizer
+    layers: number of layers of the language model
+    """
     from safetensors.torch import save_file
     from transformers import AutoTokenizer, Qwen3VLConfig, Qwen3VLModel
 
@@ -253,7 +260,7 @@ def write_checkpoint(folder: Path, base_model: str, layers: int = ALL_LAYERS) ->
 
 
 def main() -> None:
-    """Measures, writes and shows."""
+    """Run the chosen benchmark, then write and print its results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     programs = {each.__name__: each for each in (forward, preparation, loading, checkpoint)}
     parser.add_argument("what", choices=programs)
@@ -261,7 +268,7 @@ def main() -> None:
     parser.add_argument("--base-model", help="checkpoint: folder or id whose tokenizer is used")
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
-    parser.add_argument("--one", help=argparse.SUPPRESS)  # of loading: prints the peak
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # loading starts itself with this option, to print one peak
     arguments = parser.parse_args()
     if arguments.what == "checkpoint" and None in (arguments.folder, arguments.base_model):
         parser.error("checkpoint: expected FOLDER and --base-model")

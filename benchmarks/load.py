@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Callers of one server, in a process of their own: reads a Load a line from standard input, answers a line of JSON.
+"""Callers of one server, as a program. Reads a Load as a line of JSON from standard input, writes a line of JSON.
 
-Closed loop: each caller asks about one sample at a time and waits for the answer. Open loop: samples are asked about at
-random moments (Poisson), however long the answers take, so that a slow answer does not hide those that wait behind it;
-a latency counts from the moment that a sample should have been sent. The callers stand for as many clients, so our
-client does not join their calls.
+Closed loop: each caller makes a call and waits for the answer. Open loop: calls begin at random times (Poisson), even
+while earlier answers are late, so that a slow answer does not hide the calls behind it. A latency counts from the time
+when the call was due. Each caller stands for a separate client, so calls are not joined.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ from rfm_client import (
 
 NUM_SAMPLES = 256
 NUM_FILMED = 16
-IN_FLIGHT = 4096  # more than any load has under way, so that no client holds samples back
-KEEP_ALIVE_S = 3.0  # the peers close a connection that is idle for 5 seconds, perhaps just when it is used again
+IN_FLIGHT = 4096  # more than any load needs, so that no client holds calls back
+KEEP_ALIVE_S = 3.0  # peers close a connection after 5 idle seconds, perhaps just as a call reuses it
 MS_PER_S = 1e3
 PEERS = {
     "FastAPI": clients.fastapi_npy,
@@ -47,16 +46,20 @@ PEERS = {
     "LitServe": lambda session, url: clients.by_msgpack(session, f"{url}/predict"),
     "mosec": lambda session, url: clients.by_msgpack(session, f"{url}/inference"),
 }
-SHARED_MEMORY, THREADS = "shared memory", "threads"  # ways; of threads each has one call at a time
+SHARED_MEMORY, THREADS = "shared memory", "threads"  # ways; "threads": the blocking client in each thread
 
 
 @dataclass(frozen=True)
 class Load:
-    """What is asked, and how.
+    """A load on a server. Either ``callers`` or ``rate_per_s`` is 0.
 
-    callers: at a time, in the closed loop; rate_per_s: samples a second of the open loop; one of them is 0
-    frames: fewest and most of a trajectory; mixed: all three sample types in turn, else progress alone
-    together: samples of one call; frame_px: height and width of raw frames, 0: embeddings
+    callers: concurrent callers of the closed loop
+    seconds: duration
+    frames: least and greatest number of frames of a sample
+    mixed: True: all three sample types in turn; False: only progress
+    rate_per_s: calls a second of the open loop
+    together: samples of a call
+    frame_px: height and width of raw frames; 0: embeddings
     """
 
     callers: int
@@ -70,7 +73,13 @@ class Load:
 
 @dataclass(frozen=True)
 class Measured:
-    """samples_per_s: answered; failed: samples that were not; latencies of calls, in milliseconds; took_s: all of it"""
+    """Rate and latencies of calls under a load.
+
+    samples_per_s: scored samples a second
+    failed: number of samples without scores
+    p50_ms, p99_ms: latencies of answered calls
+    took_s: duration, up to the last answer
+    """
 
     samples_per_s: float
     failed: int
@@ -80,7 +89,7 @@ class Measured:
 
 
 def samples(load: Load, video_dim: int, text_dim: int) -> list[Sample]:
-    """The same for every server. Pairs are as long together as single trajectories."""
+    """Return the samples of a load, equal for every server. A pair has as many frames as a single trajectory."""
     random = np.random.default_rng(0)
 
     def trajectory(num_frames: int) -> Trajectory:
@@ -106,7 +115,7 @@ def samples(load: Load, video_dim: int, text_dim: int) -> list[Sample]:
 
 @asynccontextmanager
 async def connected(way: str, url: str) -> AsyncIterator[Ask]:
-    """A function that asks about samples together."""
+    """Yield a function that scores samples in one call."""
     if way in PEERS:
         async with aiohttp.ClientSession(
             connector=aiohttp.TCPConnector(limit=0, keepalive_timeout=KEEP_ALIVE_S)
@@ -137,7 +146,7 @@ def _score(result: Result) -> float:
 
 
 async def measure(ask: Ask, load: Load, asked: Sequence[Sample], *, threads: bool = False) -> Measured:
-    """Asks for ``load.seconds``; each caller in a task, or in a thread of its own."""
+    """Apply a load to a server, with each caller in its own task or thread, and measure it."""
     latencies_s: list[float] = []
     failed = 0
     started_s = time.perf_counter()
@@ -148,7 +157,7 @@ async def measure(ask: Ask, load: Load, asked: Sequence[Sample], *, threads: boo
         try:
             await ask([asked[(index * load.together + i) % len(asked)] for i in range(load.together)])
             latencies_s.append(time.perf_counter() - due_s)
-        except Exception:  # noqa: BLE001  whatever it was, the samples have no scores, and are counted
+        except Exception:  # noqa: BLE001  every error counts as failed samples
             failed += load.together
 
     async def call(index: int) -> None:
@@ -175,12 +184,12 @@ async def measure(ask: Ask, load: Load, asked: Sequence[Sample], *, threads: boo
 
 
 async def main(way: str, url: str, video_dim: int, text_dim: int) -> None:
-    """Answers loads until standard input ends."""
+    """Apply the loads from standard input until it ends."""
     async with connected(way, url) as ask:
         while line := await asyncio.to_thread(sys.stdin.readline):
             load = Load(**json.loads(line))
             asked = samples(load, video_dim, text_dim)
-            for sample in asked[:3]:  # connections are made, and each type has been answered once
+            for sample in asked[:3]:  # opens connections, and warms up each sample type
                 await ask([sample])
             print(json.dumps(asdict(await measure(ask, load, asked, threads=way == THREADS))), flush=True)
 
