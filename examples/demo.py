@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A first look: what the served demo checkpoint says about clips of the toy world that it was not trained on.
+"""Score toy-world clips, unseen in training, with the served demo checkpoint.
 
 python examples/demo.py                              # serves model_repository meanwhile
 python examples/demo.py --url grpc://localhost:8001  # asks a running server
@@ -28,7 +28,7 @@ REPOSITORY = Path(__file__).parents[1] / "model_repository"
 
 
 class Clips(NamedTuple):
-    """Clips of a task, each in a scene of its own. wrong_sentence: a success at another task under this one's name."""
+    """Clips of a task, each in its own scene. wrong_sentence: a success at another task, with this task's sentence."""
 
     success: Clip
     failure: Clip
@@ -38,7 +38,7 @@ class Clips(NamedTuple):
 
     @classmethod
     def of(cls, seed: int) -> Clips:
-        """The same clips for the same seed."""
+        """Return the clips of a seed."""
         return cls(
             make_clip("success", TASK, seed),
             make_clip("dropped", TASK, seed + 1),
@@ -54,7 +54,7 @@ def demo(
     seed: Annotated[int, typer.Option(help="Of the clips.")] = 2_000_000,
     output: Annotated[Path, typer.Option(help="Folder for picture, clips and log.")] = Path("demo_output"),
 ) -> None:
-    """Progress, success, preference and similarity of toy-world clips: a table and a picture. The clips are kept."""
+    """Show progress, success, preference and similarity of toy-world clips in a table and a picture. Keep the clips."""
     output.mkdir(parents=True, exist_ok=True)
     console = Console()
     trajectories = [filmed(clip, output / f"{name}.mp4") for name, clip in Clips.of(seed)._asdict().items()]
@@ -68,13 +68,13 @@ def demo(
 
 
 def filmed(clip: Clip, file: Path) -> Trajectory:
-    """The clip as it is read back from its video, so that ``rfm-client score`` and the page give the same numbers."""
+    """Write a clip as a video and read it back, so that ``rfm-client score`` and the page give the same scores."""
     write_video(file, clip.frames)
     return load_trajectory(file, task=clip.task.sentence())
 
 
 def show_clips(url: str, trajectories: Sequence[Trajectory], picture: Path, console: Console) -> None:
-    """Asks about the clips, in the order of ``Clips``, in one call; prints a table and draws a picture."""
+    """Score the clips, in the order of ``Clips``, with one call. Print a table and draw a picture."""
     success, failure, rewound, wrong, second = trajectories
     samples: dict[str, Sample] = {
         "a success": ProgressSample(success),

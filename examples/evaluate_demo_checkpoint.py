@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How good the demo's checkpoint is, on clips of the toy world that it was not trained on, as it is served.
+"""Measure the served demo checkpoint on toy-world clips unseen in training.
 
 python examples/evaluate_demo_checkpoint.py --repository model_repository   # serves it meanwhile
 python examples/evaluate_demo_checkpoint.py --url grpc://localhost:8001     # asks a running server
@@ -33,7 +33,7 @@ def evaluate(
     seed: Annotated[int, typer.Option(help="Seed of the first clip.")] = 1_000_000,
     output: Annotated[Path, typer.Option(help="Where the figures go, as JSON.")] = Path("demo_output/evaluation.json"),
 ) -> None:
-    """Prints a table of figures with their bounds, and writes them."""
+    """Print a table of figures with their bounds, and write the figures. Status 1: a bound is missed."""
     given = [source for source in (repository, url, checkpoint) if source is not None]
     if len(given) != 1:
         raise typer.BadParameter(f"expected one of --repository, --url, --checkpoint, got {len(given)}")
@@ -89,7 +89,7 @@ def _evaluator(
 
 
 def _in_process(folder: Path) -> Evaluate:
-    """The engine of what training wrote."""
+    """Return the evaluation function of an engine on the files of training."""
     from rfm import families
     from rfm.engine import Engine
     from rfm.rewind.encoders import Encoders

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Trains the demo's checkpoint on the toy world: a small ReWiND with its encoders, end to end, on the CPU.
+"""Train the demo's checkpoint on the toy world: a small ReWiND with its encoders, end to end, on the CPU.
 
     python examples/train_demo_checkpoint.py FOLDER
 
-First the image encoder learns to tell the state of the world and of each task, through a head that is then thrown
-away. Then text encoder and transformer learn progress, success, preference and similarity on its embeddings, with
-videos rewound as in ReWiND (https://arxiv.org/abs/2505.10911). At last all parts learn together.
+First the image encoder learns to predict the state of the world and of each task, through a temporary head. Then text
+encoder and transformer learn progress, success, preference and similarity on its embeddings, with videos rewound as in
+ReWiND (https://arxiv.org/abs/2505.10911). Finally all parts learn together.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ PEAK_LEARNING_RATE = 1.5e-3
 WARMUP_STEPS = 100
 WEIGHT_DECAY = 0.01
 MAX_GRADIENT_NORM = 1.0
-JOINT_ENCODER_SHARE = 0.2  # of the learning rate, for an image encoder that knows its business already
+JOINT_ENCODER_SHARE = 0.2  # of the learning rate, for the pretrained image encoder in the joint steps
 LOG_EVERY = 50
 SAVE_EVERY = 250
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How many steps the image encoder learns alone, is frozen, and learns with all others."""
+    """Numbers of steps in which the image encoder learns alone, is frozen, and learns with the other parts."""
 
     encoder: int
     frozen: int
@@ -51,17 +51,20 @@ class Plan:
 
     @property
     def total(self) -> int:
-        """Of all."""
+        """Number of all steps."""
         return self.encoder + self.frozen + self.joint
 
     def rate(self, step: int) -> float:
-        """Share of the peak learning rate: up and down along a cosine, once for the encoder, once for all else."""
+        """Return a step's share of the peak learning rate: warm-up and cosine decay, for each of two stages.
+
+        The first stage is the encoder's, the second is all other steps.
+        """
         begin, end = (0, self.encoder) if step < self.encoder else (self.encoder, self.total)
         down = 0.5 * (1 + math.cos(math.pi * (step - begin) / max(end - begin, 1)))
         return min(1.0, (step - begin + 1) / WARMUP_STEPS) * (0.02 + 0.98 * down)
 
     def encoder_rate(self, step: int) -> float:
-        """The image encoder's."""
+        """Return the image encoder's share of the peak learning rate."""
         return self.rate(step) * (1.0 if step < self.encoder else JOINT_ENCODER_SHARE)
 
 
@@ -74,7 +77,7 @@ def train(
     groups: Annotated[int, typer.Option(help="Groups of four clips in a step.")] = GROUPS_PER_STEP,
     threads: Annotated[int, typer.Option(help="torch threads; one more process renders.")] = 1,
 ) -> None:
-    """Trains, and writes the checkpoint, its encoders and training.json (losses) into FOLDER."""
+    """Train, and write the checkpoint, its encoders and training.json (losses) into FOLDER."""
     if folder.exists():
         raise typer.BadParameter(f"expected a folder that does not exist, got {folder}")
     torch.set_num_threads(threads)
@@ -99,7 +102,7 @@ def train(
 
 
 def _run(learner: Learner, loader: DataLoader[Groups], plan: Plan, folder: Path) -> list[dict[str, float]]:
-    """One pass over the data; gives the mean losses of every LOG_EVERY steps."""
+    """Train for all steps. Return the mean losses of every LOG_EVERY steps and at the end of each stage."""
     random = np.random.default_rng(torch.initial_seed())
     optimizer, schedule = _optimizer(learner, plan)
     recent: list[dict[str, float]] = []
@@ -123,7 +126,7 @@ def _run(learner: Learner, loader: DataLoader[Groups], plan: Plan, folder: Path)
                 text = " ".join(f"{name} {value:.4g}" for name, value in log[-1].items())
                 bar.update(shown, description=text)
                 bar.console.print(text, highlight=False, soft_wrap=True)
-            if step % SAVE_EVERY == 0 and plan.encoder < step < plan.total:  # what a run that is cut short leaves
+            if step % SAVE_EVERY == 0 and plan.encoder < step < plan.total:  # kept if the run is cut short
                 write_checkpoint(learner, folder / f"step_{step}")
     return log
 

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""A policy learns from pixels, in the toy world, with no other reward than the served demo checkpoint's.
+"""Train a policy from pixels in the toy world. Its only reward comes from the served demo checkpoint.
 
     python examples/train_policy.py
     python examples/train_policy.py --live http://localhost:8100    # a gateway's page shows its episodes
 
-The policy sees the first picture of a scene, and chooses where the gripper closes and where it opens: where the columns
-of the picture look most like two colours, which it has to find out. The cross-entropy method (CEM) tries colours, keeps
-those of the policies that were paid most, and goes on around them. Each step is paid the progress of the episode so
-far, as the served model sees it. The truth of the world is used only to print how often a policy succeeds.
+The policy sees the first frame of a scene. It has two colours as parameters. The gripper closes at the columns most
+like the first colour, and opens at the columns most like the second. The cross-entropy method (CEM) tries colours,
+keeps the policies with the highest rewards, and samples around them. The reward of a step is the served model's
+progress of the episode so far. The true state of the world serves only to print success rates.
 """
 
 from __future__ import annotations
@@ -28,17 +28,20 @@ from toy_world import Task, forward, pick_and_place, random_scene, render, resti
 TASK = Task("red", "plate")
 REPOSITORY = Path(__file__).parents[1] / "model_repository"
 FRAMES, ELITES, LEAST_SPREAD = 16, 0.15, 8.0  # colours are 0..255
-TABLE_ROWS = slice(46, 62)  # of a picture, in which blocks, bowl and plate stand
+TABLE_ROWS = slice(46, 62)  # rows of a frame with blocks, bowl and plate
 
 Rewards = Callable[[np.ndarray, range], tuple[np.ndarray, np.ndarray]]
-Policies = np.ndarray  # float64 [P, 2, 3]: RGB of what is grasped, and of where it is let go
+Policies = np.ndarray  # float64 [P, 2, 3]: RGB of the object to grasp and of the place of release
 
 
 def places(policies: Policies, picture: np.ndarray) -> np.ndarray:
-    """float64 [P, 2]: the columns, as shares of the picture's width, that look most like each policy's colours."""
+    """Return float64 [P, 2]: the columns most like each policy's colours, as shares of the width W.
+
+    policies: float64 [P, 2, 3]; picture: uint8 [H, W, 3]
+    """
     columns = picture[TABLE_ROWS].astype(float)  # [rows, W, 3]
     away = np.abs(columns[None, None] - policies[:, :, None, None]).sum(axis=-1)  # [P, 2, rows, W]
-    looks = np.sort(away, axis=2)[:, :, :4].mean(axis=2)  # of the most alike rows
+    looks = np.sort(away, axis=2)[:, :, :4].mean(axis=2)  # distance of the four nearest rows
     smooth = np.apply_along_axis(np.convolve, 2, -looks, np.ones(7) / 7, "same")[:, :, 4:-4]
     return (smooth.argmax(axis=2) + 4.5) / picture.shape[1]
 
@@ -46,7 +49,7 @@ def places(policies: Policies, picture: np.ndarray) -> np.ndarray:
 def rewards(
     client: RewardClient, live: LiveView | None, policies: Policies, seeds: range
 ) -> tuple[np.ndarray, np.ndarray]:
-    """float64 [P] each: the progress that a step is paid, on average, and the share of episodes that succeed."""
+    """Return each policy's mean reward of a step and share of successful episodes, float64 [P] each."""
     videos, successes = [], []
     for seed in seeds:
         scene = random_scene(TASK, np.random.default_rng(seed))
@@ -62,12 +65,12 @@ def rewards(
 
 
 def any_policies(count: int, random: np.random.Generator) -> Policies:
-    """Policies that know nothing: any colours."""
+    """Return untrained policies, float64 [count, 2, 3], with random colours."""
     return random.uniform(0, 255, (count, 2, 3))
 
 
 def train(paid: Rewards, rounds: int, population: int, scenes: int, seed: int) -> np.ndarray:
-    """The policy, float64 [2, 3], that CEM ends with."""
+    """Return CEM's final policy, float64 [2, 3]."""
     random = np.random.default_rng(seed)
     policies = any_policies(population, random)
     for number in range(rounds):
@@ -88,7 +91,7 @@ def main(
     log: Annotated[Path, typer.Option(help="File for Triton's log.")] = Path("tritonserver.log"),
     live: Annotated[str | None, typer.Option(help="URL of a gateway, whose page shows the episodes.")] = None,
 ) -> None:
-    """Prints success rates before and after training."""
+    """Print success rates before and after training."""
     with (
         stopped_by_signals(),
         temporary_server(REPOSITORY, log) as endpoints,

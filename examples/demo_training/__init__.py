@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""How the demo's checkpoint is trained: its data, its networks, its losses."""
+"""Training of the demo's checkpoint: data, networks, losses."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Training data: groups of clips that belong together, rendered as they are needed.
+"""Training data: groups of related clips, rendered on demand.
 
-G groups, 4 clips a group (the constants below), T frames a clip, 6 tasks, S numbers of hint.
+G groups, 4 clips a group (the constants below), T frames a clip, H x W pixels, 6 tasks, S values of hints.
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ from toy_world.scene import random_scene
 from toy_world.tasks import COLOURS, TARGETS, TASKS, Task
 
 CLIP_FRAMES = 12
-SCATTERED_FRAMES = 3  # of a clip, where the encoder learns alone: few of each, so that it sees many scenes
+SCATTERED_FRAMES = 3  # of a clip while the encoder learns alone: few, so that it sees many scenes
 SUCCESS, SECOND_SUCCESS, FAILURE, OTHER_TASK = range(4)  # the clips of a group
 HINT_DIM = 3 + 4 * len(COLOURS) + len(TARGETS) + 2 * len(TASKS)
 _SAME_SCENE_SHARE = 0.5
 
 
 class Groups(NamedTuple):
-    """frames: uint8 [G, 4, T, H, W, 3]
-    task, other_task: int64 [G], what SUCCESS and OTHER_TASK show
-    progress: float32 [G, 4, T, 6], success: float32 [G, 4, T, 6], the truth under each task
-    hints: float32 [G, 4, T, S], what an image tells: where everything is (NaN for a block that is not there), and how
-        far each task has come
+    """Clips of G groups, with their true scores.
+
+    frames: uint8 [G, 4, T, H, W, 3]
+    task, other_task: int64 [G], tasks of the clips SUCCESS and OTHER_TASK
+    progress, success: float32 [G, 4, T, 6], true scores under each task
+    hints: float32 [G, 4, T, S], state in a frame: positions (NaN for a missing block), then progress and success of
+        each task
     """
 
     frames: Tensor
@@ -47,9 +49,9 @@ class Groups(NamedTuple):
 
 @dataclass(frozen=True)
 class GroupsDataset(Dataset[Groups]):
-    """``num_steps`` times ``groups_per_step`` groups; the same for the same seed, in whatever process.
+    """``num_steps`` batches of ``groups_per_step`` groups. A seed gives the same groups in any process.
 
-    In the first ``scattered_steps`` the same number of frames comes from more groups, SCATTERED_FRAMES of each clip.
+    In the first ``scattered_steps``, the same number of frames comes from more groups, SCATTERED_FRAMES of each clip.
     """
 
     seed: int
@@ -102,12 +104,12 @@ def _scattered(episode: Episode, random: np.random.Generator) -> Episode:
 
 
 def _under_tasks(clip: Episode, truth: Callable[[Episode, Task], np.ndarray]) -> np.ndarray:
-    """float32 [T, 6]."""
+    """Return true scores under each task, float32 [T, 6]."""
     return np.stack([truth(clip, task) for task in TASKS], axis=1).astype(np.float32)
 
 
 def _state(clip: Episode) -> np.ndarray:
-    """float32 [T, 17]: gripper, blocks, what is held, which blocks there are, targets."""
+    """Return float32 [T, 17]: gripper, blocks, held block, present blocks, targets."""
     held = clip.held[:, None] == np.arange(len(COLOURS))
     there = ~np.isnan(clip.blocks[:, :, 0])
     targets = np.broadcast_to(clip.scene.targets, (len(clip), len(TARGETS)))

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Questions about a batch of groups, and how wrong the answers are.
+"""Questions about a batch of groups, and the losses of their answers.
 
-Every clip is embedded once; rows reuse the embeddings: played forwards, rewound, or stopped, under any task.
-R rows, T frames of a row, K progress bins.
+Each clip is embedded once. Rows reuse the embeddings: played forwards, rewound or stopped, under any task.
+G groups, R rows, T frames of a row or a clip, H x W pixels, K progress bins, Dv width of a frame embedding, Dt width of
+a text embedding, S values of hints.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from demo_training.networks import Learner
 from rfm.rewind.network import RewindBatch
 from toy_world.tasks import TASKS, VERBS
 
-LENGTHS = (4, 17)  # frames of a row: from, below
+LENGTHS = (4, 17)  # range of frames of a row, without the upper bound
 _LONG_ROWS_SHARE, _LONGEST = 0.2, 33
-_PLACE_WEIGHT, _TASK_WEIGHT = 3.0, 8.0  # of the hints on where everything is, and on how far the tasks have come
+_PLACE_WEIGHT, _TASK_WEIGHT = 3.0, 8.0  # of the hints on the state of the world, and on progress and success
 _SUCCESS_POSITIVE_WEIGHT = 2.0
 
-# Rows: (clip, how it is played, under which task). "any": of all six, drawn at random.
+# Rows: (clip, playback, task). "any": a random task of all six.
 _SINGLES = (
     (SUCCESS, "forward", "own"),
     (SUCCESS, "forward", "other"),
@@ -39,10 +40,10 @@ _SINGLES = (
     (OTHER_TASK, "forward", "other"),
     (OTHER_TASK, "forward", "any"),
 )
-NOISE, OTHER_NOISE, RANDOM, OTHER_RANDOM = range(4, 8)  # clips without a world: frames of noise, random embeddings
-_NOISE_FRAMES = 6  # of a clip of noise, which shows them in turn
+NOISE, OTHER_NOISE, RANDOM, OTHER_RANDOM = range(4, 8)  # clips without a scene: frames of noise, random embeddings
+_NOISE_FRAMES = 6  # of a noise clip, repeated to CLIP_FRAMES
 
-# (one, how, another, how): the first is better.
+# (first clip, playback, second clip, playback): the first is better.
 _PREFERENCES = (
     (SUCCESS, "forward", FAILURE, "forward"),
     (SECOND_SUCCESS, "forward", FAILURE, "forward"),
@@ -52,13 +53,13 @@ _PREFERENCES = (
     (SECOND_SUCCESS, "forward", SUCCESS, "stopped"),
     (SUCCESS, "forward", NOISE, "forward"),
 )
-# Neither is better, in either order. The last pair goes under a random text, too.
+# Neither is better, in either order. The last pair has random text embeddings, too.
 _UNDECIDED = (
     (SUCCESS, "forward", SECOND_SUCCESS, "forward"),
     (NOISE, "forward", OTHER_NOISE, "forward"),
     (RANDOM, "forward", OTHER_RANDOM, "forward"),
 )
-# (reference, other, whether they do the same)
+# (reference, other, 1 for the same task done)
 _SIMILARITIES = (
     (SUCCESS, SECOND_SUCCESS, 1.0),
     (SECOND_SUCCESS, SUCCESS, 1.0),
@@ -69,7 +70,7 @@ _SIMILARITIES = (
 
 
 class _Video(NamedTuple):
-    """One trajectory of R rows: embeddings [R, T, Dv], progress and success [R, T]."""
+    """A trajectory of each of R rows: embeddings float32 [R, T, Dv], progress and success float32 [R, T]."""
 
     embeddings: Tensor
     progress: Tensor
@@ -78,7 +79,11 @@ class _Video(NamedTuple):
 
 @dataclass(frozen=True)
 class Questions:
-    """Draws rows about groups whose clips are embedded: float32 [G, 8, T, Dv]; texts: float32 [6, Dt]."""
+    """Draws questions about groups.
+
+    embeddings: float32 [G, 8, T, Dv], of the groups' 4 clips and 4 clips without a scene
+    texts: float32 [6, Dt], of the tasks
+    """
 
     groups: Groups
     embeddings: Tensor
@@ -86,7 +91,7 @@ class Questions:
     random: np.random.Generator
 
     def losses(self, learner: Learner) -> dict[str, Tensor]:
-        """The mean loss of each kind of answer."""
+        """Return the mean loss of each kind of answer."""
         losses = self._single_losses(learner)
         for name, loss in self._pair_losses(learner).items():
             losses[name] = losses.get(name, torch.zeros(())) + loss
@@ -149,7 +154,7 @@ class Questions:
         return losses | {"preference": answers[~is_similarity].mean(), "similarity": answers[is_similarity].mean()}
 
     def _video(self, clip: int, how: str, task: Tensor, length: int) -> _Video:
-        """One trajectory of each group."""
+        """Return a trajectory of each group. how: ``forward``, ``stopped`` or ``rewound``"""
         moments = torch.from_numpy(np.stack([_moments(how, length, self.random) for _ in range(len(task))]))
         groups = torch.arange(len(task))[:, None]
         truths = (truth[groups, clip, moments, task[:, None]] for truth in (self.groups.progress, self.groups.success))
@@ -170,7 +175,10 @@ class Questions:
 
 
 def noise_clips(num_groups: int, size_px: tuple[int, int], random: np.random.Generator) -> Tensor:
-    """uint8 [G, 2, T, H, W, 3], clips of noise, finer or coarser, of more or less contrast."""
+    """Return clips of noise of random grain, contrast and brightness, uint8 [G, 2, 6, H, W, 3].
+
+    size_px: H and W
+    """
     height, width = size_px
     clips = np.empty((num_groups, 2, _NOISE_FRAMES, height, width, 3), np.uint8)
     for clip in clips.reshape(-1, *clips.shape[2:]):
@@ -183,9 +191,10 @@ def noise_clips(num_groups: int, size_px: tuple[int, int], random: np.random.Gen
 
 
 def with_noise(groups: Groups, embeddings: Tensor, noise: Tensor) -> tuple[Groups, Tensor]:
-    """Groups and embeddings, float32 [G, 8, T, Dv], with the clips that show nothing: no progress, no success.
+    """Add clips without a scene, which have no progress and no success, to groups and embeddings.
 
-    noise: float32 [G, 2, S, Dv], embeddings of ``noise_clips``
+    embeddings: float32 [G, 4, T, Dv]; in the result [G, 8, T, Dv]
+    noise: float32 [G, 2, 6, Dv], embeddings of ``noise_clips``
     """
     shown = noise.repeat(1, 1, CLIP_FRAMES // _NOISE_FRAMES, 1)
     embeddings = torch.cat([embeddings, shown, torch.randn_like(shown)], dim=1)
@@ -195,7 +204,7 @@ def with_noise(groups: Groups, embeddings: Tensor, noise: Tensor) -> tuple[Group
 
 
 def hint_loss(learner: Learner, embeddings: Tensor, hints: Tensor) -> Tensor:
-    """How badly the hints can be read from the embeddings: [..., Dv], [..., S]."""
+    """Return the loss, float32 [], of hints, float32 [..., S], read from embeddings, float32 [..., Dv]."""
     read = learner.hint_head(embeddings)
     errors = (read - torch.where(hints.isnan(), read.detach(), hints)).square()
     num_tasks = 2 * len(TASKS)
@@ -203,7 +212,7 @@ def hint_loss(learner: Learner, embeddings: Tensor, hints: Tensor) -> Tensor:
 
 
 def drawn_verb(random: np.random.Generator) -> str:
-    """One of VERBS."""
+    """Return a random verb of VERBS."""
     return str(random.choice(VERBS))
 
 
@@ -217,13 +226,13 @@ def _frame_losses(progress_logits: Tensor, success_logits: Tensor, video: _Video
 
 
 def _two_hot(progress: Tensor, bins: int) -> Tensor:
-    """[R, T] -> [R, T, K]: the two bins beside a progress, weighted so that their mean is the progress."""
+    """Map progress [R, T] to bin weights [R, T, K]: the two nearest bins, with the progress as their mean."""
     position = progress * (bins - 1)
     return F.relu(1 - (position[..., None] - torch.arange(bins)).abs())
 
 
 def _moments(how: str, length: int, random: np.random.Generator) -> np.ndarray:
-    """int64 [length], frames of a clip of CLIP_FRAMES in the order in which a row shows them, from the first on."""
+    """Return int64 [length]: a row's frames, as indices into a clip of CLIP_FRAMES."""
     last = CLIP_FRAMES - 1
     if how == "stopped":
         last = int(random.integers(1, CLIP_FRAMES - 4))

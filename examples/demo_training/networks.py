@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The demo checkpoint's networks: those that are served, small, and a head that only training has."""
+"""The demo checkpoint's networks: small served networks, and a head for training alone.
+
+H x W pixels, Dv width of a frame embedding, Dt width of a text embedding.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ TEXT_DIM = 32
 MAX_TASK_TOKENS = 128
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-_INIT_STD = 0.1  # about 1 / sqrt(width); the 0.02 of large models starts such narrow ones too slowly
+_INIT_STD = 0.1  # about 1 / sqrt(width); with the 0.02 of large models, narrow networks learn too slowly at first
 _TEXT_GAIN = 6.0
 
 CONFIG = RewindConfig(
@@ -45,7 +48,7 @@ CONFIG = RewindConfig(
 
 
 class Learner(nn.Module):
-    """Everything that is trained: encoders, transformer, and a head that reads hints from an image."""
+    """The trained networks: encoders, transformer, and a head that reads hints from a frame embedding."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -57,12 +60,12 @@ class Learner(nn.Module):
         self.eval()  # no dropout: the networks are small, and data never repeat
 
     def embed_frames(self, frames: Tensor) -> Tensor:
-        """uint8 [..., H, W, 3] -> float32 [..., Dv], as ``Encoders`` embeds them, with gradients."""
+        """Embed frames, uint8 [..., H, W, 3], as ``Encoders`` does, with gradients: float32 [..., Dv]."""
         crops = self.encoders.preprocessor(frames.flatten(0, -4))
         return self.image_model(pixel_values=crops).pooler_output.unflatten(0, frames.shape[:-3])
 
     def embed_tasks(self, verb: str) -> Tensor:
-        """float32 [6, Dt], the sentences of TASKS with ``verb``, as ``Encoders`` embeds them, with gradients."""
+        """Embed the sentences of TASKS with ``verb``, as ``Encoders`` does, with gradients: float32 [6, Dt]."""
         sentences = [task.sentence(verb) for task in TASKS]
         tokens = self.encoders.tokenizer(sentences, padding=True, return_tensors="pt")
         hidden = self.text_model(**tokens).last_hidden_state
@@ -71,7 +74,11 @@ class Learner(nn.Module):
 
 
 def _network() -> RewindTransformer:
-    """Starts with loud tasks: means over mostly the same words differ little, and were long taken no notice of."""
+    """Return the network, with a larger gain for tasks.
+
+    Text embeddings are means over mostly the same words and differ little. Without the gain, training ignores them for
+    long.
+    """
     network = RewindTransformer(CONFIG)
     network.text_proj.weight.data *= _TEXT_GAIN
     network.text_position_embedding.data /= _TEXT_GAIN
@@ -81,14 +88,14 @@ def _network() -> RewindTransformer:
 
 
 def _waves(length: int, width: int) -> Tensor:
-    """[length, width]: sines and cosines of the position. Tokens that start so tell early from late at once."""
+    """Return sines and cosines of the position, [length, width], so that tokens encode time from the start."""
     position = torch.arange(length)[:, None]
     rates = 64.0 ** -torch.linspace(0, 1, width // 2)
     return torch.cat([torch.sin(position * rates), torch.cos(position * rates)], dim=1)
 
 
 def write_checkpoint(learner: Learner, folder: Path) -> None:
-    """Writes ``checkpoint`` in upstream's layout, and ``image_encoder`` and ``text_encoder``, its base models."""
+    """Write ``checkpoint`` in upstream's layout, and its base models ``image_encoder`` and ``text_encoder``."""
     encoders = learner.encoders
     encoders.save(folder)
     RewindCheckpoint(CONFIG, learner.network.state_dict()).save(folder / "checkpoint")
@@ -100,7 +107,7 @@ def write_checkpoint(learner: Learner, folder: Path) -> None:
 
 
 def num_parameters(module: nn.Module) -> int:
-    """How many numbers it has."""
+    """Return the number of a module's parameters."""
     return sum(parameter.numel() for parameter in module.parameters())
 
 
@@ -137,7 +144,7 @@ def _encoders() -> Encoders:
 
 
 def _tokenizer() -> Any:
-    """Reads the tasks' words whole and any other letter by letter, in the way of a BERT tokenizer."""
+    """Return a BERT tokenizer that keeps the tasks' words whole and splits others into letters."""
     from tokenizers import Tokenizer, normalizers, pre_tokenizers, processors
     from tokenizers.models import WordPiece
     from transformers import PreTrainedTokenizerFast
@@ -157,6 +164,6 @@ def _tokenizer() -> Any:
 
 
 def seeded_learner(seed: int) -> Learner:
-    """The same networks for the same seed."""
+    """Return the networks of a seed."""
     torch.manual_seed(seed)
     return Learner()
