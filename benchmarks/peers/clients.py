@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""How a caller asks each peer: functions for a load generator.
+"""Clients of the peers, for a load generator.
 
-Each factory takes a session and the server's address, and gives a coroutine function from samples of embeddings, which
-are asked about together, to the progress at the last frame, the preference or the similarity of each. Failures are
-raised.
+Each factory takes a session and the server's address. It returns a coroutine function that scores samples of embeddings
+together: progress at the last frame, preference or similarity of each. It raises an error if a sample has no score.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ KINDS: dict[type, str] = {
     PreferenceSample: "preference",
     SimilaritySample: "similarity",
 }
-NAMES: dict[type, tuple[str, ...]] = {  # of their trajectories, as the evaluation server has them
+NAMES: dict[type, tuple[str, ...]] = {  # the evaluation server's names of their trajectories
     ProgressSample: ("trajectory",),
     PreferenceSample: ("chosen_trajectory", "rejected_trajectory"),
     SimilaritySample: ("ref_trajectory", "sim_trajectory"),
@@ -36,7 +35,7 @@ _MSGPACK = {"Content-Type": "application/msgpack"}
 
 
 def fastapi_npy(session: aiohttp.ClientSession, base_url: str) -> Ask:
-    """Asks the FastAPI evaluation server, or our gateway, with .npy files in a form."""
+    """Return a client of the FastAPI evaluation server, or of our gateway, with .npy files in a form."""
 
     async def ask(samples: Sequence[Sample]) -> list[float]:
         async with session.post(f"{base_url}/evaluate_batch_npy", data=_form(samples)) as answer:
@@ -47,7 +46,7 @@ def fastapi_npy(session: aiohttp.ClientSession, base_url: str) -> Ask:
 
 
 def by_msgpack(session: aiohttp.ClientSession, url: str) -> Ask:
-    """Asks the LitServe or mosec server with a message a sample, as ``engines`` describes it."""
+    """Return a client of the LitServe or mosec server, with a message for each sample (see ``engines``)."""
 
     async def ask_one(sample: Sample) -> float:
         videos = [_video(trajectory) for trajectory in sample.trajectories]
@@ -83,7 +82,7 @@ def _text(trajectory: Trajectory) -> np.ndarray:
 
 
 def _form(samples: Sequence[Sample]) -> aiohttp.FormData:
-    """A request of the multipart endpoint."""
+    """Return a request for the multipart endpoint."""
     form = aiohttp.FormData()
     for index, sample in enumerate(samples):
         described: dict[str, Any] = {"sample_type": KINDS[type(sample)]}
@@ -100,7 +99,7 @@ def _form(samples: Sequence[Sample]) -> aiohttp.FormData:
 
 
 def _scores(samples: Sequence[Sample], outputs: Mapping[str, Any]) -> list[float]:
-    """From an answer of the evaluation server, which has the samples of each type in a list of their own."""
+    """Return the scores in order of the samples. The evaluation server's answer has a list for each sample type."""
     told = {
         "progress": (values[-1] for values in (outputs["outputs_progress"] or {}).get("progress_pred", ())),
         "preference": iter((outputs["outputs_preference"] or {}).get("prediction_probs", ())),

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What the LitServe and mosec servers have in common: their messages, and the engine behind them.
+"""Messages and engine of the LitServe and mosec servers.
 
-A message is a msgpack map a sample, arrays as their float32 bytes. Request: ``type`` (progress, preference or
-similarity), ``shapes`` ([[T, D]] of each trajectory), ``video`` (their embeddings, one after the other) and ``text``
-(the first trajectory's [Dt]). Answer: ``progress`` and ``success`` (a float32 [T] a trajectory), and of pairs
-``query``; or ``error``. The engine's accelerator may be simulated: forward passes are a sleep, which takes no CPU and
-no lock.
+T frames, D width of a frame embedding, Dt width of a text embedding.
+
+A message is a msgpack map for a sample, with arrays as float32 bytes. Request: ``type`` (progress, preference or
+similarity), ``shapes`` ([T, D] of each trajectory), ``video`` (their embeddings in sequence) and ``text`` (the first
+trajectory's [Dt]). Answer: ``progress`` and ``success`` (float32 [T] of each trajectory), and for pairs ``query``; or
+``error``. With a simulated accelerator, forward passes sleep, without CPU time and without the GIL.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _PAIRS = {"preference": PreferenceSample, "similarity": SimilaritySample}
 
 
 def options(told: str | None) -> argparse.Namespace:
-    """Of a peer's command line."""
+    """Return the options of a peer's command line."""
     parser = argparse.ArgumentParser(description=told, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", required=True, help="checkpoint folder")
     parser.add_argument("--port", type=int, required=True)
@@ -52,7 +53,7 @@ def options(told: str | None) -> argparse.Namespace:
 
 
 def sample_of(message: Mapping[str, Any]) -> Sample:
-    """The sample of a request. Raises KeyError, ValueError, InvalidSampleError."""
+    """Return the sample of a request. Raises KeyError, ValueError, InvalidSampleError."""
     text = np.frombuffer(message["text"], np.float32)
     video = np.frombuffer(message["video"], np.float32)
     shapes = message["shapes"]
@@ -65,7 +66,7 @@ def sample_of(message: Mapping[str, Any]) -> Sample:
 
 
 def answer_of(outcome: Outcome) -> dict[str, Any]:
-    """The answer to a request."""
+    """Return the answer to a request."""
     if isinstance(outcome, RewardError):
         return {"error": str(outcome)}
     if isinstance(outcome, ProgressResult):
@@ -83,7 +84,7 @@ def _frames(*scores: FrameScores) -> dict[str, Any]:
 
 
 class Ledger:
-    """How long a simulated accelerator has worked, in ``file``."""
+    """The working time of a simulated accelerator, kept in ``file`` for all processes."""
 
     def __init__(self, file: Path) -> None:
         if not file.exists():
@@ -92,11 +93,11 @@ class Ledger:
         self._memory = mmap.mmap(self._file.fileno(), 0)
 
     def busy_s(self) -> float:
-        """Seconds in forward passes since the beginning."""
+        """Return the seconds of all forward passes so far."""
         return float(_LEDGER.unpack_from(self._memory)[0])
 
     def run(self, duration_s: float) -> None:
-        """Sleeps, as one forward pass; several instances take turns."""
+        """Sleep for the time of a forward pass. Several instances take turns."""
         fcntl.flock(self._file, fcntl.LOCK_EX)
         started_s = time.perf_counter()
         time.sleep(duration_s)
@@ -105,7 +106,7 @@ class Ledger:
 
 
 def simulate(engine: Engine, file: Path, batch_s: float, row_s: float) -> Engine:
-    """The engine, whose forward passes only sleep: ``batch_s`` and ``row_s`` for each row. Scores are 0.5."""
+    """Make the engine's forward passes sleep for ``batch_s``, plus ``row_s`` for each row. Scores are 0.5."""
     ledger, num_bins = Ledger(file), engine.predictor.network.config.progress_bins
 
     def score(rows: Sequence[Any], batch: Any) -> list[RowScores]:
@@ -117,7 +118,7 @@ def simulate(engine: Engine, file: Path, batch_s: float, row_s: float) -> Engine
 
 
 def _half(row: Any, num_bins: int) -> RowScores:
-    """Scores of a row of either family."""
+    """Return scores of 0.5 for a row of any family."""
     counts = [getattr(video, "num_shown", None) or len(video) for video in row.videos]
     frames = []
     for count in counts:
@@ -128,7 +129,7 @@ def _half(row: Any, num_bins: int) -> RowScores:
 
 
 def engine_of(checkpoint: str, device: str = "cpu") -> Engine:
-    """The engine of a checkpoint; simulated if SIMULATION lies in its folder, with the arguments of ``simulate``."""
+    """Return the engine of a checkpoint. A file SIMULATION in the folder has arguments for ``simulate``."""
     engine = Engine.from_checkpoint(checkpoint, device=device)
     simulation = Path(checkpoint, SIMULATION)
     if not simulation.exists():

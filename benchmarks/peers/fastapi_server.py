@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The design of the FastAPI evaluation server, with one replica on the CPU.
 
-As its README tells it: identical replicas in a pool, a thread pool for checkout and inference, and each request's batch
-farmed to whichever replica is free, which it then has to itself. Samples of different requests never share a forward,
-all samples of a kind in a request have one length, and a request with a bad sample fails as a whole. Only its npy
-endpoint is here, which is the faster one.
+As in its README: a pool of identical replicas, a thread pool for checkout and inference, and a free replica for each
+request alone. Samples of different requests never share a forward pass. All samples of a type in a request have the
+same length. A bad sample fails its whole request. Only the faster endpoint, npy, is here.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from upstream_forward import Scores, UpstreamRewind, load, progress_of
 from engines import options
 
 UPLOAD_KEY = "__numpy_file__"
-TRAJECTORIES = {  # of each type, in the order in which the network reads them
+TRAJECTORIES = {  # of each sample type, in the network's order
     "progress": ("trajectory",),
     "preference": ("chosen_trajectory", "rejected_trajectory"),
     "similarity": ("ref_trajectory", "sim_trajectory"),
@@ -38,7 +37,7 @@ Json = Mapping[str, Any]
 
 
 class ReplicaPool:
-    """Replicas that are checked out for a request each, and the threads that do it."""
+    """Replicas, each checked out for a request at a time, and the threads that score."""
 
     def __init__(self, replicas: Sequence[UpstreamRewind], max_workers: int) -> None:
         self._replicas: Queue[UpstreamRewind] = Queue()
@@ -47,7 +46,7 @@ class ReplicaPool:
         self._threads = ThreadPoolExecutor(max_workers)
 
     async def evaluate(self, samples: Sequence[Json]) -> Json:
-        """The answer to a request, scored in a thread."""
+        """Return the answer to a request, scored in a thread."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, self._evaluate, samples)
 
     def _evaluate(self, samples: Sequence[Json]) -> Json:
@@ -59,12 +58,12 @@ class ReplicaPool:
 
 
 def create_app(pool: ReplicaPool) -> FastAPI:
-    """The application."""
+    """Return the application with the npy endpoint."""
     app = FastAPI()
 
     @app.post("/evaluate_batch_npy")
     async def evaluate_batch_npy(request: Request) -> Json:
-        """Scores the samples in the fields sample_0, sample_1 and so on, whose arrays are .npy uploads."""
+        """Score the samples in the fields sample_0, sample_1 and so on. Their arrays are .npy uploads."""
         arrays: dict[str, np.ndarray] = {}
         fields: dict[str, Any] = {}
         async with request.form() as form:
@@ -79,7 +78,7 @@ def create_app(pool: ReplicaPool) -> FastAPI:
 
 
 def _merged(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """The value with uploaded arrays in place of their names."""
+    """Return the value with uploaded arrays in place of their names."""
     if not isinstance(value, dict):
         return value
     if UPLOAD_KEY in value:
@@ -89,7 +88,7 @@ def _merged(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 @torch.inference_mode()
 def _score(network: UpstreamRewind, samples: Sequence[Json]) -> Json:
-    """The answer to the samples of one request: a forward for each kind of sample in it."""
+    """Return the answer to a request, with a forward pass for each sample type."""
     outputs = ("outputs_preference", "outputs_progress", "outputs_success", "outputs_similarity")
     answer: dict[str, Any] = dict.fromkeys(outputs)
     for kind in TRAJECTORIES:
@@ -108,7 +107,7 @@ def _score(network: UpstreamRewind, samples: Sequence[Json]) -> Json:
 
 
 def _forward(network: UpstreamRewind, samples: Sequence[Json], kind: Any) -> Scores:
-    """Raises RuntimeError for trajectories of unequal lengths."""
+    """Return raw scores of samples of one type. Raises RuntimeError for trajectories of unequal lengths."""
     sides = [[sample[name] for sample in samples] for name in TRAJECTORIES[kind]]
     text = _stacked(trajectory["text_embedding"] for trajectory in sides[0])
     videos = [_stacked(trajectory["video_embeddings"] for trajectory in side) for side in sides]
@@ -120,11 +119,11 @@ def _stacked(arrays: Iterable[Any]) -> Tensor:
 
 
 def main() -> None:
-    """Serves until SIGTERM."""
+    """Serve until SIGTERM."""
     arguments = options(__doc__)
     torch.set_num_threads(arguments.threads)
     torch.set_num_interop_threads(1)
-    pool = ReplicaPool([load(arguments.checkpoint)], max_workers=1)  # more than replicas starve
+    pool = ReplicaPool([load(arguments.checkpoint)], max_workers=1)  # more workers than replicas would wait
     uvicorn.run(create_app(pool), host="127.0.0.1", port=arguments.port, log_level="warning", access_log=False)
 
 

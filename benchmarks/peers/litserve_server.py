@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Our engine behind LitServe, with its dynamic batching: an HTTP process and an inference process.
 
-Requests and answers are raw bytes (``engines``), so that neither JSON nor a form is parsed. One that the engine cannot
-score is answered with 400; one that cannot be read fails its batch, as LitServe has it.
+Requests and answers are raw bytes (``engines``), so the server parses neither JSON nor a form. An invalid sample gets
+status 400. In LitServe, an unreadable request fails its whole batch.
 """
 
-# No "from __future__ import annotations": LitServe gives FastAPI the annotations as they are.
+# No "from __future__ import annotations": LitServe passes annotations to FastAPI unresolved.
 import multiprocessing
 import signal
 from typing import Annotated, Any
@@ -20,13 +20,13 @@ from rfm.engine import Outcome
 from rfm_client import Sample
 
 MAX_BATCH_SIZE = 64
-BATCH_TIMEOUT_S = 0.001  # 0 would spin on the queue, which another process holds
+BATCH_TIMEOUT_S = 0.001  # 0 would spin on the queue of another process
 REQUEST_TIMEOUT_S = 60
 MIME_TYPE = "application/msgpack"
 
 
 class RewardAPI(litserve.LitAPI):
-    """Samples in, scores out."""
+    """LitServe's adapter: samples in, scores out."""
 
     def __init__(self, checkpoint: str, threads: int, **settings: Any) -> None:
         super().__init__(**settings)
@@ -34,39 +34,39 @@ class RewardAPI(litserve.LitAPI):
         self.threads = threads
 
     def setup(self, device: str) -> None:
-        """Loads the engine, in the inference process."""
+        """Load the engine, in the inference process."""
         torch.set_num_threads(self.threads)
         torch.set_num_interop_threads(1)
         self.engine = engine_of(self.checkpoint, device)
 
     def decode_request(self, request: Annotated[bytes, Body(media_type=MIME_TYPE)]) -> Sample:
-        """The sample in the body of a request."""
+        """Return the sample in the body of a request."""
         return sample_of(msgpack.unpackb(request))
 
     def batch(self, inputs: list[Sample]) -> list[Sample]:
-        """The samples as they are: the engine takes any mix."""
+        """Return the samples unchanged, since the engine takes any mix."""
         return inputs
 
     def predict(self, x: list[Sample]) -> list[Outcome]:
-        """The outcome of each sample."""
+        """Return the outcome of each sample."""
         return self.engine.evaluate(x)
 
     def unbatch(self, output: list[Outcome]) -> list[Outcome]:
-        """The outcomes as they are."""
+        """Return the outcomes unchanged."""
         return output
 
     def encode_response(self, output: Outcome) -> Response:
-        """The answer to a request."""
+        """Return the answer to a request."""
         answer = answer_of(output)
         return Response(msgpack.packb(answer), 400 if "error" in answer else 200, media_type=MIME_TYPE)
 
 
 def main() -> None:
-    """Serves until SIGTERM."""
+    """Serve until SIGTERM."""
     arguments = options(__doc__)
     batching = {"max_batch_size": MAX_BATCH_SIZE, "batch_timeout": BATCH_TIMEOUT_S}
     api = RewardAPI(arguments.checkpoint, arguments.threads, **batching)
-    # Its fast_queue is not asked for: 0.2.19 ignores it.
+    # Without fast_queue, which LitServe 0.2.19 ignores.
     server = litserve.LitServer(api, accelerator="cpu", timeout=REQUEST_TIMEOUT_S)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
@@ -78,12 +78,12 @@ def main() -> None:
             generate_client_file=False,
         )
     finally:
-        for process in multiprocessing.active_children():  # of a start that was broken off
+        for process in multiprocessing.active_children():  # left over from an interrupted start
             process.terminate()
 
 
 def _interrupt(*_: object) -> None:
-    """Ends the server as SIGINT does, on which alone LitServe ends its processes; those inherit this."""
+    """End the server as SIGINT does, since LitServe ends its processes only then. They inherit this handler."""
     if multiprocessing.parent_process() is None:
         raise KeyboardInterrupt
 

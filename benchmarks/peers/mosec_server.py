@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Our engine behind mosec, with its dynamic batching: a Rust HTTP process and an inference process.
 
-Requests and answers are msgpack (``engines``). A sample that the engine cannot score is answered with ``error``; a
-request that cannot be read fails its batch, as mosec has it.
+Requests and answers are msgpack (``engines``). The answer to an invalid sample has ``error``. In mosec, an unreadable
+request fails its whole batch.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from mosec.mixin import MsgpackMixin
 from engines import answer_of, engine_of, options, sample_of
 
 MAX_BATCH_SIZE = 64
-MAX_WAIT_MS = 1  # the least that it takes
+MAX_WAIT_MS = 1  # mosec's minimum
 REQUEST_TIMEOUT_MS = 60_000
 
 
 class RewardWorker(MsgpackMixin, mosec.Worker):
-    """Samples in, scores out; runs in the inference process, which is told of the checkpoint by its environment."""
+    """Scores samples in the inference process. Environment variables name the checkpoint."""
 
     def __init__(self) -> None:
         super().__init__()
-        warnings.filterwarnings("ignore", "IPC data", RuntimeWarning)  # told of every large batch
+        warnings.filterwarnings("ignore", "IPC data", RuntimeWarning)  # one warning for each large batch
         torch.set_num_threads(int(os.environ["PEER_THREADS"]))
         torch.set_num_interop_threads(1)
         self.engine = engine_of(os.environ["PEER_CHECKPOINT"])
 
     def forward(self, data: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """The answer to each request of a batch."""
+        """Return the answer to each request of a batch."""
         return [answer_of(outcome) for outcome in self.engine.evaluate([sample_of(message) for message in data])]
 
 
 def main() -> None:
-    """Serves until SIGTERM."""
+    """Serve until SIGTERM."""
     arguments = options(__doc__)
     os.environ |= {  # mosec reads its own settings from here
         "MOSEC_ADDRESS": "127.0.0.1",
@@ -48,7 +48,7 @@ def main() -> None:
         "MOSEC_LOG_LEVEL": "error",
         "MOSEC_TIMEOUT": str(REQUEST_TIMEOUT_MS),
     }
-    logging.getLogger(mosec.log.MOSEC_LOG_NAME).setLevel(logging.ERROR)  # its own level is read before
+    logging.getLogger(mosec.log.MOSEC_LOG_NAME).setLevel(logging.ERROR)  # mosec set its level on import
     server = mosec.Server()
     settings = {"PEER_CHECKPOINT": arguments.checkpoint, "PEER_THREADS": str(arguments.threads)}
     server.append_worker(

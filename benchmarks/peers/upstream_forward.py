@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The original ReWiND forward in stock torch modules: what the FastAPI evaluation server runs for each request.
+"""Upstream's ReWiND forward pass in stock torch modules, as the FastAPI evaluation server runs it for each request.
 
-It is written as the original is: ``nn.TransformerEncoder``, a causal mask built on every call, progress tokens
-interleaved by stacking, and rows of one length. Its state dict has the names of the checkpoint.
-B rows, T frames of a trajectory, L tokens, D width, K progress bins.
+Follows upstream's code: ``nn.TransformerEncoder``, a causal mask built on every call, progress tokens interleaved by
+stacking, and rows of equal length. The state dict has the checkpoint's names.
+B rows, T frames of a trajectory, L tokens, D width, Dv width of a frame embedding, Dt width of a text embedding, K
+progress bins.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ SampleType = Literal["progress", "preference", "similarity"]
 
 
 class Scores(NamedTuple):
-    """Raw scores: progress logits [B, T, K], success logits [B, T]; of pairs the second's too, and query [B]."""
+    """Raw scores: logits of progress [B, T, K] and success [B, T]; for pairs also the second's, and query [B]."""
 
     progress: Tensor
     success: Tensor
@@ -71,7 +72,10 @@ class UpstreamRewind(nn.Module):
     def forward(
         self, text: Tensor, first: Tensor, second: Tensor | None = None, sample_type: SampleType = "progress"
     ) -> Scores:
-        """Scores of text [B, Dt], first [B, T, Dv] and, unless progress is asked, second [B, T, Dv]."""
+        """Return the scores of text [B, Dt], first [B, T, Dv] and, for pairs, second [B, T, Dv].
+
+        Raises ValueError if the shapes of first and second differ.
+        """
         text_token = self.text_proj(text).unsqueeze(1)
         if self.config.use_per_frame_progress_token:
             text_token = text_token + self.text_position_embedding
@@ -93,7 +97,7 @@ class UpstreamRewind(nn.Module):
         return Scores(*self._frame_scores(of_first), *self._frame_scores(of_second), query)
 
     def _trajectory_tokens(self, video: Tensor, which: Literal["A", "B"]) -> Tensor:
-        """[B, T, Dv] -> [B, T, D], or [B, 2T, D] with a progress token behind each frame."""
+        """Map [B, T, Dv] to [B, T, D], or to [B, 2T, D] with a progress token behind each frame."""
         frames = self.video_proj(video)
         first_embedding = self.first_embedding_A if which == "A" else self.first_embedding_B
         frames = torch.cat([frames[:, :1] + first_embedding, frames[:, 1:]], dim=1)
@@ -105,20 +109,20 @@ class UpstreamRewind(nn.Module):
         return torch.stack([frames, progress_tokens], dim=2).reshape(batch_size, 2 * num_frames, width)
 
     def _encode(self, tokens: Tensor) -> Tensor:
-        """[B, L, D] -> [B, L, D]."""
+        """Apply the transformer to tokens [B, L, D]."""
         mask = None
         if self.config.causal_mask:
             mask = nn.Transformer.generate_square_subsequent_mask(tokens.shape[1], device=tokens.device)
         return self.transformer(tokens, mask=mask)
 
     def _frame_scores(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Progress [B, T, K] and success [B, T] logits from one trajectory's tokens."""
+        """Return logits of progress [B, T, K] and success [B, T] from a trajectory's tokens [B, T or 2T, D]."""
         read = hidden[:, 1::2] if self.config.use_per_frame_progress_token else hidden
         return self.progress_head(read), self.success_head(read).squeeze(-1)
 
 
 def progress_of(logits: Tensor) -> Tensor:
-    """Progress [..., T] in 0..1 of logits [..., T, K]: the bins' mean under the softmax; of one output its sigmoid."""
+    """Return progress [..., T], 0 to 1, of logits [..., T, K]: bins' mean under the softmax; K = 1: sigmoid."""
     if logits.shape[-1] == 1:
         return logits.squeeze(-1).sigmoid()
     bins = torch.linspace(0, 1, logits.shape[-1], device=logits.device)
@@ -126,7 +130,7 @@ def progress_of(logits: Tensor) -> Tensor:
 
 
 def load(folder: str | Path) -> UpstreamRewind:
-    """The network of a ReWiND checkpoint folder with its weights, on the CPU. Raises CheckpointError, TypeError."""
+    """Return the network of a ReWiND checkpoint folder, on the CPU. Raises CheckpointError, TypeError."""
     checkpoint = load_checkpoint(folder)
     if not isinstance(checkpoint, RewindCheckpoint):
         raise TypeError(f"{folder}: expected a ReWiND checkpoint, got {type(checkpoint).__name__}")
