@@ -34,19 +34,19 @@ _PADDED: tuple[Rule, ...] = ("rint_pad", *_REWIND)  # filled up to K slots with 
 
 
 def trained_rule(trained_padding: bool) -> Rule:
-    """Return the rule by which training cut the clips of a checkpoint.
+    """Return the rule by which the checkpoint's training chose frames of a clip.
 
-    trained_padding: True if training padded shorter clips
+    trained_padding: True if training padded clips shorter than K frames
     """
     return "rint_pad" if trained_padding else "rint"
 
 
 @dataclass(frozen=True, eq=False)
 class Prefix:
-    """The frames that a rule shows of the frames 0 to t, and the slot with frame t's score.
+    """The frames that a rule shows of the frames 0 to t, and the slot whose score counts for frame t.
 
     indices: int64 [S], the frame in each slot, padding included
-    read: the slot with frame t's score
+    read: the slot whose score counts for frame t
     """
 
     indices: FrameIndices
@@ -56,7 +56,7 @@ class Prefix:
     def frame_slots(self) -> FrameIndices:
         """int64 [N], a slot for each of the N distinct frames, in order.
 
-        A repeated frame has its last slot, frame t the slot ``read``.
+        For a repeated frame, its last slot; for frame t, the slot ``read``.
         """
         slots = np.flatnonzero(np.diff(self.indices, append=self.indices[-1] + 1))
         slots[-1] = self.read
@@ -93,7 +93,7 @@ class Sampling:
 
         trained_frames, trained_padding: ``max_frames`` and ``trained_padding`` of the checkpoint's ``ModelInfo``
 
-        Raises ValueError if a required number is missing in both.
+        Raises ValueError if a required number is given by neither caller nor checkpoint.
         """
         rule = rule or trained_rule(trained_padding)
         if frames is None and rule not in (*_REWIND, "all"):
@@ -123,15 +123,15 @@ class Sampling:
 
 
 def thinned(num_frames: int, limit: int | None) -> FrameIndices | None:
-    """Return int64 [limit], the frames that training would keep of a longer clip; None: all frames.
+    """Return the frames, int64 [limit], that training would keep of a longer clip; None: all are kept.
 
-    Uses the rule ``rint``, by which ``robometer`` cuts training clips.
+    Uses the rule ``rint``, by which upstream cuts training clips.
     """
     return None if limit is None or num_frames <= limit else _rint(num_frames - 1, limit)
 
 
 def taken(trajectory: Trajectory, indices: FrameIndices) -> Trajectory:
-    """Return the trajectory with the frames, or frame embeddings, at ``indices``, int64 [N]; its text stays."""
+    """Return the trajectory with the frames or embeddings at ``indices``, int64 [N], and its task."""
     if trajectory.frames is not None:
         return replace(trajectory, frames=trajectory.frames[indices])
     assert trajectory.video_embeddings is not None  # a Trajectory has frames or embeddings

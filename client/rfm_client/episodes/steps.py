@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Steps of an episode: options, frames so far, requests about them, and scores.
 
-Nothing here sends: ``episodes.py`` and the Gymnasium wrappers do. N episodes, H x W pixels.
+Nothing here sends requests to the server: ``episodes.py`` and the Gymnasium wrappers do. N episodes, H x W pixels.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class SuccessRule:
     """A scored step succeeds if most of the last frames shown to the model reach ``threshold``.
 
     threshold: least success of such a frame, 0..1
-    last: number of frames that vote; padding and repeated frames count once
+    last: number of frames that vote; each distinct frame votes once, however often it is repeated or padded
 
     Raises ValueError.
     """
@@ -72,8 +72,8 @@ class EpisodeOptions:
         the checkpoint has none, the first step raises ValueError
     cameras: names of the cameras with a frame in each step; empty: a single camera without a name
     fuse: how to combine the scores of several cameras
-    orient: turn that makes frames upright, before all else: an Orientation, or a dict by camera; cameras that it omits
-        are not turned
+    orient: rotation or flip that makes frames upright, applied first: an Orientation, or a dict by camera; cameras that
+        it omits are not turned
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
     success: rule of a step's success
@@ -95,7 +95,9 @@ class EpisodeOptions:
         is_each_once = len(set(self.cameras)) == len(self.cameras)
         require("cameras", is_each_once, "names that differ", list(self.cameras))
         require("fuse", self.fuse in FUSES, f"one of {', '.join(FUSES)}", repr(self.fuse))
-        Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError if rule and number contradict
+        Sampling.of(
+            self.sampling, self.frames, trained_frames=1
+        )  # raises ValueError if rule and number contradict; 1: for the checkpoint's, unknown here
         unknown = [repr(camera) for camera in self._orient.cameras if camera not in self.cameras]
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one orientation, as cameras names none"
@@ -109,7 +111,7 @@ class EpisodeOptions:
 
     @property
     def needs_model_info(self) -> bool:
-        """True if the checkpoint decides which frames are shown, or their size."""
+        """True if ``sampling`` or ``frames`` is left out, or frames are shrunk."""
         return self.resize or self.sampling is None or self.frames is None
 
     def sampling_for(self, info: ModelInfo | None) -> Sampling:
@@ -134,7 +136,7 @@ class StepScore:
     success: probability that the task is done; NaN: the checkpoint does not predict it
     succeeded: True if the success rule holds; False where success is NaN
     step: number of the frame, from 0
-    ms: time to the answer, milliseconds
+    ms: milliseconds from the call to the answer, waiting included
     """
 
     progress: float
@@ -149,7 +151,7 @@ class StepScores:
     """The scores of N episodes, each at its newest frame.
 
     progress, success: float32 [N], as in StepScore; NaN where ``mask`` left an episode out
-    succeeded: bool [N]; False there
+    succeeded: bool [N]; False where ``mask`` left an episode out, or success is NaN
     step: int64 [N], number of each newest frame, from 0; -1: none yet
     ms: time to the answer, milliseconds
     """
@@ -169,7 +171,7 @@ class StepScores:
 class EpisodeFrames:
     """The frames of one episode so far, their requests, and the live view.
 
-    index: number of the episode beside others, from 0
+    index: number of this episode among those that grow together, from 0
     where: its name in errors, such as ``episodes[3]``; empty: no name
     """
 
@@ -202,7 +204,7 @@ class EpisodeFrames:
                     pixels = resize_frames(pixels[np.newaxis], size)[0]
                 if first is not None and first.pixels.shape != pixels.shape:
                     expected = f"uint8 {list(first.pixels.shape)}, as the episode's first"
-                    expected += "" if size is None else ", or a reset"  # another checkpoint may be served by now
+                    expected += "" if size is None else ", or a reset"  # the checkpoint's size may have changed
                     raise InvalidSampleError.at(where, expected, f"uint8 {list(pixels.shape)}")
                 kept.append(EpisodeFrame(pixels))
         except InvalidSampleError as error:
@@ -259,7 +261,7 @@ class EpisodeFrames:
 
 
 class StepRequest:
-    """The windows of the newest frames of some episodes.
+    """For each of some episodes, the windows that the rule shows at its newest frame.
 
     asked_s: start of the caller's wait, by ``time.perf_counter``
 
@@ -284,7 +286,7 @@ class StepRequest:
 
 
 def checked_frame(frame: Any, where: str) -> UInt8Array:
-    """Return a copy of a frame, uint8 [H, W, 3], whose array may be drawn into again. Raises InvalidSampleError."""
+    """Return a copy of a frame, uint8 [H, W, 3]; the caller may reuse its array. Raises InvalidSampleError."""
     kept = copied(frame)
     is_frame = kept.dtype == np.uint8 and kept.ndim == 3 and kept.shape[2] == 3 and 0 not in kept.shape
     require(where, is_frame, "uint8 [H, W, 3]", f"{kept.dtype} {list(kept.shape)}", InvalidSampleError)

@@ -7,17 +7,17 @@ env = RewardModelWrapper(env, partial(RewardClient, "grpc://localhost:8001"), "b
 A wrapper keeps all frames of the running episode, H * W * 3 bytes a step. The rule ``sampling`` selects from them.
 
 A wrapper scores the frame of the reset, every ``every``-th step, and the last step of an episode. With ``blocking``, a
-step waits for its score. Without, it takes the newest known score, and is skipped while ``max_pending`` steps have open
-requests. Even then, the reset waits for its score, and so does the last step unless ``await_last=False``. The last step
-cancels older requests.
+step waits for its score. Without, it uses the newest known score, and its own score is not requested while
+``max_pending`` steps have open requests. The reset always waits for its score. The last step waits, too, and cancels
+older requests; with ``await_last=False`` it is not scored.
 
-``info["reward_model"]`` has ``progress`` and ``success`` of the newest known score (NaN: the checkpoint does not
-predict it), its ``step``, its ``lag`` in steps, and the steps ``skipped`` in this episode. After a step it also has
-``env_reward``; with ``terminate_on_success``, ``succeeded``.
+``info["reward_model"]`` has ``progress`` and ``success`` of the newest known score (success is NaN if the checkpoint
+does not predict it), its ``step``, its ``lag`` in steps, and the steps ``skipped`` in this episode. With
+``terminate_on_success`` it has ``succeeded``; after a step, ``env_reward``.
 
 ``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
-frame, and in delta mode the next reward makes up for it. If the frame was lost, the next ``step`` raises ResetNeeded.
-A step after an episode's end does, too, unless the environment resets in that step.
+frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
+ResetNeeded. A step after an episode's end does, too, unless the environment resets in that step.
 """
 
 from __future__ import annotations
@@ -36,10 +36,14 @@ except ImportError as error:
 
 INFO = "reward_model"  # key in info
 
-_ENDS = ("final_obs", "final_observation", "terminal_observation")  # in info after a reset in step
+_ENDS = (
+    "final_obs",
+    "final_observation",
+    "terminal_observation",
+)  # in info, if the step that ended an episode also reset
 
 DEFAULTS = RewardOptions()
-LOST = "a frame was lost to the error of an earlier call"
+LOST = "an earlier call failed before its frame was kept"
 
 
 class RewardModelWrapper(gymnasium.Wrapper):
@@ -50,7 +54,8 @@ class RewardModelWrapper(gymnasium.Wrapper):
     task: the task sentence, or a function that reads it from the info of each reset
 
     A step after an episode's end raises ResetNeeded. With ``gymnasium.wrappers.Autoreset`` among the wrappers of
-    ``env``, this step begins a new episode instead, with reward 0. ``env`` must not reset in the last step.
+    ``env``, this step begins a new episode instead, with reward 0. ``env`` itself must not reset in the
+    step that ends an episode.
 
     Raises ValueError if ``options`` names a source of frames that ``env`` lacks, TypeError if ``env`` is no
     ``gymnasium.Env``.
@@ -138,7 +143,7 @@ def check_kind(env: Any, kind: type[Any]) -> None:
     """Raise TypeError for another kind of environment."""
     if not isinstance(env, kind):
         got = f"{type(env).__module__}.{type(env).__name__}"
-        remedy = "wrap each environment in RewardModelWrapper before you make another kind of vector of them"
+        remedy = "for a gymnasium vector use RewardModelVectorWrapper; else wrap each environment in RewardModelWrapper"
         raise TypeError(f"env: expected a gymnasium {kind.__name__}, got {got}; {remedy}")
 
 
@@ -146,7 +151,7 @@ def _check_shows_its_end(info: Info) -> None:
     found = [key for key in _ENDS if key in info]
     if found:
         expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"
-        remedy = "let it not reset in step, and wrap it in gymnasium.wrappers.Autoreset if resets shall be automatic"
+        remedy = "turn off its own reset; for automatic resets wrap it in gymnasium.wrappers.Autoreset"
         raise InvalidSampleError.at("info", expected, f"{', '.join(found)}; {remedy}")
 
 
