@@ -121,12 +121,12 @@ class Supervisor:
         self._back_off = self._new_back_off()
         self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
-        self._left_out: dict[str, str] = {}  # reasons by model, of models that kept ending Triton
+        self._left_out: dict[str, str] = {}  # reasons by model: left out after too many faults in a row
 
     def run(self) -> int:
         """Serve. Return Triton's exit status. Raises ServerStartError for a failed start or a crash loop."""
         for path in cleanup.clear():
-            self._say(f"removed {path}, which a server left that was killed")
+            self._say(f"removed {path}, left by a killed server")
         self._status.record(dict.fromkeys(self._server.models, "it is loaded"))
         for what in (TRITON, *self._server.models, *(() if self._gateway is None else (GATEWAY,))):
             self._status.restarts.labels(what)  # begins at 0, so that the first restart is an increase
@@ -161,7 +161,7 @@ class Supervisor:
         return status
 
     def _start(self) -> None:
-        """Start Triton with the versions served before, and watch it. Raises ServerStartError."""
+        """Start Triton with the versions served before (at first, the repository's). Raises ServerStartError."""
         self._server.start_ready(self._served)
         if self._is_to_stop.is_set():
             return
@@ -213,7 +213,7 @@ class Supervisor:
                 what, why = error.model or what, str(error)
 
     def _leaves_out(self, what: str, why: str) -> bool:
-        """Leave out the model ``what`` and its ensembles. False if no other model is left."""
+        """Leave out the model ``what`` and its ensembles. False if it is no served model, or no other is left."""
         served = self._served or {}
         left_out = [what, *(name for name, config in served.items() if what in parts_of(config))]
         others = {name: config for name, config in served.items() if name not in left_out}

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SuccessRule:
-    """A scored step succeeds if most of the last frames shown to the model reach ``threshold``.
+    """A step succeeds if most of the last distinct frames of its own sample reach ``threshold``.
 
     threshold: least success of such a frame, 0..1
     last: number of frames that vote; each distinct frame votes once, however often it is repeated or padded
@@ -95,9 +95,7 @@ class EpisodeOptions:
         is_each_once = len(set(self.cameras)) == len(self.cameras)
         require("cameras", is_each_once, "names that differ", list(self.cameras))
         require("fuse", self.fuse in FUSES, f"one of {', '.join(FUSES)}", repr(self.fuse))
-        Sampling.of(
-            self.sampling, self.frames, trained_frames=1
-        )  # raises ValueError if rule and number contradict; 1: for the checkpoint's, unknown here
+        Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
         unknown = [repr(camera) for camera in self._orient.cameras if camera not in self.cameras]
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one orientation, as cameras names none"
@@ -135,7 +133,7 @@ class StepScore:
     progress: how much of the task is done, 0..1
     success: probability that the task is done; NaN: the checkpoint does not predict it
     succeeded: True if the success rule holds; False where success is NaN
-    step: number of the frame, from 0
+    step: number of the frame among the episode's, from 0
     ms: milliseconds from the call to the answer, waiting included
     """
 
