@@ -37,7 +37,6 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 
 PATIENCE_S = 60.0
-RESTART_S = 3 * PATIENCE_S  # a start that Triton spoils is noticed after 60 s, then repeated
 
 
 class Outcomes:
@@ -57,7 +56,7 @@ class Outcomes:
         with self._changed:
             start = len(self._all)
             enough = lambda: sum(isinstance(outcome, kind) for outcome in self._all[start:]) >= count  # noqa: E731
-            assert self._changed.wait_for(enough, RESTART_S)
+            assert self._changed.wait_for(enough, PATIENCE_S)
 
     @property
     def errors(self) -> list[Exception]:
@@ -99,10 +98,10 @@ def test_calls_survive_restarts_and_kills_of_servers(tmp_path: Path, repository:
         for protocol in ("grpc", "http"):
             urls = [url_of(endpoints, protocol) for endpoints in both]
             for servers in (urls[:1], urls):
-                client = callers.enter_context(RewardClient(servers, timeout_s=RESTART_S))
+                client = callers.enter_context(RewardClient(servers, timeout_s=PATIENCE_S))
                 outcomes.append(callers.enter_context(calling(client)))
                 clients.append(client)
-        sharing = callers.enter_context(RewardClient(both[0].grpc_url, timeout_s=RESTART_S, shared_memory=True))
+        sharing = callers.enter_context(RewardClient(both[0].grpc_url, timeout_s=PATIENCE_S, shared_memory=True))
         expected, shared = clients[0].progress(trajectory(0)), sharing.progress(heavy(), frame_steps=2)
         wait_for(lambda: all(answered(endpoints) for endpoints in both))  # the load is shared
         first.stop()
