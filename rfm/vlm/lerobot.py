@@ -48,7 +48,7 @@ def lerobot_run(content: Mapping[str, Any], file: Path) -> RunConfig:
     if unknown := sorted(content.keys() - known):
         remedy = "if it changes no score, remove it"
         raise CheckpointError(f"{file}: expected the keys of LeRobot's Robometer, got {shown(unknown[0])}; {remedy}")
-    for key in (LEROBOT_BACKBONE, *(key for key in _DECIDING["model"])):
+    for key in (LEROBOT_BACKBONE, *_DECIDING["model"]):
         if content.get(key) is None:
             raise CheckpointError(f"{file}: {key}: expected a value, got none; save the model with LeRobot again")
     sections = {name: {key: content.get(key) for key in keys} for name, keys in _DECIDING.items()}

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from rfm.checkpoint.content import ADAPTER_CONFIG, NETWORK_CONFIG, RUN_CONFIG, CheckpointError, read_run_config, shown
 from rfm.checkpoint.provenance import OF_UPSTREAM, OF_WEIGHTS, TRAINED_WITH_PADDING, Decision, file_name, source_name
-from rfm.checkpoint.run_config import find_run_config, frame_count, trained_frames
+from rfm.checkpoint.run_config import find_run_config, frame_count
 from rfm.vlm.backbone import QWEN_2_5, SMOL
 from rfm.vlm.network import VlmConfig
 
@@ -115,7 +115,9 @@ class RunConfig:
             "average_temporal_patches": self.get("model.average_temporal_patches", False),
             "progress_in_preference": self.get("training.predict_pref_progress", False),
             "base_model_id": self.get("model.base_model_id", ""),
-            "trained_frames": trained_frames(self.sections, self.file),
+            "trained_frames": frame_count(
+                self.sections["data"].get("max_frames"), f"{self.file}: {self.shown('data.max_frames')}"
+            ),
         }
 
     def size_px(self, family: str, multi_image: bool) -> tuple[int, int] | None:

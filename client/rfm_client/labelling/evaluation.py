@@ -9,7 +9,6 @@ VOC is 1.
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.data.datasets.lerobot_rows import read_table
+from rfm_client.data.datasets.lerobot_rows import column_names, read_table
+from rfm_client.data.datasets.lerobot_v21 import EPISODES_FILE, json_lines
 from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
 from rfm_client.labelling.label_files import PROGRESS_ENDING, read_label_table
@@ -151,19 +151,20 @@ def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool]:
     frames, episodes = (
         sorted(dataset.glob(pattern)) for pattern in ("data/**/*.parquet", "meta/episodes/**/*.parquet")
     )
-    for files in (frames, episodes):
-        if files and source in read_table(files[0]).column_names:
+    columns = [column_names(files[0]) if files else [] for files in (frames, episodes)]
+    for files, names in zip((frames, episodes), columns, strict=True):
+        if source in names:
             table = [read_table(file, ["episode_index", source]).to_pydict() for file in files]
             rows = [row for part in table for row in zip(part["episode_index"], part[source], strict=True)]
             return {
                 index: _outcome(f"outcome: {source}: episode {index}", value) for index, value in dict(rows).items()
             }
-    lines = dataset / "meta" / "episodes.jsonl"
-    told = [json.loads(line) for line in lines.read_text().splitlines() if line] if lines.is_file() else []
-    if not told or source not in told[0]:
-        known = read_table(frames[0]).column_names if frames else []
-        raise DatasetError.at("outcome", f"a CSV file, or a column of {dataset}: {', '.join(known)}", repr(source))
-    return {row["episode_index"]: _outcome(f"outcome: {lines}: {source}", row.get(source)) for row in told}
+    file = dataset / EPISODES_FILE
+    told = list(json_lines(file)) if file.is_file() else []
+    if not told or source not in told[0][1]:
+        known = ", ".join(columns[0])
+        raise DatasetError.at("outcome", f"a CSV file, or a column of {dataset}: {known}", repr(source))
+    return {line["episode_index"]: _outcome(f"{where}: {source}", line.get(source)) for where, line in told}
 
 
 def _of_csv(file: Path) -> dict[int, bool]:

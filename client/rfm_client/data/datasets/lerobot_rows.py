@@ -193,6 +193,16 @@ def read_table(file: Path, columns: list[str] | None = None, filters: Any = None
     return table
 
 
+def column_names(file: Path) -> list[str]:
+    """Return the column names of a Parquet file, without reading its rows. Raises DatasetError for a broken file."""
+    from pyarrow import ArrowException, parquet
+
+    try:
+        return list(parquet.read_schema(file).names)
+    except (OSError, ArrowException) as error:
+        raise DatasetError.at(file, "a readable Parquet file", error) from error
+
+
 def _read_columns(file: Path) -> Mapping[str, npt.NDArray[Any]]:
     table = read_table(file, list(_ROW_COLUMNS))
     return {name: table[name].to_numpy() for name in _ROW_COLUMNS}

@@ -18,7 +18,7 @@ TASKS_FILE = Path("meta", "tasks.jsonl")
 
 def read_entries(info: Info) -> Iterator[Entry]:
     """Yield the episodes in the metadata. Raises DatasetError."""
-    for where, line in _lines(info.root / EPISODES_FILE):
+    for where, line in json_lines(info.root / EPISODES_FILE):
         index, length = _number(where, line, "episode_index"), _number(where, line, "length")
         values = {"episode_chunk": index // info.chunks_size, "episode_index": index}
         tasks = line.get("tasks")
@@ -34,11 +34,11 @@ def read_entries(info: Info) -> Iterator[Entry]:
 
 def read_tasks(root: Path) -> dict[int, str | None]:
     """Return each task's sentence by its number. Raises DatasetError."""
-    return {_number(where, line, "task_index"): line.get("task", "") for where, line in _lines(root / TASKS_FILE)}
+    return {_number(where, line, "task_index"): line.get("task", "") for where, line in json_lines(root / TASKS_FILE)}
 
 
-def _lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Each object of a file of JSON lines, with its place for messages first."""
+def json_lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield each object of a file of JSON lines, after its place for messages. Raises DatasetError."""
     try:
         texts = file.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:
