@@ -73,7 +73,7 @@ def protocol(request: pytest.FixtureRequest) -> str:
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
-    """A test under which Triton itself ended with SIGABRT, which 2.51 does now and then, is run once more."""
+    """Run a test once more if it failed while Triton 2.51 aborted or hung at its start, as it does now and then."""
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
     CRASHES.clear()
     reports = runtestprotocol(item, nextitem=nextitem, log=False)

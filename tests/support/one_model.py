@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,23 @@ import tritonclient.grpc
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import Endpoints, TritonServer
 
-CRASHES: list[Path] = []  # repositories whose Triton has ended with SIGABRT, by itself
+CRASHES: list[Path] = []  # repositories whose Triton has ended with SIGABRT, by itself, or whose start was repeated
 
 
 class BriefServer(TritonServer):
     """A server that is killed when its test is over: Triton takes a second for each model process to end in order."""
+
+    _num_stops = 0
+
+    def start_ready(self, served: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+        before = self._num_stops
+        super().start_ready(served)
+        if self._num_stops > before:  # the first start hung for a minute: too long for callers with a deadline
+            CRASHES.append(self.repository)
+
+    def stop(self) -> int:
+        self._num_stops += 1
+        return super().stop()
 
     def __exit__(self, *raised: Any) -> None:
         if self.exit_status == -signal.SIGABRT:
