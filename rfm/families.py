@@ -15,7 +15,7 @@ from rfm.checkpoint.weights import check_finite
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options
 
 # Packages in the order in which they are tried. ReWiND comes last: its first checkpoints do not name their network.
-FAMILIES = ("rfm.vlm", "rfm.rewind")
+FAMILIES = ("rfm.topreward", "rfm.roboreward", "rfm.vlm", "rfm.rewind")
 
 
 def named(package: str) -> Family:
@@ -42,11 +42,20 @@ def encoders_of(package: str | None) -> type[FrameEncoders]:
     return encoders
 
 
-def choose(folder: Path, package: str | None = None) -> Family:
-    """Return the family ``package``, else the first family that reads the folder. Raises CheckpointError."""
+def choose(folder: Path, package: str | None = None, options: Options | None = None) -> Family:
+    """Return the family ``package``, or of the reward model in ``options``, else the first that reads the folder.
+
+    Raises CheckpointError.
+    """
     if package:
         return named(package)
     known = [named(name) for name in FAMILIES]
+    if options is not None and options.reward_model is not None:
+        wanted, _ = options.named()
+        if (found := next((family for family in known if wanted in family.reward_models), None)) is not None:
+            return found
+        names = [name for family in known for name in family.reward_models]
+        raise CheckpointError(f"--as: expected one of {', '.join(names)}, got {wanted!r}")
     return next((family for family in known if family.reads(folder)), known[-1])  # its load explains the fault
 
 
@@ -57,6 +66,7 @@ def load(
     base_model: str | None = None,
     image_encoder: str | None = None,
     text_encoder: str | None = None,
+    reward_model: str | None = None,
 ) -> Checkpoint:
     """Load the checkpoint of a local folder or Hugging Face id. Raises CheckpointError.
 
@@ -64,8 +74,8 @@ def load(
     others: as in ``rfm.family.Options``
     """
     folder = find(source)
-    options = Options(base_model, image_encoder, text_encoder)
-    return load_from(folder, choose(folder, family), options)
+    options = Options(base_model, image_encoder, text_encoder, reward_model)
+    return load_from(folder, choose(folder, family, options), options)
 
 
 def load_from(folder: Path, family: Family, options: Options) -> Checkpoint:

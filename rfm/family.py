@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.provenance import Decision
 from rfm_client.contract import FrameSize, RewardError
 from rfm_client.contract.frame_refs import EncoderSampleRefs
@@ -32,11 +33,42 @@ class Options:
     base_model: folder or id of a vision-language checkpoint's base model; None: as the checkpoint names it
     image_encoder, text_encoder: folders or ids of a ReWiND checkpoint's encoders; None: upstream's, if the checkpoint
         has weights of encoders or the other is set
+    reward_model: the way in which an ordinary vision-language model is asked, ``name,setting=value,...``; None: the
+        checkpoint is a reward model
     """
 
     base_model: str | None = None
     image_encoder: str | None = None
     text_encoder: str | None = None
+    reward_model: str | None = None
+
+    def named(self) -> tuple[str | None, dict[str, str]]:
+        """Return the reward model's name and the user's settings of it, from ``name,setting=value,...``.
+
+        Raises CheckpointError.
+        """
+        if self.reward_model is None:
+            return None, {}
+        name, *settings = self.reward_model.split(",")
+        if wrong := [setting for setting in settings if setting.count("=") != 1]:
+            raise CheckpointError(f"--as: expected setting=value, got {wrong[0]!r}")
+        return name, dict(setting.split("=") for setting in settings)  # type: ignore[misc]
+
+    def settings(self, known: Mapping[str, type]) -> dict[str, Any]:
+        """Return the user's settings as numbers. Raises CheckpointError for an unknown setting or a wrong value.
+
+        known: type of each setting
+        """
+        return {name: _value(name, text, known) for name, text in self.named()[1].items()}
+
+
+def _value(name: str, text: str, known: Mapping[str, type]) -> Any:
+    if name not in known:
+        raise CheckpointError(f"--as: expected settings among {', '.join(known)}, got {name!r}")
+    try:
+        return {"true": True, "false": False}[text] if known[name] is bool else known[name](text)
+    except (KeyError, ValueError):
+        raise CheckpointError(f"--as: {name}: expected a value of type {known[name].__name__}, got {text!r}") from None
 
 
 @dataclass(frozen=True)
@@ -51,6 +83,9 @@ class Description:
     frame_size: the size to which the checkpoint resizes each raw frame; None: it depends on the frame
     frames_per_value: consecutive frames with one score
     keeps_features: it can cache features of frames, and then takes samples with frame references
+    has_log_prob: progress comes with a log-probability of each frame
+    needs_whole_episode: its scores are relative to the whole episode, so dense mode and online use are refused
+    kind: the reward model's name for people
     is_large: exports are verified in the dtype that serves, on a GPU if it has room, since float32 on the CPU is slow
     """
 
@@ -67,6 +102,9 @@ class Description:
     is_large: bool = False
     has_preference: bool = True
     has_success: bool = True
+    has_log_prob: bool = False
+    needs_whole_episode: bool = False
+    kind: str = ""
 
     @property
     def lacks(self) -> frozenset[str]:
@@ -175,9 +213,11 @@ class Family:
     reads: returns True if a folder may hold a checkpoint of the family; used if the caller names no family
     load: loads the checkpoint of a local folder; raises CheckpointError
     encoders: the class of the family's encoders; None: its checkpoints score raw frames
+    reward_models: names that ``--as`` takes, for ordinary models that the family asks in its own way
     """
 
     name: str
     reads: Callable[[Path], bool]
     load: Callable[[Path, Options], Checkpoint]
     encoders: type[FrameEncoders] | None = None
+    reward_models: tuple[str, ...] = ()

@@ -55,8 +55,14 @@ class Predictor(Protocol[Row, Batch]):
     def count(self, batch: Batch, execution: Execution) -> None:
         """Add the batch's tokens, with and without padding, and its encoded frames to ``execution``."""
 
-    def score(self, rows: Sequence[Row], batch: Batch) -> list[RowScores | RewardError]:
-        """Run one forward pass; return each row's scores on the CPU, or its error."""
+    def score(self, rows: Sequence[Row], batch: Batch, execution: Execution) -> list[RowScores | RewardError]:
+        """Run one forward pass; return each row's scores on the CPU, or its error.
+
+        execution: a predictor of several passes calls its ``on_forward`` after each
+        """
+
+    def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
+        """Return the scores of a progress sample's frames, from those of all its rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +122,19 @@ def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> Fram
         progress=progress,
         success=no_success(progress) if success_logits is None else success_logits.sigmoid().float().cpu().numpy(),
         progress_logits=progress_logits.float().cpu().numpy() if discrete else None,
+    )
+
+
+def of_rows(sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
+    """Return a progress sample's scores: of its one row, in dense mode the last score of each prefix's row."""
+    if not getattr(sample, "frame_steps", 0):
+        return rows[0].frames[0]
+    frames = [row.frames[0] for row in rows]
+    logits = [scores.progress_logits[-1] for scores in frames if scores.progress_logits is not None]
+    return FrameScores(
+        progress=np.stack([scores.progress[-1] for scores in frames]),
+        success=np.stack([scores.success[-1] for scores in frames]),
+        progress_logits=np.stack(logits) if logits else None,
     )
 
 

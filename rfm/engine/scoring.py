@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
 import torch
 
 from rfm import families
@@ -24,7 +23,6 @@ from rfm.engine.predictor import Predictor, RowScores
 from rfm.family import Checkpoint, FrameEncoders
 from rfm_client.contract import (
     BatchTiming,
-    FrameScores,
     InvalidSampleError,
     PreferenceResult,
     PreferenceSample,
@@ -84,6 +82,7 @@ class Engine:
         family: str | None = None,
         encoders: FrameEncoders | None = None,
         base_model: str | None = None,
+        reward_model: str | None = None,
         device: str | torch.device = "cpu",
         dtype: torch.dtype | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
@@ -92,11 +91,11 @@ class Engine:
     ) -> Engine:
         """Return the engine for a checkpoint's folder or Hugging Face id.
 
-        source, family, base_model: as in ``rfm.families.load``; others: as in ``of`` and the class
+        source, family, base_model, reward_model: as in ``rfm.families.load``; others: as in ``of`` and the class
         Raises CheckpointError.
         """
         return cls.of(
-            families.load(source, family=family, base_model=base_model),
+            families.load(source, family=family, base_model=base_model, reward_model=reward_model),
             encoders=encoders,
             device=device,
             dtype=dtype,
@@ -209,7 +208,9 @@ class Engine:
         collate_s, forward_s = execution.collate_s - before.collate_s, execution.forward_s - before.forward_s
         timing = BatchTiming(collate_s * 1e3, forward_s * 1e3)
         return [
-            sample.rows if isinstance(sample.rows, RewardError) else _outcome(sample.sample, scores[of_sample], timing)
+            sample.rows
+            if isinstance(sample.rows, RewardError)
+            else self._outcome(sample.sample, scores[of_sample], timing)
             for sample, of_sample in zip(prepared, rows_of, strict=True)
         ]
 
@@ -249,7 +250,7 @@ class Engine:
 
         def forward(part: Sequence[Any]) -> Sequence[RowScores | RewardError]:
             of_part = batch if part is rows and batch is not None else self.predictor.collate(part)
-            scores = self.predictor.score(part, of_part)
+            scores = self.predictor.score(part, of_part, execution)
             self.predictor.count(of_part, execution)
             return scores
 
@@ -267,31 +268,27 @@ class Engine:
         if part:
             yield part
 
-
-def _outcome(
-    sample: Sample | ProgressSampleRefs, scores: Sequence[RowScores | RewardError], timing: BatchTiming
-) -> Outcome:
-    rows = [row for row in scores if isinstance(row, RowScores)]
-    if len(rows) < len(scores):
-        return next(row for row in scores if isinstance(row, RewardError))
-    if isinstance(sample, (ProgressSample, ProgressSampleRefs)):
-        frames = _last_of_each(rows) if sample.frame_steps else rows[0].frames[0]
-        logits = frames.progress_logits
-        return ProgressResult(progress=frames.progress, success=frames.success, progress_logits=logits, timing=timing)
-    first, second = rows[0].frames
-    query = rows[0].query
-    assert query is not None  # every row of two trajectories has a query
-    if isinstance(sample, PreferenceSample):
-        return PreferenceResult(preference=query, first=first, second=second, timing=timing)
-    return SimilarityResult(similarity=query, reference=first, other=second, timing=timing)
-
-
-def _last_of_each(rows: Sequence[RowScores]) -> FrameScores:
-    """Return the scores of dense mode: frame t's score is the last score in the row of its prefix."""
-    frames = [row.frames[0] for row in rows]
-    logits = [scores.progress_logits[-1] for scores in frames if scores.progress_logits is not None]
-    return FrameScores(
-        progress=np.stack([scores.progress[-1] for scores in frames]),
-        success=np.stack([scores.success[-1] for scores in frames]),
-        progress_logits=np.stack(logits) if logits else None,
-    )
+    def _outcome(
+        self,
+        sample: Sample | ProgressSampleRefs,
+        scores: Sequence[RowScores | RewardError],
+        timing: BatchTiming,
+    ) -> Outcome:
+        rows = [row for row in scores if isinstance(row, RowScores)]
+        if len(rows) < len(scores):
+            return next(row for row in scores if isinstance(row, RewardError))
+        if isinstance(sample, (ProgressSample, ProgressSampleRefs)):
+            frames = self.predictor.joined(sample, rows)
+            return ProgressResult(
+                progress=frames.progress,
+                success=frames.success,
+                progress_logits=frames.progress_logits,
+                log_prob=frames.log_prob,
+                timing=timing,
+            )
+        first, second = rows[0].frames
+        query = rows[0].query
+        assert query is not None  # every row of two trajectories has a query
+        if isinstance(sample, PreferenceSample):
+            return PreferenceResult(preference=query, first=first, second=second, timing=timing)
+        return SimilarityResult(similarity=query, reference=first, other=second, timing=timing)

@@ -15,9 +15,26 @@ import torch
 
 from rfm.engine.execution import Execution
 from rfm.engine.layers import as_tensor
-from rfm.engine.predictor import RowScores, are_finite, check_type, checked, frame_scores, part_of, prefix_indices
+from rfm.engine.predictor import (
+    RowScores,
+    are_finite,
+    check_type,
+    checked,
+    frame_scores,
+    of_rows,
+    part_of,
+    prefix_indices,
+)
 from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer, rounded_up
-from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, SimilaritySample, Trajectory
+from rfm_client.contract import (
+    FrameScores,
+    InvalidSampleError,
+    ProgressSample,
+    RewardError,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+)
 from rfm_client.contract.frame_refs import ProgressSampleRefs
 from rfm_client.contract.samples import Float32Array
 
@@ -170,7 +187,9 @@ class RewindPredictor:
         execution.add_tokens(batch.packing.num_tokens, len(batch.packing.at))
 
     @torch.inference_mode()
-    def score(self, rows: Sequence[RewindRow], batch: RewindBatch) -> list[RowScores | RewardError]:
+    def score(
+        self, rows: Sequence[RewindRow], batch: RewindBatch, execution: Execution
+    ) -> list[RowScores | RewardError]:
         """Run one forward pass; return each row's scores, or its error."""
         output = self.network(batch.to(self.device, self.dtype))
         frames = frame_scores(output.progress, output.success)
@@ -191,3 +210,7 @@ class RewindPredictor:
         if are_finite([frames], logits, has_success=has_success):  # all rows at once, which is faster
             return list(scored)
         return checked(scored, has_success=has_success)
+
+    def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
+        """Return the scores of a progress sample's frames, from those of all its rows."""
+        return of_rows(sample, rows)

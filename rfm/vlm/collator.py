@@ -102,7 +102,7 @@ class VlmCollator:
         """
         check_type(sample, self.config)
         frame_steps = sample.frame_steps if isinstance(sample, (ProgressSample, ProgressSampleRefs)) else 0
-        videos = tuple(_video(trajectory, frame_steps) for trajectory in sample.trajectories)
+        videos = tuple(video_of(trajectory, frame_steps) for trajectory in sample.trajectories)
         self._check_task(sample.trajectories[0].task)
         row = self._row(sample, videos)
         if frame_steps:
@@ -159,7 +159,7 @@ class VlmCollator:
             text, pad, lengths = self._placed(self._chat.text(tuple(parts)), videos)
         except ValueError as error:  # the frames are too narrow to be resized
             raise InvalidSampleError.at("frames", *str(error).split(", got ")) from error
-        ids = _expanded(self._chat.tokens(text), self.tokenizer.convert_tokens_to_ids(pad), lengths)
+        ids = expanded(self._chat.tokens(text), self.tokenizer.convert_tokens_to_ids(pad), lengths)
         is_similarity = isinstance(sample, SimilaritySample)
         query_token = SIMILARITY_TOKEN if is_similarity else PREFERENCE_TOKEN
         query = int(self._positions(ids, query_token)[-1]) if len(videos) > 1 else None
@@ -261,7 +261,7 @@ class QwenCollator(VlmCollator):
             return text, IMAGE_PAD, of_shots
         if self.config.family != QWEN3:
             return text, VIDEO_PAD, [grid.groups * grid.tokens_per_group for grid in grids]
-        timed = [_timed_groups(grid) for grid in grids]
+        timed = [timed_groups(group_times(grid.groups)) for grid in grids]
         return _replaced(text, VISION_START + VIDEO_PAD + VISION_END, timed), VIDEO_PAD, of_shots
 
     def _spans(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> tuple[Spans, ...]:
@@ -350,7 +350,8 @@ class SmolCollator(VlmCollator):
         return replace(batch, pixels=pixels)
 
 
-def _video(trajectory: Trajectory | TrajectoryRefs, frame_steps: int) -> VlmVideo:
+def video_of(trajectory: Trajectory | TrajectoryRefs, frame_steps: int) -> VlmVideo:
+    """Return the video of a trajectory's frames. Raises InvalidSampleError for embeddings."""
     if isinstance(trajectory, TrajectoryRefs):
         return VlmVideo.of(named_frames(trajectory), frame_steps, trajectory.digests)
     if trajectory.frames is None:
@@ -364,7 +365,7 @@ def _replaced(text: str, placeholder: str, replacements: Sequence[str]) -> str:
     return pieces[0] + "".join(new + piece for new, piece in zip(replacements, pieces[1:], strict=True))
 
 
-def _expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:
+def expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:
     """Repeat each ``pad`` token by ``lengths``, which is faster than to tokenise so many."""
     times = np.ones(len(ids), np.int64)
     at = np.flatnonzero(ids == pad)
@@ -373,11 +374,15 @@ def _expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:
     return ids.repeat(times)
 
 
-def _timed_groups(grid: Grid) -> str:
-    """Return Qwen3-VL's text of a video: each temporal patch behind the mean time of its frames."""
-    groups = []
-    for group in range(grid.groups):
-        frame_times = [(group * FRAMES_PER_GROUP + frame) / VIDEO_FPS for frame in range(FRAMES_PER_GROUP)]
-        time_s = sum(frame_times) / FRAMES_PER_GROUP
-        groups.append(f"<{time_s:.1f} seconds>{VISION_START}{VIDEO_PAD}{VISION_END}")
-    return "".join(groups)
+def group_times(num_groups: int) -> list[float]:
+    """Return the mean time of the frames of each temporal patch, in seconds, at VIDEO_FPS."""
+    frame_times = [
+        [(group * FRAMES_PER_GROUP + frame) / VIDEO_FPS for frame in range(FRAMES_PER_GROUP)]
+        for group in range(num_groups)
+    ]
+    return [sum(times) / FRAMES_PER_GROUP for times in frame_times]
+
+
+def timed_groups(times_s: Sequence[float]) -> str:
+    """Return Qwen3-VL's text of a video: each temporal patch behind its time."""
+    return "".join(f"<{time_s:.1f} seconds>{VISION_START}{VIDEO_PAD}{VISION_END}" for time_s in times_s)

@@ -107,11 +107,13 @@ class QwenImages:
 
     patch_px: P
     size_px: height and width in the training run's settings; None: each frame's own
+    max_video_side_px: larger frames of videos are scaled down to it first; None: they are not
     """
 
     patch_px: int
     normalisation: Normalisation
     size_px: tuple[int, int] | None = None
+    max_video_side_px: int | None = MAX_VIDEO_SIDE_PX
 
     def to_config(self) -> dict[str, Any]:
         """Return the corresponding fields of preprocessor_config.json."""
@@ -133,16 +135,7 @@ class QwenImages:
     def video_to_size(self, frames: UInt8Array, num_shown: int) -> Tensor:
         """Resize frames for a video of ``num_shown`` frames: uint8 [T, H, W, 3] -> [T, H', W', 3]."""
         *first_sizes, last_size = self._video_sizes(frames.shape[1], frames.shape[2], num_shown)
-        video = _to_sizes(frames, first_sizes)
-        if first_sizes[-1] == last_size:
-            return video
-        scaled = torch.empty(len(video), *last_size, video.shape[-1], dtype=torch.uint8)
-        for index, frame in enumerate(video):
-            # In float and rounded, as torchvision does. PyTorch's own uint8 resizing differs by up to 1.
-            planes = frame.movedim(-1, 0)[None].float()
-            planes = F.interpolate(planes, last_size, mode="bicubic", antialias=True).clamp_(0, MAX_UINT8).round_()
-            scaled[index] = planes[0].movedim(0, -1)
-        return scaled
+        return scaled_video(_to_sizes(frames, first_sizes), last_size)
 
     def patches(self, frames: Tensor, shots: Tensor | None, dtype: torch.dtype = torch.float32) -> Tensor:
         """Cut frames into N patches: uint8 [T, H', W', 3] -> [N, C * FRAMES_PER_GROUP * P * P].
@@ -171,8 +164,8 @@ class QwenImages:
         factor = self.patch_px * MERGE
         sizes = []
         fitted_size(height, width, factor)  # refuses narrow frames, which scaling down would leave without pixels
-        if max(height, width) > MAX_VIDEO_SIDE_PX:
-            scale = MAX_VIDEO_SIDE_PX / max(height, width)
+        if self.max_video_side_px is not None and max(height, width) > self.max_video_side_px:
+            scale = self.max_video_side_px / max(height, width)
             height, width = max(int(height * scale), 1), max(int(width * scale), 1)
             sizes.append((height, width))
         sizes.append(fitted_size(*(self.size_px or (height, width)), MERGE * factor))
@@ -220,6 +213,18 @@ def _scaled_to_longest(height: int, width: int, longest: int) -> tuple[int, int]
         return max(scaled + scaled % 2, 1), longest
     scaled = int(longest * (width / height))
     return longest, max(scaled + scaled % 2, 1)
+
+
+def scaled_video(video: Tensor, size: tuple[int, int]) -> Tensor:
+    """Resize a video to height and width as torchvision does: uint8 [T, H, W, 3] -> [T, *size, 3]."""
+    if video.shape[1:3] == size:
+        return video
+    scaled = torch.empty(len(video), *size, video.shape[-1], dtype=torch.uint8)
+    for index, frame in enumerate(video):
+        # In float and rounded. PyTorch's own uint8 resizing differs by up to 1.
+        planes = F.interpolate(frame.movedim(-1, 0)[None].float(), size, mode="bicubic", antialias=True)
+        scaled[index] = planes.clamp_(0, MAX_UINT8).round_()[0].movedim(0, -1)
+    return scaled
 
 
 def _to_sizes(frames: UInt8Array, sizes: Sequence[tuple[int, int]], resample: int = PIL_BICUBIC) -> Tensor:

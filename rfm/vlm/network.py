@@ -18,57 +18,25 @@ from torch import Tensor, nn
 from rfm.engine.layers import PredictionHead
 from rfm.vlm.backbone import BACKBONES, SMOL
 from rfm.vlm.batch import VlmBatch
-from rfm.vlm.qwen import check_attention, features, last_hidden_state
+from rfm.vlm.qwen import KeyValues, check_attention, features, last_hidden_state
 
 Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
 
 
 @dataclass(frozen=True)
-class VlmConfig:
-    """The configuration of a checkpoint's network and prompts.
+class BackboneConfig:
+    """The configuration of a backbone, and the dtype of its parameters and heads.
 
     backbone: transformers' configuration (config.json)
-    dtype: of all parameters, heads included
-    multi_image: each frame is an image; else a trajectory is a video
-    per_frame_progress_token: the state of an image is that of a progress token behind it
-    frame_pooling: pools an image's tokens to its state, without progress tokens; boundary: takes the last token
-    pooling_temperature: of attention pooling
-    average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
-    progress_in_preference: prompts for preference also ask for progress
-    size_px: height and width to which every frame is resized first; None: resizing starts from each frame's size
-    trained_frames: as in ``rfm.family.Description``
     """
 
     backbone: dict[str, Any]
     dtype: Literal["float32", "bfloat16", "float16"]
-    multi_image: bool
-    per_frame_progress_token: bool
-    frame_pooling: Pooling
-    pooling_temperature: float
-    average_temporal_patches: bool
-    progress_bins: int
-    has_similarity: bool
-    progress_in_preference: bool
-    size_px: tuple[int, int] | None
-    base_model_id: str
-    trained_frames: int | None = None
-    has_preference: bool = True
-    has_success: bool = True
 
     @property
     def family(self) -> str:
         """The backbone's model_type, a key of BACKBONES."""
         return str(self.backbone["model_type"])
-
-    @property
-    def pools_images(self) -> bool:
-        """True if an image's tokens are pooled by ``frame_pooling``, which upstream uses only for images."""
-        return self.multi_image and not self.per_frame_progress_token
-
-    @property
-    def pools_by_attention(self) -> bool:
-        """True if the attention of frame_pool_attn weighs an image's tokens."""
-        return self.pools_images and self.frame_pooling == "attention"
 
     @property
     def pads_left(self) -> bool:
@@ -84,6 +52,45 @@ class VlmConfig:
     def torch_dtype(self) -> torch.dtype:
         """The torch type that ``dtype`` names."""
         return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[self.dtype]
+
+
+@dataclass(frozen=True)
+class VlmConfig(BackboneConfig):
+    """The configuration of a checkpoint's network and prompts.
+
+    multi_image: each frame is an image; else a trajectory is a video
+    per_frame_progress_token: the state of an image is that of a progress token behind it
+    frame_pooling: pools an image's tokens to its state, without progress tokens; boundary: takes the last token
+    pooling_temperature: of attention pooling
+    average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
+    progress_in_preference: prompts for preference also ask for progress
+    size_px: height and width to which every frame is resized first; None: resizing starts from each frame's size
+    trained_frames: as in ``rfm.family.Description``
+    """
+
+    multi_image: bool
+    per_frame_progress_token: bool
+    frame_pooling: Pooling
+    pooling_temperature: float
+    average_temporal_patches: bool
+    progress_bins: int
+    has_similarity: bool
+    progress_in_preference: bool
+    size_px: tuple[int, int] | None
+    base_model_id: str
+    trained_frames: int | None = None
+    has_preference: bool = True
+    has_success: bool = True
+
+    @property
+    def pools_images(self) -> bool:
+        """True if an image's tokens are pooled by ``frame_pooling``, which upstream uses only for images."""
+        return self.multi_image and not self.per_frame_progress_token
+
+    @property
+    def pools_by_attention(self) -> bool:
+        """True if the attention of frame_pool_attn weighs an image's tokens."""
+        return self.pools_images and self.frame_pooling == "attention"
 
 
 @dataclass(frozen=True)
@@ -120,16 +127,10 @@ class VlmRewardModel(nn.Module):
 
     def forward(self, batch: VlmBatch) -> VlmOutput:
         """Return the logits of every frame and query in the batch, which is on the network's device."""
-        made = None
         if self.config.family == SMOL:
-            hidden = self.model(**batch.inputs, use_cache=False).last_hidden_state
+            hidden, made = self.model(**batch.inputs, use_cache=False).last_hidden_state, None
         else:
-            if batch.plan is not None:
-                made = features(self.model.visual, batch.inputs["pixel_values"], batch.plan)
-            assert batch.layout is not None
-            shots = [*([] if made is None else [made]), *batch.layout.kept.values()]
-            merged = torch.cat(shots) if len(shots) > 1 else shots[0]
-            hidden = last_hidden_state(self.model.language_model, batch.inputs, merged)
+            hidden, made = qwen_states(self.model, batch)
         frames = self._frame_states(hidden, batch.spans, batch.num_span_tokens)
         queries = hidden[batch.query_rows, batch.query_tokens]
         return VlmOutput(
@@ -157,6 +158,20 @@ class VlmRewardModel(nn.Module):
         return (_of_each("sum", states.float(), lengths) / lengths[:, None]).to(hidden.dtype)
 
 
+def qwen_states(backbone: Any, batch: VlmBatch, key_values: KeyValues | None = None) -> tuple[Tensor, Tensor | None]:
+    """Return a Qwen backbone's last hidden states, [B, L, D], and the features that its vision tower computed.
+
+    key_values: receives the keys and values of all tokens, for ``next_hidden_state``
+    """
+    made = None
+    if batch.plan is not None:
+        made = features(backbone.visual, batch.inputs["pixel_values"], batch.plan)
+    assert batch.layout is not None
+    shots = [*([] if made is None else [made]), *batch.layout.kept.values()]
+    merged = torch.cat(shots) if len(shots) > 1 else shots[0]
+    return last_hidden_state(backbone.language_model, batch.inputs, merged, key_values), made
+
+
 def _of_each(reduction: str, values: Tensor, lengths: Tensor) -> Tensor:
     """Return the sum or maximum of each segment, float32 [N, ...] -> [F, ...]."""
     # unsafe: without a check of the lengths, for which the host would wait
@@ -170,7 +185,7 @@ def _softmax_of_each(scores: Tensor, lengths: Tensor, segment: Tensor) -> Tensor
     return (weights / _of_each("sum", weights, lengths)[segment]).to(scores.dtype)
 
 
-def build_backbone(config: VlmConfig, dtype: torch.dtype) -> nn.Module:
+def build_backbone(config: BackboneConfig, dtype: torch.dtype) -> nn.Module:
     """Return the backbone with uninitialised weights in ``dtype``; buffers keep their own dtype."""
     try:
         import transformers

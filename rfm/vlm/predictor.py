@@ -15,7 +15,7 @@ from rfm.engine.device import Copies, memory_errors
 from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.layers import progress_from_logits, speed_up
-from rfm.engine.predictor import RowScores, checked, no_success, part_of
+from rfm.engine.predictor import RowScores, checked, no_success, of_rows, part_of
 from rfm.vlm.batch import Layout, VlmBatch
 from rfm.vlm.collator import VlmCollator, VlmRow
 from rfm.vlm.images import FRAMES_PER_GROUP
@@ -79,7 +79,7 @@ class VlmPredictor:
         execution.cache_bytes = None if self.cache is None else self.cache.num_bytes
 
     @torch.inference_mode()
-    def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
+    def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
         """Run one forward pass; return each row's scores, or its error."""
         self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         output = self._output(batch)
@@ -100,12 +100,15 @@ class VlmPredictor:
                 self._keep(rows, batch.layout, output.made)
         return checked(of_rows, has_success=output.success is not None)
 
-    def _output(self, batch: VlmBatch) -> VlmOutput:
+    def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
+        """Return the scores of a progress sample's frames, from those of all its rows."""
+        return of_rows(sample, rows)
+
+    def _output(self, batch: VlmBatch, *arguments: Any) -> Any:
         """Return the network's output. Out of memory, clear the cache, since the engine tries again with fewer rows."""
         try:
             with memory_errors():
-                output: VlmOutput = self.network(batch.to(self.device, self._dtype))
-                return output
+                return self.network(batch.to(self.device, self._dtype), *arguments)
         except torch.OutOfMemoryError:
             if self.cache is not None:
                 self.cache.clear()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,15 @@ from rfm.vlm.collator import (
     VlmCollator,
 )
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Normalisation, QwenImages, SmolImages, fitted_size
-from rfm.vlm.network import VlmConfig
+from rfm.vlm.network import BackboneConfig, VlmConfig
 from rfm.vlm.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS, Chat, Visual
 from rfm_client.contract import FrameSize
 
 PROCESSOR_FOLDER = "processor"  # in an exported checkpoint
 PROCESSOR_CONFIG = "processor_config.json"
+VIDEO_PREPROCESSOR_CONFIG = "video_preprocessor_config.json"
+# Files of preprocessing, and their keys in PROCESSOR_CONFIG of transformers 5.
+OF_IMAGES, OF_VIDEOS = (PREPROCESSOR_CONFIG, "image_processor"), (VIDEO_PREPROCESSOR_CONFIG, "video_processor")
 TOKENIZER_CONFIG = "tokenizer_config.json"
 # Fields of TOKENIZER_CONFIG that transformers 4.57 and 5 read alike; the rest is in tokenizer.json.
 _KEPT = (
@@ -56,13 +60,7 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
     num_tokens: rows of the checkpoint's token embedding
     processor: folder or id with tokenizer and image preprocessing
     """
-    try:
-        tokenizer = _tokenizer(processor)
-        preprocessor = _preprocessor(processor)
-        tokenizer.chat_template = _chat_template(processor, tokenizer)
-    except (LookupError, OSError, ValueError) as error:
-        hint = "name its folder with --base-model"
-        raise CheckpointError(f"base model {processor}: tokenizer and processor: {error} ({hint})") from error
+    tokenizer, preprocessor = read_processor(processor)
     tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
     if len(tokenizer) != num_tokens:  # upstream resizes the embedding to the tokenizer
         expected = f"a tokenizer of {num_tokens} tokens with the special ones, as the checkpoint's embedding"
@@ -77,11 +75,33 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
     return _collator(config, tokenizer, preprocessor, processor)
 
 
+def read_processor(processor: str | Path, *, videos: bool = False) -> tuple[Any, dict[str, Any]]:
+    """Return the tokenizer, with its chat template, and the preprocessing of images in a folder or of a Hub id.
+
+    videos: the preprocessing of videos in its place
+    Raises CheckpointError.
+    """
+    try:
+        tokenizer = _tokenizer(processor)
+        preprocessor = read_preprocessor(processor, *(OF_VIDEOS if videos else OF_IMAGES))
+        tokenizer.chat_template = _chat_template(processor, tokenizer)
+    except (LookupError, OSError, ValueError) as error:
+        hint = "name its folder with --base-model"
+        raise CheckpointError(f"base model {processor}: tokenizer and processor: {error} ({hint})") from error
+    return tokenizer, preprocessor
+
+
 def _check_tokens(config: VlmConfig, tokenizer: Any, processor: str | Path) -> None:
     first = len(tokenizer) - len(SPECIAL_TOKENS)
-    expected = {token: first + index for index, token in enumerate(SPECIAL_TOKENS)}
+    check_tokens(config, tokenizer, processor, {token: first + index for index, token in enumerate(SPECIAL_TOKENS)})
+
+
+def check_tokens(
+    config: BackboneConfig, tokenizer: Any, processor: str | Path, expected: Mapping[str, int] | None = None
+) -> None:
+    """Raise CheckpointError unless the tokenizer has the ids in the backbone's config.json and ``expected``."""
     stated = {token: config.backbone.get(name) for name, token in _STATED_TOKENS[config.family].items()}
-    expected |= {token: number for token, number in stated.items() if type(number) is int}
+    expected = {**(expected or {}), **{token: number for token, number in stated.items() if type(number) is int}}
     for token, number in expected.items():
         got = tokenizer.convert_tokens_to_ids(token)
         if got != number:
@@ -104,15 +124,15 @@ def _tokenizer(processor: str | Path) -> Any:
     return PreTrainedTokenizerFast(tokenizer_file=str(file), additional_special_tokens=special, **kept)
 
 
-def _preprocessor(processor: str | Path) -> dict[str, Any]:
-    """Read the image preprocessing from PREPROCESSOR_CONFIG or transformers 5's file. Raises OSError, ValueError."""
+def read_preprocessor(processor: str | Path, file: str, key: str) -> dict[str, Any]:
+    """Read the preprocessing from ``file``, or from ``key`` of transformers 5's file. Raises OSError, ValueError."""
     try:
-        return read_json(_cached(processor, PREPROCESSOR_CONFIG))
+        return read_json(_cached(processor, file))
     except OSError:
-        images = read_json(_cached(processor, PROCESSOR_CONFIG)).get("image_processor")
-    if not isinstance(images, dict):
-        raise ValueError(f"expected {PREPROCESSOR_CONFIG}, or image_processor in {PROCESSOR_CONFIG}, got none")
-    return images
+        found = read_json(_cached(processor, PROCESSOR_CONFIG)).get(key)
+    if not isinstance(found, dict):
+        raise ValueError(f"expected {file}, or {key} in {PROCESSOR_CONFIG}, got none")
+    return found
 
 
 def _cached(processor: str | Path, name: str) -> Path:
@@ -141,15 +161,20 @@ def save_processor(collator: VlmCollator, folder: Path) -> None:
 
 
 def _collator(config: VlmConfig, tokenizer: Any, preprocessor: dict[str, Any], where: str | Path) -> VlmCollator:
-    if abs(preprocessor.get("rescale_factor", 1 / 255) - 1 / 255) > 1e-9:  # Qwen's own files leave the default out
-        raise CheckpointError(f"{where}: rescale_factor: expected 1/255, got {preprocessor.get('rescale_factor')}")
-    normalisation = Normalisation(tuple(preprocessor["image_mean"]), tuple(preprocessor["image_std"]))
+    normalisation = normalisation_of(preprocessor, where)
     if config.family != SMOL:
         images = QwenImages(preprocessor["patch_size"], normalisation, config.size_px)
         return QwenCollator(config, tokenizer, images)
     vision = config.backbone["vision_config"]
     tokens = (vision["image_size"] // vision["patch_size"] // config.backbone["scale_factor"]) ** 2
     return SmolCollator(config, tokenizer, SmolImages(SMOL_SIZE_PX, preprocessor["resample"], tokens, normalisation))
+
+
+def normalisation_of(preprocessor: Mapping[str, Any], where: str | Path) -> Normalisation:
+    """Return the normalisation that a preprocessor's file states. Raises CheckpointError."""
+    if abs(preprocessor.get("rescale_factor", 1 / 255) - 1 / 255) > 1e-9:  # Qwen's own files leave the default out
+        raise CheckpointError(f"{where}: rescale_factor: expected 1/255, got {preprocessor.get('rescale_factor')}")
+    return Normalisation(tuple(preprocessor["image_mean"]), tuple(preprocessor["image_std"]))
 
 
 _EXAMPLE = "TASK"

@@ -16,6 +16,7 @@ Shots of a size share a call; transformers computes them one after the other.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -266,25 +267,71 @@ def _windows(grids: Sequence[Grid], side: int) -> tuple[Runs, Indices]:
 FULL_ATTENTION = "full_attention"
 
 
-def last_hidden_state(language: Any, inputs: dict[str, Tensor], features: Tensor) -> Tensor:
+class KeyValues:
+    """The keys and values of all tokens so far, of each layer, in the form of transformers' cache."""
+
+    def __init__(self) -> None:
+        self._of_layers: dict[int, tuple[Tensor, Tensor]] = {}
+
+    def update(self, keys: Tensor, values: Tensor, layer: int, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+        """Add the keys and values of new tokens, [B, heads, L, D / heads]; return those of all tokens."""
+        if layer in self._of_layers:
+            before = self._of_layers[layer]
+            keys, values = torch.cat([before[0], keys], dim=2), torch.cat([before[1], values], dim=2)
+        self._of_layers[layer] = keys, values
+        return keys, values
+
+
+def last_hidden_state(
+    language: Any, inputs: dict[str, Tensor], features: Tensor, key_values: KeyValues | None = None
+) -> Tensor:
     """Return the hidden states behind the final norm, [B, L, D].
 
     language: transformers' language model
     inputs: on its device: input_ids, int64 [B, L]; position_ids, int64 [3, B, L]; visual_tokens, int64 [M], the visual
         tokens' indices among all B * L; visual_features, int64 [M], the index of each in ``features``
     features: [N / U, levels, D], the merged tokens of all shots
+    key_values: receives the keys and values of all tokens; None: they are not needed
     """
     at, picked = inputs["visual_tokens"], inputs["visual_features"]
     merged, *deeper = features.unbind(1)
     hidden = language.embed_tokens(inputs["input_ids"])
     hidden.flatten(0, 1).index_copy_(0, at, merged[picked].to(hidden.dtype))
     turned = language.rotary_emb(hidden, inputs["position_ids"])
+    options = _cached(language, key_values)
     for number, layer in enumerate(language.layers):
-        hidden = layer(hidden, position_embeddings=turned, attention_mask=None)
+        hidden = layer(hidden, position_embeddings=turned, attention_mask=None, **options)
         hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # transformers 4.57 of Qwen2.5-VL
         if number < len(deeper):
             hidden.flatten(0, 1).index_add_(0, at, deeper[number][picked].to(hidden.dtype))
     return language.norm(hidden)
+
+
+def next_hidden_state(
+    language: Any, tokens: Tensor, position_ids: Tensor, is_seen: Tensor, key_values: KeyValues
+) -> Tensor:
+    """Return the hidden state of each conversation's next token behind the final norm, [B, D].
+
+    tokens: int64 [B]
+    position_ids: int64 [B], equal in time, row and column, since the token is text
+    is_seen: bool [B, L], the tokens so far, this one included, that are not padding
+    key_values: of the tokens before; receives this token's
+    """
+    hidden = language.embed_tokens(tokens[:, None])
+    turned = language.rotary_emb(hidden, position_ids[None, :, None].expand(3, -1, -1))
+    options = _cached(language, key_values)
+    for layer in language.layers:
+        hidden = layer(hidden, position_embeddings=turned, attention_mask=is_seen[:, None, None], **options)
+        hidden = hidden[0] if isinstance(hidden, tuple) else hidden
+    return language.norm(hidden)[:, 0]
+
+
+def _cached(language: Any, key_values: KeyValues | None) -> dict[str, KeyValues]:
+    """Return the argument of a layer for its cache, whose name transformers changed in 5.x."""
+    if key_values is None:
+        return {}
+    known = inspect.signature(language.layers[0].forward).parameters
+    return {"cache" if "cache" in known else "past_key_values": key_values}
 
 
 def check_attention(backbone: Any) -> None:

@@ -32,12 +32,14 @@ class FrameScores:
     progress: float32 [T], share of the task done, 0..1
     success: float32 [T], probability that the task is done; NaN throughout: the checkpoint does not predict it
     progress_logits: float32 [T, K], raw scores of the progress bins, on request, from discrete checkpoints only
+    log_prob: float32 [T], logarithm of TOPReward's probability that the frames so far complete the task, on request
     frame_indices: int64 [T], indices of the scored frames in the trajectory; None: all frames
     """
 
     progress: Float32Array
     success: Float32Array
     progress_logits: Float32Array | None = None
+    log_prob: Float32Array | None = None
     frame_indices: npt.NDArray[np.int64] | None = None
 
     @property

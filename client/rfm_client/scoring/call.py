@@ -46,6 +46,7 @@ class Call:
         deadline: Deadline,
         *,
         logits: bool = False,
+        log_prob: bool = False,
         timing: bool = False,
         subsample: bool = False,
         resize: bool = False,
@@ -56,5 +57,9 @@ class Call:
         prefix = request_id or secrets.token_hex(_ID_BYTES)
         self.deadline = deadline
         self.request_ids = (f"{prefix}-{number}" for number in itertools.count(1))
-        self.outputs = (*[wire.PROGRESS_LOGITS] * logits, *[wire.TIMING_MS] * timing)
+        self.outputs = (
+            *[wire.PROGRESS_LOGITS] * logits,
+            *[wire.LOG_PROB] * log_prob,
+            *[wire.TIMING_MS] * timing,
+        )
         self.subsample, self.resize = subsample, resize

@@ -20,6 +20,7 @@ from rfm_client.contract.results import (
 )
 from rfm_client.contract.samples import Float32Array, PreferenceSample, ProgressSample, Sample, SimilaritySample
 from rfm_client.contract.wire.specs import (
+    LOG_PROB,
     PREFERENCE,
     PROGRESS,
     PROGRESS_LOGITS,
@@ -30,7 +31,7 @@ from rfm_client.contract.wire.specs import (
     pad_stack,
 )
 
-_OF_FRAMES = (PROGRESS, SUCCESS, PROGRESS_LOGITS)  # outputs [B, P, ...], named as the fields of FrameScores
+_OF_FRAMES = (PROGRESS, SUCCESS, PROGRESS_LOGITS, LOG_PROB)  # outputs [B, P, ...], named as the fields of FrameScores
 _OF_SAMPLES = (PREFERENCE, SIMILARITY)  # outputs [B, 1], named as the fields of results
 
 
@@ -66,6 +67,7 @@ def decode_progress(
         progress=scores.progress,
         success=scores.success,
         progress_logits=scores.progress_logits,
+        log_prob=scores.log_prob,
         timing=_timing(tensors, row),
         model_version=model_version,
     )
@@ -112,11 +114,14 @@ def _timing(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> BatchTiming | 
 
 
 def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: slice) -> FrameScores:
-    logits = _present(tensors, PROGRESS_LOGITS, row, positions) if PROGRESS_LOGITS in tensors else None
+    logits, log_prob = (
+        _present(tensors, name, row, positions) if name in tensors else None for name in (PROGRESS_LOGITS, LOG_PROB)
+    )
     return FrameScores(
         progress=_present(tensors, PROGRESS, row, positions),
         success=_present(tensors, SUCCESS, row, positions, may_lack=True),
         progress_logits=logits,
+        log_prob=log_prob,
     )
 
 

@@ -31,6 +31,7 @@ SUCCESS = "success"
 PREFERENCE = "preference"
 SIMILARITY = "similarity"
 PROGRESS_LOGITS = "progress_logits"
+LOG_PROB = "log_prob"
 TIMING_MS = "timing_ms"
 
 REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # ids that a request may have
@@ -98,18 +99,22 @@ def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
     )
 
 
-def score_outputs(progress_bins: int | None) -> tuple[TensorSpec, ...]:
-    """Return the outputs of a reward model; progress_bins: K of a discrete checkpoint, None: continuous."""
-    scores = (
+def score_outputs(progress_bins: int | None, *, has_log_prob: bool = False) -> tuple[TensorSpec, ...]:
+    """Return the outputs of a reward model.
+
+    progress_bins: K of a discrete checkpoint; None: continuous
+    has_log_prob: with TOPReward's log-probability of each frame
+    """
+    scores: tuple[TensorSpec, ...] = (
         TensorSpec(PROGRESS, "FP32", (VARIABLE,)),
         TensorSpec(SUCCESS, "FP32", (VARIABLE,)),
         TensorSpec(PREFERENCE, "FP32", (1,)),
         TensorSpec(SIMILARITY, "FP32", (1,)),
         TensorSpec(TIMING_MS, "FP32", (2,)),
     )
-    if progress_bins is None:
-        return scores
-    return (*scores, TensorSpec(PROGRESS_LOGITS, "FP32", (VARIABLE, progress_bins)))
+    if progress_bins is not None:
+        scores = (*scores, TensorSpec(PROGRESS_LOGITS, "FP32", (VARIABLE, progress_bins)))
+    return (*scores, TensorSpec(LOG_PROB, "FP32", (VARIABLE,))) if has_log_prob else scores
 
 
 def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:

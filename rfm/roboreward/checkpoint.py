@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: MIT
+"""RoboReward's checkpoints: ordinary folders of a Qwen3-VL, which only their names tell from others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
+from rfm.checkpoint.provenance import Decision, source_name
+from rfm.engine.feature_cache import FeatureCache
+from rfm.family import Description, Options
+from rfm.roboreward.predictor import RoboRewardPredictor
+from rfm.roboreward.prompts import SCORES, RoboRewardCollator, RoboRewardConfig
+from rfm.vlm.collator import QWEN3
+from rfm.vlm.images import Normalisation, QwenImages
+from rfm.vlm.language import LanguageCheckpoint, LanguageFolder, LanguageNetwork, reward_model_of
+
+WRITTEN, EXPECTED = "roboreward", "roboreward-expected"  # of ``--as``
+REWARD_MODELS = (WRITTEN, EXPECTED)
+GENERATION_CONFIG = "generation_config.json"
+# Keys of GENERATION_CONFIG without effect on the likeliest token.
+_IDLE = {
+    "_from_model_config", "bos_token_id", "do_sample", "eos_token_id", "max_length", "max_new_tokens", "pad_token_id",
+    "temperature", "top_k", "top_p", "transformers_version", "use_cache",
+}  # fmt: skip
+_NEUTRAL = {"repetition_penalty": 1.0, "no_repeat_ngram_size": 0, "num_beams": 1, "min_length": 0}
+
+
+@dataclass(frozen=True)
+class RoboRewardCheckpoint(LanguageCheckpoint):
+    """RoboReward in memory."""
+
+    @property
+    def description(self) -> Description:
+        """The model's inputs and outputs."""
+        return Description(
+            network_class=LanguageNetwork.__name__,
+            widths=None,
+            progress_bins=len(SCORES),
+            has_similarity=False,
+            keeps_features=True,
+            is_large=True,
+            has_preference=False,
+            has_success=False,
+            kind="RoboReward, expected value of the score" if self.config.is_expected else "RoboReward",
+        )
+
+    def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> RoboRewardCollator:
+        """Return the collator with this tokenizer and preprocessing. Raises CheckpointError."""
+        images = QwenImages(patch_px, normalisation, max_video_side_px=None)
+        collator = RoboRewardCollator(self.config, tokenizer, images)  # type: ignore[arg-type]
+        for score, token in zip(SCORES, collator.digits, strict=True):
+            if tokenizer.decode([token]) != str(score):
+                raise CheckpointError(f"base model {self.processor}: expected a token for {score}, got none")
+        return collator
+
+    def make_predictor(
+        self, network: LanguageNetwork, device: torch.device, cache: FeatureCache[Any] | None
+    ) -> RoboRewardPredictor:
+        """Return the predictor with this network."""
+        return RoboRewardPredictor(network, self.collator, device, cache)
+
+
+def reads(folder: Path) -> bool:
+    """True if the folder holds an export of RoboReward, or a Qwen3-VL whose path has its name."""
+    if reward_model_of(folder) is not None:
+        return reward_model_of(folder) == RoboRewardConfig.reward_model
+    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
+    return content.get("model_type") == QWEN3 and "roboreward" in str(folder.resolve()).lower()
+
+
+def load(folder: Path, options: Options) -> RoboRewardCheckpoint:
+    """Load the model of a local folder: a Qwen3-VL's, or an export. Raises CheckpointError."""
+    name, _ = options.named()
+    options.settings({})
+    files = LanguageFolder.read(folder, options)
+    config = files.saved(RoboRewardConfig)
+    if config is None:
+        base = source_name(options.base_model or folder)
+        # bfloat16 whatever config.json says, as upstream
+        config = RoboRewardConfig(files.backbone, "bfloat16", base, _stops(folder), is_expected=name == EXPECTED)
+    elif name is not None and config.is_expected != (name == EXPECTED):
+        raise CheckpointError(
+            f"--as: expected the reward model of this export, got {name}; export the checkpoint again"
+        )
+    told = [
+        Decision("dtype", config.dtype, "upstream: always"),
+        Decision("stops", list(config.stops), GENERATION_CONFIG),
+        Decision("max_new_tokens", config.max_new_tokens, "upstream"),
+        Decision("is_expected", config.is_expected, "--as" if name else "default"),
+    ]
+    checkpoint = RoboRewardCheckpoint(
+        config, files.weights, files.processor, (*files.decisions(config.base_model_id), *told)
+    )
+    checkpoint.check()
+    return checkpoint
+
+
+def _stops(folder: Path) -> tuple[int, ...]:
+    """Return the tokens that end an answer. Raises CheckpointError for settings that change the likeliest token."""
+    file = folder / GENERATION_CONFIG
+    if not is_there(file):
+        raise CheckpointError(f"{file}: expected the file, got none; copy it from the checkpoint as it was published")
+    content = read_json(file)
+    for key in sorted(content.keys() - _IDLE):
+        if key not in _NEUTRAL or content[key] not in (None, _NEUTRAL[key]):
+            expected = f"{_NEUTRAL[key]}" if key in _NEUTRAL else "no such key"
+            raise CheckpointError(f"{file}: {key}: expected {expected}, got {shown(content[key])}; remove it")
+    stops = content.get("eos_token_id")
+    found = stops if isinstance(stops, list) else [stops]
+    if not found or not all(type(token) is int for token in found):
+        raise CheckpointError(f"{file}: eos_token_id: expected ids of tokens, got {shown(stops)}")
+    return tuple(found)

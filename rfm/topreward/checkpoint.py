@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: MIT
+"""TOPReward of a Qwen3-VL: there is no checkpoint of its own, only a prompt and its settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
+from rfm.checkpoint.hub import find
+from rfm.checkpoint.provenance import Decision, source_name
+from rfm.engine.feature_cache import FeatureCache
+from rfm.family import Description, Options
+from rfm.topreward.predictor import TopRewardPredictor
+from rfm.topreward.prompts import PROMPT_PREFIX, PROMPT_SUFFIX, TopRewardCollator, TopRewardConfig, TopRewardImages
+from rfm.vlm.images import Normalisation
+from rfm.vlm.language import LanguageCheckpoint, LanguageFolder, LanguageNetwork, reward_model_of
+from rfm.vlm.processor import OF_VIDEOS, VIDEO_PREPROCESSOR_CONFIG, read_preprocessor
+
+LEROBOT, ROBOMETER = "topreward", "topreward-robometer"  # of ``--as``
+REWARD_MODELS = (LEROBOT, ROBOMETER)
+_TYPE = "topreward"  # the value of the key ``type`` of LeRobot's config.json
+FPS, MAX_FRAMES, NUM_PREFIXES = 2.0, 64, 15  # defaults: LeRobot's; of Robometer's baseline
+# Keys of LeRobot's config.json about its own pipelines, uploads and cropping of online samples.
+_IDLE = {
+    "attn_implementation", "default_task", "device", "image_key", "input_features", "license", "max_frames",
+    "max_input_length", "normalization_mapping", "output_features", "pretrained_path", "pretrained_revision",
+    "private", "push_to_hub", "repo_id", "success_threshold", "tags", "task_key", "torch_dtype", "type", "vlm_name",
+}  # fmt: skip
+_DECIDING = {
+    "add_chat_template": "chat_template",
+    "fps": "fps",
+    "prompt_prefix": "prompt_prefix",
+    "prompt_suffix_template": "prompt_suffix",
+}
+_OF_USER = {"num_prefixes": int, "fps": float, "chat_template": bool}  # settings that ``--as`` takes
+
+
+@dataclass(frozen=True)
+class TopRewardCheckpoint(LanguageCheckpoint):
+    """TOPReward in memory."""
+
+    @property
+    def description(self) -> Description:
+        """The model's inputs and outputs."""
+        return Description(
+            network_class=LanguageNetwork.__name__,
+            widths=None,
+            progress_bins=1,
+            has_similarity=False,
+            max_frames=self.config.max_frames,
+            keeps_features=True,
+            is_large=True,
+            has_preference=False,
+            has_success=False,
+            has_log_prob=True,
+            needs_whole_episode=True,
+            kind=f"TOPReward, as {'LeRobot' if self.config.variant == 'lerobot' else 'Robometer'} computes it",
+        )
+
+    def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> TopRewardCollator:
+        """Return the collator with this tokenizer and preprocessing."""
+        images = TopRewardImages(patch_px, normalisation, config=self.config)
+        return TopRewardCollator(self.config, tokenizer, images)  # type: ignore[arg-type]
+
+    def make_predictor(
+        self, network: LanguageNetwork, device: torch.device, cache: FeatureCache[Any] | None
+    ) -> TopRewardPredictor:
+        """Return the predictor with this network."""
+        return TopRewardPredictor(network, self.collator, device, cache)
+
+
+def reads(folder: Path) -> bool:
+    """True if the folder holds LeRobot's settings of TOPReward, or an export of it."""
+    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
+    return content.get("type") == _TYPE or reward_model_of(folder) == TopRewardConfig.reward_model
+
+
+def load(folder: Path, options: Options) -> TopRewardCheckpoint:
+    """Load the model of a local folder: a Qwen3-VL's, LeRobot's settings, or an export. Raises CheckpointError."""
+    name, given = options.named()
+    content = read_json(folder / NETWORK_CONFIG)
+    of_lerobot: dict[str, Any] = {}
+    if content.get("type") == _TYPE:
+        if name == ROBOMETER:
+            raise CheckpointError(f"--as: expected {LEROBOT} for a config.json of LeRobot, got {name}")
+        of_lerobot = _lerobot_settings(content, folder / NETWORK_CONFIG)
+        folder = find(options.base_model or str(content.get("vlm_name")))
+        options = replace(options, base_model=None)
+    files = LanguageFolder.read(folder, options)
+    config = files.saved(TopRewardConfig)
+    if config is not None and given:
+        raise CheckpointError(
+            "--as: expected no settings for an export, which has its own; export the checkpoint again"
+        )
+    if config is None:
+        is_lerobot = name != ROBOMETER
+        settings: dict[str, Any] = {
+            "variant": "lerobot" if is_lerobot else "robometer",
+            "chat_template": not is_lerobot,
+            "fps": FPS,
+            "num_prefixes": None if is_lerobot else NUM_PREFIXES,
+            "max_frames": None if is_lerobot else MAX_FRAMES,
+            "prompt_prefix": PROMPT_PREFIX,
+            "prompt_suffix": PROMPT_SUFFIX,
+            **_limits(files),
+            **of_lerobot,
+            **options.settings(_OF_USER),
+        }
+        _check(settings)
+        base = source_name(options.base_model or folder)
+        config = TopRewardConfig(files.backbone, files.dtype, base, **settings)  # type: ignore[arg-type]
+    told = [
+        Decision(key, getattr(config, key), "--as" if key in given else NETWORK_CONFIG if of_lerobot else "default")
+        for key in ("variant", "chat_template", "fps", "num_prefixes", "max_frames", "prompt_prefix", "prompt_suffix")
+    ]
+    limits = [Decision(key, getattr(config, key), VIDEO_PREPROCESSOR_CONFIG) for key in ("least_px", "most_px")]
+    settled = (*files.decisions(config.base_model_id), *told, *limits)
+    checkpoint = TopRewardCheckpoint(config, files.weights, files.processor, settled)
+    checkpoint.check()
+    return checkpoint
+
+
+def _lerobot_settings(content: Mapping[str, Any], file: Path) -> dict[str, Any]:
+    """Return the fields of TopRewardConfig in LeRobot's config.json. Raises CheckpointError for an unknown key."""
+    if unknown := sorted(content.keys() - _IDLE - _DECIDING.keys()):
+        remedy = "if it changes no score, remove it"
+        raise CheckpointError(f"{file}: expected the keys of LeRobot's TOPReward, got {shown(unknown[0])}; {remedy}")
+    for key in _DECIDING:
+        if content.get(key) is None:
+            raise CheckpointError(f"{file}: {key}: expected a value, got none; save the model with LeRobot again")
+    return {field: content[key] for key, field in _DECIDING.items()}
+
+
+def _limits(files: LanguageFolder) -> dict[str, int]:
+    """Return the least and most pixels of a video by its processor. Raises CheckpointError."""
+    preprocessor = read_preprocessor(files.processor, *OF_VIDEOS)
+    size = preprocessor.get("size")
+    where = f"{files.processor}: {VIDEO_PREPROCESSOR_CONFIG}"
+    if not isinstance(size, dict) or not all(type(size.get(edge)) is int for edge in ("shortest_edge", "longest_edge")):
+        raise CheckpointError(f"{where}: size: expected shortest_edge and longest_edge, got {shown(size)}")
+    for key, usual in {"fps": 2, "min_frames": 4, "do_resize": True, "resample": 3, "temporal_patch_size": 2}.items():
+        if preprocessor.get(key, usual) != usual:
+            raise CheckpointError(f"{where}: {key}: expected {usual}, got {shown(preprocessor[key])}")
+    return {"least_px": size["shortest_edge"], "most_px": size["longest_edge"]}
+
+
+def _check(settings: Mapping[str, Any]) -> None:
+    """Raise CheckpointError for settings that no prompt can be made of."""
+    prefixes, fps, suffix = settings["num_prefixes"], settings["fps"], settings["prompt_suffix"]
+    if prefixes is not None and prefixes < 1:
+        raise CheckpointError(f"num_prefixes: expected at least 1, got {prefixes}")
+    if not 0 < float(fps) < float("inf"):
+        raise CheckpointError(f"fps: expected a number above 0, got {shown(fps)}")
+    try:
+        is_good = suffix.format(instruction="TASK") != suffix.format(instruction="")
+    except (AttributeError, IndexError, LookupError, ValueError):
+        is_good = False
+    if not is_good:
+        raise CheckpointError(f"prompt_suffix: expected text with {{instruction}}, got {shown(suffix)}")

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: MIT
+"""The predictor of TOPReward: log-probabilities of the answer behind each prefix, and progress relative to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import torch
+
+from rfm.engine.device import memory_errors
+from rfm.engine.execution import Execution
+from rfm.engine.predictor import RowScores, no_success
+from rfm.topreward.prompts import TopRewardConfig
+from rfm.vlm.batch import VlmBatch
+from rfm.vlm.collator import VlmRow
+from rfm.vlm.images import FRAMES_PER_GROUP
+from rfm.vlm.predictor import VlmPredictor
+from rfm_client.contract import FrameScores, InferenceFailedError, RewardError, Sample
+from rfm_client.contract.frame_refs import ProgressSampleRefs
+from rfm_client.contract.samples import Float32Array
+
+
+class TopRewardPredictor(VlmPredictor):
+    """A Qwen3-VL on a device, which is asked whether a video completes the task."""
+
+    @torch.inference_mode()
+    def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
+        """Run one forward pass; return the log-probability of each row's answer, or its error."""
+        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
+        output = self._output(batch)
+        answers = torch.tensor([int(row.input_ids[-1]) for row in rows], device=output.logits.device)
+        logits = output.logits.float() if self._config.variant == "lerobot" else output.logits
+        log_probs = logits.log_softmax(-1).gather(1, answers[:, None])[:, 0].float().cpu().numpy()
+        if batch.layout is not None and np.isfinite(log_probs).all():
+            with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are complete without the cache
+                self._keep(rows, batch.layout, output.made)
+        return [_of_row(log_probs[index : index + 1]) for index in range(len(rows))]
+
+    def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
+        """Return the scores of an episode's frames: progress is 0 at the least likely prefix, 1 at the likeliest."""
+        num_frames = sample.trajectories[0].num_frames
+        prefixes = self._config.prefixes(num_frames)
+        log_probs = np.concatenate([_log_prob(row) for row in rows])
+        progress = self._progress(log_probs, num_frames)
+        frames = np.arange(1, num_frames + 1)
+        progress, log_prob = (
+            np.interp(frames, prefixes, values).astype(np.float32) for values in (progress, log_probs)
+        )
+        return FrameScores(progress=progress, success=no_success(progress), log_prob=log_prob)
+
+    def _progress(self, log_probs: Float32Array, num_frames: int) -> Any:
+        is_robometer = self._config.variant == "robometer"
+        values = log_probs.astype(np.float64) if is_robometer else log_probs
+        least, most = values.min(), values.max()
+        if least == most or (is_robometer and num_frames <= FRAMES_PER_GROUP):
+            return np.ones_like(values)
+        return ((values - least) / (most - least)).clip(0, 1)
+
+    @property
+    def _config(self) -> TopRewardConfig:
+        config: TopRewardConfig = self.network.config
+        return config
+
+
+def _of_row(log_prob: Float32Array) -> RowScores | RewardError:
+    if not np.isfinite(log_prob).all():
+        return InferenceFailedError("the network gave a score that is not finite")
+    unknown = np.full_like(log_prob, np.nan)  # progress is known once all rows are
+    return RowScores([FrameScores(progress=unknown, success=unknown, log_prob=log_prob)])
+
+
+def _log_prob(row: RowScores) -> Float32Array:
+    log_prob = row.frames[0].log_prob
+    assert log_prob is not None  # by ``score``
+    return log_prob
