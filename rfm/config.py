@@ -67,6 +67,13 @@ class ExportConfig(Settings):
     base_model: str | None = setting(
         None, "Folder or id of a vision-language checkpoint's base model; else the one that it names."
     )
+    reward_model: str | None = setting(
+        None,
+        "Reward model that an ordinary Qwen3-VL is asked as: topreward, topreward-robometer, roboreward or "
+        "roboreward-expected; settings follow: topreward,num_prefixes=15.",
+        flag="--as",
+        metavar="NAME",
+    )
     max_queue_size: int | None = setting(
         None, "Requests that may wait for a model; more are rejected at once. Else any number.", **_COUNT
     )

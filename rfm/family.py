@@ -52,7 +52,7 @@ class Options:
         name, *settings = self.reward_model.split(",")
         if wrong := [setting for setting in settings if setting.count("=") != 1]:
             raise CheckpointError(f"--as: expected setting=value, got {wrong[0]!r}")
-        return name, dict(setting.split("=") for setting in settings)  # type: ignore[misc]
+        return name, dict(setting.split("=") for setting in settings)
 
     def settings(self, known: Mapping[str, type]) -> dict[str, Any]:
         """Return the user's settings as numbers. Raises CheckpointError for an unknown setting or a wrong value.

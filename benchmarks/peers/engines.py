@@ -109,7 +109,7 @@ def simulate(engine: Engine, file: Path, batch_s: float, row_s: float) -> Engine
     """Make the engine's forward passes sleep for ``batch_s``, plus ``row_s`` for each row. Scores are 0.5."""
     ledger, num_bins = Ledger(file), engine.predictor.network.config.progress_bins
 
-    def score(rows: Sequence[Any], batch: Any) -> list[RowScores]:
+    def score(rows: Sequence[Any], batch: Any, execution: Any) -> list[RowScores]:
         ledger.run(batch_s + row_s * len(rows))
         return [_half(row, num_bins) for row in rows]
 

@@ -96,6 +96,8 @@ def _facts(
         encodes=encoders is not None,
         is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
         trained_padding=description.trained_padding is not False,
+        has_log_prob=description.has_log_prob,
+        needs_whole_episode=description.needs_whole_episode,
     )
 
 

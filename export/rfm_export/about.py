@@ -15,12 +15,13 @@ from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.checkpoint.content import read_run_config
 from rfm.checkpoint.hub import commit_of
-from rfm.checkpoint.provenance import is_folder, settings_digest, source_name, weights_digest
+from rfm.checkpoint.provenance import is_folder, license_of, settings_digest, source_name, weights_digest
 from rfm.checkpoint.run_config import find_run_config
 from rfm.family import NETWORK, Checkpoint, EncodersDescription, config_fields
 from rfm.parameters import DTYPE_PARAMETER
 from rfm_client.contract.model_info import (
     DIGEST_PARAMETER,
+    LICENSE_PARAMETER,
     NETWORK_PARAMETER,
     REVISION_PARAMETER,
     RUN_CONFIG_PARAMETER,
@@ -28,12 +29,12 @@ from rfm_client.contract.model_info import (
     SOURCE_PARAMETER,
 )
 
-_OF_ORIGIN = (SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER)
+_OF_ORIGIN = (SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER, LICENSE_PARAMETER)
 _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for example hub_token, wandb_api_key
 
 
 def origin_of(source: str | Path, folder: Path) -> dict[str, str]:
-    """Return the checkpoint's origin as parameters by name: source, commit, config.yaml of the training run.
+    """Return the checkpoint's origin as parameters by name: source, commit, training run's config.yaml, licence.
 
     The source of a folder is the end of its path. config.yaml becomes JSON without secrets.
 
@@ -43,7 +44,9 @@ def origin_of(source: str | Path, folder: Path) -> dict[str, str]:
     revision = "" if is_folder(source) else commit_of(folder)
     file = find_run_config(folder)
     of_run = {} if file is None else {RUN_CONFIG_PARAMETER: json.dumps(_public(read_run_config(file)))}
-    return {SOURCE_PARAMETER: source_name(source), REVISION_PARAMETER: revision, **of_run}
+    license = license_of(folder)
+    of_card = {} if license is None else {LICENSE_PARAMETER: license}
+    return {SOURCE_PARAMETER: source_name(source), REVISION_PARAMETER: revision, **of_run, **of_card}
 
 
 def origin_in(config: pb.ModelConfig) -> dict[str, str]:

@@ -22,8 +22,11 @@ from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sam
 from rfm_client.contract.model_info import (
     FRAME_SIZE_PARAMETER,
     FRAMES_PER_VALUE_PARAMETER,
+    KIND_PARAMETER,
+    LACKS_PARAMETER,
     MAX_FRAMES_PARAMETER,
     TRAINED_PADDING_PARAMETER,
+    WHOLE_EPISODE_PARAMETER,
 )
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_client.contract.synthetic import blank_trajectory
@@ -99,7 +102,8 @@ def generated_models(
     settings = replace(version.settings, instances=version.settings.instances or (2 if several else 1))
     # With several instances, each cache would have to see all frames.
     keeps = description.keeps_features and cache_mib > 0 and settings.instances == 1
-    outputs = wire.score_outputs(description.progress_bins if description.progress_bins > 1 else None)
+    bins = description.progress_bins if description.progress_bins > 1 else None
+    outputs = wire.score_outputs(bins, has_log_prob=description.has_log_prob)
     inputs = wire.frame_inputs(by_digest=keeps) if widths is None else wire.embedding_inputs(*widths)
     about = {**_limits(description, description.frame_size), **version.about}
     scorer = Interface(scorer_name(description, name), inputs, outputs, about)
@@ -124,6 +128,9 @@ def _limits(description: Description, frame_size: FrameSize | None) -> dict[str,
         MAX_FRAMES_PARAMETER: str(min(limits)) if limits else "",
         FRAME_SIZE_PARAMETER: "" if frame_size is None else str(frame_size),
         FRAMES_PER_VALUE_PARAMETER: str(description.frames_per_value),
+        KIND_PARAMETER: description.kind,
+        LACKS_PARAMETER: ",".join(sorted(description.lacks)),
+        **({WHOLE_EPISODE_PARAMETER: "true"} if description.needs_whole_episode else {}),
         **({} if padding is None else {TRAINED_PADDING_PARAMETER: str(padding).lower()}),
     }
 

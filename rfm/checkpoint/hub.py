@@ -14,7 +14,7 @@ from rfm.checkpoint.weights import PICKLE_STEM, pickled_weights
 
 _SOURCE = "a folder that exists or a Hugging Face id org/name[/subfolder][@tag]"
 _ID = re.compile(r"(?P<repo>\w[\w.-]*/\w[\w.-]*)(?:/(?P<subfolder>[\w=.+-]+(?:/[\w=.+-]+)*))?(?:@(?P<tag>.+))?")
-_FILES = ["*.safetensors", "*.json", "*.yaml", "*.yml", "*.txt"]
+_FILES = ["*.safetensors", "*.json", "*.yaml", "*.yml", "*.txt", "README.md"]
 _BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
 
 

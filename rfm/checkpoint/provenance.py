@@ -6,15 +6,20 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from rfm.checkpoint.content import NETWORK_CONFIG, is_there, read_json
+
 PROVENANCE = "provenance.json"  # beside an exported checkpoint's config.json; nothing reads it
 OF_WEIGHTS = "weights"
 OF_UPSTREAM = "default of upstream"
 
+MODEL_CARD = "README.md"
+_CARD_LICENSE = re.compile(r"\A---\n(?:.*\n)*?license: *(\S+) *\n")
 _NAMED_PARTS = 2  # of a path, whose rest may be private
 
 
@@ -46,6 +51,16 @@ TRAINED_WITH_PADDING = Decision("trained_padding", True, "upstream: every traini
 def source_name(source: str | Path) -> str:
     """Return the public name of a checkpoint's source: the end of a folder's path, or the Hub id."""
     return "/".join(Path(source).expanduser().resolve().parts[-_NAMED_PARTS:]) if is_folder(source) else str(source)
+
+
+def license_of(folder: Path) -> str | None:
+    """Return the licence that a checkpoint's model card (README.md) or config.json states; None: neither does."""
+    card = folder / MODEL_CARD
+    if is_there(card) and (found := _CARD_LICENSE.search(card.read_text(errors="replace"))):
+        return found[1].strip("\"'")
+    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
+    stated = content.get("license")
+    return stated if isinstance(stated, str) and stated else None
 
 
 def is_folder(source: str | Path) -> bool:

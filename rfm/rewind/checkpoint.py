@@ -103,6 +103,7 @@ class RewindCheckpoint:
             trained_padding=self.config.trained_padding,
             has_preference=self.config.has_preference,
             has_success=self.config.has_success,
+            kind="ReWiND",
         )
 
     @property

@@ -52,7 +52,7 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
     def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> RoboRewardCollator:
         """Return the collator with this tokenizer and preprocessing. Raises CheckpointError."""
         images = QwenImages(patch_px, normalisation, max_video_side_px=None)
-        collator = RoboRewardCollator(self.config, tokenizer, images)  # type: ignore[arg-type]
+        collator = RoboRewardCollator(self.config, tokenizer, images)
         for score, token in zip(SCORES, collator.digits, strict=True):
             if tokenizer.decode([token]) != str(score):
                 raise CheckpointError(f"base model {self.processor}: expected a token for {score}, got none")

@@ -65,7 +65,7 @@ class TopRewardCheckpoint(LanguageCheckpoint):
     def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> TopRewardCollator:
         """Return the collator with this tokenizer and preprocessing."""
         images = TopRewardImages(patch_px, normalisation, config=self.config)
-        return TopRewardCollator(self.config, tokenizer, images)  # type: ignore[arg-type]
+        return TopRewardCollator(self.config, tokenizer, images)
 
     def make_predictor(
         self, network: LanguageNetwork, device: torch.device, cache: FeatureCache[Any] | None
@@ -113,7 +113,7 @@ def load(folder: Path, options: Options) -> TopRewardCheckpoint:
         }
         _check(settings)
         base = source_name(options.base_model or folder)
-        config = TopRewardConfig(files.backbone, files.dtype, base, **settings)  # type: ignore[arg-type]
+        config = TopRewardConfig(files.backbone, files.dtype, base, **settings)
     told = [
         Decision(key, getattr(config, key), "--as" if key in given else NETWORK_CONFIG if of_lerobot else "default")
         for key in ("variant", "chat_template", "fps", "num_prefixes", "max_frames", "prompt_prefix", "prompt_suffix")

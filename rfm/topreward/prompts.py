@@ -79,7 +79,7 @@ class TopRewardConfig(LanguageConfig):
         """Return the frames of a prefix that the model sees, int64, and the seconds of each pair's mean time."""
         if self.variant == "lerobot":
             shown = np.arange(length)
-            times_s: Sequence[float] = [frame / self.fps for frame in shown.tolist()]
+            times_s = [frame / self.fps for frame in shown.tolist()]
         else:
             filled = np.minimum(np.arange(length + length % FRAMES_PER_GROUP), length - 1)
             wanted = max(int(len(filled) / ASSUMED_FPS * SAMPLED_FPS), LEAST_SAMPLED)

@@ -111,6 +111,7 @@ class VlmCheckpoint:
             is_large=True,
             has_preference=self.config.has_preference,
             has_success=self.config.has_success,
+            kind="RFM or Robometer",
         )
 
     @property

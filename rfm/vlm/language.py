@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch
@@ -45,10 +45,11 @@ from rfm.vlm.collator import (
     video_of,
 )
 from rfm.vlm.images import MERGE, Normalisation
-from rfm.vlm.network import BackboneConfig, build_backbone, qwen_states
+from rfm.vlm.network import BackboneConfig, Dtype, build_backbone, qwen_states
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, normalisation_of, read_processor, save_processor
 from rfm.vlm.qwen import Box, KeyValues, positions
+from rfm.vlm.run_config import DTYPES
 from rfm.vlm.video import Indices, VlmVideo, shots_of
 from rfm_client.contract import InvalidSampleError, Sample
 from rfm_client.contract.frame_refs import ProgressSampleRefs
@@ -141,7 +142,7 @@ class LanguageCollator(QwenCollator):
         ids = np.concatenate([ids, more]) if len(more) else ids
         starts = self._positions(ids, VISION_START) + 1
         boxes = [Box(int(start), 1, grid.rows // MERGE, grid.columns // MERGE) for start in starts]
-        return VlmRow(ids, (video,), ((),), len(ids) - 1, False, picked=shown, position_ids=positions(len(ids), boxes))
+        return VlmRow(ids, (video,), ([],), len(ids) - 1, False, picked=shown, position_ids=positions(len(ids), boxes))
 
     def template(self, *content: str, add_generation_prompt: bool) -> str:
         """Return the chat template's text of one user message: the video, then ``content``."""
@@ -273,7 +274,7 @@ class LanguageFolder:
     settings: dict[str, Any] | None
     weights: dict[str, Tensor]
     processor: str | Path
-    dtype: str
+    dtype: Dtype
 
     @classmethod
     def read(cls, folder: Path, options: Options) -> LanguageFolder:
@@ -296,7 +297,9 @@ class LanguageFolder:
         own = folder / PROCESSOR_FOLDER
         processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
         dtype = str(backbone.get("dtype") or backbone.get("torch_dtype") or "bfloat16").removeprefix("torch.")
-        return cls(folder, backbone, settings, weights, processor, dtype)
+        if dtype not in DTYPES:
+            raise CheckpointError(f"{file}: dtype: expected one of {', '.join(DTYPES)}, got {shown(dtype)}")
+        return cls(folder, backbone, settings, weights, processor, cast(Dtype, dtype))
 
     def saved(self, config: type[Config]) -> Config | None:
         """Return the configuration that ``LanguageCheckpoint.save`` wrote; None: the folder is no export."""
@@ -307,7 +310,8 @@ class LanguageFolder:
             for name, value in self.settings.items()
             if name != REWARD_MODEL
         }
-        return config(backbone=self.backbone, **fields)
+        made: Any = config
+        return cast(Config, made(backbone=self.backbone, **fields))
 
     def decisions(self, base_model_id: str) -> tuple[Decision, ...]:
         """Return the source of the settings that all reward models of a Qwen3-VL share."""

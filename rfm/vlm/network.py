@@ -20,6 +20,7 @@ from rfm.vlm.backbone import BACKBONES, SMOL
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.qwen import KeyValues, check_attention, features, last_hidden_state
 
+Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
 Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
 
 
@@ -31,7 +32,7 @@ class BackboneConfig:
     """
 
     backbone: dict[str, Any]
-    dtype: Literal["float32", "bfloat16", "float16"]
+    dtype: Dtype
 
     @property
     def family(self) -> str:

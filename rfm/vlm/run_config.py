@@ -70,7 +70,8 @@ class RunConfig:
             raise CheckpointError(
                 f"{folder}: expected {RUN_CONFIG} of the training run there, in the folder above, or on main of its "
                 "Hub repository, got none: weights do not tell how the model was shown frames; "
-                f"copy the run's {RUN_CONFIG} into the folder"
+                f"copy the run's {RUN_CONFIG} into the folder; with an ordinary vision-language model, say --as which "
+                "reward model it is asked"
             )
         content = read_run_config(file)
         sections = {name: content.get(name) or {} for name in _SECTIONS}

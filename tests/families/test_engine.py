@@ -44,12 +44,15 @@ class Pipelined:
     def count(self, batch: Any, execution: Execution) -> None:
         execution.add_tokens(1, 1)
 
-    def score(self, rows: Sequence[int], batch: Any) -> list[RowScores | RewardError]:
+    def score(self, rows: Sequence[int], batch: Any, execution: Execution) -> list[RowScores | RewardError]:
         if rows[0] + 1 < len(self.collated):
             assert self.collated[rows[0] + 1].wait(WAIT_S)
         self.scored += 1
         score = np.full(1, rows[0], np.float32)
         return [RowScores([FrameScores(progress=score, success=score)])]
+
+    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
+        return rows[0].frames[0]
 
 
 def test_the_next_batch_is_collated_while_the_current_one_runs() -> None:

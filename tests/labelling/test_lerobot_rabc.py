@@ -19,6 +19,7 @@ from rfm_commands.cli import app
 FOLDER = ROOT / "lerobot_rabc"
 EXPECTED = json.loads((FOLDER / "expected.json").read_text())
 RUNS = [run for run in EXPECTED["runs"] if "robometer" in run["what"]]
+TOPREWARD_RUNS = [run for run in EXPECTED["runs"] if "topreward" in run["what"]]
 
 
 @pytest.mark.parametrize("run", RUNS, ids=lambda run: run["file"])
@@ -29,13 +30,32 @@ def test_robometer_s_table_is_that_of_lerobot(tmp_path: Path, run: dict[str, Any
     words += ["--sampling", "linspace_round", "--frames", arguments.get("num_subsampled_frames", 4)]
     if "episodes" in arguments:
         words += ["--episodes", ",".join(map(str, arguments["episodes"]))]
+    atol = 1e-5 if HAS_AVX512 else 0.05  # other processors round bfloat16 sums elsewhere
+    check(tmp_path / "robometer_progress.parquet", words, run, atol)
+
+
+@pytest.mark.parametrize("run", TOPREWARD_RUNS, ids=lambda run: run["file"])
+def test_topreward_s_table_is_that_of_lerobot(tmp_path: Path, run: dict[str, Any]) -> None:
+    arguments = run["arguments"]
+    settings = [f"num_prefixes={arguments['num_samples']}"] if "num_samples" in arguments else []
+    settings += [f"fps={arguments['fps']}"] if "fps" in arguments else []
+    words = ["label", FOLDER / EXPECTED["dataset"], "--output", tmp_path, "--alias", "topreward_progress"]
+    words += ["--checkpoint", FOLDER / run["checkpoint"], "--as", ",".join(["topreward", *settings]), "--mode", "whole"]
+    if "episodes" in arguments:
+        words += ["--episodes", ",".join(map(str, arguments["episodes"]))]
+    check(tmp_path / "topreward_progress.parquet", words, run, 2e-5)
+    labels = parquet.read_table(tmp_path / "rfm_progress.parquet")
+    assert labels["log_prob"].to_numpy().max() < 0
+    assert "success" not in labels.column_names
+
+
+def check(file: Path, words: list[Any], run: dict[str, Any], atol: float) -> None:
     done = CliRunner().invoke(app, [*map(str, words), "--no-picture"])
     assert done.exit_code == 0, done.output
-    table = parquet.read_table(tmp_path / "robometer_progress.parquet")
+    table = parquet.read_table(file)
     for name in ("index", "episode_index", "frame_index"):
         assert table[name].to_pylist() == run["rows"][name]
         assert str(table.schema.field(name).type) == run["columns"][name]
     assert str(table.schema.field("progress_sparse").type) == run["columns"]["progress_sparse"]
     expected = np.array(run["rows"]["progress_sparse"])
-    atol = 1e-5 if HAS_AVX512 else 0.05  # other processors round bfloat16 sums elsewhere
     np.testing.assert_allclose(table["progress_sparse"].to_numpy(), expected, rtol=0, atol=atol)

@@ -21,9 +21,17 @@ from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS
 from rfm.checkpoint.provenance import Decision
 from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache
-from rfm.engine.predictor import RowScores, frame_scores, prefix_indices
+from rfm.engine.predictor import RowScores, frame_scores, of_rows, prefix_indices
 from rfm.family import NETWORK, Description, EncodersDescription, Family, Options
-from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, SimilaritySample, Trajectory
+from rfm_client.contract import (
+    FrameScores,
+    InvalidSampleError,
+    ProgressSample,
+    RewardError,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+)
 from rfm_client.contract.frame_refs import EncoderSampleRefs, TrajectoryRefs
 from rfm_client.contract.samples import EncoderSample
 
@@ -121,7 +129,9 @@ class ToyPredictor:
         execution.add_tokens(len(batch), len(batch))
 
     @torch.inference_mode()
-    def score(self, rows: Sequence[list[np.ndarray]], batch: Tensor) -> list[RowScores | RewardError]:
+    def score(
+        self, rows: Sequence[list[np.ndarray]], batch: Tensor, execution: Execution
+    ) -> list[RowScores | RewardError]:
         logits = iter(self.network(batch).split([len(video) for row in rows for video in row]))
         scored: list[RowScores | RewardError] = []
         for row in rows:
@@ -129,6 +139,9 @@ class ToyPredictor:
             query = (of_row[0][-1] - of_row[1][-1]).sigmoid().item() if len(row) == 2 else None
             scored.append(RowScores([frame_scores(each, each[:, 0]) for each in of_row], query))
         return scored
+
+    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
+        return of_rows(sample, rows)
 
 
 @dataclass(frozen=True)

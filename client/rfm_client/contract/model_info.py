@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rfm_client.contract import wire
+from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
 
 MAX_FRAMES_PARAMETER = "max_frames"  # parameters of config.pbtxt; empty: unknown
@@ -21,6 +22,10 @@ DIGEST_PARAMETER = "weights_digest"
 SETTINGS_DIGEST_PARAMETER = "settings_digest"
 NETWORK_PARAMETER = "network"
 RUN_CONFIG_PARAMETER = "run_config"
+KIND_PARAMETER = "kind"
+LICENSE_PARAMETER = "license"
+LACKS_PARAMETER = "lacks"  # names of scores that the checkpoint does not give, with commas between
+WHOLE_EPISODE_PARAMETER = "needs_whole_episode"  # "true"; any other value: false
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,11 @@ class ModelInfo:
         tokenizer, image processor), dtype, kind of device; None: unknown
     network: ``class``, ``config``, and the number of weights of each part (``parameters``)
     run_config: config.yaml of the training run, without secrets; empty: the checkpoint has none
+    kind: name of the reward model, such as TOPReward; None: unknown
+    license: licence of the weights, by the checkpoint's model card or config.json; None: unknown
+    lacks: which of success, preference and similarity the checkpoint does not give; None: unknown
+    has_log_prob: True if it gives log-probabilities (``log_prob=True`` of a call)
+    needs_whole_episode: True if its scores are relative to the whole episode, so it cannot score while one runs
     """
 
     name: str
@@ -64,11 +74,23 @@ class ModelInfo:
     settings_digest: str | None = None
     network: Mapping[str, Any] = field(default_factory=dict)
     run_config: Mapping[str, Any] = field(default_factory=dict)
+    kind: str | None = None
+    license: str | None = None
+    lacks: tuple[str, ...] | None = None
+    has_log_prob: bool = False
+    needs_whole_episode: bool = False
 
     @property
     def widths(self) -> tuple[int, int] | None:
         """``video_dim`` and ``text_dim``; None: the model reads raw frames and writes scores."""
         return None if self.video_dim is None or self.text_dim is None else (self.video_dim, self.text_dim)
+
+    def check_scores_prefixes(self) -> None:
+        """Raise InvalidSampleError for a model that cannot score while an episode runs."""
+        if self.needs_whole_episode:
+            expected = "a model that scores an episode while it runs"
+            got = f"{self.kind}, whose progress is relative to the whole episode: score it at its end"
+            raise InvalidSampleError.at(f"model {self.name}", expected, got)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
@@ -80,6 +102,7 @@ class ModelInfo:
         parameters = {name: value.get("string_value", "") for name, value in config.get("parameters", {}).items()}
         max_frames = parameters.get(MAX_FRAMES_PARAMETER)
         frame_size = parameters.get(FRAME_SIZE_PARAMETER)
+        lacks = parameters.get(LACKS_PARAMETER)
         versions = config.get("version_policy", {}).get("specific", {}).get("versions", [])
         return cls(
             name=config["name"],
@@ -100,6 +123,11 @@ class ModelInfo:
             settings_digest=parameters.get(SETTINGS_DIGEST_PARAMETER) or None,
             network=json.loads(parameters.get(NETWORK_PARAMETER) or "{}"),
             run_config=json.loads(parameters.get(RUN_CONFIG_PARAMETER) or "{}"),
+            kind=parameters.get(KIND_PARAMETER) or None,
+            license=parameters.get(LICENSE_PARAMETER) or None,
+            lacks=tuple(filter(None, lacks.split(","))) if lacks is not None else None,
+            has_log_prob=wire.LOG_PROB in last_dims,
+            needs_whole_episode=parameters.get(WHOLE_EPISODE_PARAMETER) == "true",
         )
 
 

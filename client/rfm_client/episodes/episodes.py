@@ -109,8 +109,6 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
 
     async def _shown(self, deadline: Deadline | None) -> tuple[Sampling, FrameSize | None]:
         """Rule and frame size for the checkpoint. The client caches both until another version answers."""
-        if not self._options.needs_model_info:
-            return self._options.sampling_for(None), None
         info = await self._client.model_info(frames=True, timeout_s=_left_s(deadline))
         return self._options.sampling_for(info), info.frame_size if self._options.resize else None
 

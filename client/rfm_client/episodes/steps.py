@@ -107,18 +107,12 @@ class EpisodeOptions:
         said = self._orient
         return [said.cameras.get(camera, said.default or "none") for camera in self.cameras or ("",)]
 
-    @property
-    def needs_model_info(self) -> bool:
-        """True if ``sampling`` or ``frames`` is left out, or frames are shrunk."""
-        return self.resize or self.sampling is None or self.frames is None
+    def sampling_for(self, info: ModelInfo) -> Sampling:
+        """Return the rule with its number of frames for a checkpoint.
 
-    def sampling_for(self, info: ModelInfo | None) -> Sampling:
-        """Return the rule with its number of frames. Raises ValueError.
-
-        info: of the checkpoint; required if ``needs_model_info``
+        Raises ValueError, InvalidSampleError for a checkpoint that needs the whole episode.
         """
-        if info is None:
-            return Sampling.of(self.sampling, self.frames, None)
+        info.check_scores_prefixes()
         return Sampling.of(self.sampling, self.frames, info.max_frames, trained_padding=info.trained_padding)
 
     @property

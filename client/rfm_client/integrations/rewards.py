@@ -16,7 +16,6 @@ from rfm_client.client import RewardClient
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.frame_size import FrameSize
-from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.numbers import checked_count, checked_finite
 from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import UInt8Array
@@ -258,7 +257,7 @@ class EpisodeRewarder:
         """Request about their newest frames, sampled by the options and the checkpoint now served."""
         asked_s = time.perf_counter()
         scoring = self._options.scoring
-        info: ModelInfo | None = self._client.model_info(frames=True) if scoring.needs_model_info else None
+        info = self._client.model_info(frames=True)
         return StepRequest([episode.frames for episode in episodes], scoring.sampling_for(info), asked_s)
 
     @property

@@ -24,7 +24,7 @@ from rfm_client.labelling.scorer import Scorer
 
 Columns: TypeAlias = dict[str, Float32Array]
 
-PROGRESS, SUCCESS = "progress", "success"
+PROGRESS, SUCCESS, LOG_PROB = "progress", "success", "log_prob"
 FRAMES_AT_A_TIME = 64  # in a request to the encoder, as in its forward pass
 MAX_BYTES = 32 * 2**20  # of the samples in one call of the scorer
 MAX_FRAME_BYTES = 2 * 2**30  # of all workers of a process
@@ -66,8 +66,8 @@ def episode_columns(
 ) -> Columns:
     """Return the columns of an episode's labels, float32 [T] each. Raises RewardError.
 
-    Columns: ``progress``, and ``success`` if the checkpoint predicts it. Several cameras add ``progress.<camera>`` and
-    ``success.<camera>``.
+    Columns: ``progress``, and ``success`` and ``log_prob`` if the checkpoint predicts them. Several cameras add
+    ``progress.<camera>`` and so on.
 
     memory: shared by all workers, for the frames of one camera at a time; unused if the checkpoint encodes frames
     go_on: called between requests; its exception ends the episode
@@ -84,8 +84,10 @@ def episode_columns(
             with memory.holding(first[0].nbytes * episode.num_frames):
                 by_camera[camera] = _scores(_held(first, chunks, episode), scorer, recipe, go_on)
     columns: Columns = {}
-    for name in (PROGRESS, SUCCESS):
+    for name in (PROGRESS, SUCCESS, LOG_PROB):
         scores = [getattr(result, name) for result in by_camera.values()]
+        if name == LOG_PROB and scores[0] is None:
+            continue
         if name == SUCCESS and all(np.isnan(score).all() for score in scores):
             continue
         _check_numbers(name, scores, episode)

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.samples import Float32Array
 from rfm_client.data.datasets.protocol import DatasetError, require
-from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
+from rfm_client.labelling.episode_scores import LOG_PROB, PROGRESS, SUCCESS, Columns
 from rfm_client.labelling.finished_episodes import IDENTITY, whole_file
 from rfm_client.labelling.labelled_before import LabelFile
 from rfm_client.labelling.plan import Item, Plan
@@ -38,8 +38,12 @@ _EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run s
 _ROWS_AT_A_TIME = 2**17  # in a row group
 _OWN_NAME = "rfm"  # default of ``LabelOptions.name``
 _PROGRESS_NAMES = ("progress_sparse", "progress_dense", "progress")
-_SIGNAL_NAMES = {PROGRESS: "progress", SUCCESS: "success_probability"}
-_DESCRIPTIONS = {PROGRESS: "Share of the task that is done", SUCCESS: "Probability that the task is done"}
+_SIGNAL_NAMES = {PROGRESS: "progress", SUCCESS: "success_probability", LOG_PROB: "log_prob"}
+_DESCRIPTIONS = {
+    PROGRESS: "Share of the task that is done",
+    SUCCESS: "Probability that the task is done",
+    LOG_PROB: "Logarithm of the probability that the frames so far complete the task",
+}
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,7 @@ def _descriptor(column: str) -> dict[str, Any]:
     return {
         "description": _DESCRIPTIONS[score] + (f", seen by {camera}" if camera else ""),
         "direction": "higher",
-        "bounds": [0.0, 1.0],
+        "bounds": [None, 0.0] if score == LOG_PROB else [0.0, 1.0],
         "unit": None,
         "missing_values": "forbidden",
         "allow_nan": False,  # the same in another revision of the proposal

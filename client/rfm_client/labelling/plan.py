@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.data.camera_fusion import Fuse
 from rfm_client.data.datasets.protocol import (
     Dataset,
@@ -50,10 +51,14 @@ class Recipe:
     def of(cls, options: LabelOptions, dataset: Dataset, checkpoint: CheckpointFacts) -> Recipe:
         """Return the recipe of the options; the dataset and the checkpoint decide the rest.
 
-        Raises DatasetError for an unknown camera, ValueError if the rule lacks its number of frames.
+        Raises DatasetError for an unknown camera, ValueError if the rule lacks its number of frames, InvalidSampleError
+        for another mode than ``whole`` with a checkpoint that needs the whole episode.
         """
         require(dataset.source, bool(dataset.cameras), "at least one camera", "none")
         cameras = chosen_cameras(dataset, options.cameras)
+        if checkpoint.needs_whole_episode and options.mode != "whole":
+            why = "of this model, whose scores are relative to the whole episode"
+            raise InvalidSampleError.at("mode", f"whole {why}", options.mode)
         rule = "all" if options.mode == "whole" else options.sampling
         return cls(
             checkpoint,

@@ -28,6 +28,8 @@ class CheckpointFacts:
     encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
     is_causal: True if no frame's score depends on later frames
     trained_padding: True if training padded shorter trajectories, or if unknown
+    has_log_prob: True if results have log-probabilities
+    needs_whole_episode: True if scores are relative to the whole episode
     """
 
     source: str | None
@@ -39,6 +41,8 @@ class CheckpointFacts:
     encodes: bool
     is_causal: bool
     trained_padding: bool = True
+    has_log_prob: bool = False
+    needs_whole_episode: bool = False
 
     def document(self) -> dict[str, Any]:
         """Return the facts for the provenance."""
@@ -64,6 +68,7 @@ class ClientScorer:
 
     def __init__(self, client: RewardClient) -> None:
         self._client = client
+        self._has_log_prob = False
 
     def checkpoint(self) -> CheckpointFacts:
         """Return the facts from the servers. Raises RewardError, also if the servers have different checkpoints."""
@@ -74,6 +79,7 @@ class ClientScorer:
             raise InvalidSampleError.at(
                 f"model {info.name}", "a weights_digest, as exports have since version 0.1.0", "none: export it again"
             )
+        self._has_log_prob = info.has_log_prob
         embedded = infos["embeddings"][0] if "embeddings" in infos else None
         network = info.network if embedded is None else embedded.network
         return CheckpointFacts(
@@ -86,6 +92,8 @@ class ClientScorer:
             encodes=embedded is not None,
             is_causal=network.get("config", {}).get("causal_mask") is True,
             trained_padding=info.trained_padding,
+            has_log_prob=info.has_log_prob,
+            needs_whole_episode=info.needs_whole_episode,
         )
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
@@ -94,7 +102,7 @@ class ClientScorer:
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
         """Return the result of each sample. Raises RewardError for the first failure."""
-        return cast("list[ProgressResult]", self._client.evaluate(samples))
+        return cast("list[ProgressResult]", self._client.evaluate(samples, log_prob=self._has_log_prob))
 
 
 def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:

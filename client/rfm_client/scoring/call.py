@@ -18,6 +18,7 @@ class CallOptions(TypedDict, total=False):
 
     timeout_s: longest time of the call; None: the client's
     logits: True: add the raw scores of the progress bins (discrete checkpoints only)
+    log_prob: True: add the log-probability of each frame (TOPReward only)
     timing: True: add the server's time for the batch
     subsample: True: score at most ``ModelInfo.max_frames`` frames of a trajectory, evenly spaced from first to last, as
         in training; the result's ``frame_indices`` lists them
@@ -28,6 +29,7 @@ class CallOptions(TypedDict, total=False):
 
     timeout_s: float | None
     logits: bool
+    log_prob: bool
     timing: bool
     subsample: bool
     resize: bool

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: MIT
+"""RoboReward: the answers of the original code, all at once, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from reward_models import Reference, references
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm.engine import Engine
+from rfm.engine.execution import Execution
+from rfm.roboreward.prompts import parsed
+from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Trajectory
+from rfm_client.contract import InvalidSampleError
+
+CASES = references("roboreward")
+CONFIGS = sorted({case.config for case in CASES})
+CHECKPOINT = CONFIGS[0] / "checkpoint"
+EXACT, ROUNDED = 1e-4, 0.3  # of logits: in float32, in bfloat16
+
+
+def samples_of(case: Reference) -> list[ProgressSample]:
+    """The samples; where the original scores steps, each prefix is a sample."""
+    samples = case.samples()
+    if not case.content["use_frame_steps"]:
+        return samples
+    return [
+        ProgressSample(Trajectory(frames=sample.trajectory.positions[: end + 1], task=sample.trajectory.task))
+        for sample in samples
+        for end in range(sample.trajectory.num_frames)
+    ]
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_answers_are_those_of_the_original_code(case: Reference, dtype: torch.dtype) -> None:
+    engine = Engine.from_checkpoint(str(case.config / "checkpoint"), reward_model="roboreward", dtype=dtype)
+    samples = samples_of(case)
+    for sample, result, told in zip(samples, engine.evaluate(samples), case.content["generations"], strict=True):
+        if told["parsed_score"] is None:
+            assert isinstance(result, InvalidSampleError)
+            assert repr(told["generated_text"]) in str(result)
+            continue
+        assert isinstance(result, ProgressResult), result
+        expected = np.full(sample.trajectory.num_frames, told["parsed_score"] / 4 - 0.25, np.float32)
+        np.testing.assert_array_equal(result.progress, expected)
+        assert result.progress_logits is not None
+        logits = np.tile(told["digit_logits_at_answer"], (sample.trajectory.num_frames, 1))
+        np.testing.assert_allclose(result.progress_logits, logits, rtol=0, atol=ROUNDED)
+        assert np.isnan(result.success).all()
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_the_expected_value_is_that_of_the_digits_behind_answer(case: Reference) -> None:
+    engine = Engine.from_checkpoint(str(case.config / "checkpoint"), reward_model="roboreward-expected")
+    for result, told in zip(engine.evaluate(samples_of(case)), case.content["generations"], strict=True):
+        assert isinstance(result, ProgressResult), result
+        assert result.progress_logits is not None
+        np.testing.assert_allclose(result.progress_logits[0], told["fp32_forced_digit_logits"], rtol=0, atol=EXACT)
+        assert result.progress[-1] * 4 + 1 == pytest.approx(told["expected_score_fp32"], abs=1e-4)
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda config: str(config.name))
+def test_a_score_is_read_as_the_original_reads_it(config: Path) -> None:
+    for case in json.loads((config / "parse_cases.json").read_text()):
+        assert parsed(case["text"]) == case["parsed"], case["text"]
+
+
+@pytest.fixture(scope="module")
+def engine() -> Engine:
+    return Engine.from_checkpoint(str(CHECKPOINT), reward_model="roboreward", feature_cache_mib=16)
+
+
+def test_a_mixed_batch_gives_the_answers_of_single_samples(engine: Engine) -> None:
+    samples = [sample for case in CASES if case.config == CONFIGS[0] for sample in samples_of(case)]
+    together = engine.evaluate(samples)
+    for sample, result in zip(samples, together, strict=True):
+        (alone,) = engine.evaluate([sample])
+        if isinstance(alone, InvalidSampleError):
+            assert str(result) == str(alone)
+            continue
+        assert isinstance(alone, ProgressResult)
+        assert isinstance(result, ProgressResult)
+        np.testing.assert_array_equal(result.progress, alone.progress)
+
+
+def test_dense_mode_scores_each_prefix_alone(engine: Engine) -> None:
+    case = next(case for case in CASES if case.file.stem == "score4_T7")
+    frames, task = case.samples()[0].trajectory.positions, case.samples()[0].trajectory.task
+    (dense,) = engine.evaluate([ProgressSample(Trajectory(frames=frames[:4], task=task), frame_steps=2)])
+    assert isinstance(dense, ProgressResult)
+    for end in range(4):
+        pair = frames[[0, end]]
+        (alone,) = engine.evaluate([ProgressSample(Trajectory(frames=pair, task=task))])
+        assert isinstance(alone, ProgressResult)
+        assert dense.progress[end] == alone.progress[-1]
+
+
+def test_every_token_is_progress_of_the_batch(engine: Engine) -> None:
+    steps: list[int] = []
+    case = next(case for case in CASES if case.file.stem == "score4_T7")
+    engine.evaluate(case.samples(), Execution(on_forward=lambda: steps.append(1)))
+    assert len(steps) == len(case.content["generations"][0]["generated_tokens"]) + 1  # and the pass as a whole
+
+
+def test_a_preference_is_refused(engine: Engine) -> None:
+    trajectory = CASES[0].samples()[0].trajectory
+    (outcome,) = engine.evaluate([PreferenceSample(trajectory, trajectory)])
+    assert isinstance(outcome, InvalidSampleError)
+    assert "expected progress (this checkpoint has no preference head), got preference" in str(outcome)
+
+
+def test_a_folder_of_its_name_needs_no_option(tmp_path: Path) -> None:
+    folder = shutil.copytree(CHECKPOINT, tmp_path / "RoboReward-4B")
+    checkpoint = families.load(folder)
+    assert checkpoint.description.kind == "RoboReward"
+    checkpoint.save(tmp_path / "saved")
+    case = next(case for case in CASES if case.file.stem == "score2_T4")
+    saved, original = (Engine.of(families.load(each)) for each in (tmp_path / "saved", folder))
+    for result, expected in zip(saved.evaluate(case.samples()), original.evaluate(case.samples()), strict=True):
+        assert isinstance(result, ProgressResult)
+        assert isinstance(expected, ProgressResult)
+        np.testing.assert_array_equal(result.progress_logits, expected.progress_logits)
+
+
+Change = Callable[[dict[str, Any]], Any]
+REFUSED: dict[str, tuple[Change, str]] = {
+    "a penalty": (lambda c: c.update(repetition_penalty=1.1), "repetition_penalty: expected 1.0, got 1.1; remove it"),
+    "an unknown key": (lambda c: c.update(suppress_tokens=[1]), "suppress_tokens: expected no such key, got [1]"),
+    "no end": (lambda c: c.pop("eos_token_id"), "eos_token_id: expected ids of tokens, got None"),
+}
+
+
+@pytest.mark.parametrize("change, message", REFUSED.values(), ids=REFUSED)
+def test_settings_that_change_the_text_are_refused(tmp_path: Path, change: Change, message: str) -> None:
+    folder = shutil.copytree(CHECKPOINT, tmp_path / "checkpoint")
+    content = json.loads((folder / "generation_config.json").read_text())
+    change(content)
+    (folder / "generation_config.json").write_text(json.dumps(content))
+    with pytest.raises(CheckpointError) as refusal:
+        families.load(folder, reward_model="roboreward")
+    assert message in str(refusal.value)
+
+
+def test_without_settings_of_generation_it_is_refused(tmp_path: Path) -> None:
+    folder = shutil.copytree(CHECKPOINT, tmp_path / "checkpoint")
+    (folder / "generation_config.json").unlink()
+    with pytest.raises(CheckpointError, match=r"generation_config.json: expected the file, got none"):
+        families.load(folder, reward_model="roboreward")

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: MIT
+"""TOPReward: the numbers of LeRobot's code and of Robometer's baseline, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from reward_models import ROOT, Reference, references
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm.engine import Engine
+from rfm.engine.execution import Execution
+from rfm_client import PreferenceSample, ProgressResult, ProgressSample, SimilaritySample, Trajectory
+from rfm_client.contract import InvalidSampleError
+from rfm_client.contract.samples import UInt8Array
+
+FOLDER = ROOT / "topreward"
+CHECKPOINT = FOLDER / "checkpoints" / "vlm_fp32_untied"
+OF_LEROBOT = FOLDER / "lerobot_plain" / "lerobot"
+RAW, ANSWERS, ROUNDED = 1e-4, 2e-5, 0.3  # of log-probabilities, progress, and log-probabilities in bfloat16
+TASK = "put the red block in the bowl"
+
+
+def is_comparable(case: Reference) -> bool:
+    """False where Robometer's code takes floats in 0..1 for grey levels, and sees black frames."""
+    return not (case.summary["engine"] == "robometer" and case.file.stem.startswith("f01"))
+
+
+CASES = [case for case in references("topreward") if is_comparable(case)]
+
+
+def engine_of(case: Reference, num_prefixes: int | None) -> Engine:
+    summary = case.summary
+    name = "topreward" if summary["engine"] == "lerobot" else "topreward-robometer"
+    settings = {"chat_template": str(summary["add_chat_template"]).lower()}
+    settings |= {"fps": summary["fps"]} if "fps" in summary else {}
+    settings |= {} if num_prefixes is None else {"num_prefixes": num_prefixes}
+    said = ",".join([name, *(f"{key}={value}" for key, value in settings.items())])
+    dtype = torch.bfloat16 if summary["vlm_dtype"] == "torch.bfloat16" else None
+    return Engine.from_checkpoint(str((case.config / summary["checkpoint"]).resolve()), reward_model=said, dtype=dtype)
+
+
+def check(result: Any, expected: dict[str, Any], curve: list[float], *, is_rounded: bool) -> None:
+    assert isinstance(result, ProgressResult), result
+    assert result.log_prob is not None
+    ends = np.array(expected["prefix_lengths"]) - 1
+    log_probs = np.array(expected["log_prob_true"])
+    np.testing.assert_allclose(result.log_prob[ends], log_probs, rtol=0, atol=ROUNDED if is_rounded else RAW)
+    if not is_rounded:
+        atol = max(ANSWERS, RAW / max(float(np.ptp(log_probs)), RAW))
+        np.testing.assert_allclose(result.progress, curve, rtol=0, atol=atol)
+    assert np.isnan(result.success).all()
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_scores_are_those_of_the_original_code(case: Reference) -> None:
+    content, is_rounded = case.content, case.summary["vlm_dtype"] == "torch.bfloat16"
+    if case.summary["engine"] == "lerobot":
+        for num_prefixes in (None, 15, 5):
+            results = engine_of(case, num_prefixes).evaluate(case.samples())
+            for result, expected in zip(results, content["prefixes"], strict=True):
+                told = expected["all" if num_prefixes is None else str(num_prefixes)]
+                check(result, told, told["curve"], is_rounded=is_rounded)
+        last = engine_of(case, None).evaluate(case.samples(case.summary["max_frames"]))
+        for result, reward in zip(last, content["reward"], strict=True):
+            assert isinstance(result, ProgressResult)
+            assert result.log_prob is not None
+            assert result.log_prob[-1] == pytest.approx(reward, abs=ROUNDED if is_rounded else RAW)
+        return
+    most = case.summary["max_frames"]
+    samples = [shortened(sample, most) for sample in case.samples()]
+    results = engine_of(case, case.summary["num_prefix_samples"]).evaluate(samples)
+    for result, expected in zip(results, content["samples"], strict=True):
+        check(result, expected, expected["progress"], is_rounded=is_rounded)
+
+
+def shortened(sample: ProgressSample, most: int) -> ProgressSample:
+    """The sample with the frames that Robometer's baseline picks of a longer video."""
+    frames = sample.trajectory.positions
+    if len(frames) > most:
+        frames = frames[np.linspace(0, len(frames) - 1, most, dtype=int)]
+    return ProgressSample(Trajectory(frames=frames, task=sample.trajectory.task))
+
+
+def noise(num_frames: int, height: int = 64, width: int = 96, seed: int = 0) -> UInt8Array:
+    return np.random.default_rng(seed).integers(0, 256, (num_frames, height, width, 3), np.uint8)
+
+
+def progress(frames: UInt8Array, task: str = TASK) -> ProgressSample:
+    return ProgressSample(Trajectory(frames=frames, task=task))
+
+
+@pytest.fixture(scope="module")
+def lerobot() -> Engine:
+    return Engine.from_checkpoint(str(CHECKPOINT), reward_model="topreward", feature_cache_mib=16)
+
+
+@pytest.fixture(scope="module")
+def robometer() -> Engine:
+    return Engine.from_checkpoint(str(CHECKPOINT), reward_model="topreward-robometer")
+
+
+def test_a_mixed_batch_gives_the_answers_of_single_samples(lerobot: Engine) -> None:
+    samples = [progress(noise(n, h, w, n), f"task {n}") for n, h, w in ((1, 64, 96), (5, 48, 80), (8, 33, 300))]
+    for alone, together in zip(samples, lerobot.evaluate(samples), strict=True):
+        (expected,) = lerobot.evaluate([alone])
+        assert isinstance(expected, ProgressResult)
+        assert isinstance(together, ProgressResult)
+        assert together.log_prob is not None
+        np.testing.assert_allclose(together.log_prob, expected.log_prob, rtol=0, atol=2e-5)
+
+
+def test_prefixes_share_the_vision_tower_s_work(lerobot: Engine) -> None:
+    lerobot.predictor.cache.clear()
+    execution, again = Execution(), Execution()
+    lerobot.evaluate([progress(noise(8))], execution)
+    assert execution.num_encoded == 16  # 4 pairs, and 4 frames that fill up their pair themselves; not 72
+    lerobot.evaluate([progress(noise(8))], again)
+    assert again.num_encoded == 0
+
+
+def test_a_large_video_is_shrunk_by_the_length_of_the_prefix(lerobot: Engine) -> None:
+    most = lerobot.predictor.collator.config.most_px
+    side = int((most / 4) ** 0.5) // 32 * 32 + 32  # a pair fits, two pairs do not
+    sizes = [lerobot.predictor.collator.images.size(side, side, length) for length in (1, 2, 3, 4)]
+    assert sizes[:2] == [(side, side)] * 2
+    assert len(set(sizes)) == 3
+
+
+def test_progress_of_equal_frames_is_noise_between_0_and_1(robometer: Engine) -> None:
+    (result,) = robometer.evaluate([progress(np.repeat(noise(1), 3, axis=0))])
+    assert isinstance(result, ProgressResult)
+    assert sorted({result.progress.min(), result.progress.max()}) == [0.0, 1.0]
+
+
+def test_the_settings_of_lerobot_s_config_json_are_used(tmp_path: Path, lerobot: Engine) -> None:
+    (expected,) = lerobot.evaluate([progress(noise(5))])
+    by_file = Engine.from_checkpoint(str(OF_LEROBOT), base_model=str(CHECKPOINT))
+    changed = shutil.copytree(OF_LEROBOT, tmp_path / "changed")
+    content = json.loads((changed / "config.json").read_text()) | {"fps": 4.0}
+    (changed / "config.json").write_text(json.dumps(content))
+    at_4_fps = Engine.from_checkpoint(str(changed), base_model=str(CHECKPOINT))
+    assert isinstance(expected, ProgressResult)
+    for engine, is_equal in ((by_file, True), (at_4_fps, False)):
+        (result,) = engine.evaluate([progress(noise(5))])
+        assert isinstance(result, ProgressResult)
+        assert np.array_equal(result.progress, expected.progress) is is_equal
+
+
+def test_a_saved_model_scores_the_same(tmp_path: Path, robometer: Engine) -> None:
+    checkpoint = families.load(CHECKPOINT, reward_model="topreward-robometer")
+    checkpoint.save(tmp_path / "saved")
+    saved = Engine.from_checkpoint(str(tmp_path / "saved"))
+    (result,), (expected,) = (engine.evaluate([progress(noise(5))]) for engine in (saved, robometer))
+    assert isinstance(result, ProgressResult)
+    assert isinstance(expected, ProgressResult)
+    np.testing.assert_array_equal(result.progress, expected.progress)
+    assert not [decision.name for decision in checkpoint.decisions() if decision.is_assumed]
+
+
+REFUSED: dict[str, tuple[str, Any, str]] = {
+    "dense mode": (
+        "lerobot",
+        ProgressSample(Trajectory(frames=noise(3), task=TASK), frame_steps=2),
+        "frame_steps: expected 0 (TOPReward's progress is relative to the whole episode",
+    ),
+    "preference": (
+        "lerobot",
+        PreferenceSample(progress(noise(2)).trajectory, progress(noise(2)).trajectory),
+        "sample_type: expected progress (this checkpoint has no preference head), got preference",
+    ),
+    "similarity": (
+        "lerobot",
+        SimilaritySample(progress(noise(2)).trajectory, progress(noise(2)).trajectory),
+        "sample_type: expected progress (this checkpoint has no similarity head), got similarity",
+    ),
+    "small frames": ("lerobot", progress(noise(2, 8, 8)), "frames of at least 32 x 32 pixels, got 8 x 8"),
+    "narrow frames": ("lerobot", progress(noise(1, 32, 6432)), "at most 200 times as long as wide"),
+    "many frames": ("robometer", progress(noise(65, 8, 8)), "num_frames: expected at most 64"),
+    "a special token": ("robometer", progress(noise(2), "a <|video_pad|>"), "text without the model's special tokens"),
+    "the end of a message": ("lerobot", progress(noise(2), "a <|im_end|>"), "text without the model's special tokens"),
+}
+
+
+@pytest.mark.parametrize("variant, sample, message", REFUSED.values(), ids=REFUSED)
+def test_a_sample_without_a_meaning_is_refused(
+    request: pytest.FixtureRequest, variant: str, sample: Any, message: str
+) -> None:
+    (outcome,) = request.getfixturevalue(variant).evaluate([sample])
+    assert isinstance(outcome, InvalidSampleError)
+    assert message in str(outcome)
+
+
+WRONG: dict[str, tuple[str, str]] = {
+    "an unknown name": ("gvl", "--as: expected one of topreward, topreward-robometer, roboreward, roboreward-expected"),
+    "an unknown setting": ("topreward,frames=3", "--as: expected settings among num_prefixes, fps, chat_template"),
+    "no value": ("topreward,fps", "--as: expected setting=value, got 'fps'"),
+    "no number": ("topreward,fps=fast", "--as: fps: expected a value of type float, got 'fast'"),
+    "no frames a second": ("topreward,fps=0", "fps: expected a number above 0, got 0.0"),
+    "no prefix": ("topreward,num_prefixes=0", "num_prefixes: expected at least 1, got 0"),
+}
+
+
+@pytest.mark.parametrize("said, message", WRONG.values(), ids=WRONG)
+def test_a_wrong_setting_is_refused(said: str, message: str) -> None:
+    with pytest.raises(CheckpointError) as refusal:
+        families.load(CHECKPOINT, reward_model=said)
+    assert message in str(refusal.value)
+
+
+def test_an_ordinary_model_is_no_reward_model_by_itself() -> None:
+    with pytest.raises(CheckpointError, match=r"with an ordinary vision-language model, say --as which reward model"):
+        families.load(CHECKPOINT)
+
+
+def test_an_unknown_key_of_lerobot_is_refused(tmp_path: Path) -> None:
+    changed = shutil.copytree(OF_LEROBOT, tmp_path / "changed")
+    content = json.loads((changed / "config.json").read_text()) | {"frame_stride": 2}
+    (changed / "config.json").write_text(json.dumps(content))
+    with pytest.raises(CheckpointError, match=r"expected the keys of LeRobot's TOPReward, got 'frame_stride'"):
+        families.load(changed, base_model=str(CHECKPOINT))
+
+
+def test_a_missing_language_head_is_refused(tmp_path: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    changed = shutil.copytree(CHECKPOINT, tmp_path / "changed")
+    weights = load_file(changed / "model.safetensors")
+    del weights["lm_head.weight"]
+    save_file(weights, changed / "model.safetensors", {"format": "pt"})
+    with pytest.raises(CheckpointError, match=r"expected lm_head.weight, since tie_word_embeddings is false, got none"):
+        families.load(changed, reward_model="topreward")
