@@ -87,12 +87,19 @@ class Evaluator:
         served = await self._served(batch.samples, deadline)
         texts = await self._texts(batch.samples, served, deadline, request_id)
         files = RequestFiles(self._folder, Decoded(self._max_decoded_bytes))
-        conversion = _Conversion(served, texts, files, FRAME_STEPS if batch.use_frame_steps else 0)
+        by_prefix = batch.use_frame_steps and served.shows_whole_prefixes
+        conversion = _Conversion(served, texts, files, FRAME_STEPS if batch.use_frame_steps and not by_prefix else 0)
         num_bytes = batch.num_bytes if self._folder is None else MIN_BYTES  # files may be large
         samples = await off_loop(num_bytes, conversion.samples, batch.samples)
-        outcomes = await self._client.evaluate(
-            samples, return_errors=True, timeout_s=deadline.remaining_s(), request_id=request_id
+        asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
+        flat = await self._client.evaluate(
+            [each for of_sample in asked for each in of_sample],
+            return_errors=True,
+            timeout_s=deadline.remaining_s(),
+            request_id=request_id,
         )
+        answers = iter(flat)
+        outcomes = [_joined([next(answers) for _ in of_sample]) for of_sample in asked]
         failed = {index: outcome for index, outcome in enumerate(outcomes) if isinstance(outcome, RewardError)}
         unfit = {index: error for index, error in failed.items() if isinstance(error, InvalidSampleError)}
         if unfit:
@@ -172,6 +179,11 @@ class _Served:
 
     embeddings: ModelInfo | None
     frames: ModelInfo | None
+
+    @property
+    def shows_whole_prefixes(self) -> bool:
+        """True for RoboReward, to which the evaluation server shows all frames of a prefix."""
+        return self.frames is not None and (self.frames.kind or "").startswith("RoboReward")
 
 
 @dataclass(frozen=True)
@@ -255,6 +267,25 @@ class _Conversion:
         if isinstance(given.frames, list):
             return Trajectory(frames=self.files.frames(given.frames), task=given.task or "")
         return Trajectory(frames=_uint8(given.frames), task=given.task or "")
+
+
+def _prefixes(sample: Sample) -> list[Sample]:
+    """Return a sample of raw frames for each prefix of a progress sample; another sample alone."""
+    if not isinstance(sample, ProgressSample):
+        return [sample]
+    frames, task = sample.trajectory.positions, sample.trajectory.task
+    return [ProgressSample(Trajectory(frames=frames[:end], task=task)) for end in range(1, len(frames) + 1)]
+
+
+def _joined(outcomes: Sequence[Result | RewardError]) -> Result | RewardError:
+    """Return the last score of each prefix, or the first error; a single outcome as it is."""
+    if len(outcomes) == 1:
+        return outcomes[0]
+    results = [outcome for outcome in outcomes if isinstance(outcome, ProgressResult)]
+    if len(results) < len(outcomes):
+        return next(outcome for outcome in outcomes if isinstance(outcome, RewardError))
+    progress, success = (np.array([getattr(each, name)[-1] for each in results]) for name in ("progress", "success"))
+    return ProgressResult(progress=progress, success=success, model_version=results[-1].model_version)
 
 
 def _has_embeddings(trajectory: schema.TrajectoryInput) -> bool:

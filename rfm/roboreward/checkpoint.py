@@ -32,7 +32,7 @@ _NEUTRAL = {"repetition_penalty": 1.0, "no_repeat_ngram_size": 0, "num_beams": 1
 
 @dataclass(frozen=True)
 class RoboRewardCheckpoint(LanguageCheckpoint):
-    """RoboReward in memory."""
+    """A checkpoint of RoboReward in memory."""
 
     @property
     def description(self) -> Description:

@@ -73,7 +73,8 @@ class RoboRewardPredictor(VlmPredictor):
         output = self._output(batch, key_values)
         logits, language = output.logits, self.network.model.language_model
         lengths = torch.tensor([row.num_tokens for row in rows], device=logits.device)
-        following = torch.tensor([int(row.position_ids[0, -1]) + 1 for row in rows], device=logits.device)  # type: ignore[index]
+        last = [int(row.position_ids[0, -1]) for row in rows if row.position_ids is not None]
+        following = torch.tensor(last, device=logits.device) + 1
         num_slots = batch.inputs["input_ids"].shape[1]
         is_seen = torch.arange(num_slots, device=logits.device) < lengths[:, None]
         stops = torch.tensor(self._config.stops, device=logits.device)

@@ -52,7 +52,7 @@ class RoboRewardConfig(LanguageConfig):
 class RoboRewardCollator(LanguageCollator):
     """The collator of RoboReward: one conversation about all frames, in dense mode one for each prefix."""
 
-    config: RoboRewardConfig  # type: ignore[assignment]
+    config: RoboRewardConfig  # type: ignore[assignment]  # no heads, so no VlmConfig
 
     @property
     def digits(self) -> list[int]:

@@ -42,7 +42,7 @@ _OF_USER = {"num_prefixes": int, "fps": float, "chat_template": bool}  # setting
 
 @dataclass(frozen=True)
 class TopRewardCheckpoint(LanguageCheckpoint):
-    """TOPReward in memory."""
+    """A model of TOPReward in memory."""
 
     @property
     def description(self) -> Description:

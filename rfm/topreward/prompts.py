@@ -136,7 +136,7 @@ class TopRewardCollator(LanguageCollator):
     """The collator of TOPReward: a conversation for each prefix of a trajectory."""
 
     images: TopRewardImages
-    config: TopRewardConfig  # type: ignore[assignment]
+    config: TopRewardConfig  # type: ignore[assignment]  # no heads, so no VlmConfig
 
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
         """Return the conversations of a progress sample. Raises InvalidSampleError."""

@@ -51,7 +51,7 @@ from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, normalisation_of, 
 from rfm.vlm.qwen import Box, KeyValues, positions
 from rfm.vlm.run_config import DTYPES
 from rfm.vlm.video import Indices, VlmVideo, shots_of
-from rfm_client.contract import InvalidSampleError, Sample
+from rfm_client.contract import InvalidSampleError, ProgressSample, Sample
 from rfm_client.contract.frame_refs import ProgressSampleRefs
 
 SETTINGS, REWARD_MODEL = "rfm", "reward_model"  # keys in an exported config.json
@@ -110,11 +110,11 @@ class LanguageCollator(QwenCollator):
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
         """Return the conversations of a progress sample. Raises InvalidSampleError."""
         check_type(sample, self.config)
-        assert not hasattr(sample, "first")  # by check_type
+        assert isinstance(sample, (ProgressSample, ProgressSampleRefs))  # by check_type
         (trajectory,) = sample.trajectories
         self._check_task(trajectory.task)
         try:
-            return self.prompts(video_of(trajectory, sample.frame_steps), trajectory.task)  # type: ignore[union-attr]
+            return self.prompts(video_of(trajectory, sample.frame_steps), trajectory.task)
         except ValueError as error:  # the frames are too small or too narrow
             if isinstance(error, InvalidSampleError):
                 raise
@@ -175,7 +175,7 @@ class LanguageCheckpoint:
 
     @property
     def parts(self) -> dict[str, dict[str, Tensor]]:
-        """All weights."""
+        """All weights of the network."""
         return {NETWORK: self.weights}
 
     @property

@@ -313,10 +313,10 @@ def test_out_of_memory_halves_the_batch_and_fails_what_never_fits(monkeypatch: p
     expected = engine.evaluate(samples)
     score = engine.predictor.score
 
-    def refusing(rows: Sequence[Any], batch: Any) -> Any:
+    def refusing(rows: Sequence[Any], batch: Any, execution: Execution) -> Any:
         if len(rows) > 2 or any(len(row.frames[0]) > 2 for row in rows):
             raise torch.OutOfMemoryError("made up")
-        return score(rows, batch)
+        return score(rows, batch, execution)
 
     monkeypatch.setattr(engine.predictor, "score", refusing)
     *results, failed = engine.evaluate([*samples, ProgressSample(video(4, 3, 56, 56))], execution)

@@ -122,13 +122,13 @@ def load(self, version, device, settings):
     _load(self, version, device, settings)
     score = self.engine.predictor.score
 
-    def gated(rows, batch):
+    def gated(rows, batch, execution):
         import time
 
         while Path({gate!r}).exists():
             Path({gate!r} + ".at_work").touch()
             time.sleep(0.01)
-        return score(rows, batch)
+        return score(rows, batch, execution)
 
     self.engine.predictor.score = gated
 

@@ -20,7 +20,7 @@ SHARED = {  # what a family may import beside itself
     "rfm.family",
     "rfm_client.contract",
 }
-FAMILIES = {"rewind", "vlm"}
+FAMILIES = {"rewind": set(), "vlm": set(), "topreward": {"rfm.vlm"}, "roboreward": {"rfm.vlm"}}  # and what each extends
 FOLDERS = {
     "rfm": ".",
     "rfm_client": "client",
@@ -38,8 +38,7 @@ MAY_IMPORT = {
     "rfm_client": set(),
     "rfm_gateway": {"rfm_client"},
     "rfm.checkpoint": {"rfm.plain_yaml"},
-    "rfm.rewind": SHARED,
-    "rfm.vlm": SHARED,
+    **{f"rfm.{family}": {*SHARED, *extended} for family, extended in FAMILIES.items()},
     "rfm.triton_model": {*SHARED, "rfm.parameters", "rfm.probe_request"},
     "rfm.launch": {"rfm.config", "rfm.parameters", "rfm_client.contract"},
     "rfm.supervise": {"rfm.launch", "rfm.probe_request", "rfm_client.contract"},

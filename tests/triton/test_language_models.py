@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: MIT
+"""TOPReward and RoboReward behind Triton: both protocols, the gateway, episodes and labels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import requests
+from pyarrow import parquet
+from typer.testing import CliRunner
+
+import rfm_export
+from faulty_servers import url_of
+from gateways import running
+from one_model import BriefServer
+from reward_models import ROOT, Reference, references
+from rfm.config import ExportConfig
+from rfm.engine import Engine
+from rfm.launch.installation import find_installation
+from rfm.launch.triton_server import Endpoints
+from rfm_client import (
+    InvalidSampleError,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    RewardClient,
+    Trajectory,
+)
+from rfm_client.cli.commands import app
+
+pytestmark = pytest.mark.triton
+
+TOP, ROBO = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied", ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint"
+DATASET = ROOT / "lerobot_rabc" / "home" / "golden" / "tiny_shared"
+NAMES = {"top": (TOP, "topreward"), "baseline": (TOP, "topreward-robometer"), "robo": (ROBO, "roboreward")}
+TASK = "put the red block in the bowl"
+
+
+@dataclass(frozen=True)
+class Served:
+    endpoints: Endpoints
+
+    def client(self, model: str, protocol: str = "grpc") -> RewardClient:
+        return RewardClient(url_of(self.endpoints, protocol), model=model)
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("language_models")
+    repository = folder / "model_repository"
+    for name, (checkpoint, reward_model) in NAMES.items():
+        rfm_export.export(checkpoint, repository, ExportConfig(name=name, num_gpus=0, reward_model=reward_model))
+    with (
+        (folder / "tritonserver.log").open("wb") as log,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+    ):
+        yield Served(server.endpoints)
+
+
+def case(section: str, name: str) -> Reference:
+    return next(each for each in references(section) if each.file.stem == name)
+
+
+@pytest.mark.parametrize("model", ["top", "baseline"])
+def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str, model: str) -> None:
+    samples = [sample for name in ("T8_48x80", "B2_T4") for sample in case("topreward", name).samples()]
+    engine = Engine.from_checkpoint(str(TOP), reward_model=NAMES[model][1])
+    with asked.client(model, protocol) as client:
+        results = client.evaluate(samples, log_prob=True)
+        plain = client.evaluate(samples)
+    for result, without, expected in zip(results, plain, engine.evaluate(samples), strict=True):
+        assert isinstance(result, ProgressResult)
+        assert isinstance(without, ProgressResult)
+        assert isinstance(expected, ProgressResult)
+        assert result.log_prob is not None
+        np.testing.assert_allclose(result.log_prob, expected.log_prob, rtol=0, atol=2e-5)
+        np.testing.assert_allclose(result.progress, expected.progress, rtol=0, atol=1e-4)
+        assert without.log_prob is None
+        assert np.isnan(result.success).all()
+
+
+def test_roboreward_is_answered_as_by_the_original(asked: Served, protocol: str) -> None:
+    told = case("roboreward", "batch_B3")
+    with asked.client("robo", protocol) as client:
+        results = client.evaluate(told.samples(), logits=True)
+    for result, progress, text in zip(
+        results, told.content["compute_progress"], told.content["generations"], strict=True
+    ):
+        assert isinstance(result, ProgressResult)
+        assert result.progress_logits is not None
+        np.testing.assert_array_equal(result.progress, np.float32(progress))
+        np.testing.assert_allclose(result.progress_logits[0], text["digit_logits_at_answer"], rtol=0, atol=0.3)
+
+
+def test_an_answer_without_a_score_fails_alone(asked: Served, protocol: str) -> None:
+    samples = [*case("roboreward", "unparsable_T3").samples(), *case("roboreward", "score5_T4").samples()]
+    with asked.client("robo", protocol) as client:
+        failed, result = client.evaluate(samples, return_errors=True)
+    assert isinstance(failed, InvalidSampleError)
+    assert "answer: expected a score from 1 to 5 in the model's answer, got 'no idea'" in str(failed)
+    assert isinstance(result, ProgressResult)
+    assert result.last_progress == 1.0
+
+
+def test_the_description_tells_what_is_given(asked: Served) -> None:
+    infos = {}
+    for name in NAMES:
+        with asked.client(name) as client:
+            infos[name] = client.model_info(frames=True)
+    assert infos["top"].kind == "TOPReward, as LeRobot computes it"
+    assert infos["robo"].kind == "RoboReward"
+    assert {name: info.needs_whole_episode for name, info in infos.items()} == {
+        "top": True, "baseline": True, "robo": False,
+    }  # fmt: skip
+    assert infos["top"].has_log_prob
+    assert not infos["robo"].has_log_prob
+    assert infos["robo"].progress_bins == 5
+    assert infos["baseline"].max_frames == 64
+    assert infos["top"].lacks == ("preference", "similarity", "success")
+
+
+def test_what_has_no_meaning_is_refused_by_name(asked: Served, protocol: str) -> None:
+    frames = np.zeros((3, 64, 96, 3), np.uint8)
+    trajectory = Trajectory(frames=frames, task=TASK)
+    with asked.client("top", protocol) as client:
+        dense, preference = client.evaluate(
+            [ProgressSample(trajectory, frame_steps=2), PreferenceSample(trajectory, trajectory)], return_errors=True
+        )
+        with (
+            pytest.raises(InvalidSampleError, match="relative to the whole episode: score it at its end"),
+            client.episode(TASK) as episode,
+        ):
+            episode.add(frames[0])
+    assert "frame_steps: expected 0 (TOPReward's progress" in str(dense)
+    assert "this checkpoint has no preference head" in str(preference)
+
+
+def test_roboreward_scores_an_episode_step_by_step(asked: Served) -> None:
+    told = case("roboreward", "steps_T4_T1")
+    frames = told.samples()[0].trajectory.positions
+    with asked.client("robo") as client, client.episode(told.samples()[0].trajectory.task, sampling="all") as episode:
+        steps = [episode.add(frame).progress for frame in frames]
+    assert steps == told.content["compute_progress"][0]
+
+
+@pytest.mark.parametrize("name", ["batch_B3", "steps_T4_T1"])
+def test_the_gateway_answers_as_robometer_s_baseline_server(asked: Served, tmp_path: Path, name: str) -> None:
+    told = case("roboreward", name)
+    samples = [
+        {
+            "sample_type": "progress",
+            "trajectory": {
+                "task": sample.trajectory.task,
+                "frames": sample.trajectory.positions.tolist(),
+            },
+        }
+        for sample in told.samples()
+    ]
+    body = {"samples": samples, "use_frame_steps": told.content["use_frame_steps"]}
+    with running(asked.endpoints, tmp_path, "robo") as gateway:
+        answer = requests.post(f"{gateway.url}/evaluate_batch", json=body, timeout=60).json()
+    assert answer["outputs_progress"] == told.content["response"]["outputs_progress"]
+    assert answer["outputs_preference"] is None
+    assert answer["outputs_success"] is None
+
+
+def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path) -> None:
+    words = [
+        "label",
+        DATASET,
+        "--url",
+        asked.endpoints.grpc_url,
+        "--model",
+        "top",
+        "--output",
+        tmp_path,
+        "--no-picture",
+    ]
+    refused = CliRunner().invoke(app, list(map(str, words)))
+    assert refused.exit_code != 0
+    assert "mode: expected whole of this model, whose scores are relative to the whole episode, got prefix" in (
+        refused.output + refused.stderr
+    )
+    done = CliRunner().invoke(app, [*map(str, words), "--mode", "whole"])
+    assert done.exit_code == 0, done.output
+    labels = parquet.read_table(tmp_path / "rfm_progress.parquet")
+    expected = parquet.read_table(ROOT / "lerobot_rabc" / "topreward_progress.parquet")
+    np.testing.assert_allclose(
+        labels["progress_sparse"].to_numpy(), expected["progress_sparse"].to_numpy(), rtol=0, atol=2e-5
+    )
+    assert np.isfinite(labels["log_prob"].to_numpy()).all()
