@@ -228,12 +228,14 @@ def _evaluate(
     samples_prefixes = prefix.frame_steps > 0 or prefix.sampling is not None
     fit = fitted_to(client, sample, video, samples_prefixes=samples_prefixes)
     sent = cast(ProgressSample, fit.sample)
+    info = client.model_info(frames=sent.trajectory.frames is not None)
     if prefix.sampling is None:
-        (result,) = client.evaluate([replace(sent, frame_steps=prefix.frame_steps)])
+        asked = replace(sent, frame_steps=prefix.frame_steps)
+        (result,) = client.evaluate([asked], log_prob=info.has_log_prob)
         return cast(ProgressResult, with_frame_indices(result, fit.frame_indices))
-    trained_frames = client.model_info(frames=sent.trajectory.frames is not None).max_frames
+    info.check_scores_prefixes()
     try:
-        sampling = Sampling.of(prefix.sampling, prefix.frames, trained_frames)
+        sampling = Sampling.of(prefix.sampling, prefix.frames, info.max_frames)
     except ValueError as error:  # the options are valid: the checkpoint lacks the number
         raise InvalidSampleError(f"--{error}") from error
     samples = prefix_samples(sent.trajectory, sampling)

@@ -72,9 +72,16 @@ class VideoRequest(BaseModel):
             raise RequestValidationError(field_errors(error)) from None
 
     def sampling(self, info: ModelInfo) -> Sampling:
-        """Return the sampling. Raises RequestValidationError for a number of frames that the rule does not take."""
+        """Return the sampling.
+
+        Raises RequestValidationError for a number of frames that the rule does not take, and for a rule with a
+        checkpoint that needs the whole episode.
+        """
+        rule = "all" if info.needs_whole_episode and self.rule is None else self.rule
+        if info.needs_whole_episode and rule != "all":
+            raise invalid(("sampling",), f"expected all: the scores of {info.kind} are relative to the whole episode")
         try:
-            return Sampling.of(self.rule, self.frames, info.max_frames, trained_padding=info.trained_padding)
+            return Sampling.of(rule, self.frames, info.max_frames, trained_padding=info.trained_padding)
         except ValueError as error:
             where, _, message = str(error).partition(": ")
             raise invalid((where,), message) from None

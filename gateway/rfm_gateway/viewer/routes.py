@@ -13,12 +13,13 @@ import json
 import logging
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
 
 import anyio
+import numpy as np
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.datastructures import UploadFile
@@ -184,6 +185,10 @@ async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Aske
     Raises RewardError.
     """
     assert trajectory.frames is not None
+    if asked.info.needs_whole_episode:
+        (whole,) = await client.evaluate([ProgressSample(trajectory)], request_id=asked.request_id)
+        yield _points(0, [cast(ProgressResult, whole)], [slice(None)])
+        return
     sampling, frames = asked.sampling, trajectory.frames
     sample_bytes = max(sampling.frames or 0, len(frames)) * math.prod(frames.shape[1:])
     most = max(min(MOST_PREFIXES, MOST_BYTES // sample_bytes), 1)
@@ -194,14 +199,22 @@ async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Aske
 
     while part := await off_loop(count * sample_bytes, following):
         results = cast("list[ProgressResult]", await client.evaluate(part, request_id=asked.request_id))
-        reads = [sampling.prefix(t).read for t in range(first, first + len(part))]
-        yield {
-            "first": first,
-            "progress": numbers_or_null(float(r.progress[read]) for r, read in zip(results, reads, strict=True)),
-            "success": numbers_or_null(float(r.success[read]) for r, read in zip(results, reads, strict=True)),
-            "model_version": results[-1].model_version,
-        }
+        yield _points(first, results, [sampling.prefix(t).read for t in range(first, first + len(part))])
         first, count = first + len(part), min(2 * count, most)
+
+
+def _points(first: int, results: Sequence[ProgressResult], reads: Sequence[int | slice]) -> dict[str, Any]:
+    """Return the points of a curve from frame ``first`` on. reads: index of the points in each result"""
+    progress, success = (
+        np.concatenate([np.atleast_1d(getattr(r, name)[read]) for r, read in zip(results, reads, strict=True)])
+        for name in ("progress", "success")
+    )
+    return {
+        "first": first,
+        "progress": numbers_or_null(progress.tolist()),
+        "success": numbers_or_null(success.tolist()),
+        "model_version": results[-1].model_version,
+    }
 
 
 async def _preferences(client: AsyncRewardClient, asked: _Asked) -> dict[str, Any]:
