@@ -17,7 +17,7 @@ import rfm_export
 from faulty_servers import url_of
 from gateways import running
 from one_model import BriefServer
-from reward_models import ROOT, Reference, references
+from reward_models import BASE, ROOT, Reference, references
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.launch.installation import find_installation
@@ -35,6 +35,7 @@ from rfm_client.cli.commands import app
 pytestmark = pytest.mark.triton
 
 TOP, ROBO = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied", ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint"
+LEROBOT = ROOT / "lerobot_robometer" / "tok_disc10" / "checkpoint"
 DATASET = ROOT / "lerobot_rabc" / "home" / "golden" / "tiny_shared"
 NAMES = {"top": (TOP, "topreward"), "baseline": (TOP, "topreward-robometer"), "robo": (ROBO, "roboreward")}
 TASK = "put the red block in the bowl"
@@ -54,6 +55,8 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     repository = folder / "model_repository"
     for name, (checkpoint, reward_model) in NAMES.items():
         rfm_export.export(checkpoint, repository, ExportConfig(name=name, num_gpus=0, reward_model=reward_model))
+    of_lerobot = ExportConfig(name="lerobot", num_gpus=0, base_model=str(BASE))
+    rfm_export.export(LEROBOT, repository, of_lerobot)
     with (
         (folder / "tritonserver.log").open("wb") as log,
         BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
@@ -81,6 +84,15 @@ def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str, mo
         np.testing.assert_allclose(result.progress, expected.progress, rtol=0, atol=1e-4)
         assert without.log_prob is None
         assert np.isnan(result.success).all()
+
+
+def test_lerobot_s_robometer_is_answered_as_by_lerobot(asked: Served, protocol: str) -> None:
+    told = next(each for each in references("lerobot_robometer") if each.config == LEROBOT.parent)
+    with asked.client("lerobot", protocol) as client:
+        results = client.evaluate(told.samples(told.content.get("cropped_to_last")))
+    for result, progress in zip(results, told.content["decoded"]["progress_pred"], strict=True):
+        assert isinstance(result, ProgressResult)
+        np.testing.assert_allclose(result.progress, progress, rtol=0, atol=2e-5)
 
 
 def test_roboreward_is_answered_as_by_the_original(asked: Served, protocol: str) -> None:
