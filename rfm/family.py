@@ -85,6 +85,7 @@ class Description:
     keeps_features: it can cache features of frames, and then takes samples with frame references
     has_log_prob: progress comes with a log-probability of each frame
     needs_whole_episode: its scores are relative to the whole episode, so dense mode and online use are refused
+    may_not_answer: its text may lack a score, also on blank frames; so it gets no warm-up, whose failure is Triton's
     kind: the reward model's name for people
     is_large: exports are verified in the dtype that serves, on a GPU if it has room, since float32 on the CPU is slow
     """
@@ -104,6 +105,7 @@ class Description:
     has_success: bool = True
     has_log_prob: bool = False
     needs_whole_episode: bool = False
+    may_not_answer: bool = False
     kind: str = ""
 
     @property

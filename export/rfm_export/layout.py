@@ -149,7 +149,9 @@ def _python_model(
 
 
 def _warmups(description: Description) -> list[Warmup]:
-    """A sample of each type that the checkpoint can score."""
+    """A sample of each type that the checkpoint can score; none if it may fail to."""
+    if description.may_not_answer:
+        return []
     trajectory = blank_trajectory(description.widths, task=WARMUP_TASK)
     samples: dict[str, Sample] = {"progress": ProgressSample(trajectory)}
     if description.has_preference:

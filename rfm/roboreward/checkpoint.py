@@ -46,6 +46,7 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
             is_large=True,
             has_preference=False,
             has_success=False,
+            may_not_answer=not self.config.is_expected,
             kind="RoboReward, expected value of the score" if self.config.is_expected else "RoboReward",
         )
 

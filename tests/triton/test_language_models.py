@@ -156,7 +156,7 @@ def test_roboreward_scores_an_episode_step_by_step(asked: Served) -> None:
     frames = told.samples()[0].trajectory.positions
     with asked.client("robo") as client, client.episode(told.samples()[0].trajectory.task, sampling="all") as episode:
         steps = [episode.add(frame).progress for frame in frames]
-    assert steps == told.content["compute_progress"][0]
+    assert steps == told.content["response"]["outputs_progress"]["progress_pred"][0]
 
 
 @pytest.mark.parametrize("name", ["batch_B3", "steps_T4_T1"])
