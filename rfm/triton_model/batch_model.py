@@ -31,7 +31,7 @@ from rfm_client.contract.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, 
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import Tensors
 
-GIVEN_UP_S = 0.1  # after a longer batch, skip cancelled requests, which Triton 2.51 still hands over
+GIVEN_UP_S = 0.1  # if the last batch took longer, skip cancelled requests: Triton 2.51 still hands them over
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
@@ -101,7 +101,7 @@ class BatchModel(Generic[Question, Answer]):
     def prepare(self, question: Question) -> tuple[Any, int]:
         """Return the input of ``answer`` for a question, and its number of tokens (see ``token_budget``). Must be fast.
 
-        Raises RewardError for a question without an answer.
+        Raises RewardError if the question cannot be answered.
         """
         return question, 0
 

@@ -27,7 +27,7 @@ from rfm_client.contract.frame_refs import ProgressSampleRefs
 class VlmPredictor:
     """A vision-language reward model on a device.
 
-    cache: holds features of shots, and frames, so that samples may send frame references; None: no cache
+    cache: holds frames, for frame references, and features of temporal patches; None: no cache
     """
 
     works_ahead = True

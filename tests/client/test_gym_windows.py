@@ -184,6 +184,17 @@ def test_the_step_in_which_autoreset_resets_begins_an_episode_and_pays_nothing(r
     assert recorder.calls[-1] == [([(0, 1, 0)], TASKS[1])]
 
 
+def test_an_autoreset_above_begins_an_episode_after_a_success(recorder: Recorder) -> None:
+    rewarded = options("pixels", add_to_env_reward=True, terminate_on_success=SuccessRule(threshold=0.0))
+    env = Autoreset(RewardModelWrapper(CodedEnv(), recorder, TASKS[0], rewarded))
+    env.reset()
+    told = [env.step(0) for _ in range(3)]
+    assert [terminated for _, _, terminated, _, _ in told] == [True, False, True]
+    assert told[1][1] == 0
+    assert told[1][4]["reward_model"]["step"] == 0
+    assert recorder.calls == [[up_to(0, episode, step)] for episode in range(2) for step in range(2)]
+
+
 ENDED: dict[str, tuple[Callable[[CodedEnv], gym.Env[Any, Any]], int, SuccessRule | None]] = {
     "terminated": (lambda env: env, 3, None),
     "truncated above Autoreset": (lambda env: TimeLimit(Autoreset(env), 1), 1, None),  # which is not told of the end

@@ -163,7 +163,7 @@ def of_prefixes(results: Sequence[ProgressResult], sampling: Sampling) -> Progre
 
 
 def of_frames(result: ProgressResult, prefix: Prefix) -> ProgressResult:
-    """Return the scores of the frames that a prefix shows, each once, without padding."""
+    """Return the scores of the frames that the rule shows, each once, without padding."""
     slots = prefix.frame_slots
     return replace(result, progress=result.progress[slots], success=result.success[slots])
 

@@ -253,7 +253,7 @@ class EpisodeFrames:
 
 
 class StepRequest:
-    """For each of some episodes, the windows that the rule shows at its newest frame.
+    """The windows of some episodes, each at its episode's newest frame.
 
     asked_s: start of the caller's wait, by ``time.perf_counter``
 

@@ -171,5 +171,5 @@ class WindowScorer:
 
 
 def _padded_bytes(num_windows: int, num_frames: int, frame_bytes: int) -> int:
-    """Bytes of a request's frames, padded to equally many in each window's row."""
+    """Bytes of a request's frames, which are spread evenly over its windows, with padding."""
     return num_windows * -(-num_frames // num_windows) * frame_bytes

@@ -53,8 +53,9 @@ class RewardModelWrapper(gymnasium.Wrapper):
         closes. Pass a function if the environment will run in another process (AsyncVectorEnv)
     task: the task sentence, or a function that reads it from the info of each reset
 
-    A step after an episode's end raises ResetNeeded. With ``gymnasium.wrappers.Autoreset`` among the wrappers of
-    ``env``, this step begins a new episode instead, with reward 0. ``env`` itself must not reset in the
+    A step after an episode's end raises ResetNeeded. With ``Autoreset(RewardModelWrapper(env, ...))`` of
+    ``gymnasium.wrappers``, this step begins a new episode instead, with reward 0. An ``Autoreset`` among the wrappers
+    of ``env`` does the same, but does not see an end by ``terminate_on_success``. ``env`` itself must not reset in the
     step that ends an episode.
 
     Raises ValueError if ``options`` names a source of frames that ``env`` lacks, TypeError if ``env`` is no
@@ -129,7 +130,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         if self._episode is None:
             raise ResetNeeded("step: expected a reset before it")
         if self._has_ended or self._episode.succeeded:
-            remedy = "call reset, or wrap the environment in gymnasium.wrappers.Autoreset before RewardModelWrapper"
+            remedy = "call reset, or wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
             raise ResetNeeded(f"step: expected a reset, since the episode has ended, got another step; {remedy}")
         if not self._is_whole:
             raise ResetNeeded(f"step: expected a reset, since {LOST}, got another step; call reset")
@@ -151,7 +152,7 @@ def _check_shows_its_end(info: Info) -> None:
     found = [key for key in _ENDS if key in info]
     if found:
         expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"
-        remedy = "turn off its own reset; for automatic resets wrap it in gymnasium.wrappers.Autoreset"
+        remedy = "turn off its own reset, and wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
         raise InvalidSampleError.at("info", expected, f"{', '.join(found)}; {remedy}")
 
 

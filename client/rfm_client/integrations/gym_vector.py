@@ -25,7 +25,9 @@ _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_
 
 
 class RewardModelVectorWrapper(VectorWrapper):
-    """A vector environment with the reward of a reward model. A step scores all sub-environments in one call.
+    """A vector environment with the reward of a reward model.
+
+    With ``blocking``, a step scores all sub-environments in one call.
 
     client: as in RewardModelWrapper
     task: one task sentence for all sub-environments, or a sequence with a sentence for each

@@ -54,7 +54,7 @@ _SAMPLE_TYPES = {
 
 
 def encode_samples(samples: Sequence[Sample]) -> Tensors:
-    """Return one request. Samples need equal shapes behind the time axis, first and second trajectories apart."""
+    """Return one request. Apart from time, all first trajectories need one shape, and all second trajectories, too."""
     tensors: Tensors = {
         SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
         NUM_FRAMES: np.array([_lengths(sample) for sample in samples], np.int32),
@@ -141,7 +141,7 @@ def _lengths(sample: Sample) -> tuple[int, int]:
 def _decode_rows(
     tensors: Mapping[str, npt.NDArray[Any]], decode: Callable[[Row, dict[bytes, UInt8Array]], Decoded]
 ) -> list[Decoded]:
-    """Decode each sample, with the request's pixels by their digests, which are computed here."""
+    """Decode each sample. The digests of the request's pixels are computed here."""
     pixels = {}
     if FRAME_DIGESTS in tensors:
         if SECOND_FRAMES in tensors:
