@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ import rfm_export
 from faulty_servers import url_of
 from gateways import running
 from one_model import BriefServer
+from paths import VIDEOS
 from reward_models import BASE, ROOT, Reference, references
 from rfm.config import ExportConfig
 from rfm.engine import Engine
@@ -31,6 +33,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.cli.commands import app
+from viewer_requests import SCORE, curve_of, events, post
 
 pytestmark = pytest.mark.triton
 
@@ -178,6 +181,22 @@ def test_the_gateway_answers_as_robometer_s_baseline_server(asked: Served, tmp_p
     assert answer["outputs_progress"] == told.content["response"]["outputs_progress"]
     assert answer["outputs_preference"] is None
     assert answer["outputs_success"] is None
+
+
+def test_the_page_shows_the_whole_episode_s_curve(asked: Served, tmp_path: Path) -> None:
+    video = VIDEOS / "jaco_play_pick_up_green_cup.mp4"
+    words = [video, "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "top", "--fps", "0.5"]
+    done = CliRunner().invoke(app, ["score", *map(str, words), "--json", str(tmp_path / "scores.json")])
+    assert done.exit_code == 0, done.output
+    (told,) = json.loads((tmp_path / "scores.json").read_text())["videos"]
+    with running(asked.endpoints, tmp_path, "top") as gateway:
+        curve = curve_of(events(post(gateway.url, SCORE, {"video": video}, task=TASK, fps=0.5)))
+        refused = post(gateway.url, SCORE, {"video": video}, task=TASK, sampling="rint", frames=4)
+    np.testing.assert_allclose(curve["progress"], told["progress"], rtol=0, atol=1e-4)
+    assert len(told["log_prob"]) == len(told["progress"])
+    assert {*curve["success"]} == {None}
+    assert refused.status_code == 422
+    assert "relative to the whole episode" in refused.text
 
 
 def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path) -> None:

@@ -229,7 +229,8 @@ def _evaluate(
     fit = fitted_to(client, sample, video, samples_prefixes=samples_prefixes)
     sent = cast(ProgressSample, fit.sample)
     info = client.model_info(frames=sent.trajectory.frames is not None)
-    if prefix.sampling is None:
+    # Of an episode as a whole, all frames are shown at once.
+    if prefix.sampling is None or (info.needs_whole_episode and prefix.sampling == "all"):
         asked = replace(sent, frame_steps=prefix.frame_steps)
         (result,) = client.evaluate([asked], log_prob=info.has_log_prob)
         return cast(ProgressResult, with_frame_indices(result, fit.frame_indices))
