@@ -127,7 +127,7 @@ class ServeConfig(Settings):
     )
     grpc_key: Path | None = setting(None, "The certificate's key (PEM).")
     grpc_client_ca: Path | None = setting(None, "Authorities (PEM) of gRPC's clients, which then need a certificate.")
-    probe_s: int = setting(2, "Seconds from one health probe of a model to the next.", **_COUNT)
+    probe_s: int = setting(2, "Seconds between the probes of a model.", **_COUNT)
     hang_s: int = setting(
         DEFAULT_HANG_S,
         "Seconds without progress of a batch after which Triton is started again.",

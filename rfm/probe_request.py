@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The smallest request that a model can answer, for health probes."""
+"""The smallest request that a model can answer, for probes."""
 
 from __future__ import annotations
 

@@ -173,7 +173,11 @@ class TritonServer:
         self.stop()
 
     def _start_ready(self, served: Mapping[str, Config] | None) -> None:
-        """Start Triton with the models whose files are up to date, then load the others with their configurations."""
+        """Start Triton with ``served``, or with all models if it is None, and wait until they are ready.
+
+        Triton starts with the models if their files name the versions in ``served``. If any file names others, Triton
+        starts without models, and then loads each with its configuration in ``served``.
+        """
         there = self.models
         if not there:
             raise ServerStartError(no_models(self.repository))
@@ -235,9 +239,11 @@ class TritonServer:
                 now_s, used_s = time.monotonic(), cpu_s_of_group(self.pid)
                 if used_s - cpu_s > WORK_S:
                     cpu_s, worked_s = used_s, now_s
-                if now_s - worked_s > STALLED_S or now_s - started_s > LOAD_S:
+                is_stalled, is_late = now_s - worked_s > STALLED_S, now_s - started_s > LOAD_S
+                if is_stalled or is_late:
                     self.kill()
-                    raise SpoiltStartError("tritonserver: expected to be ready, got processes that wait") from None
+                    got = f"{STALLED_S:g} s without CPU time" if is_stalled else f"no answer in {LOAD_S:g} s"
+                    raise SpoiltStartError(f"tritonserver: expected to be ready, got {got}") from None
                 time.sleep(POLL_S)
                 continue
             failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in models]

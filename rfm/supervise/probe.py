@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Health probes: a synthetic request to a model every few seconds."""
+"""Probes: a synthetic request to a model every few seconds."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Probe:
         """
         fails_s = time.monotonic() - self._succeeded_s
         if self._num_failures is not None and self._num_failures >= BROKEN_COUNT and fails_s >= BROKEN_S:
-            return f"it has failed at {BROKEN_COUNT} health probes in a row"
+            return f"it has failed at {BROKEN_COUNT} probes in a row"
         if time.monotonic() - max(self._waiting_since_s, progress_s) > self._hang_s:
             return f"it has answered nothing for {self._hang_s:g} s"
         return None

@@ -33,7 +33,7 @@ class Status:
         gauge = partial(Gauge, registry=self._registry)
         self._ready = gauge("rfm_serve_ready", "1: the model is ready.", ["model"])
         self._reason = gauge("rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"])
-        told = "From a health probe to its answer."
+        told = "From a probe to its answer."
         self.probe_seconds = Histogram(
             "rfm_serve_probe_seconds", told, ["model"], registry=self._registry, buckets=_BUCKETS_S
         )

@@ -26,7 +26,7 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 
 
 class CrashLoopError(ServerStartError):
-    """A process ended too often in a row to restart it."""
+    """A process had too many faults in a row to restart it."""
 
 
 class BackOff:
@@ -42,13 +42,13 @@ class BackOff:
         self._running_since_s = time.monotonic()
 
     def pause_s(self, reason: str) -> float:
-        """Record an exit or a failed start. Return the seconds to wait before the next start. Raises CrashLoopError."""
+        """Record a fault or a failed start. Return the seconds to wait before the next start. Raises CrashLoopError."""
         if self._running_since_s is not None and time.monotonic() - self._running_since_s >= self._steady_s:
             self._row = 0
         self._running_since_s = None  # a failed start does not count as running
         self._row += 1
         if self._row > MOST:
-            got = f"{self._row} ends, each within {self._steady_s:g} s of a start; the last: {reason}"
+            got = f"{self._row} faults, each within {self._steady_s:g} s of a start; the last: {reason}"
             raise CrashLoopError(f"{self._what}: expected to run, got {got}")
         return 0.0 if self._row == 1 else min(FIRST_PAUSE_S * 2.0 ** (self._row - 2), LONGEST_PAUSE_S)
 
@@ -117,7 +117,7 @@ class Supervisor:
             TritonWatch, server, self._status, probe_s=probe_s, hang_s=hang_s, silent_s=triton_silent_s
         )
         self._is_to_stop = threading.Event()
-        self._new_back_off = partial(BackOff, "tritonserver", STEADY_S + hang_s)
+        self._new_back_off = partial(BackOff, TRITON, STEADY_S + hang_s)
         self._back_off = self._new_back_off()
         self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
@@ -127,7 +127,7 @@ class Supervisor:
         """Serve. Return Triton's exit status. Raises ServerStartError for a failed start or a crash loop."""
         for path in cleanup.clear():
             self._say(f"removed {path}, left by a killed server")
-        self._status.record(dict.fromkeys(self._server.models, "it is loaded"))
+        self._status.record(dict.fromkeys(self._server.models, "it is loading"))
         for what in (TRITON, *self._server.models, *(() if self._gateway is None else (GATEWAY,))):
             self._status.restarts.labels(what)  # begins at 0, so that the first restart is an increase
         port, host = self._status_port, self._server.endpoints.host
@@ -195,11 +195,12 @@ class Supervisor:
         while not self._is_to_stop.is_set():
             self._count(what, why)
             self._close_watch()
-            self._status.record_down(f"tritonserver is started again: {what}: {why}")
+            reason = why if what == TRITON else f"{what}: {why}"
+            self._status.record_down(f"{TRITON} is started again: {reason}")
             self._server.kill()
             self._server.stop()
             try:
-                pause_s = self._back_off.pause_s(f"{what}: {why}")
+                pause_s = self._back_off.pause_s(reason)
             except CrashLoopError:
                 if not self._leaves_out(what, why):
                     raise
@@ -219,8 +220,9 @@ class Supervisor:
         others = {name: config for name, config in served.items() if name not in left_out}
         if what not in served or not others:
             return False
-        self._say(f"{what} is left out, since it kept ending: {why}")
-        reason = f"it is left out, since {what} kept ending: {why}; `rfm models load` takes it in"
+        fault = f"had the last of {MOST + 1} faults in a row: {why}"
+        self._say(f"{what} is left out, since it {fault}")
+        reason = f"it is left out, since {what} {fault}; `rfm models load` serves it again"
         self._left_out |= dict.fromkeys(left_out, reason)
         self._served = others
         self._back_off = self._new_back_off()

@@ -120,7 +120,7 @@ class TritonWatch:
         self._going: set[str] = set()  # models that are loading or unloading
         self._leaving: set[str] = set()
         self.served = dict(served)
-        self.reasons: dict[str, str] = dict.fromkeys(served, "it is loaded")
+        self.reasons: dict[str, str] = dict.fromkeys(served, "it is loading")
         self.fault: tuple[str, str] | None = None  # the model, or TRITON, and the reason
         self._closed = threading.Event()
         threading.Thread(target=self._run, name="rfm-watch", daemon=True).start()
@@ -143,7 +143,7 @@ class TritonWatch:
                 _, text = self._metrics.request("GET", "/metrics", min(_TIMEOUT_S, self._silent_s / LOOKS))
             except NO_ANSWER:
                 num_failed += 1
-                self.reasons = dict.fromkeys(self.served, "tritonserver gives no answer")
+                self.reasons = dict.fromkeys(self.served, f"{TRITON} gives no answer")
                 if num_failed >= LOOKS and time.monotonic() - answered_s >= self._silent_s:
                     self.fault = TRITON, f"no answer for {self._silent_s:g} s"
                 continue
@@ -217,7 +217,7 @@ class TritonWatch:
             return next(iter(told), "it is not loaded")
         probe = self._probes.get(model)
         if probe is not None and not probe.has_answered:
-            return "it has not answered a health probe yet"
+            return "it has not answered a probe yet"
         reasons = {part: self._reason(part, versions) for part in parts_of(self.served[model]) if part in self.served}
         return next((f"{part}: {reason}" for part, reason in reasons.items() if reason != NO_REASON), NO_REASON)
 

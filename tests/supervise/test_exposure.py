@@ -165,11 +165,11 @@ def test_the_status_tells_nothing_of_what_there_was() -> None:
     about.record({"a": NO_REASON, "a_frames": NO_REASON})
     assert told(about) == {'rfm_serve_ready{model="a"}': 1, 'rfm_serve_ready{model="a_frames"}': 1}
     about.record_down("restarted")
-    about.record({"a": "it is loaded", "a_frames": NO_REASON})
+    about.record({"a": "it is loading", "a_frames": NO_REASON})
     assert told(about) == {
         'rfm_serve_ready{model="a"}': 0,
         'rfm_serve_ready{model="a_frames"}': 1,
-        'rfm_serve_not_ready{model="a",reason="it is loaded"}': 1,
+        'rfm_serve_not_ready{model="a",reason="it is loading"}': 1,
     }
     about.record_down("restarted")
     assert about.ready[1]["models"]["a_frames"] == {"ready": False, "reason": "restarted"}

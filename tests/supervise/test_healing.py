@@ -96,7 +96,7 @@ def test_what_dies_stops_hangs_or_is_silent_is_healed_and_no_call_is_lost_until_
 
         wait_for(kill)
     assert served.process.returncode == 1
-    wanted = r"rfm: tritonserver: expected to run, got 6 ends, each within 63 s of a start; the last: .*exit status -9"
+    wanted = r"rfm: triton: expected to run, got 6 faults, each within 63 s of a start; the last: .*exit status -9"
     assert re.fullmatch(wanted, served.said[-1]), served.said
 
 
@@ -176,7 +176,8 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
             api.load(OTHER)
         served.wait_ready()
     assert served.process.returncode == 0
-    assert any(line.startswith(f"rfm: {OTHER} is left out, since it kept ending: ") for line in served.said)
+    told = f"rfm: {OTHER} is left out, since it had the last of 6 faults in a row: "
+    assert any(line.startswith(told) for line in served.said)
 
 
 @pytest.mark.triton
@@ -207,7 +208,7 @@ def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the
     assert any(f"removed {SHARED_MEMORY}" in line for line in served.said)
 
 
-def test_a_crash_loop_is_many_ends_each_soon_after_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_crash_loop_is_many_faults_each_soon_after_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """What ran for long is no part of it; starts that fail are, however long they take."""
     now_s = 0.0
     monkeypatch.setattr("time.monotonic", lambda: now_s)
@@ -222,9 +223,10 @@ def test_a_crash_loop_is_many_ends_each_soon_after_a_start(monkeypatch: pytest.M
     assert [run_for(1.0) for _ in range(MOST)] == [0, 0.5, 1, 2, 4]
     assert run_for(STEADY_S) == 0
     assert [run_for(1.0) for _ in range(MOST - 1)] == [0.5, 1, 2, 4]
-    with pytest.raises(CrashLoopError, match=r"^gateway: expected to run, got 6 ends, each within 60 s .* last: why$"):
+    wanted = r"^gateway: expected to run, got 6 faults, each within 60 s .* last: why$"
+    with pytest.raises(CrashLoopError, match=wanted):
         run_for(1.0)
-    ends = BackOff("tritonserver")
+    ends = BackOff("triton")
     run_for(5 * STEADY_S)
     for _ in range(MOST - 1):
         now_s += 2 * STEADY_S
