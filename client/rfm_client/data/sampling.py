@@ -3,7 +3,7 @@
 
 ``docs/guides/choose_frames.md`` lists the rules and their users. No rule shows a frame after t.
 
-Shapes: K frames that the rule shows, S slots of the sample, T frames of the episode.
+Shapes: K the rule's number of frames, S slots of the sample, T frames of the episode.
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ class EpisodeOptions:
     def sampling_for(self, info: ModelInfo) -> Sampling:
         """Return the rule with its number of frames for a checkpoint.
 
-        Raises ValueError, InvalidSampleError for a checkpoint that needs the whole episode.
+        Raises ValueError without a needed number, InvalidSampleError if the checkpoint needs the whole episode.
         """
         info.check_scores_prefixes()
         return Sampling.of(self.sampling, self.frames, info.max_frames, trained_padding=info.trained_padding)
@@ -128,7 +128,7 @@ class StepScore:
     success: probability that the task is done; NaN: the checkpoint does not predict it
     succeeded: True if the success rule holds; False where success is NaN
     step: number of the frame among the episode's, from 0
-    ms: milliseconds from the call to the answer, waiting included
+    ms: milliseconds to the answer, without the wait for an open ``add_nowait`` request
     """
 
     progress: float

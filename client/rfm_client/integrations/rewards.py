@@ -37,7 +37,8 @@ class RewardOptions:
         episode's rewards add up to its last known progress minus its first, however late scores come
     scale: factor of this reward
     add_to_env_reward: True: add the environment's own reward; False: replace it
-    every: steps from one score to the next; in between, ``absolute`` repeats its value and ``delta`` is 0
+    every: steps from one score to the next; until a new score comes, ``absolute`` repeats its value
+        and ``delta`` is 0
     terminate_on_success: rule that ends the episode at a success, except at the frame of the reset. The reset raises
         ValueError if the checkpoint does not predict success
     frames_from: source of frames, uint8 [H, W, 3]: a key of the observation, or a function from an environment's
