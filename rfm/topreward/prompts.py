@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, TypeAlias
 
 import numpy as np
@@ -93,11 +93,10 @@ class TopRewardConfig(LanguageConfig):
 class TopRewardImages(QwenImages):
     """The preprocessing of videos."""
 
-    config: TopRewardConfig | None = None
+    config: TopRewardConfig = field(kw_only=True)
 
     def size(self, height: int, width: int, num_frames: int) -> tuple[int, int]:
         """Return height and width to which the frames of a prefix are resized. Raises ValueError for small frames."""
-        assert self.config is not None
         factor = self.patch_px * MERGE
         if self.config.variant == "robometer":
             return SIDES_PX[1], SIDES_PX[1]
@@ -117,14 +116,12 @@ class TopRewardImages(QwenImages):
 
     def grid(self, groups: int, height: int, width: int) -> Grid:
         """Return the grid of ``groups`` temporal patches of frames of this size in pixels."""
-        assert self.config is not None
         if self.config.variant == "robometer":
             height = width = SIDES_PX[-1]
         return super().grid(groups, height, width)
 
     def patches(self, frames: Tensor, shots: Tensor | None, dtype: torch.dtype = torch.float32) -> Tensor:
         """Cut frames into patches, as ``QwenImages`` does; Robometer's variant resizes them in float before."""
-        assert self.config is not None
         if self.config.variant == "robometer":
             planes = frames.movedim(-1, 1).float()
             planes = F.interpolate(planes, (SIDES_PX[-1], SIDES_PX[-1]), mode="bicubic", antialias=True)
@@ -199,7 +196,9 @@ class TopRewardCollator(LanguageCollator):
 
 def _scaled_by_v2(video: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize a video on the CPU as torchvision's v2 does, in integers: uint8 [T, H, W, 3] -> [T, *size, 3]."""
-    if video.shape[1:3] == size or not len(video):
-        return video.new_empty(len(video), *size, video.shape[-1]) if not len(video) else video
+    if video.shape[1:3] == size:
+        return video
+    if len(video) == 0:  # all features are cached
+        return video.new_empty(0, *size, video.shape[-1])
     planes = F.interpolate(video.movedim(-1, 1), size, mode="bicubic", antialias=True)
     return planes.movedim(1, -1).contiguous()
