@@ -159,3 +159,17 @@ def test_without_settings_of_generation_it_is_refused(tmp_path: Path) -> None:
     (folder / "generation_config.json").unlink()
     with pytest.raises(CheckpointError, match=r"generation_config.json: expected the file, got none"):
         families.load(folder, reward_model="roboreward")
+
+
+@pytest.mark.gpu
+def test_a_gpu_writes_the_answers_of_the_original_in_bfloat16() -> None:
+    engine = Engine.from_checkpoint(str(CHECKPOINT), reward_model="roboreward", device="cuda")
+    cases = [case for case in CASES if case.config == CONFIGS[0]]
+    told = [each for case in cases for each in case.content["generations"]]
+    results = engine.evaluate([sample for case in cases for sample in samples_of(case)])
+    for result, expected in zip(results, told, strict=True):
+        if expected["parsed_score"] is None:
+            assert isinstance(result, InvalidSampleError)
+            continue
+        assert isinstance(result, ProgressResult)
+        assert result.last_progress == expected["parsed_score"] / 4 - 0.25

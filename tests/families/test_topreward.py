@@ -238,3 +238,18 @@ def test_a_missing_language_head_is_refused(tmp_path: Path) -> None:
     save_file(weights, changed / "model.safetensors", {"format": "pt"})
     with pytest.raises(CheckpointError, match=r"expected lm_head.weight, since tie_word_embeddings is false, got none"):
         families.load(changed, reward_model="topreward")
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("reward_model", ["topreward", "topreward-robometer"])
+def test_a_gpu_gives_the_cpu_s_numbers(reward_model: str) -> None:
+    samples = [progress(noise(n, h, w, n)) for n, h, w in ((1, 64, 96), (5, 48, 80), (8, 100, 200))]
+    engines = (
+        Engine.from_checkpoint(str(CHECKPOINT), reward_model=reward_model, device=device, dtype=torch.float32)
+        for device in ("cpu", "cuda")
+    )
+    for expected, result in zip(*(engine.evaluate(samples) for engine in engines), strict=True):
+        assert isinstance(expected, ProgressResult)
+        assert isinstance(result, ProgressResult)
+        assert result.log_prob is not None
+        np.testing.assert_allclose(result.log_prob, expected.log_prob, rtol=0, atol=RAW)
