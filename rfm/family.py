@@ -85,7 +85,8 @@ class Description:
     keeps_features: it can cache features of frames, and then takes samples with frame references
     has_log_prob: progress comes with a log-probability of each frame
     needs_whole_episode: its scores are relative to the whole episode, so dense mode and online use are refused
-    may_not_answer: its text may lack a score, also on blank frames; so it gets no warm-up, whose failure is Triton's
+    may_not_answer: its answer may hold no score, also on blank frames; so it gets no warm-up, because Triton does not
+        load a model whose warm-up fails
     kind: the reward model's name for people
     is_large: exports are verified in the dtype that serves, on a GPU if it has room, since float32 on the CPU is slow
     """

@@ -23,7 +23,7 @@ from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import VlmRow
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.qwen import KeyValues, next_hidden_state
-from rfm_client.contract import FrameScores, InvalidSampleError, RewardError
+from rfm_client.contract import FrameScores, InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.samples import Float32Array
 
 
@@ -31,11 +31,11 @@ from rfm_client.contract.samples import Float32Array
 class Answer:
     """A written answer.
 
-    tokens: without the token that ends it
+    tokens: without the token that ends it; None: some logits were not finite
     digit_logits: float32 [5], logits of SCORES where the first of these digits is written; None: there is none
     """
 
-    tokens: list[int]
+    tokens: list[int] | None
     digit_logits: Float32Array | None
 
 
@@ -81,7 +81,9 @@ class RoboRewardPredictor(VlmPredictor):
         tokens: list[Tensor] = []
         digits: list[Tensor] = []
         has_ended = torch.zeros(len(rows), dtype=torch.bool, device=logits.device)
+        is_finite = ~has_ended
         for step in range(self._config.max_new_tokens):
+            is_finite &= has_ended | logits.isfinite().all(-1)
             tokens.append(logits.argmax(-1))
             digits.append(logits[:, self.collator.digits].float())
             has_ended |= torch.isin(tokens[-1], stops)
@@ -94,7 +96,11 @@ class RoboRewardPredictor(VlmPredictor):
                 logits = self.network.lm_head(hidden)
         of_rows = torch.stack(tokens, dim=1).cpu().tolist()
         of_digits = torch.stack(digits, dim=1).cpu().numpy()
-        return [self._ended(ids, each) for ids, each in zip(of_rows, of_digits, strict=True)], output.made
+        answers = [
+            self._ended(ids, each) if is_good else Answer(None, None)
+            for ids, each, is_good in zip(of_rows, of_digits, is_finite.cpu().tolist(), strict=True)
+        ]
+        return answers, output.made
 
     def _ended(self, tokens: list[int], digits: Float32Array) -> Answer:
         """Return the answer up to its end. digits: float32 [N, 5], logits of SCORES at each token"""
@@ -104,6 +110,8 @@ class RoboRewardPredictor(VlmPredictor):
         return Answer(tokens[:end], None if at is None else digits[at])
 
     def _read(self, answer: Answer, row: VlmRow) -> RowScores | RewardError:
+        if answer.tokens is None:
+            return InferenceFailedError("the network gave a score that is not finite")
         text = self.collator.tokenizer.decode(answer.tokens, skip_special_tokens=True)
         score = parsed(text)
         if score is None:
