@@ -48,7 +48,7 @@ class BackOff:
         self._running_since_s = None  # a failed start does not count as running
         self._row += 1
         if self._row > MOST:
-            got = f"{self._row} faults, each within {self._steady_s:g} s of a start; the last: {reason}"
+            got = f"{self._row} faults in a row; the last: {reason}"
             raise CrashLoopError(f"{self._what}: expected to run, got {got}")
         return 0.0 if self._row == 1 else min(FIRST_PAUSE_S * 2.0 ** (self._row - 2), LONGEST_PAUSE_S)
 
