@@ -193,7 +193,6 @@ class Supervisor:
         what: the model with the fault, or TRITON
         """
         while not self._is_to_stop.is_set():
-            self._count(what, why)
             self._close_watch()
             reason = why if what == TRITON else f"{what}: {why}"
             self._status.record_down(f"{TRITON} is started again: {reason}")
@@ -207,6 +206,7 @@ class Supervisor:
                 pause_s = 0.0
             if self._is_to_stop.wait(pause_s):
                 return
+            self._count(what, why)
             try:
                 self._start()
                 return
