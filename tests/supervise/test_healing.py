@@ -147,7 +147,7 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
         assert served.said == []
         config.write_text(one_version)
 
-        with pytest.raises(ServerUnavailableError, match="ended under this request twice"):
+        with pytest.raises(ServerUnavailableError, match="ended twice during this request"):
             client.progress(trajectory(99, mark=DEADLY))
         # A process that dies before the supervisor has seen its command line counts as Triton's.
         wait_for(lambda: served.restarts(MODEL, "triton") == 2)
