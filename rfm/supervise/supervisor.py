@@ -207,6 +207,7 @@ class Supervisor:
             self._count(what, why)
             if self._is_to_stop.wait(pause_s):
                 return
+            self._count(what, why)
             try:
                 self._start()
                 return

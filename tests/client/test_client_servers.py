@@ -86,7 +86,7 @@ class Stand:
 
 
 def lost() -> ServerUnavailableError:
-    """What a call gets under which its connection ends."""
+    """What a call gets if its connection ends during it."""
     error = ServerUnavailableError("Socket closed")
     error.may_have_ended_server = True
     return error
