@@ -204,7 +204,6 @@ class Supervisor:
                 if not self._leaves_out(what, why):
                     raise
                 pause_s = 0.0
-            self._count(what, why)
             if self._is_to_stop.wait(pause_s):
                 return
             self._count(what, why)

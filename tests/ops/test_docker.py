@@ -37,6 +37,7 @@ from rfm_commands.config import Config
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 DOCKER = ROOT / "docker"
+REPOSITORY = ROOT / "model_repository"
 DOCKERFILE = (DOCKER / "Dockerfile").read_text()
 COMPOSE = yaml.safe_load((DOCKER / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
@@ -300,8 +301,24 @@ def test_every_service_is_confined(name: str) -> None:
     assert "healthcheck" in service or name in OURS  # the image has its own
     assert "HEALTHCHECK" in DOCKERFILE
     for volume in service.get("volumes", []):
-        source = VARIABLE.sub(r"\2", volume).partition(":")[0]
-        assert source in COMPOSE["volumes"] or (DOCKER / source).exists(), source
+        source, target, *_ = VARIABLE.sub(r"\2", volume).split(":")
+        is_the_users = target == "/models"
+        assert is_the_users or source in COMPOSE["volumes"] or (DOCKER / source).exists(), source
+
+
+@pytest.mark.parametrize(("profile", "name"), [("gpu", "server"), ("cpu", "server-cpu")])
+def test_the_repository_that_the_guide_exports_is_served_unless_another_is_named(profile: str, name: str) -> None:
+    """With the profile gpu, on the GPU."""
+    guide = (ROOT / "docs" / "guides" / "gpu_box.md").read_text()
+    for variables, source in (({}, "/srv/rfm/my_models"), ({"RFM_MODELS": "../model_repository"}, REPOSITORY)):
+        service = composed(profile, **variables)["services"][name]
+        (volume,) = service["volumes"]
+        bound = volume.split(":")[:2] if isinstance(volume, str) else [volume["source"], volume["target"]]
+        assert bound == [str(source), "/models"]
+    assert "--repository /srv/rfm/my_models" in guide
+    assert SERVICES[name]["command"][0] == "--repository=/models"
+    devices = SERVICES[name]["deploy"]["resources"].get("reservations", {}).get("devices", [])
+    assert [device["driver"] for device in devices] == (["nvidia"] if profile == "gpu" else [])
 
 
 def test_prometheus_has_the_secrets_that_its_configuration_names() -> None:
