@@ -72,7 +72,7 @@ LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last fo
 EXTRAS = {
     "av": {"video_decoding.py"},
     "async_timeout": {"deadline.py"},  # Python 3.10 only
-    "PIL": {"resize.py", "lerobot.py"},
+    "PIL": {"resize.py", "stored_pictures.py"},
     "gymnasium": {"gym.py", "gym_vector.py"},
     "typer": {"cli"},
     "rich": {"cli"},

@@ -19,8 +19,9 @@ from rfm_client.cli.options import ServerOptions
 from rfm_client.cli.show import print_tables, table
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
-from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode
+from rfm_client.data.datasets.hdf5 import SUFFIXES
+from rfm_client.data.datasets.opening import hdf5_files, open_dataset
+from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode, require
 from rfm_client.data.orientation import ORIENTATIONS, Orient
 from rfm_client.labelling.episode_scores import FrameMemory, episode_columns
 from rfm_client.labelling.finished_episodes import Parts
@@ -43,7 +44,8 @@ DatasetArgument = Annotated[
     str,
     typer.Argument(
         metavar="DATASET",
-        help="LeRobot folder or Hub id org/name@revision, HDF5 file, folder of videos with tasks.csv or tasks.json.",
+        help="LeRobot folder or Hub id org/name@revision; HDF5 file, or a folder of them; folder of videos, of folders "
+        "of pictures, or of .npy and .npz files, with tasks.csv or tasks.json.",
     ),
 ]
 
@@ -138,6 +140,8 @@ class LabelCommand:
 
     def run(self) -> ExitCode:
         """Run as the options say. Raises RewardError, OSError and ImportError."""
+        if files := hdf5_files(self.source):
+            return self._run_each(files)
         if self.options.report:
             self._report()
             return ExitCode.OK
@@ -154,6 +158,29 @@ class LabelCommand:
         if self.options.rrd is not None:
             self._record(self.options.rrd, report)
         return status
+
+    def _run_each(self, files: Sequence[Path]) -> ExitCode:
+        """Run for each HDF5 file of a folder, once all can be opened. Raises DatasetError for a file that cannot."""
+        formats = ", ".join(self.labels.formats)
+        require(
+            "format", formats in ("", "hdf5"), "hdf5 for a folder of HDF5 files, each with labels of its own", formats
+        )
+        stems = [file.stem for file in files]
+        twice = [str(file) for file in files if stems.count(file.stem) > 1]
+        got = f"{', '.join(twice)}: leave out --output, and labels lie beside their files"
+        has_room = self.labels.output is None or not twice
+        require("output", has_room, "a folder for files whose names differ", got)
+        commands = []
+        for file in files:
+            rrd = self.options.rrd and self.options.rrd / file.stem
+            commands.append(replace(self, source=str(file), options=replace(self.options, rrd=rrd)))
+        for command in commands:
+            selected(command._dataset(), self.labels)
+        codes = []
+        for command in commands:
+            self.say(f"{command.source}")
+            codes.append(command.run())
+        return next((code for code in codes if code is not ExitCode.OK), ExitCode.OK)
 
     def _label(self) -> Report:
         watch = ProgressBar(self.say)
@@ -217,7 +244,8 @@ class LabelCommand:
             from rfm_client.cli.pictures import draw_summary
 
             beside = file.parent.parent if file.parent.name == "reward_signals" else file.parent
-            picture = (self.labels.output or beside) / f"{self.labels.name}_summary.png"
+            of_file = f"{Path(self.source).stem}." if Path(self.source).suffix.lower() in SUFFIXES else ""
+            picture = (self.labels.output or beside) / f"{of_file}{self.labels.name}_summary.png"
             draw_summary(picture, summary)
             typer.echo(f"{picture}")
 

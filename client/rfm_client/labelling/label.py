@@ -12,13 +12,12 @@ from typing import Any
 
 from rfm_client.data.datasets.hdf5 import Hdf5Dataset
 from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.data.datasets.protocol import Dataset, DatasetError, require
+from rfm_client.data.datasets.protocol import SIGNALS_FOLDER, Dataset, DatasetError, require
 from rfm_client.data.orientation import Orient
 from rfm_client.labelling.finished_episodes import IDENTITY, Parts
 from rfm_client.labelling.hdf5_labels import check_room, hdf5_labels, write_hdf5
 from rfm_client.labelling.label_files import (
     PROGRESS_ENDING,
-    SIGNALS_FOLDER,
     parquet_labels,
     progress_file,
     signals_file,

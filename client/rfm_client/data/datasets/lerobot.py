@@ -7,7 +7,6 @@ offset common to all rows. Otherwise it is refused, because the row of a frame i
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -27,6 +26,7 @@ from rfm_client.data.datasets.protocol import (
     orientations_of,
     require,
 )
+from rfm_client.data.datasets.stored_pictures import decoded_picture, opened_picture, pillow
 from rfm_client.data.datasets.video_frames import Span, Times, decode, video_identity, video_packets
 from rfm_client.data.orientation import Orient
 from rfm_client.data.video_decoding import Packets, decoder
@@ -35,8 +35,6 @@ _VIDEOS_AT_A_TIME = 4  # whose packets stay in memory
 _TOLERANCE_S = 1e-4  # LeRobot's, between a row's time and its frame's
 _CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
 _AGAIN = "write the dataset again, or leave this video's episodes out (--episodes)"
-_COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's modes of at most 8 bits a channel
-_DEEP = ";16"  # Pillow's mark of 16 bits a channel, which it cuts to 8
 
 
 class LeRobotDataset(Dataset):
@@ -80,7 +78,7 @@ class LeRobotDataset(Dataset):
         return episodes
 
     def decoder(self, camera: str) -> str | None:
-        return decoder() if camera in self.info.videos else _pillow()
+        return decoder() if camera in self.info.videos else pillow()
 
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         if camera not in self.info.videos:
@@ -94,14 +92,14 @@ class LeRobotDataset(Dataset):
             return sum(packets.num_bytes[frames[episode.index]])
         images = self._images(episode, camera)
         for t, image in enumerate(images):
-            _opened_image(_where(episode, camera, t), image)
+            opened_picture(_where(episode, camera, t), image)
         return sum(map(len, images))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         if camera in self.info.videos:
             return decode(self.span(episode, camera))
         images = self._images(episode, camera)
-        return (_decoded_image(_where(episode, camera, t), image) for t, image in enumerate(images))
+        return (decoded_picture(_where(episode, camera, t), image) for t, image in enumerate(images))
 
     def times_s(self, episode: DatasetEpisode) -> Times:
         """Return float64 [T], each frame's time from the start of the episode. Raises DatasetError."""
@@ -176,35 +174,3 @@ class LeRobotDataset(Dataset):
 
 def _where(episode: DatasetEpisode, camera: str, t: int) -> str:
     return f"{episode.name}: {camera}: frame {t}"
-
-
-def _decoded_image(where: str, image: bytes) -> UInt8Array:
-    with _opened_image(where, image) as opened:
-        try:
-            return np.asarray(opened.convert("RGB"))
-        except OSError as error:
-            raise DatasetError.at(where, "an image", error) from error
-
-
-def _opened_image(where: str, image: bytes) -> Any:
-    """Open a picture of 8-bit colours, and read only its header."""
-    _pillow()
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        opened = Image.open(io.BytesIO(image))
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise DatasetError.at(where, "an image", error) from error
-    is_deep = _DEEP in str(opened.tile)
-    expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
-    got = f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}"
-    require(where, opened.mode in _COLOURS and not is_deep, expected, got)
-    return opened
-
-
-def _pillow() -> str:
-    try:
-        import PIL
-    except ImportError as error:
-        raise ImportError('datasets of images need Pillow: pip install "./client[label]"') from error
-    return f"Pillow {PIL.__version__}"

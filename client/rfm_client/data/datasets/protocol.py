@@ -20,6 +20,8 @@ from rfm_client.contract.errors import RewardError
 from rfm_client.contract.samples import Trajectory, UInt8Array
 from rfm_client.data.orientation import Orient, Orientation, turned
 
+SIGNALS_FOLDER = "reward_signals"  # folder of labels in a dataset's folder
+
 _CAMERA_PREFIX = "observation.images."
 
 
