@@ -25,7 +25,7 @@ from rfm_client.labelling.label_files import (
 )
 from rfm_client.labelling.labelled_before import LabelFile, joined, restore
 from rfm_client.labelling.options import Format, LabelOptions, RayOptions
-from rfm_client.labelling.plan import Item, Plan, Recipe, make_plan, selected
+from rfm_client.labelling.plan import Item, Plan, Recipe, chosen_numbers, make_plan, selected
 from rfm_client.labelling.ray_engine import Connect, RayJob, finish_all_with_ray
 from rfm_client.labelling.run import FailedEpisode, Run, Watch
 from rfm_client.labelling.scorer import Scorer
@@ -144,9 +144,9 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     recipe = Recipe.of(options, dataset, scorer.checkpoint())
     episodes = selected(dataset, options)
     recipe.check_lengths(episodes)
-    told = " ".join(dataset.notes)
+    told, faults = " ".join(dataset.notes), dataset.cameras_in(chosen_numbers(dataset, replace(options, shard=None)))[1]
     turned = [f"orient: {name} {turn} (asked for)" for name, turn in recipe.orientations.items() if name not in told]
-    left_out = [] if options.cameras else [f"left out: {name}: {why}" for name, why in dataset.left_out.items()]
+    left_out = [] if options.cameras else [f"left out: {name}: {why}" for name, why in faults.items()]
     for line in (*recipe.told(options), *left_out, *dataset.notes, *turned):
         watch.note(line)
     return make_plan(dataset, recipe, episodes)
@@ -227,7 +227,7 @@ def _put_together(plan: Plan, outputs: Outputs, failures: Sequence[FailedEpisode
     labels = outputs.parts.read_all(plan)
     files = outputs.write(plan, labels)
     assert outputs.dataset is not None  # ``_begin`` sets it
-    num_episodes = len(outputs.dataset.episodes)
+    num_episodes = len(outputs.dataset.numbers)
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
         watch.note(f"{len(plan.items)} of the dataset's {num_episodes} episodes have labels{others}")

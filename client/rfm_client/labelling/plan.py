@@ -6,7 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from rfm_client.contract.errors import InvalidSampleError
@@ -54,8 +54,9 @@ class Recipe:
         Raises DatasetError for an unknown camera, ValueError if the rule lacks its number of frames, InvalidSampleError
         for another mode than ``whole`` with a checkpoint that needs the whole episode.
         """
-        require(dataset.source, bool(dataset.cameras), "at least one camera", "none")
-        cameras = chosen_cameras(dataset, options.cameras)
+        numbers = chosen_numbers(dataset, replace(options, shard=None))
+        cameras = chosen_cameras(dataset, options.cameras, numbers)
+        require(dataset.source, bool(cameras), "at least one camera", "none")
         if checkpoint.needs_whole_episode and options.mode != "whole":
             why = "of this model, whose scores are relative to the whole episode"
             raise InvalidSampleError.at("mode", f"whole {why}", options.mode)
@@ -159,13 +160,24 @@ class Plan:
 
 
 def selected(dataset: Dataset, options: LabelOptions) -> list[DatasetEpisode]:
-    """Return the episodes that the options choose. Raises DatasetError for an episode that the dataset lacks."""
-    episodes = {episode.index: episode for episode in dataset.episodes}
-    wanted = sorted(episodes) if options.episodes is None else sorted(set(options.episodes))
-    missing = [index for index in wanted if index not in episodes]
+    """Return the episodes that the options choose; the others are not read.
+
+    Raises DatasetError for an episode that the dataset lacks, or that cannot be read.
+    """
+    episodes = [dataset.episode(number) for number in chosen_numbers(dataset, options)]
+    if options.shard is None:  # the episodes of another shard may need the task
+        dataset.given_task.check_used(episodes)
+    return episodes
+
+
+def chosen_numbers(dataset: Dataset, options: LabelOptions) -> list[int]:
+    """Return the numbers of the episodes that the options choose. Raises DatasetError for an unknown episode."""
+    known = set(dataset.numbers)
+    wanted = sorted(known) if options.episodes is None else sorted(set(options.episodes))
+    missing = [number for number in wanted if number not in known]
     got = ", ".join(map(str, missing[:5])) or "none"
-    require("episodes", bool(wanted) and not missing, f"some of the {len(episodes)} of the dataset", got)
-    chosen = [episodes[index] for index in wanted[: options.limit]]
+    require("episodes", bool(wanted) and not missing, f"some of the {len(known)} of the dataset", got)
+    chosen = wanted[: options.limit]
     if options.shard is not None:
         i, n = options.shard
         chosen = chosen[len(chosen) * i // n : len(chosen) * (i + 1) // n]

@@ -12,10 +12,11 @@ import csv
 import json
 import re
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 
+from rfm_client.contract.errors import RewardError
 from rfm_client.data.datasets.protocol import (
     Dataset,
     DatasetEpisode,
@@ -54,21 +55,33 @@ class EpisodeFiles(Dataset):
         self.root = contents.root
         self.source = contents.root.resolve().name
         self.orientations = orientations_of(contents.orient, self.cameras)
-        self._contents = contents
+        self.given_task = contents.task
+        self.numbers = range(len(contents.tasks))
+        self._contents, self._names = contents, list(contents.tasks)
+        self._lengths: dict[str, int] = {}
+        self._firsts = [0]
 
-    def read_episodes(self) -> Sequence[DatasetEpisode]:
-        """Read the length and the task of every episode. Raises DatasetError."""
-        episodes: list[DatasetEpisode] = []
-        first = 0
-        for index, (name, told) in enumerate(self._contents.tasks.items()):
-            own = told if told else self.own_task(self.root / name)
-            task = self._contents.task.of(f"{self._contents.table}: {name}", own)
-            num_frames = self.length(self.root / name)
-            require(self.root / name, num_frames > 0, "frames", "none")
-            episodes.append(DatasetEpisode(index, name, task.strip(), num_frames, first))
-            first += num_frames
-        self._contents.task.check_used(episodes)
-        return episodes
+    def read_episode(self, number: int) -> DatasetEpisode:
+        """Read an episode, and count the frames before it; a broken one before it has none. Raises DatasetError."""
+        name = self._names[number]
+        own = self._contents.tasks[name] or self.own_task(self.root / name)
+        task = self.given_task.of(f"{self._contents.table}: {name}", own)
+        num_frames = self._length(name)
+        while len(self._firsts) <= number:
+            self._firsts.append(self._firsts[-1] + self._length_or_0(self._names[len(self._firsts) - 1]))
+        return DatasetEpisode(number, name, task.strip(), num_frames, self._firsts[number])
+
+    def _length(self, name: str) -> int:
+        if name not in self._lengths:
+            self._lengths[name] = self.length(self.root / name)
+            require(self.root / name, self._lengths[name] > 0, "frames", "none")
+        return self._lengths[name]
+
+    def _length_or_0(self, name: str) -> int:
+        try:
+            return self._length(name)
+        except RewardError:  # raised again if this episode is read
+            return 0
 
     @abstractmethod
     def length(self, file: Path) -> int:

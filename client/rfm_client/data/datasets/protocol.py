@@ -55,6 +55,39 @@ class DatasetEpisode:
     first_index: int
 
 
+@dataclass(frozen=True)
+class TaskOverride:
+    """The caller's task for episodes. Raises DatasetError for an empty text, or an override without a text.
+
+    text: task of episodes without their own; None: not given
+    overrides: True: ``text`` is the task of all episodes
+    """
+
+    text: str | None = None
+    overrides: bool = False
+
+    def __post_init__(self) -> None:
+        is_said = self.text is not None and bool(self.text.strip())
+        got = "none" if self.text is None else repr(self.text)
+        require("task", is_said or (self.text is None and not self.overrides), "a sentence", got)
+
+    def of(self, where: object, own: object) -> str:
+        """Return the task of an episode; ``own`` is its own. Raises DatasetError without a task."""
+        is_missing = not own or (isinstance(own, str) and not own.strip())
+        if self.text is not None and (self.overrides or is_missing):
+            return self.text
+        if is_missing or not isinstance(own, str):
+            got = "none" if not own else repr(own)
+            raise DatasetError.at(where, "a task as a sentence", f'{got}: add --task "SENTENCE"')
+        return own
+
+    def check_used(self, episodes: Sequence[DatasetEpisode]) -> None:
+        """Raise DatasetError if the text is given, but is no episode's task."""
+        is_used = self.text is None or any(episode.task == self.text for episode in episodes)
+        got = f"{self.text!r}: leave it out, or put it in the place of theirs with --override-task"
+        require("task", is_used, "none for episodes that all have tasks of their own", got)
+
+
 class Dataset(ABC):
     """Episodes on disk. Opening a dataset reads its tables, but no frames.
 
@@ -65,6 +98,8 @@ class Dataset(ABC):
     cameras: names, in the dataset's order
     depth_cameras: cameras of distances instead of colours, used only if named
     left_out: pictures that cannot be scored, with the reason; not in ``cameras``
+    numbers: of all episodes, in order
+    given_task: the caller's task
     orientations: turn that ``frames`` makes, by camera; others are not turned
     notes: lines for the caller to read before scoring
     """
@@ -76,17 +111,35 @@ class Dataset(ABC):
     cameras: Sequence[str] = ()
     depth_cameras: Sequence[str] = ()
     left_out: Mapping[str, str] = {}
+    numbers: Sequence[int] = ()
+    given_task: TaskOverride = TaskOverride()
     orientations: Mapping[str, Orientation] = {}
     notes: Sequence[str] = ()
 
     @cached_property
     def episodes(self) -> Sequence[DatasetEpisode]:
         """All episodes, by index. Raises DatasetError."""
-        return self.read_episodes()
+        episodes = [self.episode(number) for number in self.numbers]
+        self.given_task.check_used(episodes)
+        return episodes
+
+    def episode(self, number: int) -> DatasetEpisode:
+        """Return one of the episodes in ``numbers``. Only the first call reads it. Raises DatasetError."""
+        if number not in self._read:
+            self._read[number] = self.read_episode(number)
+        return self._read[number]
+
+    @cached_property
+    def _read(self) -> dict[int, DatasetEpisode]:
+        return {}
 
     @abstractmethod
-    def read_episodes(self) -> Sequence[DatasetEpisode]:
-        """Read and check the tables of all episodes."""
+    def read_episode(self, number: int) -> DatasetEpisode:
+        """Read and check the tables of an episode. A fault of another episode is no error. Raises DatasetError."""
+
+    def cameras_in(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
+        """Return ``cameras`` and ``left_out`` of these episodes alone. Raises DatasetError if they share no camera."""
+        return self.cameras, self.left_out
 
     @abstractmethod
     def decoder(self, camera: str) -> str | None:
@@ -117,22 +170,25 @@ class Dataset(ABC):
         return (turned(frame, orientation) for frame in self.stored_frames(episode, camera))
 
 
-def chosen_cameras(dataset: Dataset, names: Iterable[str]) -> tuple[str, ...]:
+def chosen_cameras(dataset: Dataset, names: Iterable[str], numbers: Sequence[int] | None = None) -> tuple[str, ...]:
     """Return the dataset's cameras of these names; without names, all but depth cameras.
+
+    numbers: episodes that need the cameras; None: all
 
     A name may omit LeRobot's ``observation.images.``. Raises DatasetError for an unknown camera, or if all
     are depth cameras and none is named.
     """
-    some = f"some of {', '.join(dataset.cameras)}"
+    cameras, left_out = dataset.cameras_in(dataset.numbers if numbers is None else numbers)
+    some = f"some of {', '.join(cameras)}"
     chosen = []
     for name in names:
-        camera = _camera_named(name, dataset.cameras)
+        camera = _camera_named(name, cameras)
         if camera is None:
-            reason = f", which is left out: {dataset.left_out[name]}" if name in dataset.left_out else ""
+            reason = f", which is left out: {left_out[name]}" if name in left_out else ""
             raise DatasetError.at("cameras", some, f"{name!r}{reason}")
         chosen.append(camera)
-    chosen = chosen or [camera for camera in dataset.cameras if camera not in dataset.depth_cameras]
-    require("cameras", bool(chosen or not dataset.cameras), f"{some} named: all are depth cameras", "none")
+    chosen = chosen or [camera for camera in cameras if camera not in dataset.depth_cameras]
+    require("cameras", bool(chosen or not cameras), f"{some} named: all are depth cameras", "none")
     return tuple(chosen)
 
 
@@ -182,36 +238,3 @@ def digest_of(parts: Iterable[bytes]) -> str:
         digest.update(len(part).to_bytes(8, "little"))
         digest.update(part)
     return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class TaskOverride:
-    """The caller's task for episodes. Raises DatasetError for an empty text, or an override without a text.
-
-    text: task of episodes without their own; None: not given
-    overrides: True: ``text`` is the task of all episodes
-    """
-
-    text: str | None = None
-    overrides: bool = False
-
-    def __post_init__(self) -> None:
-        is_said = self.text is not None and bool(self.text.strip())
-        got = "none" if self.text is None else repr(self.text)
-        require("task", is_said or (self.text is None and not self.overrides), "a sentence", got)
-
-    def of(self, where: object, own: object) -> str:
-        """Return the task of an episode; ``own`` is its own. Raises DatasetError without a task."""
-        is_missing = not own or (isinstance(own, str) and not own.strip())
-        if self.text is not None and (self.overrides or is_missing):
-            return self.text
-        if is_missing or not isinstance(own, str):
-            got = "none" if not own else repr(own)
-            raise DatasetError.at(where, "a task as a sentence", f'{got}: add --task "SENTENCE"')
-        return own
-
-    def check_used(self, episodes: Sequence[DatasetEpisode]) -> None:
-        """Raise DatasetError if the text is given, but is no episode's task."""
-        is_used = self.text is None or any(episode.task == self.text for episode in episodes)
-        got = f"{self.text!r}: leave it out, or put it in the place of theirs with --override-task"
-        require("task", is_used, "none for episodes that all have tasks of their own", got)
