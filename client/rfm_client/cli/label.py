@@ -21,7 +21,7 @@ from rfm_client.contract.errors import RewardError
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.data.datasets.hdf5 import SUFFIXES
 from rfm_client.data.datasets.opening import hdf5_files, open_dataset
-from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode, require
+from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode, SeveralTasks, require
 from rfm_client.data.orientation import ORIENTATIONS, Orient
 from rfm_client.labelling.episode_scores import FrameMemory, episode_columns
 from rfm_client.labelling.finished_episodes import Parts
@@ -58,6 +58,11 @@ class EpisodeTexts(Settings):
 
     task: str | None = setting(None, "Task sentence of the episodes that have none.")
     override_task: bool = setting(False, "Put --task in the place of the tasks that episodes have.")
+    several_tasks: SeveralTasks = setting(
+        "each",
+        "LeRobot episodes with several tasks. each: each stretch of frames with one task is scored by itself. "
+        "first: all frames by the first frame's task.",
+    )
     orient: Texts = setting(
         (),
         "Turn stored pictures upright, of all cameras or of one; may be repeated. Else as stored; LIBERO's HDF5 files "
@@ -75,7 +80,12 @@ class EpisodeTexts(Settings):
     @property
     def opening(self) -> dict[str, Any]:
         """Arguments of ``open_dataset`` after the source."""
-        return {"task": self.task, "override_task": self.override_task, "orient": Orient.parse(self.orient)}
+        return {
+            "task": self.task,
+            "override_task": self.override_task,
+            "several_tasks": self.several_tasks,
+            "orient": Orient.parse(self.orient),
+        }
 
 
 @dataclass(frozen=True)
@@ -340,7 +350,7 @@ def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int) -> f
 
 
 def _plan_rows(plan: Plan, dataset: Dataset, num_bytes: int, took_s: float) -> list[tuple[str, str]]:
-    tasks = sorted({item.episode.task for item in plan.items})
+    tasks = sorted({task for item in plan.items for task, _ in item.episode.stretches})
     cameras = plan.recipe.cameras
     return [
         ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),

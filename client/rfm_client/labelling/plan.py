@@ -111,11 +111,12 @@ class Recipe:
     def check_lengths(self, episodes: Sequence[DatasetEpisode]) -> None:
         """Raise DatasetError for an episode above the checkpoint's limit, if the recipe shows whole episodes."""
         limit = self.checkpoint.max_frames
-        longest = max(episodes, key=lambda episode: episode.num_frames)
+        lengths = {episode.name: max(count for _, count in episode.stretches) for episode in episodes}
+        longest = max(lengths, key=lambda name: lengths[name])
         shows_all = self.mode == "whole" or self.sampling.frames is None
-        fits = not shows_all or limit is None or longest.num_frames <= limit
-        got = f"{longest.num_frames}: use mode prefix and a rule with a number of frames"
-        require(longest.name, fits, f"at most {limit} frames, as the checkpoint takes", got)
+        fits = not shows_all or limit is None or lengths[longest] <= limit
+        got = f"{lengths[longest]}: use mode prefix and a rule with a number of frames"
+        require(longest, fits, f"at most {limit} frames, as the checkpoint takes", got)
 
 
 @dataclass(frozen=True)
@@ -190,6 +191,7 @@ def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisod
     items = []
     for episode in episodes:
         about = f"{episode.index} {episode.first_index} {episode.num_frames} {episode.task}"
+        about += f" {episode.tasks}" if episode.tasks else ""
         videos = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.cameras]
         items.append(Item(episode, digest_of(part.encode() for part in (document, about, *videos))))
     return Plan(items, recipe, {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision})

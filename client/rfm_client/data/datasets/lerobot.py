@@ -74,7 +74,8 @@ class LeRobotDataset(Dataset):
     def read_episode(self, number: int) -> DatasetEpisode:
         entry = self._entry(number)
         rows = self._rows.read(entry)
-        return DatasetEpisode(number, entry.where, rows.task, len(rows.times_s), rows.first_index)
+        tasks = tuple(rows.tasks) if len(rows.tasks) > 1 else ()
+        return DatasetEpisode(number, entry.where, rows.tasks[0][1], len(rows.times_s), rows.first_index, tasks)
 
     def decoder(self, camera: str) -> str | None:
         return decoder() if camera in self.info.videos else pillow()

@@ -19,7 +19,7 @@ from rfm_client.data.datasets.frame_folders import FrameFolders, is_picture
 from rfm_client.data.datasets.hdf5 import ALOHA, ALOHA_GROUP, SUFFIXES, Hdf5Dataset
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.datasets.lerobot_rows import INFO_FILE
-from rfm_client.data.datasets.protocol import SIGNALS_FOLDER, Dataset, DatasetError, TaskOverride, require
+from rfm_client.data.datasets.protocol import SIGNALS_FOLDER, Dataset, DatasetError, SeveralTasks, TaskOverride, require
 from rfm_client.data.datasets.videos import VideoFolder
 from rfm_client.data.inputs import ARRAY_SUFFIXES
 from rfm_client.data.orientation import Orient
@@ -54,17 +54,24 @@ _FILES_OF_OURS = re.compile(r".*_(summary\.png|rewards\.hdf5)")  # beside the ep
 
 
 def open_dataset(
-    source: str | Path, *, task: str | None = None, override_task: bool = False, orient: Orient = Orient()
+    source: str | Path,
+    *,
+    task: str | None = None,
+    override_task: bool = False,
+    several_tasks: SeveralTasks = "each",
+    orient: Orient = Orient(),
 ) -> Dataset:
     """Return the dataset at a path, or download the Hub id ``org/name[@revision]``. An existing path wins.
 
     task: task of episodes without their own
     override_task: True: ``task`` is the task of all episodes
+    several_tasks: of a LeRobot episode with several tasks: ``each``: each frame has its own; ``first``: all frames have
+        the first frame's, as in LeRobot's own scripts
     orient: turn of each camera's frames. HDF5 files marked as LIBERO's are turned by default
 
     Raises DatasetError.
     """
-    path, given = Path(source), TaskOverride(task, override_task)
+    path, given = Path(source), TaskOverride(task, override_task, several_tasks)
     if path.is_file() and path.suffix.lower() in SUFFIXES:
         return Hdf5Dataset(path, task=given, orient=orient)
     if (path / INFO_FILE).is_file():

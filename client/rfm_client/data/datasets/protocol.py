@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from rfm_client.contract.samples import Trajectory, UInt8Array
 from rfm_client.data.orientation import Orient, Orientation, turned
 
 SIGNALS_FOLDER = "reward_signals"  # folder of labels in a dataset's folder
+
+SeveralTasks: TypeAlias = Literal["each", "first"]
 
 _CAMERA_PREFIX = "observation.images."
 
@@ -45,7 +48,9 @@ class DatasetEpisode:
 
     index: its number in the dataset
     name: its name in the dataset
+    task: of all frames, or of the first frame
     first_index: the dataset's number of its first frame; the others follow
+    tasks: the first frame and the task of each stretch of frames with one task; empty: one task for all frames
     """
 
     index: int
@@ -53,6 +58,14 @@ class DatasetEpisode:
     task: str
     num_frames: int
     first_index: int
+    tasks: tuple[tuple[int, str], ...] = ()
+
+    @property
+    def stretches(self) -> list[tuple[str, int]]:
+        """Task and number of frames of each stretch of frames with one task, in order."""
+        tasks = self.tasks or ((0, self.task),)
+        ends = [*(first for first, _ in tasks[1:]), self.num_frames]
+        return [(task, end - first) for (first, task), end in zip(tasks, ends, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -61,14 +74,18 @@ class TaskOverride:
 
     text: task of episodes without their own; None: not given
     overrides: True: ``text`` is the task of all episodes
+    several: of an episode with several tasks: ``each``: each frame has its own; ``first``: all have the first frame's
     """
 
     text: str | None = None
     overrides: bool = False
+    several: SeveralTasks = "each"
 
     def __post_init__(self) -> None:
         is_said = self.text is not None and bool(self.text.strip())
         got = "none" if self.text is None else repr(self.text)
+        kinds = get_args(SeveralTasks)
+        require("several_tasks", self.several in kinds, f"one of {', '.join(kinds)}", repr(self.several))
         require("task", is_said or (self.text is None and not self.overrides), "a sentence", got)
 
     def of(self, where: object, own: object) -> str:
@@ -83,7 +100,7 @@ class TaskOverride:
 
     def check_used(self, episodes: Sequence[DatasetEpisode]) -> None:
         """Raise DatasetError if the text is given, but is no episode's task."""
-        is_used = self.text is None or any(episode.task == self.text for episode in episodes)
+        is_used = self.text is None or any(task == self.text for episode in episodes for task, _ in episode.stretches)
         got = f"{self.text!r}: leave it out, or put it in the place of theirs with --override-task"
         require("task", is_used, "none for episodes that all have tasks of their own", got)
 
