@@ -178,6 +178,15 @@ def chosen_numbers(dataset: Dataset, options: LabelOptions) -> list[int]:
     missing = [number for number in wanted if number not in known]
     got = ", ".join(map(str, missing[:5])) or "none"
     require("episodes", bool(wanted) and not missing, f"some of the {len(known)} of the dataset", got)
+    if options.filter_key is not None:
+        keys = ", ".join(dataset.filter_keys) or "none, since the dataset has no filter keys"
+        is_known = options.filter_key in dataset.filter_keys
+        require("filter_key", is_known, f"one of {keys}", repr(options.filter_key))
+        of_key = dataset.filter_keys[options.filter_key]
+        gone = [number for number in of_key if number not in known]
+        got = f"{', '.join(map(str, gone[:5])) or 'none'} in {options.filter_key}"
+        wanted = sorted(set(wanted) & set(of_key))
+        require("filter_key", bool(wanted) and not gone, f"some of the {len(known)} episodes of the dataset", got)
     chosen = wanted[: options.limit]
     if options.shard is not None:
         i, n = options.shard

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """HDF5 files of robomimic and LIBERO: ``data/demo_<i>/obs/<camera>``. Needs ``rfm-client[hdf5]``.
 
-The task is LIBERO's sentence (``problem_info`` of ``data``), robomimic's (``env_args``), or the caller's. LIBERO stores
-its pictures upside down: they are turned, unless the caller says otherwise.
+The task is the demonstration's own (``ep_meta``), else LIBERO's sentence (``problem_info`` of ``data``), robomimic's
+(``env_args``), or the caller's. LIBERO stores its pictures upside down: they are turned, unless the caller says
+otherwise. robomimic's filter keys (``mask/train``) name some of the demonstrations.
 """
 
 from __future__ import annotations
@@ -63,7 +64,9 @@ class Hdf5Dataset(Dataset):
             self._demos = {index: name for index, (name, _) in demos.items()}
             self._pictures = _pictures_in(demos)
             self._forms = _forms_in(demos)
-            self._task = _task_of(opened["data"].attrs)
+            of_all = _task_of(opened["data"].attrs)
+            self._tasks = {index: _own_task_of(demo) or of_all for index, (_, demo) in demos.items()}
+            self.filter_keys = _filter_keys_in(opened)
             self.cameras, self.left_out = self._shared(list(demos))
             self._lengths = {
                 index: _lengths_of(demo, self.cameras or self._cameras_of(index)) for index, (_, demo) in demos.items()
@@ -82,7 +85,7 @@ class Hdf5Dataset(Dataset):
 
     def read_episode(self, number: int) -> DatasetEpisode:
         where = f"{self.file}: data/{self._demos[number]}"
-        task = self.given_task.of(f"{self.file}: problem_info or env_args", self._task)
+        task = self.given_task.of(f"{where}: ep_meta, or data: problem_info or env_args", self._tasks[number])
         lengths = self._lengths[number]
         got = ", ".join(f"{key} {length}" for key, length in lengths.items()) or self._forms[number]
         require(where, _one_length(lengths) > 0, "one length, above 0", got)
@@ -257,6 +260,27 @@ def _document(attributes: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     except (ValueError, TypeError, RecursionError):
         return {}
     return document if isinstance(document, dict) else {}
+
+
+def _own_task_of(demo: Any) -> Any:
+    """The task in a demonstration's ``ep_meta``, as robomimic reads it, or in an attribute; None: none."""
+    attributes = getattr(demo, "attrs", {})
+    stored = _document(attributes, "ep_meta")
+    own = next((stored[key] for key in _SENTENCES if stored.get(key)), None)
+    own = own or next((attributes[key] for key in _SENTENCES if key in attributes), None)
+    return own.decode() if isinstance(own, bytes) else own
+
+
+def _filter_keys_in(opened: Any) -> Mapping[str, Sequence[int]]:
+    """Numbers of the demonstrations in each dataset of ``mask``, without datasets of anything else."""
+    group = opened.get("mask")
+    found: dict[str, list[int]] = {}
+    for key, names in group.items() if hasattr(group, "keys") else ():
+        told = [name.decode() if isinstance(name, bytes) else str(name) for name in np.ravel(names[()]).tolist()]
+        matches = [_DEMO.match(name) for name in told]
+        if all(matches):
+            found[key] = sorted(int(match[1]) for match in matches if match)
+    return found
 
 
 def _task_of(attributes: Mapping[str, Any]) -> Any:

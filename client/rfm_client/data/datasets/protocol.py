@@ -116,6 +116,7 @@ class Dataset(ABC):
     depth_cameras: cameras of distances instead of colours, used only if named
     left_out: pictures that cannot be scored, with the reason; not in ``cameras``
     numbers: of all episodes, in order
+    filter_keys: numbers of the episodes of each filter key, such as ``train``
     given_task: the caller's task
     orientations: turn that ``frames`` makes, by camera; others are not turned
     notes: lines for the caller to read before scoring
@@ -129,6 +130,7 @@ class Dataset(ABC):
     depth_cameras: Sequence[str] = ()
     left_out: Mapping[str, str] = {}
     numbers: Sequence[int] = ()
+    filter_keys: Mapping[str, Sequence[int]] = {}
     given_task: TaskOverride = TaskOverride()
     orientations: Mapping[str, Orientation] = {}
     notes: Sequence[str] = ()
