@@ -75,7 +75,8 @@ VECTORS: dict[str, tuple[Any, Any, bool]] = {
 def test_a_step_asks_once_about_each_episode_s_own_frames(
     recorder: Recorder, kind: Any, source: Any, reuse: bool
 ) -> None:
-    venv = VecMonitor(coded(kind, rendered=source is None, reuse=reuse))
+    venv = coded(kind, rendered=source is None, reuse=reuse)
+    venv = VecMonitor(venv) if kind is DummyVecEnv else venv
     with closing(RewardModelVecEnv(venv, recorder, TASKS, options(source))) as env:
         env.reset()
         ends = []

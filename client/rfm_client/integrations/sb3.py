@@ -113,9 +113,10 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         self._is_whole = False  # until each frame is kept
         self.venv.step_async(actions)
 
-    def step_wait(self) -> tuple[Any, Any, Any, Any]:
+    def step_wait(self) -> tuple[Any, Any, Any, list[Info]]:
         """End the step; return the model's rewards, float32 [num_envs]. Raises RewardError."""
-        observations, env_rewards, dones, infos = self.venv.step_wait()
+        observations, env_rewards, dones, told = self.venv.step_wait()
+        infos = [dict(info) for info in told]  # a list in one ``VecEnv``, a tuple in another
         ended = np.flatnonzero(dones).tolist()
         self._take_reset_infos(ended)
         frames = [info.pop(_FRAME, None) for info in infos]
@@ -138,7 +139,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         rewards = np.zeros(self.num_envs, np.float32)
         for index, episode in enumerate(stepped):
             rewards[index] = episode.reward(float(env_rewards[index]))
-            infos[index] = {**infos[index], INFO: episode.info() | {"env_reward": float(env_rewards[index])}}
+            infos[index][INFO] = episode.info() | {"env_reward": float(env_rewards[index])}
         for index in ended:
             self.reset_infos[index] |= {INFO: self._episodes[index].info()}
         return observations, rewards, dones, infos
