@@ -6,6 +6,7 @@ Nothing here sends requests to the server: ``episodes.py`` and the Gymnasium wra
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,15 @@ from rfm_client.episodes.windows import EpisodeFrame, Window
 
 if TYPE_CHECKING:
     from rfm_client.episodes.live import LiveEpisode, LiveView
+
+STILL_FRAMES = 10  # equal pictures in a row, after which an episode warns
+
+_BLACK = (
+    "black ones in a row: simulators in one process can blacken each other's pictures; give each a process of its own"
+)
+_STILL = "equal ones in a row: look at a frame, since the camera may be stuck, or render() may not draw anew"
+
+logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True)
@@ -173,6 +183,7 @@ class EpisodeFrames:
         self._orientations = options.orientations
         self._frames: list[tuple[EpisodeFrame, ...]] = []  # by step and camera
         self._live: LiveEpisode | None = None
+        self._has_warned = False
 
     @property
     def step(self) -> int:
@@ -204,8 +215,23 @@ class EpisodeFrames:
         return tuple(kept)
 
     def append(self, frame: tuple[EpisodeFrame, ...]) -> None:
-        """Add the frames that ``checked`` returned."""
+        """Add the frames that ``checked`` returned. Warn, once an episode, if a camera shows the same picture."""
         self._frames.append(frame)
+        if not self._has_warned:
+            self._warn_of_still_frames()
+
+    def _warn_of_still_frames(self) -> None:
+        last = self._frames[-STILL_FRAMES:]
+        if len(last) < STILL_FRAMES:
+            return
+        for number, camera in enumerate(self._options.cameras or ("",)):
+            newest = last[-1][number].pixels
+            if all(np.array_equal(newest, each[number].pixels) for each in reversed(last[:-1])):
+                self._has_warned = True
+                where = ": ".join(filter(None, [self._where, f"frame[{camera!r}]" if camera else "frame"]))
+                got = _STILL if newest.any() else _BLACK
+                logger.warning("%s: expected pictures that change, got %d %s", where, STILL_FRAMES, got)
+                return
 
     def pop(self) -> None:
         """Remove the newest frame again."""

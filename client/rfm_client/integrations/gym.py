@@ -13,7 +13,7 @@ older requests; with ``await_last=False`` it is not scored.
 
 ``info["reward_model"]`` has ``progress`` and ``success`` of the newest known score (success is NaN if the checkpoint
 does not predict it), its ``step``, its ``lag`` in steps, and the steps ``skipped`` in this episode. With
-``terminate_on_success`` it has ``succeeded``; after a step, ``env_reward``.
+``terminate_on_success`` or ``success_bonus`` it has ``succeeded``; after a step, ``env_reward``.
 
 ``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
 frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises

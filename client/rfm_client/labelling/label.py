@@ -12,13 +12,12 @@ from typing import Any
 
 from rfm_client.data.datasets.hdf5 import Hdf5Dataset
 from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.data.datasets.protocol import Dataset, DatasetError, require
+from rfm_client.data.datasets.protocol import SIGNALS_FOLDER, Dataset, DatasetError, SeveralTasks, require
 from rfm_client.data.orientation import Orient
 from rfm_client.labelling.finished_episodes import IDENTITY, Parts
 from rfm_client.labelling.hdf5_labels import check_room, hdf5_labels, write_hdf5
 from rfm_client.labelling.label_files import (
     PROGRESS_ENDING,
-    SIGNALS_FOLDER,
     parquet_labels,
     progress_file,
     signals_file,
@@ -26,7 +25,7 @@ from rfm_client.labelling.label_files import (
 )
 from rfm_client.labelling.labelled_before import LabelFile, joined, restore
 from rfm_client.labelling.options import Format, LabelOptions, RayOptions
-from rfm_client.labelling.plan import Item, Plan, Recipe, make_plan, selected
+from rfm_client.labelling.plan import Item, Plan, Recipe, chosen_numbers, make_plan, selected
 from rfm_client.labelling.ray_engine import Connect, RayJob, finish_all_with_ray
 from rfm_client.labelling.run import FailedEpisode, Run, Watch
 from rfm_client.labelling.scorer import Scorer
@@ -145,9 +144,13 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     recipe = Recipe.of(options, dataset, scorer.checkpoint())
     episodes = selected(dataset, options)
     recipe.check_lengths(episodes)
-    told = " ".join(dataset.notes)
+    several = sum(bool(episode.tasks) for episode in episodes)
+    if several:
+        how = "each stretch of frames with one task is scored by itself (--several-tasks first: all by the first task)"
+        watch.note(f"tasks: {several} episodes have several: {how}")
+    told, faults = " ".join(dataset.notes), dataset.cameras_in(chosen_numbers(dataset, replace(options, shard=None)))[1]
     turned = [f"orient: {name} {turn} (asked for)" for name, turn in recipe.orientations.items() if name not in told]
-    left_out = [] if options.cameras else [f"left out: {name}: {why}" for name, why in dataset.left_out.items()]
+    left_out = [] if options.cameras else [f"left out: {name}: {why}" for name, why in faults.items()]
     for line in (*recipe.told(options), *left_out, *dataset.notes, *turned):
         watch.note(line)
     return make_plan(dataset, recipe, episodes)
@@ -185,16 +188,22 @@ def label_with_ray(
     *,
     task: str | None = None,
     override_task: bool = False,
+    several_tasks: SeveralTasks = "each",
     orient: Orient = Orient(),
     ray: RayOptions = _ANY_CLUSTER,
 ) -> Report:
     """Label as ``label`` does, on a Ray cluster. Each actor opens the dataset and connects by itself.
 
-    source, task, override_task, orient: as in ``open_dataset``
+    source, task, override_task, several_tasks, orient: as in ``open_dataset``
     connect: returns a context with a scorer, on any node; this process reads the checkpoint's facts with it
     """
-    opening = {"task": task, "override_task": override_task, "orient": orient}
-    dataset = open_dataset(source, task=task, override_task=override_task, orient=orient)
+    opening: dict[str, Any] = {
+        "task": task,
+        "override_task": override_task,
+        "several_tasks": several_tasks,
+        "orient": orient,
+    }
+    dataset = open_dataset(source, **opening)
     with connect() as scorer:
         outputs, plan = _begin(dataset, scorer, options, watch)
     job = RayJob(source, opening, connect, plan, outputs.parts.url, options.workers)
@@ -228,7 +237,7 @@ def _put_together(plan: Plan, outputs: Outputs, failures: Sequence[FailedEpisode
     labels = outputs.parts.read_all(plan)
     files = outputs.write(plan, labels)
     assert outputs.dataset is not None  # ``_begin`` sets it
-    num_episodes = len(outputs.dataset.episodes)
+    num_episodes = len(outputs.dataset.numbers)
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
         watch.note(f"{len(plan.items)} of the dataset's {num_episodes} episodes have labels{others}")

@@ -23,14 +23,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.samples import Float32Array
-from rfm_client.data.datasets.protocol import DatasetError, require
+from rfm_client.data.datasets.protocol import SIGNALS_FOLDER, DatasetError, require
 from rfm_client.labelling.episode_scores import LOG_PROB, PROGRESS, SUCCESS, Columns
 from rfm_client.labelling.finished_episodes import IDENTITY, whole_file
 from rfm_client.labelling.labelled_before import LabelFile
 from rfm_client.labelling.plan import Item, Plan
 
 PROGRESS_ENDING = "_progress.parquet"
-SIGNALS_FOLDER = "reward_signals"
 PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 

@@ -59,11 +59,10 @@ class LabelFile:
         got = (self.provenance and differ) or self.flaw or ""
         require(self.path, self.flaw is None and not differ, "no labels, or those of the same recipe", got)
 
-        episodes = {episode.index: episode for episode in dataset.episodes}
-        lost = set(self.digests) - set(episodes)
-        expected = f"labels of the dataset's {len(episodes)} episodes"
+        lost = set(self.digests) - set(dataset.numbers)
+        expected = f"labels of the dataset's {len(dataset.numbers)} episodes"
         require(self.path, not lost, expected, f"some of episode {min(lost, default=None)}")
-        others = [episodes[index] for index in sorted(self.digests) if index not in known]
+        others = [dataset.episode(index) for index in sorted(self.digests) if index not in known]
         items = {item.episode.index: item for item in make_plan(dataset, plan.recipe, others).items}
         found = {index: {**known, **items}[index] for index in self.digests}
         changed = [index for index, digest in self.digests.items() if found[index].digest != digest]
