@@ -14,6 +14,7 @@ from selenium.webdriver import ActionChains, Keys
 from selenium.webdriver.support.select import Select
 
 from browsers import Browser
+from gateway_requests import TOLERANCE
 from gateways import poll, running
 from labelling import BrightnessScorer
 from rfm.launch.triton_server import Endpoints
@@ -22,6 +23,7 @@ from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.orientation import Orient
 from rfm_client.labelling import ClientScorer, LabelOptions, label, open_dataset, summarise
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew
+from viewer_requests import run_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -61,8 +63,9 @@ class Page:
 
     @property
     def numbers(self) -> list[list[float]]:
-        """The numbers of the watched episode's curves."""
-        return [[float(cell) for cell in row[1:]] for row in self.browser.cells("#episode-curves tr")]
+        """Progress and success of each of the watched episode's curves, beside its lines."""
+        values = [self.browser.values("episode-chart", signal) for signal in ("progress", "success")]
+        return [[float(of_signal[name]) for of_signal in values] for name in values[0]]
 
     def choose(self, number: int) -> LeRobotDataset:
         """Shows a dataset."""
@@ -208,7 +211,7 @@ def test_a_click_plays_the_episode_and_the_curve_follows(page: Page) -> None:
     columns = columns_of(page.folders[BRIGHT], 3)
     last = [[columns[name][-1] for name in ("progress_sparse", "success")]]
     last += [[columns[f"{name}.{camera}"][-1] for name in ("progress", "success")] for camera in CAMERAS]
-    np.testing.assert_allclose(page.numbers, [each * 2 for each in last], rtol=0, atol=SHOWN)
+    np.testing.assert_allclose(page.numbers, last, rtol=0, atol=SHOWN)
 
 
 def test_dragging_in_the_chart_moves_the_videos_and_the_numbers(page: Page) -> None:
@@ -227,7 +230,7 @@ def test_dragging_in_the_chart_moves_the_videos_and_the_numbers(page: Page) -> N
     frame = round(page.browser.times_s(PLAYERS)[-1] * 10)
     names = [("progress_sparse", "success"), *((f"progress.{each}", f"success.{each}") for each in CAMERAS)]
     expected = [[columns[name][frame] for name in pair] for pair in names]
-    np.testing.assert_allclose([row[:2] for row in page.numbers], expected, rtol=0, atol=SHOWN)
+    np.testing.assert_allclose(page.numbers, expected, rtol=0, atol=SHOWN)
 
 
 @pytest.mark.parametrize("number", [DEMO, BRIGHT, *CODED], ids=["v3.0", "v2.1", *CODINGS])
@@ -252,7 +255,11 @@ def test_an_episode_is_put_into_the_score_tab_and_scored(page: Page) -> None:
         assert row[0] == f"toy_v30_many_episode_000000.{camera.rpartition('.')[2]}.mp4"
         assert row[4] == f"{len(columns['index'])} of {len(columns['index'])}"
         expected = [columns[f"{name}.{camera}"][-1] for name in ("progress", "success")]
-        assert [float(text) for text in row[7:9]] == pytest.approx(expected, abs=2 * SHOWN)  # as the labels
+        assert [float(text) for text in row[5:7]] == pytest.approx(expected, abs=2 * SHOWN)  # as the labels
+    run_line(page.folders[DEMO].parent, page.browser["command"].text)
+    again = columns_of(page.folders[DEMO].parent / "toy_v30_many_episode_0", 0)
+    for camera in CAMERAS:
+        np.testing.assert_allclose(again[f"progress.{camera}"], columns[f"progress.{camera}"], rtol=0, atol=TOLERANCE)
 
 
 def test_videos_are_turned_as_they_were_for_the_labels_also_when_they_are_scored(page: Page) -> None:

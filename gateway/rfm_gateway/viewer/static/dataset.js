@@ -4,7 +4,7 @@
 import { curvesOf, datasets, episodesOf, videoOf } from "./api.js";
 import { EpisodeTable, ORDER_NAMES, PLAIN_ORDER, sorted } from "./episodes.js";
 import { Histogram } from "./histogram.js";
-import { cell, named, shown } from "./table.js";
+import { shown } from "./text.js";
 import { Timeline } from "./timeline.js";
 
 const CAMERA_PREFIX = "observation.images.";
@@ -23,7 +23,7 @@ export class DatasetTab {
   #curves = [];
   #stopping = new AbortController();
 
-  /** onScore({ files, task, fps, orientations }): somebody wants an episode scored; onError(error): something went wrong */
+  /** onScore({ files, task, fps, orientations, origins }): somebody wants an episode scored; onError(error): something went wrong */
   constructor(page, { onScore, onError }) {
     this.#page = page;
     this.#onScore = onScore;
@@ -33,7 +33,7 @@ export class DatasetTab {
     const elements = {
       videos: page["episode-videos"], chart: page["episode-chart"], slider: page["episode-time"], button: page["episode-play"],
     };
-    this.#timeline = new Timeline(elements, (seconds) => this.#showNumbers(seconds));
+    this.#timeline = new Timeline(elements);
     page.dataset.addEventListener("change", () => this.#choose());
     page.labels.addEventListener("change", () => this.#load(this.#labels));
     page.shelf.addEventListener("change", () => page.errors.replaceChildren());
@@ -157,22 +157,12 @@ export class DatasetTab {
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
   }
 
-  #showNumbers(seconds) {
-    const rows = this.#curves.filter(({ isLabelled }) => isLabelled).map((curve) => {
-      const row = document.createElement("tr");
-      const after = curve.times.findIndex((time) => time > seconds + 1e-3);
-      const here = after < 0 ? curve.times.length - 1 : Math.max(after - 1, 0);
-      const numbers = [curve.progress[here], curve.success[here], curve.progress.at(-1), curve.success.at(-1)];
-      row.append(named(curve.index, curve.label), ...numbers.map((value) => cell(shown(value), "number")));
-      return row;
-    });
-    this.#page["episode-curves"].replaceChildren(...rows);
-  }
-
   #score() {
     this.#timeline.videos.pause();
-    const { fps, orientations } = this.#told;
-    this.#onScore({ files: this.#watched.files, task: this.#watched.task, fps, orientations });
+    const { fps, orientations, cameras } = this.#told;
+    const { files, task, episode } = this.#watched;
+    const origins = cameras.map((camera) => ({ dataset: this.#datasets[this.#number].name, episode, camera, fps, task }));
+    this.#onScore({ files, task, fps, orientations, origins });
   }
 }
 

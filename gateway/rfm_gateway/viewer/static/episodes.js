@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: MIT
 // The episodes of a dataset as a table, sorted by what one wants to see first.
 
-import { cell, shown } from "./table.js";
+import { cell } from "./table.js";
+import { shown } from "./text.js";
 
 const ROWS_AT_A_TIME = 200;
 
