@@ -192,7 +192,7 @@ export class Chart {
     }));
     const options = {
       ...this.#size(),
-      padding: [4, 12, this.#label === null ? 0 : 4, 0],
+      padding: [4, this.#onThreshold ? 44 : 12, this.#label === null ? 0 : 4, 0], // to the right the threshold is written
       legend: { show: false },
       cursor: { x: false, y: false, points: { show: false }, drag: { x: false, y: false } },
       scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [0, 1] } },

@@ -339,6 +339,7 @@ listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, v
 listen(page.png, { click: async () => save("curves.png", await pngFigure(figure())) });
 listen(page.svg, { click: () => save("curves.svg", figure(), "image/svg+xml") });
 listen(page.copy, { click: () => copy(page.command, "command line is") });
+listen(page["use-copy"], { click: () => copy(page["use-words"], "words are") });
 listen(page["live-copy"], { click: () => copy(page["live-code"], "lines are") });
 listen(document, {
   dragover: (event) => { event.preventDefault(); page.dropping.hidden = false; },

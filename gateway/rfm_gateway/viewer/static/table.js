@@ -8,14 +8,14 @@ const NAME_LETTERS = 40;
 
 /** Writes a row for each curve into `body`. threshold: at which success counts */
 export function showTable(body, curves, threshold) {
-  body.replaceChildren(...curves.map((curve) => row(curve, threshold)));
-  label(body);
+  const names = [...body.closest("table").querySelectorAll("thead th")].map((head) => head.textContent);
+  body.replaceChildren(...curves.map((curve) => label(row(curve, threshold), names)));
 }
 
-/** Gives each cell the name of its column, which stands before it where a table is shown as cards. */
-export function label(body) {
-  const names = [...body.closest("table").querySelectorAll("thead th")].map((head) => head.textContent);
-  for (const each of body.rows) [...each.cells].forEach((one, place) => { one.dataset.name = names[place]; });
+/** A row whose cells have the names of their columns, which stand before them where rows are shown as cards. */
+export function label(element, names) {
+  [...element.cells].forEach((one, place) => { one.dataset.name = names[place]; });
+  return element;
 }
 
 function row(curve, threshold) {
