@@ -8,6 +8,7 @@ import uPlot from "./uplot/uPlot.esm.js";
 const NUM_COLOURS = 8;
 const VALUE_PX = 16; // height of a number beside a line
 const VALUE_WIDTH_PX = 48;
+const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
 const LOW_PX = 240; // a chart so low has fewer marks
 const TICKS = { progress: [0, 0.25, 0.5, 0.75, 1], success: [0, 0.5, 1] };
 const FEW_TICKS = { progress: [0, 0.5, 1], success: [0, 1] };
@@ -93,8 +94,8 @@ export class Chart {
     this.#panes = panesOf(this.#curves);
     this.#begin = Math.min(...this.#curves.map(({ begin }) => begin ?? 0), Infinity);
     this.#end = Math.max(0, ...this.#curves.map(({ allTimes }) => allTimes.at(-1))); // so that the axis does not grow
-    const shortest = this.#isOfSteps ? 10 : 1; // of a curve of one point; uPlot divides an axis of no length for ever
-    if (this.#end <= this.#begin) this.#end = this.#begin + shortest;
+    if (this.#isOfSteps) this.#end = Math.max(this.#end, this.#begin + FEWEST_STEPS);
+    if (this.#end <= this.#begin) this.#end = this.#begin + 1; // uPlot divides an axis of no length for ever
     const signals = Object.keys(this.#panes);
     const tables = this.#curves.map((curve) => [
       curve.times, ...signals.map((signal) => curve[signal].map((value) => heightOf(this.#panes, signal, value))),

@@ -46,12 +46,34 @@ export class LiveCard {
       this.#numbers.set(name, value);
     }
     this.element.append(this.#heading, this.#state, this.#task, this.#image, this.#chartHost, list);
-    this.#chart = new Chart(this.#chartHost, () => {}, { label: null, isOfSteps: true });
-    this.#chart.moveTo(NaN); // there is no time to mark
+    this.#chart = new Chart(this.#chartHost, (step) => this.#chart.moveTo(step), { label: null, isOfSteps: true });
+    this.#chart.moveTo(NaN); // there is no step to mark
+    this.#chartHost.addEventListener("pointerleave", () => this.#chart.moveTo(NaN));
+  }
+
+  /** The name of its run. */
+  get run() {
+    return this.#about.name || "Episode";
+  }
+
+  get succeeded() {
+    return this.#newest?.succeeded ?? false;
+  }
+
+  get lastProgress() {
+    return this.#newest?.progress ?? null;
+  }
+
+  get lastSuccess() {
+    return this.#newest?.success ?? null;
+  }
+
+  get numSteps() {
+    return this.#newest === null ? null : this.#newest.step + 1;
   }
 
   get title() {
-    return `${this.#about.name || "Episode"}, environment ${this.#about.env}`;
+    return `${this.run}, environment ${this.#about.env}`;
   }
 
   get hasEnded() {
