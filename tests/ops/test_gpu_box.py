@@ -39,7 +39,6 @@ from rfm_serve import Serving, serving, wait_for
 pytestmark = pytest.mark.slow
 
 GUIDE = (ROOT / "docs" / "guides" / "gpu_box.md").read_text()
-NGINX_FILE = ROOT / "docker" / "nginx" / "rfm.conf"
 UNIT_FILE = ROOT / "docker" / "systemd" / "rfm-serve.service"
 BIN = Path(sys.executable).parent
 NAME, IP = "localhost", "127.0.0.1"  # the box, as clients call it in these tests
@@ -62,15 +61,15 @@ def commands(heading: str) -> str:
     return "\n".join(re.findall(r"^ {4}(.*)$", section(heading), re.MULTILINE))
 
 
-def shell(script: str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Runs commands of the guide without root: what they put into /etc is put into the folder."""
-    script = 'set -eu\nsudo() { "$@"; }\n' + script.replace("/etc/", f"{folder}/etc/")
-    environment = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}", **variables}
-    return subprocess.run(["bash", "-c", script], cwd=folder, env=environment, capture_output=True, text=True)
+def shell(script: str, box: Path) -> subprocess.CompletedProcess[str]:
+    """Runs commands of the guide in ``box/keys``, without root: what they put into /etc is put into ``box/etc``."""
+    script = 'set -eu\nsudo() { "$@"; }\n' + script.replace("/etc/", f"{box}/etc/")
+    environment = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}"}
+    return subprocess.run(["bash", "-c", script], cwd=box / "keys", env=environment, capture_output=True, text=True)
 
 
-def said(script: str, folder: Path, **variables: str) -> str:
-    done = shell(script, folder, **variables)
+def said(script: str, box: Path) -> str:
+    done = shell(script, box)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -99,10 +98,10 @@ class Box:
 
     @property
     def ca_file(self) -> Path:
-        return self.folder / "ca.pem"
+        return self.folder / "keys" / "ca.pem"
 
     def key(self, caller: str = CALLER) -> str:
-        return (self.folder / f"{caller}.key").read_text().strip()
+        return (self.folder / "keys" / f"{caller}.key").read_text().strip()
 
     def client(self, url: str, **options: Any) -> RewardClient:
         return RewardClient(url, **{"ca_file": self.ca_file, "api_key": self.key(), **options})
@@ -119,13 +118,17 @@ class Box:
 def papers(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder after steps 5 and 6."""
     folder = tmp_path_factory.mktemp("box")
-    (folder / "etc").mkdir()
+    (folder / "docker").symlink_to(ROOT / "docker")
+    (folder / "etc" / "nginx" / "conf.d").mkdir(parents=True)
+    begin, _, step = commands("5. A key").partition("\n")
+    subprocess.run(["bash", "-c", begin], cwd=folder, check=True)
     for caller in (CALLER, LATER):
-        step = commands("5. A key")
         assert f"caller={CALLER}" in step
         said(step.replace(f"caller={CALLER}", f"caller={caller}"), folder)
     told = said(here(commands("6. A certificate"), "6"), folder)
     assert told.count("server.pem: OK") == 2
+    (copy,) = re.findall("^sudo cp .*$", commands("7. nginx"), re.MULTILINE)
+    said(copy, folder)
     return folder
 
 
@@ -134,12 +137,14 @@ def nginx(folder: Path, ports: dict[int, int]) -> Iterator[subprocess.Popen[byte
     """Debian's nginx with the file of the guide, on other ports of this machine, and its own folders in ``folder``."""
     program = shutil.which("nginx", path=f"{BIN}:{os.environ['PATH']}:/usr/sbin")
     assert program, "nginx: expected in PATH, got nothing (make ops-tools)"
-    text = NGINX_FILE.read_text()
+    copied = folder / "etc" / "nginx" / "conf.d" / "rfm.conf"
+    text = copied.read_text()
     for shown, free in ports.items():
         assert re.search(rf"[ :]{shown}[ ;]", text), shown
         text = re.sub(rf"([ :]){shown}([ ;])", rf"\g<1>{free}\2", text)
     text = text.replace("listen ", "listen 127.0.0.1:").replace("/etc/", f"{folder}/etc/")
-    (folder / "etc" / "rfm.conf").write_text(text.replace("/var/", f"{folder}/var/"))
+    moved = folder / "etc" / "rfm.conf"
+    moved.write_text(text.replace("/var/", f"{folder}/var/"))
     (folder / "var" / "log" / "nginx").mkdir(parents=True, exist_ok=True)
     paths = "".join(
         f"{name}_temp_path {folder}/{name};" for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
@@ -147,7 +152,7 @@ def nginx(folder: Path, ports: dict[int, int]) -> Iterator[subprocess.Popen[byte
     main = folder / "etc" / "nginx.conf"
     main.write_text(
         f"user {getpass.getuser()}; daemon off; pid {folder}/nginx.pid; error_log {folder}/error.log;"
-        f"events {{}} http {{ {paths} include {folder}/etc/rfm.conf; }}"
+        f"events {{}} http {{ {paths} include {moved}; }}"
     )
     process = subprocess.Popen([program, "-e", folder / "error.log", "-c", main])
     try:
@@ -162,7 +167,7 @@ def nginx(folder: Path, ports: dict[int, int]) -> Iterator[subprocess.Popen[byte
 @pytest.fixture(scope="module")
 def box(papers: Path) -> Iterator[Box]:
     repository = shutil.copytree(ROOT / "model_repository", papers / "my_models")
-    clip.write(papers / "video.mp4")
+    clip.write(papers / "keys" / "video.mp4")
     gateway_port, port = Endpoints.free().http_port, Endpoints.free().http_port
     with serving(repository, "--gateway-port", str(gateway_port)) as served:
         served.wait_ready()
@@ -176,10 +181,10 @@ def box(papers: Path) -> Iterator[Box]:
 
 
 def test_keys_and_certificates_are_for_their_readers_alone(papers: Path) -> None:
-    for name in ("ca.key", "server.key", "alice.key", "etc/rfm/server.key", "etc/rfm/keys.map"):
+    for name in ("keys", "keys/ca.key", "keys/server.key", "keys/alice.key", "etc/rfm/server.key", "etc/rfm/keys.map"):
         assert (papers / name).stat().st_mode & 0o077 == 0, name
     lines = (papers / "etc/rfm/keys.map").read_text().splitlines()
-    keys = {caller: (papers / f"{caller}.key").read_text().strip() for caller in (CALLER, LATER)}
+    keys = {caller: (papers / "keys" / f"{caller}.key").read_text().strip() for caller in (CALLER, LATER)}
     assert lines == [f'"Bearer {key}" {caller};' for caller, key in keys.items()]
 
 
@@ -201,7 +206,7 @@ def test_the_checks_of_the_guide_say_what_it_promises(box: Box) -> None:
 def test_the_commands_of_another_machine_get_answers_with_the_key_and_none_without(box: Box) -> None:
     script = here(commands("8. From another machine"), "8").replace(f":{PORTS['proxy']}", f":{box.port}")
     in_python = re.compile(r"^(?:key|client) = .*$", re.MULTILINE)
-    names: dict[str, Any] = {"Path": lambda name: box.folder / name, "RewardClient": RewardClient}
+    names: dict[str, Any] = {"Path": lambda name: box.folder / "keys" / name, "RewardClient": RewardClient}
     exec("\n".join(in_python.findall(script)).replace('"ca.pem"', 'Path("ca.pem")'), names)
     with closing(names["client"]) as client:
         assert client.is_ready()
@@ -308,12 +313,12 @@ def test_a_server_behind_the_proxy_that_is_down_is_unavailable(papers: Path) -> 
     """Not denied, so the client tries again."""
     port = Endpoints.free().http_port
     ports = {shown: Endpoints.free().http_port for shown in (PORTS["grpc"], PORTS["http"], PORTS["gateway"])}
-    key = (papers / f"{CALLER}.key").read_text().strip()
+    key = (papers / "keys" / f"{CALLER}.key").read_text().strip()
     with nginx(papers, {**ports, PORTS["proxy"]: port}):
         for scheme in ("grpcs", "https"):
             url = f"{scheme}://{IP}:{port}"
             with (
-                RewardClient(url, ca_file=papers / "ca.pem", api_key=key, retry=False) as asked,
+                RewardClient(url, ca_file=papers / "keys" / "ca.pem", api_key=key, retry=False) as asked,
                 pytest.raises(ServerUnavailableError),
             ):
                 asked.progress(FILMED)
