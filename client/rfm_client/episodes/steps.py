@@ -78,8 +78,8 @@ class EpisodeOptions:
     """How each step of an episode is scored. Raises ValueError for contradictory options.
 
     sampling: a rule of ``rfm_client.data.sampling``; None: the rule of the checkpoint's training
-    frames: the rule's number of frames; None: the checkpoint's ``ModelInfo.max_frames``. If the rule needs a number and
-        the checkpoint has none, the first step raises ValueError
+    frames: the rule's number of frames; None: the rule's own if fixed, else ``ModelInfo.max_frames``. If the rule needs
+        a number and the checkpoint has none, the first step raises ValueError
     cameras: names of the cameras with a frame in each step; empty: a single camera without a name
     fuse: how to combine the scores of several cameras
     orient: rotation or flip that makes frames upright, applied first: an Orientation, or a dict by camera; cameras that
@@ -238,7 +238,7 @@ class EpisodeFrames:
         self._frames.pop()
 
     def windows(self, prefix: Prefix) -> list[Window]:
-        """Return the window of each camera. Raises InvalidSampleError for an invalid task."""
+        """Return each camera's window: its sampled frames, and the task. Raises InvalidSampleError for a wrong task."""
         shown = [self._frames[index] for index in prefix.indices]
         return [Window(of_camera, self.task) for of_camera in zip(*shown, strict=True)]
 
