@@ -198,3 +198,22 @@ def test_a_vector_that_cannot_be_paid_is_refused(
 ) -> None:
     with pytest.raises(error, match=message):
         RewardModelVecEnv(make(), recorder, task, asked)
+
+
+@pytest.mark.triton
+def test_steps_that_do_not_wait_end_with_the_score_of_the_last_frame(client: RewardClient) -> None:
+    rewarded = RewardOptions(frames_from="pixels", blocking=False, mode="delta")
+    with closing(RewardModelVecEnv(DummyVecEnv([cart_pole_with_pixels] * 2), client, TASK, rewarded)) as env:
+        env.seed(0)
+        env.reset()
+        first = [info["reward_model"]["progress"] for info in env.reset_infos]
+        returns, num_ended = np.zeros(2), 0
+        while num_ended < 2:
+            _, rewards, dones, infos = env.step(np.array([0, 1]))
+            returns += rewards
+            for number in np.flatnonzero(dones).tolist():
+                last = infos[number]["reward_model"]
+                assert last["lag"] == 0
+                assert returns[number] == pytest.approx(last["progress"] - first[number], abs=1e-5)
+                first[number] = env.reset_infos[number]["reward_model"]["progress"]
+                returns[number], num_ended = 0.0, num_ended + 1

@@ -36,22 +36,19 @@ class FrameFolders(EpisodeFiles):
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
         num_bytes = 0
-        for file, picture in self._stored(episode):
-            opened_picture(str(file), picture).close()
-            num_bytes += len(picture)
+        for file in self._files(episode):
+            opened_picture(str(file), file).close()
+            num_bytes += file.stat().st_size
         return num_bytes
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        return (decoded_picture(str(file), picture) for file, picture in self._stored(episode))
+        return (decoded_picture(str(file), file) for file in self._files(episode))
 
-    def _stored(self, episode: DatasetEpisode) -> Iterator[tuple[Path, bytes]]:
-        files = _pictures_in(self.root / episode.name)
-        require(self.root / episode.name, len(files) == episode.num_frames, f"{episode.num_frames} frames", len(files))
-        for file in files:
-            try:
-                yield file, file.read_bytes()
-            except OSError as error:
-                raise DatasetError.at(file, "a readable picture", error.strerror) from error
+    def _files(self, episode: DatasetEpisode) -> list[Path]:
+        folder = self.root / episode.name
+        files = _pictures_in(folder)
+        require(folder, len(files) == episode.num_frames, f"{episode.num_frames} frames", len(files))
+        return files
 
 
 def is_picture(file: Path) -> bool:

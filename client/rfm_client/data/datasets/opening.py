@@ -50,7 +50,7 @@ _KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and the name of
     "folders of pictures": (FrameFolders, "folder"),
     "arrays": (ArrayFiles, "file"),
 }
-_FILES_OF_OURS = re.compile(r".*_(summary\.png|rewards\.hdf5)")  # beside the episodes, once they have labels
+_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside the episodes, once they have labels
 
 
 def open_dataset(
@@ -144,8 +144,9 @@ def _listed(folder: Path) -> tuple[str, list[str]]:
     told = " and ".join(f"{kind} ({names[0]})" for kind, names in found.items())
     got = f"{told}: give each kind a folder of its own, or list the episodes of one kind in tasks.csv"
     require(folder, len(found) < 2, "episodes of one kind", got)
-    other = _unread(folder) or f"{'other files' if _names_in(folder) else 'an empty folder'}: {_FILL}"
-    require(folder, any(kind in _KINDS for kind in found), _LAYOUTS, other)
+    if not any(kind in _KINDS for kind in found):
+        other = f"{'other files' if _names_in(folder) else 'an empty folder'}: {_FILL}"
+        raise DatasetError.at(folder, _LAYOUTS, _unread(folder) or other)
     return next(iter(found.items()))
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,8 @@ def pillow() -> str:
     return f"Pillow {PIL.__version__}"
 
 
-def decoded_picture(where: str, picture: bytes) -> UInt8Array:
-    """Return the pixels of a picture, uint8 [H, W, 3]. Raises DatasetError."""
+def decoded_picture(where: str, picture: bytes | Path) -> UInt8Array:
+    """Return the pixels of a picture, or of its file, uint8 [H, W, 3]. Raises DatasetError."""
     with opened_picture(where, picture) as opened:
         try:
             return np.asarray(opened.convert("RGB"))
@@ -33,16 +34,18 @@ def decoded_picture(where: str, picture: bytes) -> UInt8Array:
             raise DatasetError.at(where, "an image", error) from error
 
 
-def opened_picture(where: str, picture: bytes) -> Any:
-    """Open a picture of 8-bit colours, and read only its header. Raises DatasetError."""
+def opened_picture(where: str, picture: bytes | Path) -> Any:
+    """Open a picture of 8-bit colours, or its file, and read only its header. Raises DatasetError."""
     pillow()
     from PIL import Image, UnidentifiedImageError
 
     try:
-        opened = Image.open(io.BytesIO(picture))
+        opened = Image.open(picture if isinstance(picture, Path) else io.BytesIO(picture))
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise DatasetError.at(where, "an image", error) from error
     is_deep = _DEEP in str(opened.tile)
+    if is_deep or opened.mode not in _COLOURS:
+        opened.close()
     expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
     got = f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}"
     require(where, opened.mode in _COLOURS and not is_deep, expected, got)
