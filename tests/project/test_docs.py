@@ -24,6 +24,7 @@ from click import Command, Context, Parameter
 from typer.main import get_command
 
 import clip
+import toy_dataset
 from labelling import LEROBOT
 from paths import ROOT
 from rfm.launch.triton_server import Endpoints
@@ -88,6 +89,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     shutil.copytree(ROOT / "tests" / "videos", tmp_path / "tests" / "videos")
     outcomes = "".join(f"{episode.index},1\n" for episode in open_dataset(tmp_path / "my_dataset").episodes)
     (tmp_path / "outcomes.csv").write_text(f"episode,success\n{outcomes}")
+    toy_dataset.write(tmp_path / "demo_output" / "toy", clips=2)
     np.savez(tmp_path / "episode.npz", frames=pictures(0), task="stack the cups")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -144,7 +146,7 @@ def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: 
     for shown, served in SERVED_AS.items():
         command = command.replace(shown, served)
     if command.startswith("rfm-client evaluate"):
-        command = f"rfm-client label my_dataset && {command}"
+        command = f"rfm-client label {command.split()[2]} && {command}"
     environment = {
         **os.environ,
         "RFM_URL": demo_server.grpc_url,

@@ -153,7 +153,7 @@ class Plan:
         return {str(item.episode.index): item.digest for item in self.items}
 
     def provenance(self) -> dict[str, Any]:
-        """Return writer, dataset and recipe of the labels, without user and time: equal runs give equal files."""
+        """Return writer, dataset and recipe of the labels, without user and time: equal runs give equal provenance."""
         digest = digest_of(item.digest.encode() for item in self.items)
         version = importlib.metadata.version("rfm-client")
         dataset = {**self.dataset, "digest": digest}
