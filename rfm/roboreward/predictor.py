@@ -28,7 +28,7 @@ from rfm_client.contract.samples import Float32Array
 
 
 @dataclass(frozen=True)
-class Answer:
+class WrittenAnswer:
     """A written answer.
 
     tokens: without the token that ends it; None: some logits were not finite
@@ -67,7 +67,7 @@ class RoboRewardPredictor(VlmPredictor):
 
     def _written(
         self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution
-    ) -> tuple[list[Answer], Tensor | None]:
+    ) -> tuple[list[WrittenAnswer], Tensor | None]:
         """Return the answers, token by token the likeliest, and the features that the vision tower computed."""
         key_values = KeyValues()
         output = self._output(batch, key_values)
@@ -97,19 +97,19 @@ class RoboRewardPredictor(VlmPredictor):
         of_rows = torch.stack(tokens, dim=1).cpu().tolist()
         of_digits = torch.stack(digits, dim=1).cpu().numpy()
         answers = [
-            self._ended(ids, each) if is_good else Answer(None, None)
+            self._ended(ids, each) if is_good else WrittenAnswer(None, None)
             for ids, each, is_good in zip(of_rows, of_digits, is_finite.cpu().tolist(), strict=True)
         ]
         return answers, output.made
 
-    def _ended(self, tokens: list[int], digits: Float32Array) -> Answer:
+    def _ended(self, tokens: list[int], digits: Float32Array) -> WrittenAnswer:
         """Return the answer up to its end. digits: float32 [N, 5], logits of SCORES at each token"""
         end = next((index for index, token in enumerate(tokens) if token in self._config.stops), len(tokens))
         known = self.collator.digits
         at = next((index for index, token in enumerate(tokens[:end]) if token in known), None)
-        return Answer(tokens[:end], None if at is None else digits[at])
+        return WrittenAnswer(tokens[:end], None if at is None else digits[at])
 
-    def _read(self, answer: Answer, row: VlmRow) -> RowScores | RewardError:
+    def _read(self, answer: WrittenAnswer, row: VlmRow) -> RowScores | RewardError:
         if answer.tokens is None:
             return InferenceFailedError("the network gave a score that is not finite")
         text = self.collator.tokenizer.decode(answer.tokens, skip_special_tokens=True)
