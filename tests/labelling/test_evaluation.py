@@ -31,6 +31,7 @@ from rfm_client.labelling import (
 )
 from rfm_client.labelling.cost import Cost
 from rfm_client.labelling.evaluation import kendall, spearman
+from rfm_client.labelling.label_files import read_cost
 from shown_datasets import copied
 
 Curves = Mapping[int, Sequence[float]]
@@ -119,12 +120,16 @@ def test_the_cost_is_that_of_the_frames_that_the_run_scored(tmp_path: Path) -> N
         (rate,) = {each.frames_per_s for each in evaluate_labels(files).evaluations}
         return rate
 
-    def check(episodes: range, watch: Watch = QUIET) -> float:
+    def check(episodes: range, watch: Watch = QUIET) -> float | None:
         """Return the rate that the files tell, which is that of five episodes."""
         scorer, began_s = BrightnessScorer(request_s), time.monotonic()
         rate = frames_per_s(scorer, watch, episodes=episodes)
-        assert rate is not None
-        assert scorer.num_samples / (time.monotonic() - began_s) < rate < scorer.num_samples / (5 * request_s)
+        took_s = time.monotonic() - began_s
+        cost = read_cost(output / "rfm_progress.parquet")
+        assert cost is not None
+        assert cost.frames == scorer.num_samples
+        assert 5 * request_s < cost.seconds < took_s
+        assert rate == cost.frames / cost.seconds
         return rate
 
     check(range(5))
