@@ -259,6 +259,22 @@ def test_the_image_serves_and_its_health_check_tells(
     assert gone.returncode == UNAVAILABLE, gone.stderr
 
 
+@pytest.mark.nightly
+def test_the_image_alone_exports_and_serves_what_it_exported(image: Image, tmp_path: Path) -> None:
+    """With `serve.yaml`, as the guide exports with it."""
+    config = next(config for config in goldens.VLM if not config.is_bfloat16)
+    sources = [f"--{name.replace('_', '-')}={source}" for name, source in config.sources.items()]
+    words = ["--checkpoint", config.checkpoint, *sources, "--config", DOCKER / "serve.yaml", "--num-gpus", "0"]
+    repository, endpoints = tmp_path / "my_models", Endpoints.free()
+    told = image.said("rfm", "export", *words, "--repository", repository)
+    assert told == f"{repository}: rfm version 1, scores equal to the checkpoint's\n"
+    ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
+    options = [f"--{name}-port={port}" for name, port in ports.items()]
+    with image.started(*ENTRYPOINT, *options, "--repository", repository):
+        image.said("rfm-client", "wait", "--url", endpoints.grpc_url, "--timeout", "100")
+        image.said("sh", DOCKER / "health.sh", RFM_URL=endpoints.grpc_url)
+
+
 def check_gateway(image: Image, endpoints: Endpoints) -> None:
     """The compose file's gateway, on this machine's addresses: its health check waits for it, and is true."""
     gateway, port = SERVICES["gateway"], str(Endpoints.free().http_port)
