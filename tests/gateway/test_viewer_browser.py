@@ -22,6 +22,7 @@ import clip
 from browsers import Browser
 from gateway_requests import TOLERANCE
 from gateways import Gateway, poll, running
+from paths import VIDEOS
 from rfm.launch.triton_server import Endpoints
 from rfm_client.data.orientation import ORIENTATIONS, Orientation, turned
 from toy_world import Task, make_clip
@@ -81,6 +82,7 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
         clip.write(folder / f"{name}.mp4", make_clip(kind, Task("red", "bowl"), seed).frames, FPS)
     (folder / "copy.mp4").write_bytes((folder / "success.mp4").read_bytes())
     (folder / "broken.mp4").write_text("no video")
+    (folder / "large.mp4").write_bytes((VIDEOS / "berkeley_rpt_stack_cup.mp4").read_bytes())
     return folder
 
 
@@ -255,7 +257,7 @@ TOO_WIDE = "return document.documentElement.scrollWidth - innerWidth"
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_videos_and_chart_are_in_view_without_scrolling(page: Page, size: tuple[int, int]) -> None:
     with page.browser.window(*size):
-        page.score("success", "failure")
+        page.score("success", "large", "failure")
         shares = dict(
             zip(
                 ("videos", "legend", "chart", "time"),
@@ -310,7 +312,7 @@ def test_the_threshold_is_dragged_in_the_chart(page: Page) -> None:
 
 
 def legend(page: Page) -> list[str]:
-    return [name.text for name in page.browser.all("#legend .nameable button")]
+    return [str(name.get_attribute("textContent")) for name in page.browser.all("#legend .nameable button")]
 
 
 def test_videos_and_curves_are_renamed_coloured_and_removed(page: Page) -> None:
@@ -320,7 +322,7 @@ def test_videos_and_curves_are_renamed_coloured_and_removed(page: Page) -> None:
     page.browser.all("#videos .nameable input")[0].send_keys(
         "a robot that does what it should do, first try", Keys.ENTER
     )
-    assert legend(page) == ["a robot that doe…d do, first try", "failure.mp4"]
+    assert legend(page) == ["a robot that does wh…hould do, first try", "failure.mp4"]
     page.browser.all("#legend .nameable button")[1].click()
     page.browser.all("#legend .nameable input")[1].send_keys("dropped", Keys.ENTER)
     assert legend(page)[1] == "dropped"

@@ -176,8 +176,9 @@ export class Chart {
 
   #newPlot(signals, data) {
     const isLow = this.#host.clientHeight < LOW_PX;
+    const panes = this.#panes; // a plot is drawn once more after the curves have gone
     const ticks = isLow ? FEW_TICKS : TICKS;
-    const marks = signals.flatMap((signal) => ticks[signal].map((value) => [heightOf(this.#panes, signal, value), value]));
+    const marks = signals.flatMap((signal) => ticks[signal].map((value) => [heightOf(panes, signal, value), value]));
     const axis = {
       stroke: () => themed("--faint"), font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif",
       grid: { stroke: () => themed("--grid"), width: 1 }, ticks: { show: false }, labelSize: 18, gap: 4,
@@ -199,7 +200,7 @@ export class Chart {
       scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [0, 1] } },
       axes: [{ ...axis, size: 24, label: this.#label, ...(this.#isOfSteps ? { incrs: STEPS } : {}) }, left],
       series: [{}, ...series],
-      hooks: { draw: [(plot) => this.#drawNames(plot, signals)], setSize: [() => this.#placeAgain()] },
+      hooks: { draw: [(plot) => drawNames(plot, panes)], setSize: [() => this.#placeAgain()] },
     };
     const plot = new uPlot(options, data, this.#host);
     plot.over.append(this.#line, this.#playhead, this.#values);
@@ -238,28 +239,27 @@ export class Chart {
       this.#onThreshold(Math.round(100 * Math.min(Math.max(value, 0), 1)) / 100);
     };
   }
-
-  /** Writes the name of each signal beside its part of the axis, and a line between the two. */
-  #drawNames({ ctx, bbox }, signals) {
-    const scale = devicePixelRatio;
-    ctx.save();
-    ctx.fillStyle = themed("--faint");
-    ctx.font = `${12 * scale}px system-ui, sans-serif`;
-    ctx.textAlign = "center";
-    for (const signal of signals) {
-      const [from, to] = this.#panes[signal];
-      ctx.save();
-      ctx.translate(bbox.left - 50 * scale, bbox.top + (1 - (from + to) / 2) * bbox.height);
-      ctx.rotate(-Math.PI / 2);
-      if ((to - from) * bbox.height > ctx.measureText(signal).width) ctx.fillText(signal, 0, 8 * scale);
-      ctx.restore();
-    }
-    ctx.restore();
-  }
 }
 
 const STEPS = [1, 2, 5].flatMap((digit) => [1, 10, 100, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8].map((power) => digit * power))
   .sort((one, other) => one - other);
+
+/** Writes the name of each signal beside its part of the axis. */
+function drawNames({ ctx, bbox }, panes) {
+  const scale = devicePixelRatio;
+  ctx.save();
+  ctx.fillStyle = themed("--faint");
+  ctx.font = `${12 * scale}px system-ui, sans-serif`;
+  ctx.textAlign = "center";
+  for (const [signal, [from, to]] of Object.entries(panes)) {
+    ctx.save();
+    ctx.translate(bbox.left - 50 * scale, bbox.top + (1 - (from + to) / 2) * bbox.height);
+    ctx.rotate(-Math.PI / 2);
+    if ((to - from) * bbox.height > ctx.measureText(signal).width) ctx.fillText(signal, 0, 8 * scale);
+    ctx.restore();
+  }
+  ctx.restore();
+}
 
 function made(name) {
   const element = document.createElement("div");

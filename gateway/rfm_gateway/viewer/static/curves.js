@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: MIT
 // What is known of each curve: what was asked, the points that have come, and how it stands.
 
+import { cut } from "./text.js";
+
+const SEPARATOR = ", ";
 const TOLD_APART_BY = ["name", "task", "model", "sampling", "fps"];
 
 /** One question about one video, and its points. */
@@ -77,9 +80,14 @@ export function pointAt(times, seconds) {
   return low ? low - 1 : null;
 }
 
-/** A short name of each curve: what tells it from the others. */
-export function shortNames(curves) {
-  const differing = TOLD_APART_BY.filter((field) => new Set(curves.map((curve) => curve[field])).size > 1);
-  const told = differing.length ? differing : ["name"];
-  return curves.map((curve) => curve.title ?? told.map((field) => (field === "fps" ? `${curve.fps} fps` : curve[field])).join(", "));
+/** A short name of each curve: what tells it from the others, in at most `most` letters. */
+export function shortNames(curves, most) {
+  const drawn = curves.filter(({ times }) => times.length); // of the others the sampling is not known
+  const told = TOLD_APART_BY.filter((field) => new Set(drawn.map((curve) => curve[field])).size > 1);
+  const fields = told.length ? told : ["name"];
+  return curves.map((curve) => {
+    const parts = fields.map((field) => (field === "fps" ? `${curve.fps} fps` : curve[field]));
+    const each = Math.floor((most + SEPARATOR.length) / parts.length) - SEPARATOR.length;
+    return cut(curve.title ?? parts.map((part) => cut(part, each)).join(SEPARATOR), most);
+  });
 }

@@ -6,10 +6,10 @@ import { shortNames } from "./curves.js";
 import { cut } from "./text.js";
 
 const [WIDTH, PLOT_HEIGHT] = [252, 150]; // points; 3.5 inches, the column of a two-column paper
-const [LEFT, RIGHT, TOP] = [34, 6, 6];
+const [LEFT, RIGHT, TOP] = [34, 10, 6];
 const LINE = 10; // points
 const FONT = "Helvetica, Arial, sans-serif";
-const LETTERS = 58; // that fit into the width
+const LETTERS = 42; // that fit into the width
 const MARKS = { progress: [0, 0.5, 1], success: [0, 1] };
 const NUM_TIMES = 6;
 const PNG_WIDTH_PX = 2100; // 600 dots an inch: twice what papers ask of pictures
@@ -23,7 +23,7 @@ export function svgFigure(template, curves, { title, threshold, label = "seconds
   const panes = panesOf(drawn);
   const titles = title ? [cut(title, LETTERS)] : [];
   const top = TOP + titles.length * (LINE + 4);
-  const height = top + PLOT_HEIGHT + 2 * LINE + 10 + drawn.length * (LINE + 2) + 4;
+  const height = top + PLOT_HEIGHT + 2 * LINE + 4 + drawn.length * (LINE + 2);
   const end = Math.max(...drawn.map(({ allTimes }) => allTimes.at(-1))) || 1;
   const x = (time) => LEFT + (time / end) * (WIDTH - LEFT - RIGHT);
   const y = (signal, value) => top + (1 - heightOf(panes, signal, value)) * PLOT_HEIGHT;
@@ -65,10 +65,10 @@ export function svgFigure(template, curves, { title, threshold, label = "seconds
       }
     }
   }
-  shortNames(drawn).forEach((name, place) => {
+  shortNames(drawn, LETTERS).forEach((name, place) => {
     const at = bottom + 2 * LINE + 8 + place * (LINE + 2);
     add("line", { x1: LEFT, x2: LEFT + 14, y1: at - 2.5, y2: at - 2.5, stroke: colourOf(drawn[place], "progress", template), "stroke-width": 1.5 });
-    add("text", { x: LEFT + 18, y: at, fill: ink }, cut(name, LETTERS));
+    add("text", { x: LEFT + 18, y: at, fill: ink }, name);
   });
   return new XMLSerializer().serializeToString(svg);
 }

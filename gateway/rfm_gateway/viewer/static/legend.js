@@ -5,7 +5,7 @@ import { colourOf } from "./chart.js";
 import { shortNames } from "./curves.js";
 import { nameable, remover } from "./nameable.js";
 
-const NAME_LETTERS = 32;
+const NAME_LETTERS = 40;
 
 export class Legend {
   #host;
@@ -27,7 +27,7 @@ export class Legend {
       element.remove();
       this.#items.delete(curve);
     }
-    const names = shortNames(curves);
+    const names = shortNames(curves, NAME_LETTERS);
     curves.forEach((curve, place) => {
       if (!this.#items.has(curve)) this.#items.set(curve, this.#newItem(curve));
       const { element, colour, name, away } = this.#items.get(curve);
@@ -48,7 +48,7 @@ export class Legend {
       curve.colour = colour.value;
       this.#onChange();
     });
-    const name = nameable(NAME_LETTERS, (text) => {
+    const name = nameable((text) => {
       curve.title = text || null;
       this.#onChange();
     });

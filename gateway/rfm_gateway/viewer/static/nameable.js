@@ -1,13 +1,17 @@
 // SPDX-License-Identifier: MIT
 // Small parts of the page: a name that a click lets one change, a button that removes.
 
-import { cut } from "./text.js";
+const END_LETTERS = 7; // of a name, which are always to be seen, since names differ at their ends
 
-/** A name that is a button; a click makes it a field. onName(text): somebody gave another name; empty: none */
-export function nameable(most, onName) {
+/**
+ * A name that is a button; a click makes it a field. Where it does not fit, its middle is left out.
+ * onName(text): somebody gave another name; empty: none
+ */
+export function nameable(onName) {
   const element = document.createElement("span");
   const button = document.createElement("button");
   const field = document.createElement("input");
+  const [begun, ended] = ["span", "span"].map((tag) => button.appendChild(document.createElement(tag)));
   let whole = "";
   element.className = "nameable";
   button.type = "button";
@@ -36,7 +40,9 @@ export function nameable(most, onName) {
   /** text: the name; about: what the name stands for */
   const show = (text, about = text) => {
     whole = text;
-    button.textContent = cut(text, most);
+    button.setAttribute("aria-label", text);
+    begun.textContent = text.slice(0, -END_LETTERS);
+    ended.textContent = text.slice(-END_LETTERS);
     button.title = about === text ? `${text}: click to rename` : `${text}: ${about}; click to rename`;
   };
   return { element, show };

@@ -4,7 +4,7 @@
 import { colourOf } from "./chart.js";
 import { cut, NONE, shown } from "./text.js";
 
-const NAME_LETTERS = 40;
+const NAME_LETTERS = 28;
 
 /** Writes a row for each curve into `body`. threshold: at which success counts */
 export function showTable(body, curves, threshold) {

@@ -6,8 +6,6 @@ import { nameable, remover } from "./nameable.js";
 const NEAR_S = 0.05; // a video that is so near to a time shows it
 const INSIDE_S = 0.001; // behind the begin of a frame, so that rounding does not show the one before
 
-const NAME_LETTERS = 36;
-
 /**
  * Videos in `host`. `onTime(seconds, video)` is called as long as one plays. The page has the controls.
  * Where videos can be changed: onName(): one has another title; onRemove(video): somebody wants one away
@@ -91,7 +89,7 @@ export class Videos {
 
   /** What changes the title of a video, and what removes it. */
   #controls(entry) {
-    const title = nameable(NAME_LETTERS, (text) => {
+    const title = nameable((text) => {
       entry.title = text || entry.name;
       title.show(entry.title, entry.name);
       away.setAttribute("aria-label", `Remove ${entry.title}`);
