@@ -55,7 +55,7 @@ class Options:
         return name, dict(setting.split("=") for setting in settings)
 
     def settings(self, known: Mapping[str, type]) -> dict[str, Any]:
-        """Return the user's settings as numbers. Raises CheckpointError for an unknown setting or a wrong value.
+        """Return the user's settings as numbers or booleans. Raises CheckpointError if one is unknown or wrong.
 
         known: type of each setting
         """
@@ -76,7 +76,7 @@ class Description:
     """The inputs and outputs of a checkpoint.
 
     widths: Dv and Dt, the widths of the frame and task embeddings that it scores; None: it scores raw frames
-    progress_bins: K; 1: continuous progress
+    progress_bins: C; 1: continuous progress
     max_frames: frames of the longest trajectory that the network can score; None: no limit
     trained_frames: most frames of a trajectory in training; None: unknown
     trained_padding: training padded shorter trajectories; None: unknown

@@ -50,7 +50,7 @@ class Predictor(Protocol[Row, Batch]):
         """Do the slow, independent work on these rows; thread-safe. ``collate`` does the rest."""
 
     def collate(self, rows: Sequence[Row]) -> Batch:
-        """Return one batch on the CPU; may run while the device computes."""
+        """Return one batch; may run while the device computes."""
 
     def count(self, batch: Batch, execution: Execution) -> None:
         """Add the batch's tokens, with and without padding, and its encoded frames to ``execution``."""
@@ -115,7 +115,7 @@ def no_success(progress: Float32Array) -> Float32Array:
 
 
 def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> FrameScores:
-    """Return scores on the CPU from progress logits [..., K] and success logits [...]; logits included if K > 1."""
+    """Return scores on the CPU from progress logits [..., C] and success logits [...]; logits included if C > 1."""
     discrete = progress_logits.shape[-1] > 1
     progress = progress_from_logits(progress_logits).cpu().numpy()
     return FrameScores(

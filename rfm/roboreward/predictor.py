@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The predictor of RoboReward: writes the answer of each conversation, all of a batch together.
+"""The predictor of RoboReward: writes a batch's answers together, or computes their expected scores.
 
 B conversations of L tokens in a batch, padded behind their tokens; N tokens written so far.
 """
@@ -46,9 +46,9 @@ class RoboRewardPredictor(VlmPredictor):
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
-        """Write the rows' answers; return each row's scores, or its error.
+        """Return each row's scores, or its error.
 
-        execution: its ``on_forward`` is called after each token
+        execution: its ``on_forward`` is called after each written token
         """
         self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         if self._config.is_expected:

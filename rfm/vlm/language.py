@@ -106,7 +106,7 @@ class LanguageNetwork(nn.Module):
 
 
 class LanguageCollator(QwenCollator):
-    """The collator of prompts with one video, whose frames stand between their times."""
+    """The collator of prompts with one video, each temporal patch behind its time."""
 
     def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
         super().__init__(config, tokenizer, images)
@@ -151,7 +151,7 @@ class LanguageCollator(QwenCollator):
         grid = self.grid(video)
         before, _, behind = text.partition(VIDEO)
         first, *others = times_s
-        # Special tokens stand around each temporal patch, so all but the first are tokenised alone.
+        # All pieces but the last end with a special token, so each alone has the same tokens as in the text.
         pieces = [before + timed_groups([first]), *(timed_groups([time_s]) for time_s in others), behind]
         tokens = np.concatenate([*map(self._piece, pieces), more]).astype(np.int64)
         pad = self.tokenizer.convert_tokens_to_ids(VIDEO_PAD)
@@ -196,7 +196,7 @@ class LanguageCheckpoint:
 
     @property
     def notes(self) -> list[str]:
-        """Return no line: the network was not trained for this project's prompts."""
+        """Return no line: no facts of training are known here."""
         return []
 
     def decisions(self) -> list[Decision]:
