@@ -147,6 +147,8 @@ def serve(
 ) -> None:
     """Run tritonserver on a model repository until a signal stops it.
 
+    With --gateway-port it also runs a gateway, and watches both.
+
     Only requests with the admin key can change its models, logging and tracing; without an admin key, no request can.
     """
     folder, more_arguments = _folder_and_arguments(words or (), repository)

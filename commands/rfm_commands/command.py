@@ -18,6 +18,7 @@ from rfm_client.contract.settings import ConfigError
 from rfm_export.errors import ExportError
 
 OF_A_CHECKPOINT = ("checkpoint", "image_encoder", "text_encoder", "base_model", "reward_model")  # settings that name it
+CHECKPOINT_TITLE = "Checkpoint"  # heading of their options in commands without --config
 
 AdminKeyFile = Annotated[
     Path | None, typer.Option(help="File with the server's admin key; else RFM_ADMIN_KEY.", show_default=False)

@@ -13,7 +13,7 @@ from rfm.config import ExportConfig
 from rfm_client.cli.command import Given, OptionsOf, with_options
 from rfm_client.cli.label import DatasetArgument, EpisodeTexts, LabelCommand, RunOptions
 from rfm_client.labelling import LabelOptions, RayOptions, Scorer
-from rfm_commands.command import OF_A_CHECKPOINT, say
+from rfm_commands.command import CHECKPOINT_TITLE, OF_A_CHECKPOINT, say
 
 _OPTIONS = (*OF_A_CHECKPOINT, "dtype")
 
@@ -21,14 +21,17 @@ _OPTIONS = (*OF_A_CHECKPOINT, "dtype")
 @with_options
 def label(
     dataset: DatasetArgument,
-    given: Annotated[Given, OptionsOf(ExportConfig, only=_OPTIONS, required=("checkpoint",))],
+    given: Annotated[Given, OptionsOf(ExportConfig, only=_OPTIONS, required=("checkpoint",), title=CHECKPOINT_TITLE)],
     texts: EpisodeTexts,
     labels: LabelOptions,
     run: RunOptions,
     ray: RayOptions,
     device: Annotated[str, typer.Option(help="Device of PyTorch: cpu, cuda, cuda:1.")] = "cpu",
 ) -> None:
-    """Label every frame of a dataset in this process, without Triton."""
+    """Label every frame of a dataset in this process, without Triton.
+
+    `rfm-client label` writes the same files by asking running servers.
+    """
     checkpoint, *encoders = (given.get(name) for name in OF_A_CHECKPOINT)
 
     @contextmanager

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, TypeAlias
 
@@ -18,10 +18,9 @@ import typer
 
 from rfm.launch.admin_key import take_key
 from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
-from rfm_client.cli.command import OptionsOf, with_options
+from rfm_client.cli.command import Given, OptionsOf, with_options
 from rfm_client.cli.options import CredentialFiles
 from rfm_client.contract.settings import Settings, setting
-from rfm_client.transport.credentials import Credentials
 from rfm_commands.command import RfmCommand, fail
 from rfm_commands.rollout import Rollout, models_of, previous_version
 
@@ -41,9 +40,16 @@ class AdministeredServer(Settings):
     admin_key_file: Path | None = setting(None, "File with the server's admin key; else RFM_ADMIN_KEY.")
 
     @contextmanager
-    def connected(self, context: typer.Context) -> Iterator[RepositoryApi]:
-        """Yield the server's repository API. Raises AdminKeyError, RepositoryApiError."""
-        credentials: Credentials = context.obj
+    def connected(self, context: typer.Context, files: Given) -> Iterator[RepositoryApi]:
+        """Yield the server's repository API. Raises AdminKeyError, RepositoryApiError.
+
+        files: given after the subcommand; they win over those before it
+        """
+        before: CredentialFiles = context.obj
+        try:
+            credentials = replace(before, **files).read()
+        except ValueError as error:
+            fail(str(error))
         if credentials.uses_tls and not self.url.startswith(SECURE):
             raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {self.url}")
         options = credentials.grpc_options(self.url.partition(":")[0])
@@ -51,6 +57,8 @@ class AdministeredServer(Settings):
             yield api
 
 
+OF_TLS = ("ca_file", "client_certificate", "client_key")
+FilesGiven: TypeAlias = Annotated[Given, OptionsOf(CredentialFiles, only=OF_TLS, title="TLS", reads_variables=False)]
 ExportedName = Annotated[str, typer.Argument(help="As in rfm export --name.")]
 Administered: TypeAlias = Annotated[AdministeredServer, OptionsOf(AdministeredServer, required=("repository",))]
 
@@ -59,13 +67,10 @@ Administered: TypeAlias = Annotated[AdministeredServer, OptionsOf(AdministeredSe
 @with_options
 def models(
     context: typer.Context,
-    files: Annotated[CredentialFiles, OptionsOf(CredentialFiles, only=("ca_file", "client_certificate", "client_key"))],
+    files: Annotated[CredentialFiles, OptionsOf(CredentialFiles, only=OF_TLS)],
 ) -> None:
     """List, load, unload and replace the models of a running server."""
-    try:
-        context.obj = files.read()
-    except ValueError as error:
-        fail(str(error))
+    context.obj = files
 
 
 @app.command("list", cls=RfmCommand)
@@ -73,9 +78,10 @@ def models(
 def list_models(
     context: typer.Context,
     server: Annotated[AdministeredServer, OptionsOf(AdministeredServer, only=("url", "admin_key_file"))],
+    files: FilesGiven,
 ) -> None:
     """List the versions of each model, with state and reason."""
-    with server.connected(context) as api:
+    with server.connected(context, files) as api:
         rows = [_row(entry) for entry in api.index()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
@@ -84,9 +90,9 @@ def list_models(
 
 @app.command(cls=RfmCommand)
 @with_options
-def load(context: typer.Context, name: ExportedName, server: Administered) -> None:
+def load(context: typer.Context, name: ExportedName, server: Administered, files: FilesGiven) -> None:
     """Serve NAME, a new or unloaded model, as configured."""
-    with server.connected(context) as api:
+    with server.connected(context, files) as api:
         for model in models_of(server.repository, name):
             api.load(model)
             typer.echo(f"{model}: {', '.join(map(str, api.ready_versions(model)))} ready")
@@ -94,9 +100,9 @@ def load(context: typer.Context, name: ExportedName, server: Administered) -> No
 
 @app.command(cls=RfmCommand)
 @with_options
-def unload(context: typer.Context, name: ExportedName, server: Administered) -> None:
+def unload(context: typer.Context, name: ExportedName, server: Administered, files: FilesGiven) -> None:
     """Stop serving NAME after the answers to requests in flight. Its files stay."""
-    with server.connected(context) as api:
+    with server.connected(context, files) as api:
         for model in reversed(models_of(server.repository, name)):
             api.unload(model)
             api.wait_gone(model)
@@ -108,22 +114,23 @@ def unload(context: typer.Context, name: ExportedName, server: Administered) -> 
 def rollout(
     context: typer.Context,
     name: ExportedName,
-    version: Annotated[int, typer.Argument(min=1, help="The version folder to serve.")],
+    version: Annotated[int, typer.Argument(help="The version folder to serve.")],
     server: Administered,
+    files: FilesGiven,
 ) -> None:
     """Serve another version of NAME without losing a request.
 
     The new version is loaded beside the old version, probed, then served alone. If it fails, the old version stays.
     """
-    with server.connected(context) as api:
+    with server.connected(context, files) as api:
         _roll_out(server, name, api, version)
 
 
 @app.command(cls=RfmCommand)
 @with_options
-def rollback(context: typer.Context, name: ExportedName, server: Administered) -> None:
+def rollback(context: typer.Context, name: ExportedName, server: Administered, files: FilesGiven) -> None:
     """Serve the previous version of NAME, as rollout does."""
-    with server.connected(context) as api:
+    with server.connected(context, files) as api:
         _roll_out(server, name, api, previous_version(server.repository, name, api))
 
 

@@ -13,6 +13,7 @@ import typer
 from rfm_client.cli.command import OptionsOf, with_options
 from rfm_client.contract.addresses import is_loopback
 from rfm_client.contract.listening import check_free, from_here, in_url
+from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.settings import ConfigError, settings_of
 from rfm_gateway.config import GatewayConfig
 
@@ -20,14 +21,30 @@ DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8000
 KEEP_ALIVE_S = 30
 STOP_WITHIN_S = 30
-OPTIONS = OptionsOf(GatewayConfig, required=("triton",), defaults={"host": DEFAULT_HOST, "port": DEFAULT_PORT})
+OPTIONS = OptionsOf(
+    GatewayConfig,
+    required=("triton",),
+    defaults={"host": DEFAULT_HOST, "port": DEFAULT_PORT, "model": DEFAULT_MODEL},
+    helps={
+        "host": "Address to listen on.",
+        "port": "Port to listen on.",
+        "triton": "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://.",
+        "metrics_url": "Triton's metrics; else port 8002 of the same host.",
+        "model": "Name under which the checkpoint was exported.",
+    },
+    title="Gateway",
+)
 
 logger = logging.getLogger("rfm_gateway")
 
 
 @with_options
 def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
-    """Serve the FastAPI server's endpoints before a Triton server."""
+    """Serve the FastAPI server's endpoints before a Triton server.
+
+    For a Triton that runs already. `rfm serve --gateway-port` starts Triton and gateway together, and restarts both.
+    `rfm gateway` and `rfm-client gateway` are the same command; the second needs no PyTorch.
+    """
     try:
         import uvicorn
 

@@ -30,14 +30,12 @@ class GatewayConfig(Settings):
 
     TITLE: ClassVar[str] = "Gateway (section gateway of the file)"
 
-    port: int | None = setting(
-        None, "Port to listen on; else rfm serve runs no gateway, and rfm gateway takes 8000.", least=1, most=MAX_PORT
-    )
-    host: str | None = setting(None, "Address to listen on; else 127.0.0.1, or that of rfm serve.")
+    port: int | None = setting(None, "Port to listen on; else there is no gateway.", least=1, most=MAX_PORT)
+    host: str | None = setting(None, "Address to listen on; else that of Triton.")
     triton: str | None = setting(
-        None, "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://; else that of rfm serve."
+        None, "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://; else the one beside it."
     )
-    metrics_url: str | None = setting(None, "Triton's metrics; else port 8002 of the same host, or of rfm serve.")
+    metrics_url: str | None = setting(None, "Triton's metrics; else those of the Triton beside it.")
     model: str | None = setting(None, "Name under which the checkpoint was exported; else rfm, or export.name.")
     api_key_file: Path | None = setting(
         None, f"File with the key that requests must show; else {GATEWAY_KEY_VARIABLE}."

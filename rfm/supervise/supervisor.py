@@ -222,7 +222,8 @@ class Supervisor:
             return False
         fault = f"had the last of {MOST + 1} faults in a row: {why}"
         self._say(f"{what} is left out, since it {fault}")
-        reason = f"it is left out, since {what} {fault}; `rfm models load`, or a restart of `rfm serve`, serves it again"
+        remedy = "`rfm models load`, or a restart of `rfm serve`, serves it again"
+        reason = f"it is left out, since {what} {fault}; {remedy}"
         self._left_out |= dict.fromkeys(left_out, reason)
         self._served = others
         self._back_off = self._new_back_off()

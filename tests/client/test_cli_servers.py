@@ -160,7 +160,7 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
             for name in ("first", "second") if kind == "preference" else ("reference", "other"):
                 assert_scores(answer[name], getattr(scores, name))
 
-    target = tmp_path / "input.json"
+    target = tmp_path / "new" / "folder" / "input.json"
     result = ask(served, "bench-input", *words, "--output", target)
     name = f"{MODEL}_frames" if use_frames else MODEL
     command = f"perf_analyzer -m {name} -i grpc -u {served.url('grpc').removeprefix('grpc://')} --input-data {target}"
@@ -274,7 +274,10 @@ USAGE: dict[str, tuple[list[str], str]] = {
     "url": (["sample", "--url", "localhost:8001"], URL),
     "port of a url": (["status", "--url", "http://localhost:99999"], URL),
     "json over a video": (["score", "--json", "a.mp4", "b.mp4"], "expected a file that ends in .json or -, got a.mp4"),
-    "json nowhere": (["status", "--json", "/nowhere/a.json"], "expected a folder at /nowhere, got none"),
+    "json nowhere": (["status", "--json", "/dev/null/a.json"], "'--json': expected a folder at /dev/null, got: "),
+    "key before": (["--api-key-file", "/nowhere", "status"], "api_key_file: expected a text file, got [Errno 2]"),
+    "key after": (["status", "--api-key-file", "/nowhere"], "api_key_file: expected a text file, got [Errno 2]"),
+    "seconds": (["wait", "--timeout", "0"], "'--timeout': expected at least 0.001, got 0.0"),
     "picture": (["score", "a.mp4", "--plot", "a.gif"], "expected a file that ends in .png, .pdf, .svg, got a.gif"),
     "many pictures": (["score", *["a.mp4"] * 51, "--plot", "a.png"], "expected at most 50 videos, got 51"),
     "array": (["score", "a.mp4", "--npy", "a.npz"], "expected a .npy file or a folder, got a.npz"),

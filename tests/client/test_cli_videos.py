@@ -55,11 +55,11 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
     seen = random_trajectory(3, 5, *WIDTHS)
     np.savez(embeddings, video_embeddings=seen.video_embeddings, text_embedding=seen.text_embedding)
     missing = tmp_path / "missing.mp4"
-    target = tmp_path / "scores.json"
-    plotted = tmp_path / "plot.png"
+    target = tmp_path / "new" / "scores.json"
+    plotted = tmp_path / "new" / "plots" / "plot.png"
     result = run(
         *("score", video, missing, embeddings, "--task", TASK, "--fps", 10, "--model", MODEL),
-        *("--json", target, "--npy", tmp_path / "arrays", "--plot", plotted),
+        *("--json", target, "--npy", tmp_path / "new" / "arrays", "--plot", plotted),
         RFM_URL=f"{served.url('http')} {served.url('grpc')}",
     )
     assert result.returncode == ExitCode.FAILED
@@ -94,8 +94,8 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
     ]
     assert columns(result.stdout, str(embeddings))[3:5] == ["5", "-"]
 
-    assert sorted(file.name for file in (tmp_path / "arrays").iterdir()) == ["clip.npy", "embeddings.npy"]
-    array = np.load(tmp_path / "arrays" / "clip.npy")
+    assert sorted(file.name for file in (tmp_path / "new" / "arrays").iterdir()) == ["clip.npy", "embeddings.npy"]
+    array = np.load(tmp_path / "new" / "arrays" / "clip.npy")
     assert array.dtype == np.float32
     np.testing.assert_array_equal(array, np.float32([first["progress"], first["success"]]).T)
     assert plotted.read_bytes().startswith(b"\x89PNG")

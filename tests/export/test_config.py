@@ -20,6 +20,7 @@ from rfm.supervise.supervisor import Supervisor
 from rfm_client.contract.settings import ConfigError, settings_of
 from rfm_commands import cli
 from rfm_commands.config import SECTIONS, Config
+from rfm_gateway.command import OPTIONS
 from rfm_gateway.config import GatewayConfig
 
 REPOSITORY = ROOT / "model_repository"
@@ -170,7 +171,8 @@ def test_every_setting_is_an_option_of_its_command() -> None:
         options = {option: each for each in commands[section].params for option in each.opts}
         for name, setting in settings_of(kind).items():
             assert (setting.option in options) is setting.has_option, name
-            assert not setting.has_option or options[setting.option].help.startswith(setting.help), name
+            text = OPTIONS.helps.get(name, setting.help) if section == "gateway" else setting.help
+            assert not setting.has_option or options[setting.option].help.startswith(text), name
 
 
 def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path: Path) -> None:

@@ -47,9 +47,9 @@ BAD_OPTIONS = {
     "--allow-folder nowhere": "No such file or directory",
     "--api-key-file nowhere": "'--api-key-file': expected a text file, got",
     f"--api-key-file {os.devnull}": NO_KEY,
-    "--port 0": "Input should be greater than or equal to 1",
+    "--port 0": "'--port': expected at least 1, got 0",
     "--host 192.0.2.1": "Cannot assign requested address; --host names another",
-    "--timeout inf": "Input should be less than or equal to 86400",
+    "--timeout inf": "'--timeout': expected a finite number, got inf",
 }
 
 

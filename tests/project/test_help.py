@@ -58,6 +58,56 @@ def test_options_stand_in_groups_and_an_example_below() -> None:
     assert "\n    rfm serve my_models --gateway-port 8100 -- --log-verbose=1\n" in shown
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_defaults_bounds_and_placeholders_are_as_one_writes_them(name: str) -> None:
+    top = COMMANDS[name.split()[0]]
+    shown = " ".join(CliRunner().invoke(top, [*name.split()[1:], "--help"], env=COMMON).output.split())
+    for unwritten in ("None", "<", "factory", "True", "False", "list[", "x>=", ".0;", ".0]", "PosixPath", "2147483647"):
+        assert unwritten not in shown
+
+
+DEFAULTS = {
+    "rfm-client score": ["default: grpc://localhost:8001; variable: RFM_URL", "default: 60", "default: --subsample"],
+    "rfm-client label": ["default: --picture", "default: 4", "variable: RFM_API_KEY_FILE"],
+    "rfm-client wait": ["Seconds to wait. [0.001 to 86400; default: 120]"],
+    "rfm gateway": ["Port to listen on. [1 to 65535; default: 8000]", "default: --viewer"],
+    "rfm serve": ["--gateway-viewer / --gateway-no-viewer", "default: --gateway-viewer", "default: 127.0.0.1"],
+    "rfm export": ["[0 to 4096; default: 0]", "[at least 1; default: 64]"],
+    "rfm demo": ["[default: model_repository]", "[default: demo_output]"],
+}
+
+
+@pytest.mark.parametrize(("name", "told"), DEFAULTS.items(), ids=DEFAULTS)
+def test_every_default_is_shown(name: str, told: list[str]) -> None:
+    program, *words = name.split()
+    shown = " ".join(CliRunner().invoke(COMMANDS[program], [*words, "--help"], env=COMMON).output.split())
+    for text in told:
+        assert text in shown, text
+
+
+def test_what_chooses_frames_stands_in_one_group_of_score() -> None:
+    shown = CliRunner().invoke(COMMANDS["rfm-client"], ["score", "--help"], env=COMMON).output
+    _, _, below = shown.partition("\nFrames:\n")
+    group, _, _ = below.partition("\n\n")
+    first_words = [line.split()[0] for line in group.splitlines() if line.startswith("  --")]
+    assert first_words == ["--fps", "--max-frames", "--subsample", "--sampling", "--frames", "--frame-steps"]
+
+
+ALTERNATIVES = {
+    "rfm label": "rfm-client label",
+    "rfm-client label": "rfm label",
+    "rfm gateway": "rfm serve --gateway-port",
+    "rfm-client gateway": "rfm serve --gateway-port",
+    "rfm serve": "--gateway-port",
+}
+
+
+@pytest.mark.parametrize(("name", "other"), ALTERNATIVES.items(), ids=ALTERNATIVES)
+def test_help_says_which_other_command_does_the_same_job(name: str, other: str) -> None:
+    shown = " ".join(str(COMMANDS[name].help).split())
+    assert other in shown
+
+
 def test_so_it_is_where_there_is_the_gateway_alone(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "rfm_gateway", "--help"], env=COMMON, cwd=tmp_path, text=True, capture_output=True

@@ -172,7 +172,8 @@ def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, key_f
     list_models = ["list", "--url", mutual.grpc_url, "--admin-key-file", str(key_file)]
     own = ["--client-certificate", str(papers.client_certificate), "--client-key", str(papers.client_key)]
     trusted = ["--ca-file", str(papers.ca), *own]
-    assert CliRunner().invoke(app, ["models", *trusted, *list_models]).stdout.split() == ["rfm", "1", "READY"]
+    for given in ([*trusted, *list_models], [*list_models, *trusted]):
+        assert CliRunner().invoke(app, ["models", *given]).stdout.split() == ["rfm", "1", "READY"]
     for credentials in (["--ca-file", str(papers.other_ca), *own], trusted[:2]):
         refused = CliRunner().invoke(app, ["models", *credentials, *list_models])
         assert (refused.exit_code, refused.stdout) == (1, "")
@@ -276,14 +277,17 @@ def test_the_command_has_the_same_options(mutual: Endpoints, proxied: str, paper
     key_file.write_text(f"{KEY}\n")
     names = {"ca_file": papers.ca, "client_certificate": papers.client_certificate, "client_key": papers.client_key}
     words = [f"--{name.replace('_', '-')}={file}" for name, file in names.items()]
-    done = CliRunner().invoke(client_app, [*words, "sample", "--url", mutual.grpc_url])
-    assert done.exit_code == 0, done.output
+    wrong = f"--ca-file={papers.other_ca}"
+    for given in ([*words, "sample"], ["sample", *words], [words[0], "sample", *words[1:]], [wrong, "sample", *words]):
+        done = CliRunner().invoke(client_app, [*given, "--url", mutual.grpc_url])
+        assert done.exit_code == 0, done.output
     in_environment = {f"RFM_{name.upper()}": str(file) for name, file in {**names, "api_key_file": key_file}.items()}
     for name in ("sample", "status", "wait"):
         done = CliRunner(env=in_environment).invoke(client_app, [name, "--url", proxied])
         assert done.exit_code == 0, done.output
-    refused = CliRunner().invoke(client_app, [f"--ca-file={papers.other_ca}", "sample", "--url", mutual.grpc_url])
-    assert (refused.exit_code, "access denied" in refused.stderr) == (1, True)
+    for given in ([wrong, "sample"], [*words, "sample", wrong]):
+        refused = CliRunner().invoke(client_app, [*given, "--url", mutual.grpc_url])
+        assert (refused.exit_code, "access denied" in refused.stderr) == (1, True)
 
 
 @contextmanager

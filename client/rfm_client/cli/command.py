@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import inspect
 import sys
@@ -10,13 +11,14 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Annotated, Any, NoReturn, TypeAlias, get_args
+from typing import Annotated, Any, NoReturn, TypeAlias, get_args, get_origin
 
 import typer
 from typer.core import TyperCommand
+from typer.models import OptionInfo
 
 from rfm_client.contract import errors
-from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, settings_of
+from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of, settings_of
 
 STANDARD_OUTPUT = "-"
 
@@ -57,6 +59,9 @@ class OptionsOf:
     only: settings with an option; empty: all
     required: settings that must be given
     defaults: replace the settings' own defaults
+    helps: replace the settings' own help texts
+    title: replaces the settings' own heading
+    reads_variables: False: the help names environment variables, and the parent command reads them
     """
 
     settings: type[Settings]
@@ -64,6 +69,9 @@ class OptionsOf:
     only: Collection[str] = ()
     required: Collection[str] = ()
     defaults: Mapping[str, Any] = field(default_factory=dict)
+    helps: Mapping[str, str] = field(default_factory=dict)
+    title: str | None = None
+    reads_variables: bool = True
 
     @property
     def chosen(self) -> list[Setting]:
@@ -88,13 +96,12 @@ class OptionsOf:
             option += f"/--{self.prefix}no-{setting.option.removeprefix('--')}"
         described = typer.Option(
             option,
-            help=setting.help if default in (None, (), "", False) else f"{setting.help}  [default: {_shown(default)}]",
-            min=setting.least,
-            max=setting.most,
-            metavar=setting.metavar,
-            envvar=setting.variable,
+            help=self._help(setting, default),
+            metavar=setting.placeholder,
+            envvar=setting.variable if self.reads_variables else None,
             show_default=False,
-            rich_help_panel=self.settings.TITLE,
+            show_envvar=False,  # ``help`` has it
+            rich_help_panel=setting.group or self.title or self.settings.TITLE,
         )
         kind = str if setting.parse else list[str] if setting.kind == Texts else setting.kind
         return inspect.Parameter(
@@ -103,6 +110,17 @@ class OptionsOf:
             default=inspect.Parameter.empty if is_required else None,
             annotation=Annotated[kind if is_required else kind | None, described],
         )
+
+    def _help(self, setting: Setting, default: Any) -> str:
+        """The help text with bounds, default and variable of the option."""
+        shown = self.option(setting) if default is True else _shown(default)
+        facts = [
+            *([setting.bounds] if setting.bounds else []),
+            *([f"default: {shown}"] if shown else []),
+            *([f"variable: {setting.variable}"] if setting.variable else []),
+        ]
+        text = self.helps.get(setting.name, setting.help)
+        return f"{text}  [{'; '.join(facts)}]" if facts else text
 
     def taken_from(self, values: dict[str, Any]) -> Given:
         """Remove this mark's options from ``values``, and return the given settings. Raises typer.BadParameter."""
@@ -129,7 +147,8 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         if name in marked:
             parameters += map(marked[name].parameter, marked[name].chosen)
         else:
-            parameters.append(parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY))
+            kind = inspect.Parameter.KEYWORD_ONLY
+            parameters.append(parameter.replace(annotation=_with_placeholder(hints[name]), kind=kind))
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
@@ -167,6 +186,12 @@ class Command(TyperCommand):
                 completed.append(STANDARD_OUTPUT)
         return super().parse_args(ctx, completed)
 
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return the words of the usage line: an argument's name, in brackets if it may be left out."""
+        arguments = [each for each in self.get_params(ctx) if each.param_type_name == "argument"]
+        names = [_argument(each) if each.required else f"[{_argument(each)}]" for each in arguments]
+        return [*([self.options_metavar] if self.options_metavar else []), *names]
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write sections for the arguments, the command's own options, and each group of settings."""
         sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
@@ -174,6 +199,7 @@ class Command(TyperCommand):
             record = parameter.get_help_record(ctx)
             if record is not None:
                 is_argument = parameter.param_type_name == "argument"
+                record = (_argument(parameter), record[1]) if is_argument else record
                 title = "Arguments" if is_argument else getattr(parameter, "rich_help_panel", None) or "Options"
                 sections.setdefault(title, []).append(record)
         for title, records in sections.items():
@@ -251,7 +277,24 @@ def _mark(hint: Any) -> OptionsOf | None:
     return next((mark for mark in get_args(hint)[1:] if isinstance(mark, OptionsOf)), None)
 
 
+def _with_placeholder(hint: Any) -> Any:
+    """The type of a parameter; its option gets a placeholder, unless it has one."""
+    kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    marks = [copy.copy(mark) for mark in marks]
+    for mark in marks:
+        if isinstance(mark, OptionInfo) and mark.metavar is None:
+            mark.metavar = placeholder_of(kind)
+    return Annotated[(kind, *marks)] if marks else hint
+
+
+def _argument(parameter: Any) -> str:
+    return str(parameter.metavar or parameter.name.upper())
+
+
 def _shown(default: Any) -> str:
-    if isinstance(default, bool):
-        return "yes"
-    return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
+    """A default as one would type it; empty for none."""
+    if default is None or default is False:
+        return ""
+    if isinstance(default, tuple):
+        return " ".join(map(str, default))
+    return f"{default:g}" if isinstance(default, float) else str(default)

@@ -26,7 +26,15 @@ from rfm_client.cli.command import (
 )
 from rfm_client.cli.evaluate import evaluate
 from rfm_client.cli.label import label
-from rfm_client.cli.options import CredentialFiles, OutputOptions, PrefixOptions, ServerOptions, VideoOptions
+from rfm_client.cli.options import (
+    CredentialFiles,
+    CredentialsGiven,
+    OutputOptions,
+    PrefixOptions,
+    ServerOptions,
+    VideoOptions,
+    credentials_of,
+)
 from rfm_client.cli.show import StreamedTable, print_tables, scores_table, status_tables
 from rfm_client.cli.synthetic import SyntheticSamples, are_frames, write_perf_analyzer_input
 from rfm_client.contract.addresses import split_url
@@ -66,8 +74,7 @@ def main(
 ) -> None:
     """Score videos with a served reward model, and show the state of its server."""
     logging.basicConfig(format="rfm-client: %(message)s", level=logging.WARNING)  # the client logs retries
-    with usage_errors("--ca-file, --client-certificate, --client-key, --api-key-file"):
-        context.obj = files.read()
+    context.obj = files
 
 
 @app.command(cls=Command, epilog=EXIT_CODES)
@@ -76,12 +83,13 @@ def score(
     context: typer.Context,
     videos: Annotated[list[str], typer.Argument(metavar="VIDEO...", help=VIDEOS)],
     server: ServerOptions,
+    files: CredentialsGiven,
     video: VideoOptions,
     prefix: PrefixOptions,
     output: OutputOptions,
 ) -> None:
     """Score each frame of one or more videos: progress and success. A failed video does not stop the others."""
-    output.check(videos)
+    output.begin(videos)
     if prefix.sampling is not None and video.max_frames is not None:
         raise ConfigError("sampling", f"expected no --max-frames with it, got {video.max_frames}")
     rows = StreamedTable(scoring.COLUMNS, videos)
@@ -98,7 +106,7 @@ def score(
         if output.prints_tables:
             rows.write(outcome.row)
 
-    with scoring.recorder(output.rrd, videos) as record, server.connected(context.obj) as client:
+    with scoring.recorder(output.rrd, videos) as record, server.connected(credentials_of(context, files)) as client:
         outcomes = scoring.SourceScorer(client, video, prefix, record).score_all(videos, tell)
     rows.end(prefix.rule)
     output.write_json(documents.score_document(server, video, prefix, outcomes))
@@ -116,6 +124,7 @@ def compare(
     context: typer.Context,
     videos: Annotated[list[str], typer.Argument(metavar="VIDEO VIDEO...", help=VIDEOS)],
     server: ServerOptions,
+    files: CredentialsGiven,
     video: VideoOptions,
     output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json", "plot"))],
 ) -> None:
@@ -126,8 +135,8 @@ def compare(
     """
     if len(videos) < MIN_COMPARED:
         raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
-    output.check(videos)
-    with server.connected(context.obj) as client:
+    output.begin(videos)
+    with server.connected(credentials_of(context, files)) as client:
         comparison = comparing.compare(client, videos, video)
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
@@ -147,9 +156,10 @@ def status(
     server: Annotated[
         ServerOptions, OptionsOf(ServerOptions, only=("urls", "timeout_s"), defaults={"timeout_s": 10.0})
     ],
+    files: CredentialsGiven,
     output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json",))],
     metrics_url: Annotated[
-        str | None, typer.Option(help="Where the server shows its metrics (http://<its host>:8002/metrics).")
+        str | None, typer.Option(help="Where the server shows its metrics; else port 8002 of its host, /metrics.")
     ] = None,
 ) -> None:
     """Show the server's models, requests, batches, GPUs and memory."""
@@ -157,9 +167,11 @@ def status(
 
     if metrics_url is not None and len(server.urls) > 1:
         raise typer.BadParameter("expected one --url with it, got several", param_hint="'--metrics-url'")
+    output.make_folders()
+    credentials = credentials_of(context, files)
     with usage_errors("'--url'"):
         statuses = [
-            read_status(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=context.obj)
+            read_status(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=credentials)
             for url in server.urls
         ]
     if output.prints_tables:
@@ -170,10 +182,15 @@ def status(
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def wait(
-    context: typer.Context, server: Annotated[ServerOptions, OptionsOf(ServerOptions, defaults={"timeout_s": 120.0})]
+    context: typer.Context,
+    server: Annotated[
+        ServerOptions,
+        OptionsOf(ServerOptions, defaults={"timeout_s": 120.0}, helps={"timeout_s": "Seconds to wait."}),
+    ],
+    files: CredentialsGiven,
 ) -> None:
     """Wait until a server has the model ready, or --timeout passes."""
-    with server.client(context.obj) as client:
+    with server.client(credentials_of(context, files)) as client:
         client.wait_ready(server.timeout_s)
 
 
@@ -182,11 +199,13 @@ def wait(
 def sample(
     context: typer.Context,
     server: ServerOptions,
+    files: CredentialsGiven,
     synthetic: SyntheticSamples,
     output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json",))],
 ) -> None:
     """Score synthetic samples, to check that the server answers. Their scores mean nothing."""
-    with server.connected(context.obj) as client:
+    output.make_folders()
+    with server.connected(credentials_of(context, files)) as client:
         samples = synthetic.samples(client)
         outcomes = client.evaluate(samples, return_errors=True)
     failures = [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
@@ -207,13 +226,15 @@ def bench_input(
     context: typer.Context,
     output: Annotated[Path, typer.Option(help="JSON file to write.")],
     server: ServerOptions,
+    files: CredentialsGiven,
     synthetic: Annotated[SyntheticSamples, OptionsOf(SyntheticSamples, defaults={"num_samples": 64})],
 ) -> None:
     """Write synthetic samples as input of Triton's perf_analyzer.
 
     It prints a perf_analyzer command that sends them.
     """
-    with server.connected(context.obj) as client:
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with server.connected(credentials_of(context, files)) as client:
         samples = synthetic.samples(client)
     write_perf_analyzer_input(output, samples)
     protocol, address = split_url(server.urls[0])

@@ -48,6 +48,7 @@ def evaluate(
     """
     from rfm_client.labelling import DatasetError, evaluate_labels, find_label_files, read_outcomes
 
+    output.make_folders()
     files = labels or find_label_files(dataset)
     if not files:
         expected = "label files, NAME_progress.parquet (rfm-client label), or --labels"

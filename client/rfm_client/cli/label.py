@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import typer
 
 from rfm_client.cli.command import ExitCode, report, with_options
-from rfm_client.cli.options import ServerOptions
+from rfm_client.cli.options import CredentialsGiven, ServerOptions, credentials_of
 from rfm_client.cli.show import print_tables, table
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
@@ -33,7 +33,6 @@ from rfm_client.labelling.ray_engine import Connect
 from rfm_client.labelling.run import Watch
 from rfm_client.labelling.scorer import ClientScorer, Scorer
 from rfm_client.labelling.summary import Summary, summarise
-from rfm_client.transport.credentials import Credentials
 
 SPEED_OVER_S = 600.0  # an episode may take minutes
 
@@ -110,18 +109,21 @@ def label(
     context: typer.Context,
     dataset: DatasetArgument,
     server: ServerOptions,
+    files: CredentialsGiven,
     texts: EpisodeTexts,
     labels: LabelOptions,
     run: RunOptions,
     ray: RayOptions,
 ) -> None:
-    """Write a label for every frame of a dataset.
+    """Label every frame of a dataset by asking running servers.
+
+    `rfm label` writes the same files with a checkpoint in its own process, without a server.
 
     The label files have the forms that training code reads, such as LeRobot's.
 
     Run the same command again to label the missing episodes.
     """
-    credentials: Credentials = context.obj  # Ray cannot send the context to other machines
+    credentials = credentials_of(context, files)  # Ray cannot send the context to other machines
 
     @contextmanager
     def connect() -> Iterator[Scorer]:

@@ -6,25 +6,26 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import typer
 
 from rfm_client.async_client import DEFAULT_TIMEOUT_S
-from rfm_client.cli.command import STANDARD_OUTPUT, usage_errors
+from rfm_client.cli.command import STANDARD_OUTPUT, Given, OptionsOf, usage_errors
 from rfm_client.client import RewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.data.orientation import Orientation
-from rfm_client.data.sampling import Rule, Sampling
+from rfm_client.data.sampling import RULES, Rule, Sampling
 from rfm_client.transport.credentials import Credentials
 
 DEFAULT_URL = "grpc://localhost:8001"
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 86_400
+FRAMES = "Frames"  # heading of all options that decide which frames are scored, and on what
 MAX_PICTURED = 50  # videos; a larger picture is unreadable, and soon cannot be drawn
 _ENDINGS = {"json": (".json",), "plot": (".png", ".pdf", ".svg"), "rrd": (".rrd",)}
 
@@ -32,6 +33,8 @@ _ENDINGS = {"json": (".json",), "plot": (".png", ".pdf", ".svg"), "rrd": (".rrd"
 @dataclass(frozen=True)
 class CredentialFiles(Settings):
     """Credentials for a protected server, as files: CAs, client certificate, API key."""
+
+    TITLE: ClassVar[str] = "TLS and key"
 
     ca_file: Path | None = setting(None, "Authorities (PEM) to trust; else the system's.", variable="RFM_CA_FILE")
     client_certificate: Path | None = setting(
@@ -49,6 +52,17 @@ class CredentialFiles(Settings):
         except (OSError, UnicodeDecodeError) as error:
             raise ValueError(f"api_key_file: expected a text file, got {error}") from None
         return Credentials(self.ca_file, self.client_certificate, self.client_key, api_key=api_key)
+
+
+# Options after a subcommand, which win over those before it and over variables.
+CredentialsGiven: TypeAlias = Annotated[Given, OptionsOf(CredentialFiles, reads_variables=False)]
+
+
+def credentials_of(context: typer.Context, given: Given) -> Credentials:
+    """Return the credentials of a subcommand: the given files, else those before it. Raises typer.BadParameter."""
+    before: CredentialFiles = context.obj
+    with usage_errors("--ca-file, --client-certificate, --client-key, --api-key-file"):
+        return replace(before, **given).read()
 
 
 @dataclass(frozen=True)
@@ -116,9 +130,13 @@ class VideoOptions(Settings):
     TITLE: ClassVar[str] = "Videos"
 
     task: str = setting("", "The task, as a sentence.")
-    fps: float = setting(3.0, "Frames a second that are taken from a video.", least=0.001)
-    max_frames: int | None = setting(None, "Score at most so many frames, evenly.", least=1)
-    subsample: bool = setting(True, "Score no more frames than the checkpoint was trained on, evenly spaced; else all.")
+    fps: float = setting(3.0, "Take so many frames a second of a video.", least=0.001, group=FRAMES)
+    max_frames: int | None = setting(
+        None, "Score at most so many of these frames, evenly spaced.", least=1, group=FRAMES
+    )
+    subsample: bool = setting(
+        True, "Score at most as many frames in one pass as the checkpoint was trained on, evenly spaced.", group=FRAMES
+    )
     resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
     orient: Orientation = setting(
         "none", "Turn frames upright before they are scored (see docs/guides/label_a_dataset.md)."
@@ -129,18 +147,23 @@ class VideoOptions(Settings):
 class PrefixOptions(Settings):
     """Rule that samples each frame's prefix; without a rule, one pass scores all frames."""
 
-    TITLE: ClassVar[str] = "Prefixes"
+    TITLE: ClassVar[str] = FRAMES
 
+    sampling: Rule | None = setting(
+        None,
+        f"Score each frame on its prefix, sampled by a rule of docs/guides/choose_frames.md ({', '.join(RULES)}); else "
+        "all frames in one pass.",
+        metavar="RULE",
+    )
+    frames: int | None = setting(
+        None, "Show the model so many frames of a prefix (with --sampling); else as many as in training.", least=1
+    )
     frame_steps: int = setting(
         0,
-        "Dense mode: score frame t on its prefix 0..t alone, sampled to so many frames.",
+        "Score each frame on its prefix, sampled by the server to so many frames (dense mode); 0: no.",
         least=0,
         most=MAX_FRAME_STEPS,
     )
-    sampling: Rule | None = setting(
-        None, "Rule by which each frame is scored on its prefix (see docs/guides/choose_frames.md)."
-    )
-    frames: int | None = setting(None, "Frames that the rule shows the model; else as many as in training.", least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -195,10 +218,7 @@ class OutputOptions(Settings):
             if Path(value).suffix not in endings:
                 instead = " or -" if name == "json" else ""
                 raise ConfigError(name, f"expected a file that ends in {', '.join(endings)}{instead}, got {value}")
-            if not Path(value).parent.is_dir():
-                raise ConfigError(name, f"expected a folder at {Path(value).parent}, got none")
-        can_be_made = self.npy is None or (self.npy.suffix in ("", ".npy") and self.npy.parent.is_dir())
-        if self.npy is not None and not self.npy.is_dir() and not can_be_made:
+        if self.npy is not None and not self.npy.is_dir() and self.npy.suffix not in ("", ".npy"):
             raise ConfigError("npy", f"expected a .npy file or a folder, got {self.npy}")
 
     @property
@@ -206,20 +226,31 @@ class OutputOptions(Settings):
         """True if tables go to standard output."""
         return self.json != STANDARD_OUTPUT
 
-    def check(self, videos: Sequence[str]) -> None:
-        """Raise ConfigError for more videos than the files take."""
+    def make_folders(self) -> None:
+        """Make the files' folders where they are missing. Raises ConfigError if that fails."""
+        folders = {name: Path(value).parent for name in _ENDINGS if (value := getattr(self, name)) is not None}
+        if self.npy is not None:
+            folders["npy"] = self.npy.parent if self.npy.suffix == ".npy" and not self.npy.is_dir() else self.npy
+        for name, folder in folders.items():
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigError(name, f"expected a folder at {folder}, got: {error.strerror}") from None
+
+    def begin(self, videos: Sequence[str]) -> None:
+        """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
         if self.plot is not None and len(videos) > MAX_PICTURED:
             raise ConfigError("plot", f"expected at most {MAX_PICTURED} videos, got {len(videos)}")
         if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
             raise ConfigError("npy", f"expected a folder for {len(videos)} videos, got {self.npy}")
+        self.make_folders()
 
     def array_files(self, stems: Sequence[str]) -> list[Path]:
-        """Return the .npy file of each video, and make its folder; empty without --npy."""
+        """Return the .npy file of each video; empty without --npy."""
         if self.npy is None:
             return []
         if self.npy.suffix == ".npy":
             return [self.npy]
-        self.npy.mkdir(exist_ok=True)
         return [self.npy / f"{stem}.npy" for stem in stems]
 
     def write_json(self, document: Mapping[str, Any]) -> None:

@@ -14,6 +14,8 @@ from typing import Any, ClassVar, Literal, TypeAlias
 Texts: TypeAlias = tuple[str, ...]
 
 _PLAIN: dict[Any, tuple[type, ...]] = {Path: (str,), float: (int, float), Texts: (list,)}  # else the type itself
+_PLACEHOLDERS: dict[Any, str | None] = {Path: "PATH", list[Path]: "PATH", int: "N", float: "NUMBER", bool: None}
+_UNBOUNDED = 2**31 - 1  # a bound that only the number's type sets
 _NAMES: dict[Any, str] = {types.NoneType: "null", Path: "str", Texts: "list of str"}
 
 
@@ -39,6 +41,7 @@ class Setting:
     metavar: placeholder for the value in a command's help
     variable: environment variable for the value
     parse: converts the text on a command line to the value; raises ValueError
+    group: heading in a command's help; None: the class's TITLE
     has_option: False: only files and programs set it
     """
 
@@ -52,6 +55,7 @@ class Setting:
     metavar: str | None = None
     variable: str | None = None
     parse: Callable[[str], Any] | None = None
+    group: str | None = None
     has_option: bool = True
 
     @property
@@ -80,20 +84,26 @@ class Setting:
             raise ConfigError(self.name, f"expected at most {self.most}, got {value}")
 
     @property
-    def _parts(self) -> tuple[Any, ...]:
-        is_union = typing.get_origin(self.kind) in (types.UnionType, typing.Union)
-        return typing.get_args(self.kind) if is_union else (self.kind,)
+    def placeholder(self) -> str | None:
+        """What stands for the value in a command's help; None for a flag."""
+        return self.metavar or placeholder_of(self.kind)
+
+    @property
+    def bounds(self) -> str:
+        """Bounds of a number in words; empty without bounds."""
+        has_most = self.most is not None and self.most < _UNBOUNDED
+        if self.least is None:
+            return f"at most {self.most:g}" if has_most else ""
+        return f"{self.least:g} to {self.most:g}" if has_most else f"at least {self.least:g}"
 
     @property
     def _choices(self) -> Texts:
         """Texts to choose from; empty: any value."""
-        return tuple(
-            text for part in self._parts if typing.get_origin(part) is Literal for text in typing.get_args(part)
-        )
+        return _choices_of(self.kind)
 
     @property
     def _kinds(self) -> tuple[Any, ...]:
-        return tuple(str if typing.get_origin(part) is Literal else part for part in self._parts)
+        return tuple(str if typing.get_origin(part) is Literal else part for part in _parts_of(self.kind))
 
     @property
     def _expected(self) -> str:
@@ -124,6 +134,22 @@ def settings_of(kind: Any) -> dict[str, Setting]:
     """Return the settings of a ``Settings`` class by name, in their order."""
     hints = typing.get_type_hints(kind)
     return {each.name: Setting(each.name, hints[each.name], each.default, **each.metadata) for each in fields(kind)}
+
+
+def placeholder_of(kind: Any) -> str | None:
+    """Return what stands for a value of this type in a command's help: ``PATH``, ``N``, choices; None for a flag."""
+    (part,) = (each for each in _parts_of(kind) if each is not types.NoneType)
+    return "|".join(_choices_of(kind)) or _PLACEHOLDERS.get(part, "TEXT")
+
+
+def _parts_of(kind: Any) -> tuple[Any, ...]:
+    """The types of a union, or the type."""
+    return typing.get_args(kind) if typing.get_origin(kind) in (types.UnionType, typing.Union) else (kind,)
+
+
+def _choices_of(kind: Any) -> Texts:
+    literals = (part for part in _parts_of(kind) if typing.get_origin(part) is Literal)
+    return tuple(text for part in literals for text in typing.get_args(part))
 
 
 def _is_number(value: Any) -> bool:
