@@ -38,6 +38,9 @@ NUM_LARGE = 10_000
 DEMO, BRIGHT, PLAIN, *CODED = range(3 + len(CODINGS))  # labelled by the demo, by brightness, not; coded otherwise
 VIDEOS = "#episode-videos video"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
+BEYOND = """
+return [document.documentElement, ...document.querySelectorAll(".work")].map((each) => each.scrollWidth - each.clientWidth);
+"""  # how far the page and what each tab shows reach to the right of what can be seen
 ARE_THERE = f"[...document.querySelectorAll('{VIDEOS}')].every((video) => !video.seeking && video.readyState >= 2)"
 
 
@@ -479,6 +482,22 @@ def test_episodes_without_labels_can_be_watched_and_scored(page: Page) -> None:
     page.browser["episode-time"].send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
     poll(page.is_at_one_time)
     page.score_episode()
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
+def test_no_tab_is_wider_than_the_window(page: Page, size: tuple[int, int], theme: str) -> None:
+    """It leaves a picture of each tab among the downloads."""
+    page.choose(DEMO)
+    page.at_rest(3)
+    page.score_episode()
+    with page.browser.window(*size), page.browser.theme(theme):
+        for tab in ("score", "dataset", "live"):
+            page.browser[f"{tab}-tab"].click()
+            page.browser.draw()
+            name = f"{tab}_{size[0]}x{size[1]}_{theme}.png"
+            assert page.browser.driver.save_screenshot(str(page.browser.downloads / name))
+            assert page.browser.run(BEYOND) == [0] * 4, name
 
 
 def test_axe_finds_nothing_in_either_theme(page: Page) -> None:

@@ -156,6 +156,7 @@ class Browser:
         file = Path(os.environ.get(IMAGES_VARIABLE, self.downloads)) / name
         self.run("document.activeElement.blur()")
         with self.window(*PICTURE_PX):
+            self.run("for (const each of document.querySelectorAll('.work')) each.scrollTo(0, 0)")
             self.draw()
             assert self.driver.save_screenshot(str(file))
         assert file.read_bytes().startswith(b"\x89PNG\r\n")
