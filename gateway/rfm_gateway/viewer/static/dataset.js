@@ -200,7 +200,8 @@ export class DatasetTab {
   #showChosen() {
     const page = this.#page;
     const numbers = this.#taken.map(({ episode }) => episode);
-    page["chosen-told"].textContent = this.#chosen.size ? `${numbers.length} that are selected` : `${numbers.length} that are shown; select some for fewer`;
+    const which = this.#chosen.size ? "selected" : "shown; select some for fewer";
+    page["chosen-told"].textContent = `${numbers.length} that are ${which}`;
     page["choose-none"].disabled = !this.#chosen.size;
     page["episodes-text"].disabled = page["episodes-json"].disabled = !numbers.length;
     const dataset = this.#datasets[this.#number];
@@ -219,7 +220,8 @@ export class DatasetTab {
     const judgedOnes = labelled.filter(({ never_succeeds: never }) => never !== null);
     const never = judgedOnes.filter(({ never_succeeds: each }) => each).length;
     const told = [`${labelled.length} of ${this.#episodes.length} episodes are labelled.`];
-    if (judgedOnes.length) told.push(`${never} never ${never === 1 ? "succeeds" : "succeed"}: success stays below ${this.#threshold}.`);
+    const verb = never === 1 ? "succeeds" : "succeed";
+    if (judgedOnes.length) told.push(`${never} never ${verb}: success stays below ${this.#threshold}.`);
     this.#page["ends-told"].textContent = told.join(" ");
     this.#histogram.show(labelled);
   }

@@ -34,7 +34,8 @@ export function svgFigure(template, curves, { title, threshold, label = "seconds
     if (text !== null) element.textContent = text;
     return element;
   };
-  const svg = made("svg", { width: `${WIDTH}pt`, height: `${height}pt`, viewBox: `0 0 ${WIDTH} ${height}`, "font-family": FONT, "font-size": 7 });
+  const size = { width: `${WIDTH}pt`, height: `${height}pt`, viewBox: `0 0 ${WIDTH} ${height}` };
+  const svg = made("svg", { ...size, "font-family": FONT, "font-size": 7 });
   const add = (...rest) => svg.append(made(...rest));
   add("rect", { width: WIDTH, height, fill: themed("--page", template) });
   titles.forEach((text) => add("text", { x: LEFT, y: TOP + 8, "font-size": 8, fill: ink }, text));
@@ -67,7 +68,8 @@ export function svgFigure(template, curves, { title, threshold, label = "seconds
   }
   shortNames(drawn, LETTERS).forEach((name, place) => {
     const at = bottom + 2 * LINE + 8 + place * (LINE + 2);
-    add("line", { x1: LEFT, x2: LEFT + 14, y1: at - 2.5, y2: at - 2.5, stroke: colourOf(drawn[place], "progress", template), "stroke-width": 1.5 });
+    const stroke = colourOf(drawn[place], "progress", template);
+    add("line", { x1: LEFT, x2: LEFT + 14, y1: at - 2.5, y2: at - 2.5, stroke, "stroke-width": 1.5 });
     add("text", { x: LEFT + 18, y: at, fill: ink }, name);
   });
   return new XMLSerializer().serializeToString(svg);

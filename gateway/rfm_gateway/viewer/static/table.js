@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// The curves as a table: what was asked, and the numbers at the time that is shown.
+// The curves as a table: what was asked, and how each ends.
 
 import { colourOf } from "./chart.js";
 import { cut, NONE, shown } from "./text.js";
