@@ -76,7 +76,7 @@ EXTRAS = {
     "gymnasium": {"gym.py", "gym_vector.py"},
     "typer": {"cli"},
     "rich": {"cli"},
-    "matplotlib": {"cli"},
+    "matplotlib": {"cli", "plot.py"},
     "pyarrow": {"label_files.py", "lerobot_rows.py", "finished_episodes.py"},
     "fsspec": {"finished_episodes.py"},
     "huggingface_hub": {"opening.py"},
