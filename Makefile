@@ -94,14 +94,18 @@ ops-check: ops-tools
 AS_ROOT = $(shell if [ "$$(id -u)" = 0 ]; then :; elif sudo -n true 2>/dev/null; then echo sudo -n; else echo false; fi)
 MISSING = { echo "make ops-tools: expected $(1) in PATH, got none; install it (Debian, Ubuntu: $(2))" >&2; exit 1; }
 
-# Get the programs of Debian and Ubuntu that tests run: Prometheus, docker-compose, Chromium.
-# Prometheus is unpacked into $(VENV), since its package starts a service when it is installed.
+# Get the programs of Debian and Ubuntu that tests run: Prometheus, nginx, docker-compose, Chromium.
+# Prometheus and nginx are unpacked into $(VENV), since their packages start a service when they are installed.
 ops-tools: $(INSTALLED)
 	@test -x $(BIN)/promtool || { command -v promtool && command -v prometheus; } >/dev/null || \
 	  { $(AS_ROOT) apt-get update -qq; cd $(VENV) && apt-get -qq -o APT::Sandbox::User=root download prometheus && \
 	  dpkg-deb --fsys-tarfile prometheus_*.deb | \
 	  tar -x -C bin --strip-components=3 ./usr/bin/prometheus ./usr/bin/promtool && rm prometheus_*.deb; } || \
 	  $(call MISSING,prometheus and promtool,apt-get install prometheus)
+	@test -x $(BIN)/nginx || PATH=$$PATH:/usr/sbin command -v nginx >/dev/null || \
+	  { $(AS_ROOT) apt-get update -qq; cd $(VENV) && apt-get -qq -o APT::Sandbox::User=root download nginx && \
+	  dpkg-deb --fsys-tarfile nginx_*.deb | tar -x -C bin --strip-components=3 ./usr/sbin/nginx && rm nginx_*.deb; } || \
+	  $(call MISSING,nginx,apt-get install nginx)
 	@docker compose version >/dev/null 2>&1 || command -v docker-compose >/dev/null || \
 	  { $(AS_ROOT) apt-get update -qq && \
 	  $(AS_ROOT) apt-get install --yes -qq --no-install-recommends docker-compose; } || \
@@ -141,7 +145,8 @@ lock:
 	mv $(VENV)/lock/requirements.txt docker/requirements.txt
 
 VERSIONED := pyproject.toml client/pyproject.toml gateway/pyproject.toml CITATION.cff docker/.env.example docker/compose.yaml \
-  docker/kubernetes/kserve/kustomization.yaml $(wildcard docker/kubernetes/overlays/*/kustomization.yaml) docs/guides/deploy.md
+  docker/kubernetes/kserve/kustomization.yaml $(wildcard docker/kubernetes/overlays/*/kustomization.yaml) docs/guides/deploy.md \
+  docs/guides/gpu_box.md
 
 # Write a version into every file that names it: make version VERSION=1.2.3
 version:

@@ -55,7 +55,7 @@ class Options:
         return name, dict(setting.split("=") for setting in settings)
 
     def settings(self, known: Mapping[str, type]) -> dict[str, Any]:
-        """Return the user's settings as numbers. Raises CheckpointError for an unknown setting or a wrong value.
+        """Return the user's settings as numbers or booleans. Raises CheckpointError if one is unknown or wrong.
 
         known: type of each setting
         """
@@ -76,7 +76,7 @@ class Description:
     """The inputs and outputs of a checkpoint.
 
     widths: Dv and Dt, the widths of the frame and task embeddings that it scores; None: it scores raw frames
-    progress_bins: K; 1: continuous progress
+    progress_bins: C; 1: continuous progress
     max_frames: frames of the longest trajectory that the network can score; None: no limit
     trained_frames: most frames of a trajectory in training; None: unknown
     trained_padding: training padded shorter trajectories; None: unknown
@@ -85,7 +85,8 @@ class Description:
     keeps_features: it can cache features of frames, and then takes samples with frame references
     has_log_prob: progress comes with a log-probability of each frame
     needs_whole_episode: its scores are relative to the whole episode, so dense mode and online use are refused
-    may_not_answer: its text may lack a score, also on blank frames; so it gets no warm-up, whose failure is Triton's
+    may_not_answer: its answer may hold no score, also on blank frames; so it gets no warm-up, because Triton does not
+        load a model whose warm-up fails
     kind: the reward model's name for people
     is_large: exports are verified in the dtype that serves, on a GPU if it has room, since float32 on the CPU is slow
     """

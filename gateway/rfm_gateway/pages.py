@@ -33,7 +33,14 @@ class _Files(StaticFiles):
 
 def add_viewer(app: FastAPI) -> None:
     """Add the page at ``/``, and its files."""
-    _add(app, "/", "/viewer", _PACKAGE / "viewer" / "static", uplot=_PACKAGE / "vendored" / "uplot")
+    _add(
+        app,
+        "/",
+        "/viewer",
+        _PACKAGE / "viewer" / "static",
+        uplot=_PACKAGE / "vendored" / "uplot",
+        examples=_PACKAGE / "viewer" / "examples",
+    )
 
 
 def add_docs(app: FastAPI) -> None:

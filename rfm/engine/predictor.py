@@ -37,7 +37,7 @@ class Predictor(Protocol[Row, Batch]):
         """True if ``work_ahead`` takes enough time to be worth a thread."""
 
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[Row]:
-        """Return the sample's rows, in dense mode one for each frame, without a forward pass.
+        """Return the sample's rows, without a forward pass: one, or one for each prefix that is scored.
 
         sample: with frame references only if ``Description.keeps_features``
         Raises InvalidSampleError if this checkpoint cannot score the sample.
@@ -50,7 +50,7 @@ class Predictor(Protocol[Row, Batch]):
         """Do the slow, independent work on these rows; thread-safe. ``collate`` does the rest."""
 
     def collate(self, rows: Sequence[Row]) -> Batch:
-        """Return one batch on the CPU; may run while the device computes."""
+        """Return one batch; may run while the device computes."""
 
     def count(self, batch: Batch, execution: Execution) -> None:
         """Add the batch's tokens, with and without padding, and its encoded frames to ``execution``."""
@@ -115,7 +115,7 @@ def no_success(progress: Float32Array) -> Float32Array:
 
 
 def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> FrameScores:
-    """Return scores on the CPU from progress logits [..., K] and success logits [...]; logits included if K > 1."""
+    """Return scores on the CPU from progress logits [..., C] and success logits [...]; logits included if C > 1."""
     discrete = progress_logits.shape[-1] > 1
     progress = progress_from_logits(progress_logits).cpu().numpy()
     return FrameScores(
@@ -131,10 +131,12 @@ def of_rows(sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> F
         return rows[0].frames[0]
     frames = [row.frames[0] for row in rows]
     logits = [scores.progress_logits[-1] for scores in frames if scores.progress_logits is not None]
+    log_probs = [scores.log_prob[-1] for scores in frames if scores.log_prob is not None]
     return FrameScores(
         progress=np.stack([scores.progress[-1] for scores in frames]),
         success=np.stack([scores.success[-1] for scores in frames]),
         progress_logits=np.stack(logits) if logits else None,
+        log_prob=np.stack(log_probs) if log_probs else None,
     )
 
 
@@ -145,6 +147,7 @@ def part_of(scores: FrameScores, index: slice | npt.NDArray[np.intp]) -> FrameSc
         progress=scores.progress[index],
         success=scores.success[index],
         progress_logits=None if logits is None else logits[index],
+        log_prob=None if scores.log_prob is None else scores.log_prob[index],
     )
 
 

@@ -11,6 +11,7 @@ import torch
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
 from rfm.checkpoint.provenance import Decision, source_name
+from rfm.checkpoint.run_config import find_run_config
 from rfm.engine.feature_cache import FeatureCache
 from rfm.family import Description, Options
 from rfm.roboreward.predictor import RoboRewardPredictor
@@ -21,6 +22,7 @@ from rfm.vlm.language import LanguageCheckpoint, LanguageFolder, LanguageNetwork
 
 WRITTEN, EXPECTED = "roboreward", "roboreward-expected"  # of ``--as``
 REWARD_MODELS = (WRITTEN, EXPECTED)
+HUB_FOLDER = "models--"  # begins the name of a repository's folder in the Hub's cache
 GENERATION_CONFIG = "generation_config.json"
 # Keys of GENERATION_CONFIG without effect on the likeliest token.
 _IDLE = {
@@ -67,11 +69,13 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
 
 
 def reads(folder: Path) -> bool:
-    """True if the folder holds an export of RoboReward, or a Qwen3-VL whose path has its name."""
+    """True if the folder holds an export of RoboReward, or a Qwen3-VL of its name without a run's config.yaml."""
     if reward_model_of(folder) is not None:
         return reward_model_of(folder) == RoboRewardConfig.reward_model
     content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
-    return content.get("model_type") == QWEN3 and "roboreward" in str(folder.resolve()).lower()
+    names = [folder.resolve().name, *(part for part in folder.parts if part.startswith(HUB_FOLDER))]
+    has_name = any("roboreward" in name.lower() for name in names)
+    return has_name and content.get("model_type") == QWEN3 and find_run_config(folder) is None
 
 
 def load(folder: Path, options: Options) -> RoboRewardCheckpoint:

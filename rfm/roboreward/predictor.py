@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The predictor of RoboReward: writes the answer of each conversation, all of a batch together.
+"""The predictor of RoboReward: writes a batch's answers together, or computes their expected scores.
 
 B conversations of L tokens in a batch, padded behind their tokens; N tokens written so far.
 """
@@ -23,19 +23,19 @@ from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import VlmRow
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.qwen import KeyValues, next_hidden_state
-from rfm_client.contract import FrameScores, InvalidSampleError, RewardError
+from rfm_client.contract import FrameScores, InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.samples import Float32Array
 
 
 @dataclass(frozen=True)
-class Answer:
+class WrittenAnswer:
     """A written answer.
 
-    tokens: without the token that ends it
+    tokens: without the token that ends it; None: some logits were not finite
     digit_logits: float32 [5], logits of SCORES where the first of these digits is written; None: there is none
     """
 
-    tokens: list[int]
+    tokens: list[int] | None
     digit_logits: Float32Array | None
 
 
@@ -46,9 +46,9 @@ class RoboRewardPredictor(VlmPredictor):
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
-        """Write the rows' answers; return each row's scores, or its error.
+        """Return each row's scores, or its error.
 
-        execution: its ``on_forward`` is called after each token
+        execution: its ``on_forward`` is called after each written token
         """
         self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         if self._config.is_expected:
@@ -67,7 +67,7 @@ class RoboRewardPredictor(VlmPredictor):
 
     def _written(
         self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution
-    ) -> tuple[list[Answer], Tensor | None]:
+    ) -> tuple[list[WrittenAnswer], Tensor | None]:
         """Return the answers, token by token the likeliest, and the features that the vision tower computed."""
         key_values = KeyValues()
         output = self._output(batch, key_values)
@@ -81,7 +81,9 @@ class RoboRewardPredictor(VlmPredictor):
         tokens: list[Tensor] = []
         digits: list[Tensor] = []
         has_ended = torch.zeros(len(rows), dtype=torch.bool, device=logits.device)
+        is_finite = ~has_ended
         for step in range(self._config.max_new_tokens):
+            is_finite &= has_ended | logits.isfinite().all(-1)
             tokens.append(logits.argmax(-1))
             digits.append(logits[:, self.collator.digits].float())
             has_ended |= torch.isin(tokens[-1], stops)
@@ -94,16 +96,22 @@ class RoboRewardPredictor(VlmPredictor):
                 logits = self.network.lm_head(hidden)
         of_rows = torch.stack(tokens, dim=1).cpu().tolist()
         of_digits = torch.stack(digits, dim=1).cpu().numpy()
-        return [self._ended(ids, each) for ids, each in zip(of_rows, of_digits, strict=True)], output.made
+        answers = [
+            self._ended(ids, each) if is_good else WrittenAnswer(None, None)
+            for ids, each, is_good in zip(of_rows, of_digits, is_finite.cpu().tolist(), strict=True)
+        ]
+        return answers, output.made
 
-    def _ended(self, tokens: list[int], digits: Float32Array) -> Answer:
+    def _ended(self, tokens: list[int], digits: Float32Array) -> WrittenAnswer:
         """Return the answer up to its end. digits: float32 [N, 5], logits of SCORES at each token"""
         end = next((index for index, token in enumerate(tokens) if token in self._config.stops), len(tokens))
         known = self.collator.digits
         at = next((index for index, token in enumerate(tokens[:end]) if token in known), None)
-        return Answer(tokens[:end], None if at is None else digits[at])
+        return WrittenAnswer(tokens[:end], None if at is None else digits[at])
 
-    def _read(self, answer: Answer, row: VlmRow) -> RowScores | RewardError:
+    def _read(self, answer: WrittenAnswer, row: VlmRow) -> RowScores | RewardError:
+        if answer.tokens is None:
+            return InferenceFailedError("the network gave a score that is not finite")
         text = self.collator.tokenizer.decode(answer.tokens, skip_special_tokens=True)
         score = parsed(text)
         if score is None:

@@ -59,6 +59,10 @@ class RoboRewardCollator(LanguageCollator):
         """The tokens of SCORES."""
         return [int(self.tokenizer.convert_tokens_to_ids(str(score))) for score in SCORES]
 
+    def example(self) -> str:
+        """Return the prompt of an example task, with VIDEO in the place of the video."""
+        return self.template(PROMPT, add_generation_prompt=True)
+
     def prompts(self, video: VlmVideo, task: str) -> list[VlmRow]:
         """Return the conversations about a video. Raises ValueError for frames that cannot be resized."""
         text = self.template(PROMPT.replace("{task}", task), add_generation_prompt=True)

@@ -48,7 +48,7 @@ class BackOff:
         self._running_since_s = None  # a failed start does not count as running
         self._row += 1
         if self._row > MOST:
-            got = f"{self._row} faults, each within {self._steady_s:g} s of a start; the last: {reason}"
+            got = f"{self._row} faults in a row; the last: {reason}"
             raise CrashLoopError(f"{self._what}: expected to run, got {got}")
         return 0.0 if self._row == 1 else min(FIRST_PAUSE_S * 2.0 ** (self._row - 2), LONGEST_PAUSE_S)
 
@@ -193,7 +193,6 @@ class Supervisor:
         what: the model with the fault, or TRITON
         """
         while not self._is_to_stop.is_set():
-            self._count(what, why)
             self._close_watch()
             reason = why if what == TRITON else f"{what}: {why}"
             self._status.record_down(f"{TRITON} is started again: {reason}")
@@ -207,6 +206,7 @@ class Supervisor:
                 pause_s = 0.0
             if self._is_to_stop.wait(pause_s):
                 return
+            self._count(what, why)
             try:
                 self._start()
                 return
@@ -222,7 +222,8 @@ class Supervisor:
             return False
         fault = f"had the last of {MOST + 1} faults in a row: {why}"
         self._say(f"{what} is left out, since it {fault}")
-        reason = f"it is left out, since {what} {fault}; `rfm models load` serves it again"
+        remedy = "`rfm models load`, or a restart of `rfm serve`, serves it again"
+        reason = f"it is left out, since {what} {fault}; {remedy}"
         self._left_out |= dict.fromkeys(left_out, reason)
         self._served = others
         self._back_off = self._new_back_off()

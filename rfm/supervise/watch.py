@@ -193,7 +193,8 @@ class TritonWatch:
             if can_be_probed(self.served[model]):
                 observe = self._status.probe_seconds.labels(model).observe
                 self._probes[model] = self._new_probe(model, observe=observe)
-                self._probes[model].has_answered = before is not None and before.has_answered  # Triton warmed it up
+                known = before is not None and before.has_answered
+                self._probes[model].has_answered = known  # a reloaded model stays ready
         (self._going.add if is_going else self._going.discard)(model)
         if is_settled:
             self._ready[model] = ready

@@ -24,7 +24,9 @@ from rfm.vlm.processor import OF_VIDEOS, VIDEO_PREPROCESSOR_CONFIG, read_preproc
 LEROBOT, ROBOMETER = "topreward", "topreward-robometer"  # of ``--as``
 REWARD_MODELS = (LEROBOT, ROBOMETER)
 _TYPE = "topreward"  # the value of the key ``type`` of LeRobot's config.json
-FPS, MAX_FRAMES, NUM_PREFIXES = 2.0, 64, 15  # defaults: LeRobot's; of Robometer's baseline
+FPS = 2.0  # LeRobot's default
+MAX_FRAMES, NUM_PREFIXES = 64, 15  # of Robometer's baseline
+MOST_FRAMES = 512  # of LeRobot's variant, by default: each prefix costs a pass
 # Keys of LeRobot's config.json about its own pipelines, uploads and cropping of online samples.
 _IDLE = {
     "attn_implementation", "default_task", "device", "image_key", "input_features", "license", "max_frames",
@@ -37,7 +39,7 @@ _DECIDING = {
     "prompt_prefix": "prompt_prefix",
     "prompt_suffix_template": "prompt_suffix",
 }
-_OF_USER = {"num_prefixes": int, "fps": float, "chat_template": bool}  # settings that ``--as`` takes
+_OF_USER = {"num_prefixes": int, "fps": float, "chat_template": bool, "max_frames": int}  # settings that ``--as`` takes
 
 
 @dataclass(frozen=True)
@@ -93,10 +95,9 @@ def load(folder: Path, options: Options) -> TopRewardCheckpoint:
         options = replace(options, base_model=None)
     files = LanguageFolder.read(folder, options)
     config = files.saved(TopRewardConfig)
-    if config is not None and given:
-        raise CheckpointError(
-            "--as: expected no settings for an export, which has its own; export the checkpoint again"
-        )
+    is_export = config is not None
+    if config is not None and (given or name not in (None, LEROBOT if config.variant == "lerobot" else ROBOMETER)):
+        raise CheckpointError("--as: expected none for an export, which has its own; export the checkpoint again")
     if config is None:
         is_lerobot = name != ROBOMETER
         settings: dict[str, Any] = {
@@ -104,7 +105,7 @@ def load(folder: Path, options: Options) -> TopRewardCheckpoint:
             "chat_template": not is_lerobot,
             "fps": FPS,
             "num_prefixes": None if is_lerobot else NUM_PREFIXES,
-            "max_frames": None if is_lerobot else MAX_FRAMES,
+            "max_frames": MOST_FRAMES if is_lerobot else MAX_FRAMES,
             "prompt_prefix": PROMPT_PREFIX,
             "prompt_suffix": PROMPT_SUFFIX,
             **_limits(files),
@@ -115,7 +116,7 @@ def load(folder: Path, options: Options) -> TopRewardCheckpoint:
         base = source_name(options.base_model or folder)
         config = TopRewardConfig(files.backbone, files.dtype, base, **settings)
     told = [
-        Decision(key, getattr(config, key), "--as" if key in given else NETWORK_CONFIG if of_lerobot else "default")
+        Decision(key, getattr(config, key), _source(key, given, of_lerobot, is_export=is_export))
         for key in ("variant", "chat_template", "fps", "num_prefixes", "max_frames", "prompt_prefix", "prompt_suffix")
     ]
     limits = [Decision(key, getattr(config, key), VIDEO_PREPROCESSOR_CONFIG) for key in ("least_px", "most_px")]
@@ -123,6 +124,12 @@ def load(folder: Path, options: Options) -> TopRewardCheckpoint:
     checkpoint = TopRewardCheckpoint(config, files.weights, files.processor, settled)
     checkpoint.check()
     return checkpoint
+
+
+def _source(key: str, given: Mapping[str, Any], of_lerobot: Mapping[str, Any], *, is_export: bool) -> str:
+    if is_export or key in of_lerobot:
+        return NETWORK_CONFIG
+    return "--as" if key in given or key == "variant" else "default"
 
 
 def _lerobot_settings(content: Mapping[str, Any], file: Path) -> dict[str, Any]:
@@ -138,7 +145,10 @@ def _lerobot_settings(content: Mapping[str, Any], file: Path) -> dict[str, Any]:
 
 def _limits(files: LanguageFolder) -> dict[str, int]:
     """Return the least and most pixels of a video by its processor. Raises CheckpointError."""
-    preprocessor = read_preprocessor(files.processor, *OF_VIDEOS)
+    try:
+        preprocessor = read_preprocessor(files.processor, *OF_VIDEOS)
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"base model {files.processor}: {error} (name its folder with --base-model)") from error
     size = preprocessor.get("size")
     where = f"{files.processor}: {VIDEO_PREPROCESSOR_CONFIG}"
     if not isinstance(size, dict) or not all(type(size.get(edge)) is int for edge in ("shortest_edge", "longest_edge")):
@@ -152,8 +162,10 @@ def _limits(files: LanguageFolder) -> dict[str, int]:
 def _check(settings: Mapping[str, Any]) -> None:
     """Raise CheckpointError for settings that no prompt can be made of."""
     prefixes, fps, suffix = settings["num_prefixes"], settings["fps"], settings["prompt_suffix"]
-    if prefixes is not None and prefixes < 1:
-        raise CheckpointError(f"num_prefixes: expected at least 1, got {prefixes}")
+    if prefixes is not None and prefixes < 2:
+        raise CheckpointError(f"num_prefixes: expected at least 2, the first and the last, got {prefixes}")
+    if settings["max_frames"] < 1:
+        raise CheckpointError(f"max_frames: expected at least 1, got {settings['max_frames']}")
     if not 0 < float(fps) < float("inf"):
         raise CheckpointError(f"fps: expected a number above 0, got {shown(fps)}")
     try:

@@ -49,7 +49,7 @@ class TopRewardConfig(LanguageConfig):
     prompt_prefix, prompt_suffix: text behind the video; the suffix has ``{instruction}`` and ends with the answer
     fps: frames a second, from which LeRobot's variant writes times; Robometer's ignores it
     num_prefixes: most prefixes that are scored, evenly spaced, the frames between are interpolated; None: all
-    max_frames: most frames of Robometer's variant; None: no limit
+    max_frames: most frames of an episode; each scored prefix is a row
     least_px, most_px: of a video, over all its frames, in LeRobot's variant
     """
 
@@ -57,7 +57,7 @@ class TopRewardConfig(LanguageConfig):
     chat_template: bool
     fps: float
     num_prefixes: int | None
-    max_frames: int | None
+    max_frames: int
     least_px: int
     most_px: int
     prompt_prefix: str = PROMPT_PREFIX
@@ -142,8 +142,9 @@ class TopRewardCollator(LanguageCollator):
             expected = "0 (TOPReward's progress is relative to the whole episode; for each step there is log_prob)"
             raise InvalidSampleError.at("frame_steps", expected, str(frame_steps))
         num_frames, most = sample.trajectories[0].num_frames, self.config.max_frames
-        if most is not None and num_frames > most:
-            raise InvalidSampleError.at("num_frames", f"at most {most} (max_frames of this model)", str(num_frames))
+        if num_frames > most:
+            expected = f"at most {most} (max_frames of this model): send fewer frames, evenly spaced (subsample=True)"
+            raise InvalidSampleError.at("num_frames", expected, str(num_frames))
         return super().rows(sample)
 
     def prompts(self, video: VlmVideo, task: str) -> list[VlmRow]:
@@ -156,9 +157,15 @@ class TopRewardCollator(LanguageCollator):
             conversations = [
                 shown for (shown, _), of_prefix in zip(of_prefixes, sizes, strict=True) if of_prefix == size
             ]
-            videos[size] = VlmVideo(video.frames, len(conversations[-1]), conversations, video.named)
+            end = 1 + max(int(shown.max()) for shown in conversations)
+            named = None if video.named is None else video.named[:end]
+            videos[size] = VlmVideo(video.frames[:end], len(conversations[-1]), conversations, named)
         prefixes = zip(of_prefixes, sizes, strict=True)
         return [self.row(videos[size], text, shown, times_s) for (shown, times_s), size in prefixes]
+
+    def example(self) -> str:
+        """Return the prompt of an example task, with VIDEO in the place of the video."""
+        return self.text("TASK")
 
     def text(self, task: str) -> str:
         """Return the prompt, with VIDEO in the place of the video, and the answer at its end."""

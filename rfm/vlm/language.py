@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -44,7 +44,7 @@ from rfm.vlm.collator import (
     timed_groups,
     video_of,
 )
-from rfm.vlm.images import MERGE, Normalisation
+from rfm.vlm.images import MERGE, Normalisation, QwenImages
 from rfm.vlm.network import BackboneConfig, Dtype, build_backbone, qwen_states
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, normalisation_of, read_processor, save_processor
@@ -59,6 +59,7 @@ VIDEO = VISION_START + VIDEO_PAD + VISION_END  # a video, or a temporal patch, i
 _HEAD, _EMBEDDING = "lm_head.weight", "model.language_model.embed_tokens.weight"
 _NAMES: Renames = ((r"^model\.lm_head\.", "lm_head."), *QWEN_NAMES)
 _TIED = "tie_word_embeddings"
+MOST_PIECES = 4096  # cached texts of a prompt and of times
 
 Config = TypeVar("Config", bound="LanguageConfig")
 
@@ -105,7 +106,21 @@ class LanguageNetwork(nn.Module):
 
 
 class LanguageCollator(QwenCollator):
-    """The collator of prompts with one video, whose frames stand between their times."""
+    """The collator of prompts with one video, each temporal patch behind its time."""
+
+    def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
+        super().__init__(config, tokenizer, images)
+        self._piece = lru_cache(MOST_PIECES)(self._chat.tokens)
+
+    def check_template(self) -> None:
+        """Raise CheckpointError unless a prompt has its video once."""
+        num_videos = self.example().count(VIDEO)
+        if num_videos != 1:
+            raise CheckpointError(f"chat template: expected one video in a prompt, got {num_videos}")
+
+    def example(self) -> str:
+        """Return the prompt of an example task, with VIDEO in the place of the video."""
+        raise NotImplementedError
 
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
         """Return the conversations of a progress sample. Raises InvalidSampleError."""
@@ -135,11 +150,12 @@ class LanguageCollator(QwenCollator):
         """
         grid = self.grid(video)
         before, _, behind = text.partition(VIDEO)
+        first, *others = times_s
+        # All pieces but the last end with a special token, so each alone has the same tokens as in the text.
+        pieces = [before + timed_groups([first]), *(timed_groups([time_s]) for time_s in others), behind]
+        tokens = np.concatenate([*map(self._piece, pieces), more]).astype(np.int64)
         pad = self.tokenizer.convert_tokens_to_ids(VIDEO_PAD)
-        ids = expanded(
-            self._chat.tokens(before + timed_groups(times_s) + behind), pad, [grid.tokens_per_group] * len(times_s)
-        )
-        ids = np.concatenate([ids, more]) if len(more) else ids
+        ids = expanded(tokens, pad, [grid.tokens_per_group] * len(times_s))
         starts = self._positions(ids, VISION_START) + 1
         boxes = [Box(int(start), 1, grid.rows // MERGE, grid.columns // MERGE) for start in starts]
         return VlmRow(ids, (video,), ([],), len(ids) - 1, False, picked=shown, position_ids=positions(len(ids), boxes))
@@ -180,7 +196,7 @@ class LanguageCheckpoint:
 
     @property
     def notes(self) -> list[str]:
-        """Return no line: the network was not trained for this project's prompts."""
+        """Return no line: no facts of training are known here."""
         return []
 
     def decisions(self) -> list[Decision]:
@@ -203,7 +219,9 @@ class LanguageCheckpoint:
             raise CheckpointError(f"base model {self.processor}: expected {expected}, got {len(tokenizer)}")
         check_tokens(self.config, tokenizer, self.processor)
         patch_px = self.config.backbone["vision_config"]["patch_size"]
-        return self.make_collator(tokenizer, patch_px, normalisation_of(preprocessor, self.processor))
+        collator = self.make_collator(tokenizer, patch_px, normalisation_of(preprocessor, self.processor))
+        collator.check_template()
+        return collator
 
     def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> LanguageCollator:
         """Return the collator with this tokenizer and preprocessing."""
@@ -302,9 +320,15 @@ class LanguageFolder:
         return cls(folder, backbone, settings, weights, processor, cast(Dtype, dtype))
 
     def saved(self, config: type[Config]) -> Config | None:
-        """Return the configuration that ``LanguageCheckpoint.save`` wrote; None: the folder is no export."""
+        """Return the configuration that ``LanguageCheckpoint.save`` wrote; None: the folder is no export.
+
+        Raises CheckpointError for an export of another reward model.
+        """
         if self.settings is None:
             return None
+        if self.settings.get(REWARD_MODEL) != config.reward_model:
+            got = shown(self.settings.get(REWARD_MODEL))
+            raise CheckpointError(f"{self.folder}: expected an export of {config.reward_model}, got one of {got}")
         fields = {
             name: tuple(value) if isinstance(value, list) else value
             for name, value in self.settings.items()

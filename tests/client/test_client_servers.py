@@ -86,7 +86,7 @@ class Stand:
 
 
 def lost() -> ServerUnavailableError:
-    """What a call gets under which its connection ends."""
+    """What a call gets if its connection ends during it."""
     error = ServerUnavailableError("Socket closed")
     error.may_have_ended_server = True
     return error
@@ -190,7 +190,7 @@ def test_a_call_under_which_two_processes_end_fails(num_servers: int) -> None:
         stand.num_ends, stand.down_s = 10, 0.2
     (error,) = ask(stands)
     assert isinstance(error, ServerUnavailableError)
-    assert "ended under this request twice: Socket closed" in str(error)
+    assert "ended twice during this request: Socket closed" in str(error)
     assert sum(stand.asked["infer"] for stand in stands) == 2
 
 

@@ -53,7 +53,7 @@ def test_a_request_that_ends_its_process_ends_two_of_a_fleet(
         # In one request with two others, which fail with it, and by another client beside those that are answered.
         batch = [ProgressSample(sample) for sample in (trajectory(0), POISON, trajectory(1))]
         outcomes = other.evaluate(batch, return_errors=True)
-        assert all("ended under this request twice" in str(outcome) for outcome in outcomes), outcomes
+        assert all("ended twice during this request" in str(outcome) for outcome in outcomes), outcomes
         for server in fleet:
             server.wait_ready(True, LONG_S)
         assert sum(server.metric("rfm_serve_restarts_total", what=MODEL) for server in fleet) == 2
@@ -61,5 +61,5 @@ def test_a_request_that_ends_its_process_ends_two_of_a_fleet(
         callers.wait_for_all()
     assert callers.wrong == []
     # Who was in one batch with it twice is lost, too.
-    assert all("ended under this request twice" in str(error) for error in callers.lost)
+    assert all("ended twice during this request" in str(error) for error in callers.lost)
     assert len(callers.lost) == lost < len(callers.answered)

@@ -130,7 +130,7 @@ def test_several_cameras_are_scored_apart_and_fused(client: RewardClient, fuse: 
 
 
 REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
-    "mode": ({"mode": "relative"}, "^mode: expected 'absolute' or 'delta', got 'relative'$"),
+    "mode": ({"mode": "relative"}, "^mode: expected one of absolute, delta, shaping, final, got 'relative'$"),
     "cameras": ({"cameras": ["front"]}, r"^cameras: expected keys of the observation \[\], got \['front'\]$"),
     "fuse": ({"fuse": "sum"}, "^fuse: expected one of mean, min, max, got 'sum'$"),
     "orient": ({"orient": "upside-down"}, "^orient: expected one of none, rotate180, .*, got 'upside-down'$"),

@@ -89,7 +89,7 @@ MISBEHAVING: dict[str, tuple[str, Misbehaviour, type[RewardError], bool]] = {
 def test_whatever_answers_the_error_is_ours(
     protocol: str, answer: Misbehaviour, kind: type[RewardError], may_have_ended: bool
 ) -> None:
-    """Whether a server may have ended under a request over gRPC is asked of a real Triton in tests/triton."""
+    """Whether a server may have ended during a request over gRPC is asked of a real Triton in tests/triton."""
     with (
         listening(answer) as port,
         # With retries the last try may be under way when its time is up, which is another error.

@@ -20,7 +20,7 @@ from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.roboreward.prompts import parsed
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Trajectory
-from rfm_client.contract import InvalidSampleError
+from rfm_client.contract import InferenceFailedError, InvalidSampleError
 
 CASES = references("roboreward")
 CONFIGS = sorted({case.config for case in CASES})
@@ -113,6 +113,14 @@ def test_every_token_is_progress_of_the_batch(engine: Engine) -> None:
     case = next(case for case in CASES if case.file.stem == "score4_T7")
     engine.evaluate(case.samples(), Execution(on_forward=lambda: steps.append(1)))
     assert len(steps) == len(case.content["generations"][0]["generated_tokens"]) + 1  # and the pass as a whole
+
+
+def test_logits_that_are_not_finite_are_a_failure_and_no_answer() -> None:
+    checkpoint = families.load(CHECKPOINT, reward_model="roboreward")
+    checkpoint.parts["network"]["model.language_model.norm.weight"].fill_(torch.inf)
+    engine = Engine.of(checkpoint)
+    (outcome,) = engine.evaluate(CASES[0].samples()[:1])
+    assert isinstance(outcome, InferenceFailedError)
 
 
 def test_a_preference_is_refused(engine: Engine) -> None:

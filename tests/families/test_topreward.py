@@ -201,11 +201,14 @@ def test_a_sample_without_a_meaning_is_refused(
 
 WRONG: dict[str, tuple[str, str]] = {
     "an unknown name": ("gvl", "--as: expected one of topreward, topreward-robometer, roboreward, roboreward-expected"),
-    "an unknown setting": ("topreward,frames=3", "--as: expected settings among num_prefixes, fps, chat_template"),
+    "an unknown setting": (
+        "topreward,frames=3",
+        "--as: expected settings among num_prefixes, fps, chat_template, max_frames",
+    ),
     "no value": ("topreward,fps", "--as: expected setting=value, got 'fps'"),
     "no number": ("topreward,fps=fast", "--as: fps: expected a value of type float, got 'fast'"),
     "no frames a second": ("topreward,fps=0", "fps: expected a number above 0, got 0.0"),
-    "no prefix": ("topreward,num_prefixes=0", "num_prefixes: expected at least 1, got 0"),
+    "one prefix": ("topreward,num_prefixes=1", "num_prefixes: expected at least 2, the first and the last, got 1"),
 }
 
 
@@ -214,6 +217,24 @@ def test_a_wrong_setting_is_refused(said: str, message: str) -> None:
     with pytest.raises(CheckpointError) as refusal:
         families.load(CHECKPOINT, reward_model=said)
     assert message in str(refusal.value)
+
+
+def test_an_export_keeps_its_reward_model(tmp_path: Path) -> None:
+    families.load(CHECKPOINT, reward_model="topreward").save(tmp_path / "saved")
+    for said in ("topreward-robometer", "topreward,fps=4", "roboreward"):
+        with pytest.raises(
+            CheckpointError, match=r"--as: expected none for an export|expected an export of roboreward"
+        ):
+            families.load(tmp_path / "saved", reward_model=said)
+
+
+def test_a_template_without_the_video_is_refused(tmp_path: Path) -> None:
+    changed = shutil.copytree(CHECKPOINT, tmp_path / "changed")
+    file = changed / "chat_template.json"
+    template = json.loads(file.read_text())["chat_template"]
+    file.write_text(json.dumps({"chat_template": "<|im_start|>system\nHelp.<|im_end|>\n" + template}))
+    with pytest.raises(CheckpointError, match="chat template: expected one video in a prompt, got 0"):
+        Engine.from_checkpoint(str(changed), reward_model="topreward")
 
 
 def test_an_ordinary_model_is_no_reward_model_by_itself() -> None:

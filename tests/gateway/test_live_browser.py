@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from selenium.webdriver import ActionChains
 
 from browsers import Browser
 from gateways import Gateway, free_port, poll, running
@@ -208,6 +209,64 @@ def test_an_episode_that_is_first_heard_of_late_is_shown(page: Page, first: int)
         view.episode("wait").add(FRAMES[0], StepScore(0.5, 0.25, False, first, 3.0))
         page.shows(f"late {first}", {"Step": f"{first}", "state": "running"})
         assert page.drawn(f"late {first}")["times"] == [first]
+
+
+RUNS = "return [...document.querySelectorAll('#live-runs tr')].map((row) => [...row.cells].map((cell) => cell.textContent))"
+
+
+def test_means_and_success_rate_over_the_last_episodes_and_all_of_them_are_reachable(page: Page) -> None:
+    """Thirty episodes end; the n-th ends after n + 1 steps, and every third succeeds."""
+    progress = [(number_of + 1) / 40 for number_of in range(30)]
+    succeeded = [number_of % 3 == 0 for number_of in range(30)]
+    with LiveView(page.url, name="means") as view:
+        for n in range(30):
+            episode = view.episode("go", n)
+            for step in range(n + 1):
+                episode.add(FRAMES[0], StepScore(progress[n], 0.25, succeeded[n], step, 3.0))
+            episode.end()
+
+        def row() -> list[str]:
+            return [text for run in page.browser.run(RUNS) if run[0] == "means" for text in run[1:]]
+
+        def expected(last: int) -> list[str]:
+            rate = f"{100 * np.mean(succeeded[-last:]):.0f} %"
+            steps = np.mean(np.arange(1, 31)[-last:])
+            return ["0", f"{last}", rate, number(float(np.mean(progress[-last:]))), "0.250", f"{steps:.1f}"]
+
+        poll(lambda: row() == expected(20))
+        page.browser.write("live-last", "5")
+        assert row() == expected(5)
+        page.browser.write("live-last", "1000")
+        assert row() == expected(30)
+        while page.browser["live-more"].is_displayed():
+            page.browser["live-more"].click()
+        assert len(page.cards("means")) == 30
+
+
+def test_progress_and_success_have_one_colour_each_and_numbers_at_the_pointer(page: Page) -> None:
+    with LiveView(page.url, name="colours") as view:
+        view.episode("go").add(FRAMES[0], StepScore(0.5, 0.25, False, 0, 3.0))
+        page.shows("colours", {"Step": "0"})
+        over = (
+            "[...document.querySelectorAll('#live-episodes article')].find((card) => "
+            "card.querySelector('h2').textContent.startsWith('colours,')).querySelector('.u-over')"
+        )
+        page.browser.run(f"{over}.scrollIntoView()")
+        ActionChains(page.browser.driver).move_to_element(page.browser.run(f"return {over}")).perform()
+        shown = page.browser.until(
+            f"{over}.querySelectorAll('.values span').length === 2 && "
+            f"[...{over}.querySelectorAll('.values span')].map((each) => [each.textContent, each.style.color])"
+        )
+        colours = {
+            page.browser.run(f"return getComputedStyle(document.documentElement).getPropertyValue('--curve-{n}')")
+            for n in (0, 1)
+        }
+        assert [text for text, _ in shown] == ["0.500", "0.250"]
+        assert {hex_of(colour) for _, colour in shown} == colours
+
+
+def hex_of(colour: str) -> str:
+    return "#" + "".join(f"{int(part):02x}" for part in colour.removeprefix("rgb(").removesuffix(")").split(","))
 
 
 def test_text_of_others_is_text(page: Page) -> None:

@@ -12,10 +12,13 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gateways import TestClient, inside
 from paths import ROOT
+from rfm_client.data.video import read_video
+from toy_world import Task, make_clip
 
 GATEWAY = ROOT / "gateway" / "rfm_gateway"
 STATIC = GATEWAY / "viewer" / "static"
@@ -24,6 +27,7 @@ FILES = {
     "viewer/main.js": "javascript",
     "viewer/page.css": "text/css",
     "viewer/uplot/uPlot.esm.js": "javascript",
+    "viewer/examples/success.mp4": "video/mp4",
     "docs": "text/html",
     "docs/swagger-ui/swagger-ui.css": "text/css",
 }
@@ -71,6 +75,14 @@ def test_the_page_names_nothing_of_elsewhere(file: Path) -> None:
     assert "://" not in file.read_text()
 
 
+@pytest.mark.parametrize(("name", "kind"), [("success", "success"), ("failure", "dropped"), ("rewound", "rewound")])
+def test_the_examples_are_clips_of_the_demo(name: str, kind: str) -> None:
+    seed = 2_000_000 + ["success", "failure", "rewound"].index(name)
+    frames = read_video(GATEWAY / "viewer" / "examples" / f"{name}.mp4")
+    expected = make_clip(kind, Task("red", "bowl"), seed).frames
+    assert np.abs(frames.astype(int) - expected).mean() < 4  # chroma has a quarter of the pixels
+
+
 @pytest.mark.parametrize("folder", [*GATEWAY.glob("vendored/*"), *Path(__file__).parent.glob("vendored/*")])
 def test_vendored_files_are_those_of_the_pinned_packages(folder: Path) -> None:
     told = json.loads((folder / "vendored.json").read_text())
@@ -89,6 +101,6 @@ def test_the_page_is_in_the_distribution(tmp_path: Path) -> None:
     words = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path), str(source)]
     subprocess.run([*pip, *words], check=True, timeout=120)
     (wheel,) = tmp_path.glob("*.whl")
-    kinds = ("docs/*", "viewer/static/*", "vendored/*/*")
+    kinds = ("docs/*", "viewer/static/*", "viewer/examples/*", "vendored/*/*")
     expected = {f"rfm_gateway/{file.relative_to(GATEWAY)}" for kind in kinds for file in GATEWAY.glob(kind)}
     assert expected <= set(zipfile.ZipFile(wheel).namelist())

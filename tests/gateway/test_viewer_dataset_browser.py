@@ -3,17 +3,22 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pyarrow import parquet
 from selenium.webdriver import ActionChains, Keys
 from selenium.webdriver.support.select import Select
 
 from browsers import Browser
+from gateway_requests import TOLERANCE
 from gateways import poll, running
 from labelling import BrightnessScorer
 from rfm.launch.triton_server import Endpoints
@@ -21,15 +26,21 @@ from rfm_client import RewardClient
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.orientation import Orient
 from rfm_client.labelling import ClientScorer, LabelOptions, label, open_dataset, summarise
-from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew
+from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, large
+from viewer_requests import run_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 SHOWN = 5e-4  # three decimals, and a tenth of a per cent
 KEY = "open sesame"
+OTHER = "brightness"  # the second reward of the first dataset
+NUM_LARGE = 10_000
 DEMO, BRIGHT, PLAIN, *CODED = range(3 + len(CODINGS))  # labelled by the demo, by brightness, not; coded otherwise
 VIDEOS = "#episode-videos video"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
+BEYOND = """
+return [document.documentElement, ...document.querySelectorAll(".work")].map((each) => each.scrollWidth - each.clientWidth);
+"""  # how far the page and what each tab shows reach to the right of what can be seen
 ARE_THERE = f"[...document.querySelectorAll('{VIDEOS}')].every((video) => !video.seeking && video.readyState >= 2)"
 
 
@@ -57,12 +68,13 @@ class Page:
     @property
     def episodes(self) -> list[int]:
         """The episodes of the table, in its order."""
-        return [int(row[0].removeprefix("Watch ")) for row in self.rows]
+        return [int(row[1].removeprefix("Watch ")) for row in self.rows]
 
     @property
     def numbers(self) -> list[list[float]]:
-        """The numbers of the watched episode's curves."""
-        return [[float(cell) for cell in row[1:]] for row in self.browser.cells("#episode-curves tr")]
+        """Progress and success of each of the watched episode's curves, beside its lines."""
+        values = [self.browser.values("episode-chart", signal) for signal in ("progress", "success")]
+        return [[float(of_signal[name]) for of_signal in values] for name in values[0]]
 
     def choose(self, number: int) -> LeRobotDataset:
         """Shows a dataset."""
@@ -113,6 +125,7 @@ def folders(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) ->
     demo, bright = copied("toy_v30_many", folder), copied("toy_v21", folder)
     with RewardClient(demo_server.grpc_url) as client:
         label(open_dataset(demo), ClientScorer(client), LabelOptions())
+    label(open_dataset(demo), BrightnessScorer(), LabelOptions(name=OTHER))
     label(open_dataset(bright, orient=Orient.parse(["wrist=rotate180"])), BrightnessScorer(), LabelOptions())
     coded = []
     for coding, (codec, options) in CODINGS.items():
@@ -152,14 +165,15 @@ def test_the_tab_opens_and_the_arrow_keys_change_tabs(page: Page) -> None:
 def test_the_table_has_the_numbers_of_the_labels(page: Page, number: int) -> None:
     dataset = page.choose(number)
     summary = summarise(page.folders[number] / "rfm_progress.parquet")
-    assert summary.best_success is not None and summary.disagreement is not None and summary.never_succeed is not None
+    assert summary.best_success is not None and summary.last_success is not None
+    assert summary.disagreement is not None and summary.never_succeed is not None
     for row in page.rows:
-        episode = int(row[0].removeprefix("Watch "))
+        episode = int(row[1].removeprefix("Watch "))
         told = dataset.episodes[episode]
-        never = "never" if episode in summary.never_succeed else ""
-        assert (row[1], int(row[2]), row[5]) == (told.task, told.num_frames, never)
-        numbers = [float(row[3]), float(row[4]), float(row[6].removesuffix(" %")) / 100, float(row[7])]
-        columns = (summary.final_progress, summary.best_success, summary.backwards, summary.disagreement)
+        assert (row[2], int(row[3])) == (told.task, told.num_frames)
+        numbers = [*map(float, row[4:7]), float(row[7].removesuffix(" %")) / 100, float(row[8])]
+        scores = (summary.final_progress, summary.best_success, summary.last_success)
+        columns = (*scores, summary.backwards, summary.disagreement)
         assert numbers == pytest.approx([values[episode] for values in columns], abs=SHOWN)
     never = f"{len(summary.never_succeed)} never {'succeeds' if len(summary.never_succeed) == 1 else 'succeed'}"
     labelled = f"{len(page.rows)} of {len(page.rows)} episodes are labelled."
@@ -167,6 +181,9 @@ def test_the_table_has_the_numbers_of_the_labels(page: Page, number: int) -> Non
     told = page.browser["histogram"].get_attribute("aria-label").removeprefix("Episodes by final progress: ")
     counts, _ = np.histogram(summary.final_progress, bins=20, range=(0, 1))
     assert [int(bar.split()[0]) for bar in told.split(", ")] == counts.tolist()
+    good = [int(bar.split()[5]) if "which" in bar else 0 for bar in told.split(", ")]
+    succeeding = summary.final_progress[summary.best_success >= 0.5]
+    assert good == np.histogram(succeeding, bins=20, range=(0, 1))[0].tolist()
     assert page.browser.run("return document.querySelector('#histogram canvas').width") > 0
 
 
@@ -180,20 +197,207 @@ def test_the_rows_are_sorted_by_what_one_wants_to_see_first(page: Page, number: 
     page.choose(number)
     summary = summarise(page.folders[number] / "rfm_progress.parquet")
     assert summary.best_success is not None and summary.disagreement is not None
+    assert summary.last_success is not None
     never, backwards, apart = summary.best_success < 0.5, -summary.backwards, -summary.disagreement
+    worst = episodes_by(-never.astype(int), backwards, apart)
+    assert page.episodes == worst
     expected = {
-        "never succeeds, then goes backwards, then cameras disagree": episodes_by(-never.astype(int), backwards, apart),
-        "goes backwards most": episodes_by(backwards),
-        "cameras disagree most": episodes_by(apart),
-        "lowest final progress": episodes_by(summary.final_progress),
-        "lowest best success": episodes_by(summary.best_success),
-        "episode number": list(range(len(never))),
+        "Goes backwards": episodes_by(backwards),
+        "Cameras disagree": episodes_by(apart),
+        "Final progress": episodes_by(summary.final_progress),
+        "Best success": episodes_by(summary.best_success),
+        "Last success": episodes_by(summary.last_success),
+        "Episode": list(range(len(never))),
     }
-    order = Select(page.browser["order"])
-    assert [option.text for option in order.options] == list(expected)
+    heads = {
+        head.text.replace("\n", " ").rstrip(" ↑↓"): head for head in page.browser.all("#episode-list thead button")
+    }
     for name, episodes in expected.items():
-        order.select_by_visible_text(name)
+        heads[name].click()
         assert page.episodes == episodes, name
+        (marked,) = page.browser.all("#episode-list [aria-sort]")
+        assert marked.text.replace("\n", " ").rstrip(" ↑↓") == name
+    heads["Episode"].click()
+    assert page.episodes == list(range(len(never)))[::-1]
+    Select(page.browser["order"]).select_by_visible_text("worst first")
+    assert page.episodes == worst
+
+
+def test_the_threshold_moves_counts_and_histogram_and_is_dragged_in_the_chart(page: Page) -> None:
+    page.choose(BRIGHT)
+    best = summarise(page.folders[BRIGHT] / "rfm_progress.parquet").best_success
+    assert best is not None
+    for threshold in (0.0, float(np.float32(np.median(best))), 1.0):
+        page.browser.run(
+            "const slider = document.getElementById('cutoff'); slider.value = arguments[0]; "
+            "slider.dispatchEvent(new Event('input'))",
+            threshold,
+        )
+        cut = float(page.browser["cutoff"].get_attribute("value"))
+        never = int((best < cut).sum())
+        assert f" {never} never succeed" in page.browser["ends-told"].text
+        assert page.browser["count-never"].text == f"{never}"
+        told = page.browser["histogram"].get_attribute("aria-label")
+        assert sum(int(part.split()[0]) for part in told.split("of which ")[1:]) == len(best) - never
+    page.at_rest(0)
+    (line,) = page.browser.all("#episode-chart .threshold")
+    ActionChains(page.browser.driver).move_to_element(line).click_and_hold().move_by_offset(0, 30).release().perform()
+    assert line.get_attribute("data-value") == page.browser["cutoff-told"].text
+    assert float(page.browser["cutoff-told"].text) < 0.95
+
+
+def tick(page: Page, name: str, number: float | None = None) -> None:
+    """Sets a filter, and its number."""
+    if number is not None:
+        page.browser.write(f"number-{name}", f"{number}")
+    page.browser[f"only-{name}"].click()
+
+
+def test_filters_keep_what_they_say_and_tell_how_many(page: Page) -> None:
+    dataset = page.choose(DEMO)
+    summary = summarise(page.folders[DEMO] / "rfm_progress.parquet")
+    assert summary.best_success is not None and summary.disagreement is not None
+    succeeds = summary.best_success >= 0.5
+    expected = {
+        "never": (None, ~succeeds),
+        "low": (0.992, succeeds & (summary.final_progress < 0.992)),
+        "backwards": (7.5, 100 * summary.backwards >= 7.5),
+        "apart": (0.018, summary.disagreement >= 0.018),
+    }
+    for name, (number, keep) in expected.items():
+        tick(page, name, number)
+        assert sorted(page.episodes) == np.flatnonzero(keep).tolist(), name
+        assert 0 < keep.sum() < len(keep)
+        assert page.browser[f"count-{name}"].text == f"{keep.sum()}"
+        tick(page, name)
+    tick(page, "never")
+    tick(page, "backwards")
+    assert sorted(page.episodes) == np.flatnonzero(~succeeds & (100 * summary.backwards >= 7.5)).tolist()
+    tick(page, "never")
+    tick(page, "backwards")
+    page.browser.write("task-part", "GREEN")
+    assert sorted(page.episodes) == [each.index for each in dataset.episodes if "green" in each.task]
+    assert page.browser["shown-told"].text == f"{len(page.episodes)} of {len(dataset.episodes)}"
+
+
+def test_selected_episodes_are_taken_along(page: Page) -> None:
+    dataset = page.choose(DEMO)
+    everything = list(range(len(dataset.episodes)))
+    page.browser["episodes-text"].click()
+    assert page.browser.saved("episodes.txt").decode().split() == [f"{number}" for number in everything]
+    for episode in (7, 2):
+        page.browser.all(f"#episodes tr[data-episode='{episode}'] input")[0].click()
+    assert not page.browser["episode"].is_displayed()  # a tick is no click on the row
+    page.browser["episodes-text"].click()
+    assert page.browser.saved("episodes.txt").decode() == "2\n7\n"
+    page.browser["episodes-json"].click()
+    saved = json.loads(page.browser.saved("episodes.json"))
+    assert (saved["dataset"], saved["labels"], saved["threshold"]) == ("toy_v30_many", "rfm_progress.parquet", 0.5)
+    columns = columns_of(page.folders[DEMO], 7)
+    assert [row["episode"] for row in saved["episodes"]] == [2, 7]
+    assert saved["episodes"][1]["last_success"] == pytest.approx(float(columns["success"][-1]))
+    assert page.browser["use-words"].text == '--dataset.episodes="[2, 7]"'
+    others = [number for number in everything if number not in (2, 7)]
+    for use, ending, away in (("delete", "cleaned", [2, 7]), ("keep", "kept", others)):
+        Select(page.browser["use"]).select_by_value(use)
+        words = shlex.split(page.browser["use-words"].text)
+        options = dict(zip(words[1::2], words[2::2], strict=True))
+        assert words[0] == "lerobot-edit-dataset"
+        assert (options["--repo_id"], options["--root"]) == ("toy_v30_many", "toy_v30_many")
+        assert (options["--new_repo_id"], options["--new_root"]) == (f"toy_v30_many_{ending}",) * 2
+        assert options["--operation.type"] == "delete_episodes"
+        assert json.loads(options["--operation.episode_indices"]) == away
+    page.browser["choose-none"].click()
+    page.browser.write("task-part", "green")
+    page.browser["choose-shown"].click()
+    green = [each.index for each in dataset.episodes if "green" in each.task]
+    assert page.browser["chosen-told"].text == f"{len(green)} that are selected"
+
+
+def test_two_label_files_are_overlaid_and_their_differences_listed(page: Page) -> None:
+    page.choose(DEMO)
+    Select(page.browser["others"]).select_by_visible_text(f"{OTHER}_progress.parquet")
+    page.browser.until("document.getElementById('filter-differ').hidden === false")
+    ours, theirs = (summarise(page.folders[DEMO] / f"{name}_progress.parquet") for name in ("rfm", OTHER))
+    assert ours.best_success is not None and theirs.best_success is not None
+    apart = np.abs(ours.final_progress - theirs.final_progress)
+    differs = (ours.best_success >= 0.5) != (theirs.best_success >= 0.5)
+    page.browser.until("document.querySelector('#episodes tr td:last-child').textContent !== '-'")
+    for row in page.rows:
+        episode = int(row[1].removeprefix("Watch "))
+        assert float(row[9].removesuffix(" ≠")) == pytest.approx(apart[episode], abs=SHOWN)
+        assert row[9].endswith("≠") == differs[episode]
+    Select(page.browser["order"]).select_by_visible_text("labels differ")
+    assert page.episodes == episodes_by(-apart)
+    tick(page, "differ", 0.3)
+    assert sorted(page.episodes) == np.flatnonzero(differs | (apart >= 0.3)).tolist()
+    tick(page, "differ")
+    page.at_rest(2)
+    names = ["all cameras", "front", "wrist", f"all cameras ({OTHER})"]
+    assert [item.text for item in page.browser.all("#episode-legend li")] == names
+    expected = [
+        columns_of(page.folders[DEMO], 2, f"{name}_progress.parquet")["progress_sparse"][0] for name in ("rfm", OTHER)
+    ]
+    np.testing.assert_allclose([page.numbers[0][0], page.numbers[3][0]], expected, rtol=0, atol=SHOWN)
+
+
+def test_the_page_tells_how_the_labels_were_made(page: Page) -> None:
+    page.choose(DEMO)
+    page.browser["made-box"].click()
+    names, texts = ([each.text for each in page.browser.all(f"#made {tag}")] for tag in ("dt", "dd"))
+    told = dict(zip(names, texts, strict=True))
+    file = page.folders[DEMO] / "rfm_progress.parquet"
+    provenance = json.loads(parquet.read_schema(file).metadata[b"rfm.provenance"])
+    rule = f"{provenance['sampling']['rule']}, {provenance['sampling']['frames']} frames"
+    assert (told["Checkpoint"], told["Sampling"]) == (provenance["checkpoint"]["source"], rule)
+    assert (told["Cameras"], told["Written by"]) == ("front, wrist; mean", provenance["writer"])
+    written = datetime.fromtimestamp(file.stat().st_mtime, timezone.utc)
+    assert told["Written"] == f"{written:%Y-%m-%d %H:%M} UTC"
+
+
+def test_ten_thousand_episodes_are_a_few_rows_of_the_document(
+    demo_server: Endpoints, quiet_browser: Browser, tmp_path: Path
+) -> None:
+    root = large(tmp_path / "large", NUM_LARGE)
+    with running(demo_server, tmp_path, "rfm", "--dataset", str(root)) as gateway:
+        page = Page(gateway.url, quiet_browser, (root,))
+        page.open()
+        assert page.browser["shown-told"].text == f"{NUM_LARGE} of {NUM_LARGE}"
+        Select(page.browser["order"]).select_by_visible_text("episode")
+        assert page.episodes[:5] == [0, 1, 2, 3, 4]
+        list_of = "document.getElementById('episode-list')"
+        for share in (0.5, 1):
+            page.browser.run(f"{list_of}.scrollTop = arguments[0] * {list_of}.scrollHeight", share)
+            page.browser.draw()
+            numbers = page.episodes
+            assert len(numbers) < 100
+            assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+            middle = numbers[len(numbers) // 2]
+            assert abs(middle - share * NUM_LARGE) < 50
+        assert numbers[-1] == NUM_LARGE - 1
+        page.browser["choose-shown"].click()
+        assert page.browser["chosen-told"].text == f"{NUM_LARGE} that are selected"
+        page.browser.all(f"#episodes tr[data-episode='{NUM_LARGE - 1}'] button")[0].click()
+        page.browser.until_text("episode-title", f"Episode {NUM_LARGE - 1}")
+        page.browser["episode-before"].click()
+        page.browser.until_text("episode-title", f"Episode {NUM_LARGE - 2}")
+        quiet_browser.driver.get("about:blank")  # before its gateway ends
+
+
+@pytest.mark.parametrize("size", [(1440, 900), (1024, 700)], ids=str)
+def test_an_episode_is_in_view_without_scrolling(page: Page, size: tuple[int, int]) -> None:
+    with page.browser.window(*size):
+        page.at_rest(3)
+        for name in ("episode-videos", "episode-chart", "episode-time"):
+            top, bottom, height = page.browser.run(
+                "const { top, bottom, height } = document.getElementById(arguments[0]).getBoundingClientRect(); "
+                "return [top, innerHeight - bottom, height / innerHeight]",
+                name,
+            )
+            assert min(top, bottom) >= 0, name
+            assert name != "episode-chart" or height >= 0.5
+        page.browser["episode-close"].click()
+        assert page.browser["episode-list"].is_displayed()
 
 
 def test_a_click_plays_the_episode_and_the_curve_follows(page: Page) -> None:
@@ -208,7 +412,7 @@ def test_a_click_plays_the_episode_and_the_curve_follows(page: Page) -> None:
     columns = columns_of(page.folders[BRIGHT], 3)
     last = [[columns[name][-1] for name in ("progress_sparse", "success")]]
     last += [[columns[f"{name}.{camera}"][-1] for name in ("progress", "success")] for camera in CAMERAS]
-    np.testing.assert_allclose(page.numbers, [each * 2 for each in last], rtol=0, atol=SHOWN)
+    np.testing.assert_allclose(page.numbers, last, rtol=0, atol=SHOWN)
 
 
 def test_dragging_in_the_chart_moves_the_videos_and_the_numbers(page: Page) -> None:
@@ -227,7 +431,7 @@ def test_dragging_in_the_chart_moves_the_videos_and_the_numbers(page: Page) -> N
     frame = round(page.browser.times_s(PLAYERS)[-1] * 10)
     names = [("progress_sparse", "success"), *((f"progress.{each}", f"success.{each}") for each in CAMERAS)]
     expected = [[columns[name][frame] for name in pair] for pair in names]
-    np.testing.assert_allclose([row[:2] for row in page.numbers], expected, rtol=0, atol=SHOWN)
+    np.testing.assert_allclose(page.numbers, expected, rtol=0, atol=SHOWN)
 
 
 @pytest.mark.parametrize("number", [DEMO, BRIGHT, *CODED], ids=["v3.0", "v2.1", *CODINGS])
@@ -252,7 +456,11 @@ def test_an_episode_is_put_into_the_score_tab_and_scored(page: Page) -> None:
         assert row[0] == f"toy_v30_many_episode_000000.{camera.rpartition('.')[2]}.mp4"
         assert row[4] == f"{len(columns['index'])} of {len(columns['index'])}"
         expected = [columns[f"{name}.{camera}"][-1] for name in ("progress", "success")]
-        assert [float(text) for text in row[7:9]] == pytest.approx(expected, abs=2 * SHOWN)  # as the labels
+        assert [float(text) for text in row[5:7]] == pytest.approx(expected, abs=2 * SHOWN)  # as the labels
+    run_line(page.folders[DEMO].parent, page.browser["command"].text)
+    again = columns_of(page.folders[DEMO].parent / "toy_v30_many_episode_0", 0)
+    for camera in CAMERAS:
+        np.testing.assert_allclose(again[f"progress.{camera}"], columns[f"progress.{camera}"], rtol=0, atol=TOLERANCE)
 
 
 def test_videos_are_turned_as_they_were_for_the_labels_also_when_they_are_scored(page: Page) -> None:
@@ -267,13 +475,29 @@ def test_videos_are_turned_as_they_were_for_the_labels_also_when_they_are_scored
 
 def test_episodes_without_labels_can_be_watched_and_scored(page: Page) -> None:
     page.choose(PLAIN)
-    assert [row[3:] for row in page.rows] == [["-"] * 5] * 8
+    assert [row[4:] for row in page.rows] == [["-"] * 6] * 8
     assert page.episodes == list(range(8))
     page.at_rest(1)
     assert page.numbers == []
     page.browser["episode-time"].send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
     poll(page.is_at_one_time)
     page.score_episode()
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
+def test_no_tab_is_wider_than_the_window(page: Page, size: tuple[int, int], theme: str) -> None:
+    """It leaves a picture of each tab among the downloads."""
+    page.choose(DEMO)
+    page.at_rest(3)
+    page.score_episode()
+    with page.browser.window(*size), page.browser.theme(theme):
+        for tab in ("score", "dataset", "live"):
+            page.browser[f"{tab}-tab"].click()
+            page.browser.draw()
+            name = f"{tab}_{size[0]}x{size[1]}_{theme}.png"
+            assert page.browser.driver.save_screenshot(str(page.browser.downloads / name))
+            assert page.browser.run(BEYOND) == [0] * 4, name
 
 
 def test_axe_finds_nothing_in_either_theme(page: Page) -> None:

@@ -26,7 +26,7 @@ from pictures import TURNS, turn
 from rfm_client.contract.settings import ConfigError
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.orientation import Orient
-from rfm_client.labelling import LabelOptions, label, open_dataset, summarise
+from rfm_client.labelling import LabelOptions, label, open_dataset
 from rfm_client.labelling.options import Format
 from rfm_gateway.config import GatewayConfig
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew
@@ -65,8 +65,6 @@ def get(folders: list[Path]) -> Iterator[Get]:
 def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: list[Path], number: int) -> None:
     told = get(f"/{number}").json()
     root = folders[number]
-    summary = summarise(root / "rfm_progress.parquet")
-    assert summary.never_succeed is not None
     episodes = LeRobotDataset(root).episodes
     assert [(each["episode"], each["task"], each["num_frames"]) for each in told["episodes"]] == [
         (episode.index, episode.task, episode.num_frames) for episode in episodes
@@ -77,14 +75,15 @@ def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: 
         expected = {
             "final_progress": columns["progress_sparse"][-1],
             "best_success": columns["success"].max(),
+            "last_success": columns["success"][-1],
             "backwards": (np.diff(columns["progress_sparse"]) < -0.01).mean(),
             "disagreement": apart.mean(),
         }
         assert {name: row[name] for name in expected} == pytest.approx(expected, abs=1e-6)
-        assert row["never_succeeds"] == (columns["success"].max() < 0.5) == (row["episode"] in summary.never_succeed)
-    counts, edges = np.histogram(summary.final_progress, bins=20, range=(0, 1))
-    assert told["bins"] == {"edges": edges.tolist(), "counts": counts.tolist()}
     assert (told["labels"], told["cameras"], told["threshold"]) == ("rfm_progress.parquet", list(CAMERAS), 0.5)
+    file = root / "rfm_progress.parquet"
+    assert told["provenance"] == json.loads(parquet.read_schema(file).metadata[b"rfm.provenance"])
+    assert told["written_s"] == pytest.approx(file.stat().st_mtime)
 
 
 @pytest.mark.parametrize("form", ["progress", "signals"])
@@ -265,11 +264,10 @@ def test_labels_of_others_may_lack_success_and_rows(tmp_path: Path) -> None:
     table = pa.table({**identity, "progress_sparse": progress})
     parquet.write_table(table.filter(pa.array(identity["frame_index"] != 5)), root / "sarm_progress.parquet")
     with serving(root) as get:
-        first, second, third, *_ = (rows := get("/0").json())["episodes"]
+        first, second, third, *_ = get("/0").json()["episodes"]
         assert first["final_progress"] is None
         assert second["final_progress"] == pytest.approx(1.5)
         assert first.keys() == second.keys() == third.keys() | {"final_progress", "backwards"}
-        assert sum(rows["bins"]["counts"]) == rows["bins"]["counts"][-1] == 1
         (curve,) = get("/0/episodes/0").json()["curves"]
         missing = [t for t, value in enumerate(curve["progress"]) if value is None]
         assert (missing, curve["success"]) == ([3, 5, lengths[0] - 1], None)

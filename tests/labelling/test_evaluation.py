@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
+import shutil
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,14 +18,25 @@ import pytest
 from pyarrow import parquet
 from typer.testing import CliRunner
 
-from labelling import BrightnessScorer
+from labelling import FEW, BrightnessScorer
 from rfm_client.cli.commands import app
-from rfm_client.labelling import DatasetError, LabelOptions, evaluate_labels, label, open_dataset, read_outcomes
+from rfm_client.labelling import (
+    DatasetError,
+    LabelOptions,
+    Watch,
+    evaluate_labels,
+    label,
+    open_dataset,
+    read_outcomes,
+)
+from rfm_client.labelling.cost import Cost
 from rfm_client.labelling.evaluation import kendall, spearman
+from rfm_client.labelling.label_files import read_cost
 from shown_datasets import copied
 
 Curves = Mapping[int, Sequence[float]]
 
+QUIET = Watch()
 RISING, FALLING, FLAT = [0.0, 0.2, 0.5, 0.9], [0.9, 0.5, 0.2, 0.0], [0.3] * 4
 
 
@@ -94,6 +108,57 @@ def test_many_episodes_take_a_moment(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     file = labels(tmp_path / "a.parquet", {each: random.random(20) for each in range(3000)})
     assert evaluate_labels([file], {each: each % 2 == 0 for each in range(3000)}).evaluations[0].num_frames == 60_000
+
+
+def test_the_cost_is_that_of_the_frames_that_the_run_scored(tmp_path: Path) -> None:
+    dataset, output = open_dataset(copied("toy_v30_many", tmp_path)), tmp_path / "labels"
+    request_s = 0.05  # and each episode is one request
+
+    def frames_per_s(scorer: BrightnessScorer, watch: Watch = QUIET, **options: Any) -> float | None:
+        label(dataset, scorer, LabelOptions(output=output, workers=1, **{**FEW, **options}), watch)
+        files = output / "rfm_progress.parquet", output / "reward_signals" / "rfm.parquet"
+        (rate,) = {each.frames_per_s for each in evaluate_labels(files).evaluations}
+        return rate
+
+    def check(episodes: range, watch: Watch = QUIET) -> float | None:
+        """Return the rate that the files tell, which is that of five episodes."""
+        scorer, began_s = BrightnessScorer(request_s), time.monotonic()
+        rate = frames_per_s(scorer, watch, episodes=episodes)
+        took_s = time.monotonic() - began_s
+        cost = read_cost(output / "rfm_progress.parquet")
+        assert cost is not None
+        assert cost.frames == scorer.num_samples
+        assert 5 * request_s < cost.seconds < took_s
+        assert rate == cost.frames / cost.seconds
+        return rate
+
+    check(range(5))
+    rate = check(range(5, 10))  # the labels of the first five are kept
+    for _ in range(2):
+        assert frames_per_s(BrightnessScorer()) == rate  # nothing was scored
+        shutil.rmtree(output / ".rfm_parts")
+    assert frames_per_s(BrightnessScorer(), frames=3, overwrite=True) not in (rate, None)
+    assert frames_per_s(BrightnessScorer(), overwrite=True, parts=str(tmp_path / "parts")) is not None
+    frames_per_s(BrightnessScorer(), frames=3, overwrite=True)
+    assert frames_per_s(BrightnessScorer(), overwrite=True, parts=str(tmp_path / "parts")) is None  # the other recipe's
+
+    class Meanwhile(Watch):
+        def begin(self, num_frames: int, num_finished: int) -> None:
+            frames_per_s(BrightnessScorer(), episodes=range(5))
+
+    shutil.rmtree(output)
+    check(range(10), Meanwhile())
+
+
+def test_a_file_that_does_not_say_its_cost_has_none(tmp_path: Path) -> None:
+    file = labels(tmp_path / "a.parquet", {0: RISING})
+    (found,) = evaluate_labels([file]).evaluations
+    assert found.frames_per_s is None
+    done = CliRunner().invoke(app, ["evaluate", str(tmp_path), "--labels", str(file)])
+    assert re.search(r"frames/s.*\n.*\n  a .* -\s", done.stdout), done.output
+    for told in ("soon", "[]", '{"frames": 3}', '{"frames": 0, "seconds": 1.0}', '{"frames": 3, "seconds": NaN}'):
+        assert Cost.parse(told.encode()) is None
+    assert Cost.parse(Cost(3, 0.5).json()) == Cost(3, 0.5)
 
 
 def written(file: Path, text: str) -> str:

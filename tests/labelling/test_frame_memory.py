@@ -34,10 +34,10 @@ class LongVideos(Dataset):
     kind, source, cameras = "made up", "long videos", ("front",)
 
     def __init__(self, root: Path, num_episodes: int, num_more: int = 0) -> None:
-        self.root, self.num_episodes, self.num_more = root, num_episodes, num_more
+        self.root, self.numbers, self.num_more = root, range(num_episodes), num_more
 
-    def read_episodes(self) -> list[DatasetEpisode]:
-        return [DatasetEpisode(i, f"video {i}", "wait", NUM_FRAMES, i * NUM_FRAMES) for i in range(self.num_episodes)]
+    def read_episode(self, number: int) -> DatasetEpisode:
+        return DatasetEpisode(number, f"video {number}", "wait", NUM_FRAMES, number * NUM_FRAMES)
 
     def decoder(self, camera: str) -> None:
         return None

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 import labelling
-from labelling import FEW, LEROBOT, BrightnessScorer, Notes, PickyScorer
+from labelling import FEW, LEROBOT, BrightnessScorer, Notes, PickyScorer, without_cost
 from rfm_client import ProgressResult, ServerUnavailableError
 from rfm_client.labelling import DatasetError, LabelOptions, label, open_dataset
 
@@ -27,7 +27,7 @@ NUM_FRAMES = 428
 
 
 def contents(output: Path) -> list[bytes]:
-    return [(output / name).read_bytes() for name in FILES]
+    return [without_cost(output / name) for name in FILES]
 
 
 def parts_of(output: Path) -> list[str]:

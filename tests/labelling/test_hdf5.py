@@ -393,3 +393,65 @@ def test_labels_say_which_cameras_are_turned_and_which_are_left_out(demos: Path)
     notes = Notes()
     label(dataset, BrightnessScorer(), LabelOptions(cameras=CAMERAS[:1], name="front"), notes)
     assert not [line for line in notes.lines if "tactile" in line or CAMERAS[1] in line]
+
+
+def test_a_demonstration_s_own_task_goes_before_that_of_the_file(demos: Path) -> None:
+    with h5py.File(demos, "r+") as opened:
+        opened["data/demo_1"].attrs["ep_meta"] = json.dumps({"lang": "close the drawer", "layout_id": 3})
+        opened["data/demo_2"].attrs["language_instruction"] = np.bytes_("turn on the stove")
+        opened["data/demo_0"].attrs["ep_meta"] = json.dumps({"layout_id": 3})
+    tasks = [TASK, "close the drawer", "turn on the stove"]
+    assert [episode.task for episode in open_dataset(demos).episodes] == tasks
+    with h5py.File(demos, "r+") as opened:
+        del opened["data"].attrs["problem_info"]
+    assert [open_dataset(demos).episode(number).task for number in (1, 2)] == tasks[1:]
+    with pytest.raises(DatasetError, match=r"demo_0: ep_meta, or data: problem_info or env_args: expected a task as a"):
+        open_dataset(demos).episode(0)
+    assert [episode.task for episode in open_dataset(demos, task="stack").episodes] == ["stack", *tasks[1:]]
+
+
+MASKS = {"train": ["demo_2", "demo_0"], "valid": ["demo_1"], "gone": ["demo_7"]}
+
+
+@pytest.fixture
+def masked(demos: Path) -> Path:
+    with h5py.File(demos, "r+") as opened:
+        for key, names in MASKS.items():
+            opened[f"mask/{key}"] = np.array(names, dtype="S8")  # as robomimic's split_train_val.py
+    return demos
+
+
+def test_a_filter_key_chooses_demonstrations_and_labels_of_others_stay(masked: Path) -> None:
+    assert open_dataset(masked).filter_keys == {"gone": [7], "train": [0, 2], "valid": [1]}
+    report = label(open_dataset(masked), BrightnessScorer(), LabelOptions(filter_key="train"))
+    assert [item.episode.name for item in report.plan.items] == ["demo_0", "demo_2"]
+    assert set(rewards_in(report.files[0])) == {"demo_0", "demo_2"}
+    scorer = BrightnessScorer()
+    report = label(open_dataset(masked), scorer, LabelOptions(filter_key="valid"))
+    assert scorer.num_samples == LENGTHS[1] * len(CAMERAS)
+    assert set(rewards_in(report.files[0])) == {"demo_0", "demo_1", "demo_2"}
+
+
+FILTERS: dict[str, tuple[LabelOptions, str]] = {
+    "another key": (LabelOptions(filter_key="test"), "filter_key: expected one of gone, train, valid, got 'test'"),
+    "no episode of both": (
+        LabelOptions(filter_key="valid", episodes=[0, 2]),
+        "filter_key: expected some of the 3 episodes of the dataset, got none in valid",
+    ),
+    "an episode that is not there": (LabelOptions(filter_key="gone"), "filter_key: expected some .* got 7 in gone"),
+}
+
+
+@pytest.mark.parametrize(("options", "message"), FILTERS.values(), ids=FILTERS)
+def test_a_filter_key_without_episodes_is_refused(masked: Path, options: LabelOptions, message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        label(open_dataset(masked), BrightnessScorer(), options)
+
+
+def test_a_filter_key_needs_a_file_that_has_it(demos: Path) -> None:
+    with h5py.File(demos, "r+") as opened:
+        opened["mask/train"] = np.array([3])  # no names of demonstrations
+    with pytest.raises(
+        DatasetError, match="filter_key: expected one of none, since the dataset has no filter keys, got"
+    ):
+        label(open_dataset(demos), BrightnessScorer(), LabelOptions(filter_key="train"))

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
+from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, without_cost
 from rfm_client.labelling import DatasetError, LabelOptions, label, open_dataset
 
 TOY = LEROBOT / "toy_v30_many"
@@ -32,15 +32,22 @@ def labelled(root: Path, output: Path, **options: Any) -> tuple[int, list[str]]:
 
 
 def labels(output: Path) -> dict[str, bytes]:
-    files = [file for file in sorted(output.rglob("*.parquet")) if ".rfm_parts" not in file.parts]
-    return {str(file.relative_to(output)): file.read_bytes() for file in files}
+    return {str(file.relative_to(output)): file.read_bytes() for file in label_files(output)}
+
+
+def labels_without_cost(output: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(output)): without_cost(file) for file in label_files(output)}
+
+
+def label_files(output: Path) -> list[Path]:
+    return [file for file in sorted(output.rglob("*.parquet")) if ".rfm_parts" not in file.parts]
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     output = tmp_path_factory.mktemp("undisturbed")
     labelled(TOY, output)
-    return labels(output)
+    return labels_without_cost(output)
 
 
 @pytest.mark.parametrize(
@@ -63,8 +70,9 @@ def test_labels_of_further_episodes_are_joined_to_those_that_are_there(
     scored, notes = labelled(TOY, output, formats=formats)
     assert scored == EPISODE_FRAMES[9]
     assert not any("episodes have labels" in line for line in notes)
-    assert labels(output) == {name: content for name, content in undisturbed.items() if name in labels(output)}
-    assert len(labels(output)) == (len(formats) or 2)
+    found = labels_without_cost(output)
+    assert found == {name: content for name, content in undisturbed.items() if name in found}
+    assert len(found) == (len(formats) or 2)
 
 
 OTHERS: dict[str, tuple[BrightnessScorer, dict[str, Any], str]] = {

@@ -189,9 +189,12 @@ def test_the_files_have_the_documented_form(output: Path) -> None:
 
     metadata = {key.decode(): value.decode() for key, value in signals.schema.metadata.items()}
     own = {key.removeprefix("lerobot.reward_scoring."): value for key, value in metadata.items()}
-    own_names = ["descriptors", "episode_indices", "format", "provenance", "rfm.episodes", "schema_version"]
+    own_names = ["descriptors", "episode_indices", "format", "provenance", "rfm.cost", "rfm.episodes", "schema_version"]
     assert sorted(own) == own_names
     assert sorted(json.loads(own["rfm.episodes"])) == ["1", "2"]
+    assert json.loads(own["rfm.cost"]).keys() == {"frames", "seconds"}
+    assert json.loads(own["rfm.cost"])["frames"] == len(signals)
+    assert progress.schema.metadata[b"rfm.cost"] == signals.schema.metadata[b"rfm.cost"]
     assert progress.schema.metadata[b"rfm.episodes"] == signals.schema.metadata[b"rfm.episodes"]
     assert (own["format"], own["schema_version"], own["episode_indices"]) == ("lerobot.frame_signals", "1", "[1,2]")
     descriptors = json.loads(own["descriptors"])

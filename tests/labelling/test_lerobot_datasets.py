@@ -308,9 +308,9 @@ CONTRADICTIONS: dict[str, dict[str, tuple[Break, str]]] = {
             cells(V30_ROWS, "task_index", lambda values: [9] * 58 + values[58:]),
             r"episode 0: task 9 in meta/tasks: expected a task as a sentence, got none",
         ),
-        "two tasks in an episode": (
+        "a second task that the metadata lack": (
             cells(V30_ROWS, "task_index", at(3, lambda _: 4)),
-            r"episode 0: .*task_index: expected one task in an episode, got 2: \[0, 4\]",
+            r"episode 0: meta/episodes: tasks: expected 'put the .*', got \['put the .*'\]",
         ),
         "no metadata of episodes": (
             lambda root: shutil.rmtree(root / "meta" / "episodes"),

@@ -37,6 +37,7 @@ from rfm_commands.config import Config
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 DOCKER = ROOT / "docker"
+REPOSITORY = ROOT / "model_repository"
 DOCKERFILE = (DOCKER / "Dockerfile").read_text()
 COMPOSE = yaml.safe_load((DOCKER / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
@@ -258,6 +259,22 @@ def test_the_image_serves_and_its_health_check_tells(
     assert gone.returncode == UNAVAILABLE, gone.stderr
 
 
+@pytest.mark.nightly
+def test_the_image_alone_exports_and_serves_what_it_exported(image: Image, tmp_path: Path) -> None:
+    """With `serve.yaml`, as the guide exports with it."""
+    config = next(config for config in goldens.VLM if not config.is_bfloat16)
+    sources = [f"--{name.replace('_', '-')}={source}" for name, source in config.sources.items()]
+    words = ["--checkpoint", config.checkpoint, *sources, "--config", DOCKER / "serve.yaml", "--num-gpus", "0"]
+    repository, endpoints = tmp_path / "my_models", Endpoints.free()
+    told = image.said("rfm", "export", *words, "--repository", repository)
+    assert told == f"{repository}: rfm version 1, scores equal to the checkpoint's\n"
+    ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
+    options = [f"--{name}-port={port}" for name, port in ports.items()]
+    with image.started(*ENTRYPOINT, *options, "--repository", repository):
+        image.said("rfm-client", "wait", "--url", endpoints.grpc_url, "--timeout", "100")
+        image.said("sh", DOCKER / "health.sh", RFM_URL=endpoints.grpc_url)
+
+
 def check_gateway(image: Image, endpoints: Endpoints) -> None:
     """The compose file's gateway, on this machine's addresses: its health check waits for it, and is true."""
     gateway, port = SERVICES["gateway"], str(Endpoints.free().http_port)
@@ -300,8 +317,24 @@ def test_every_service_is_confined(name: str) -> None:
     assert "healthcheck" in service or name in OURS  # the image has its own
     assert "HEALTHCHECK" in DOCKERFILE
     for volume in service.get("volumes", []):
-        source = VARIABLE.sub(r"\2", volume).partition(":")[0]
-        assert source in COMPOSE["volumes"] or (DOCKER / source).exists(), source
+        source, target, *_ = VARIABLE.sub(r"\2", volume).split(":")
+        is_the_users = target == "/models"
+        assert is_the_users or source in COMPOSE["volumes"] or (DOCKER / source).exists(), source
+
+
+@pytest.mark.parametrize(("profile", "name"), [("gpu", "server"), ("cpu", "server-cpu")])
+def test_the_repository_that_the_guide_exports_is_served_unless_another_is_named(profile: str, name: str) -> None:
+    """With the profile gpu, on the GPU."""
+    guide = (ROOT / "docs" / "guides" / "gpu_box.md").read_text()
+    for variables, source in (({}, "/srv/rfm/my_models"), ({"RFM_MODELS": "../model_repository"}, REPOSITORY)):
+        service = composed(profile, **variables)["services"][name]
+        (volume,) = service["volumes"]
+        bound = volume.split(":")[:2] if isinstance(volume, str) else [volume["source"], volume["target"]]
+        assert bound == [str(source), "/models"]
+    assert "--repository /srv/rfm/my_models" in guide
+    assert SERVICES[name]["command"][0] == "--repository=/models"
+    devices = SERVICES[name]["deploy"]["resources"].get("reservations", {}).get("devices", [])
+    assert [device["driver"] for device in devices] == (["nvidia"] if profile == "gpu" else [])
 
 
 def test_prometheus_has_the_secrets_that_its_configuration_names() -> None:

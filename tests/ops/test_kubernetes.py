@@ -329,8 +329,51 @@ def test_the_autoscaler_s_metric_is_recorded_and_handed_on(folder: str) -> None:
 
 
 def test_what_the_readme_applies_is_there() -> None:
-    applied = re.findall(r"-k docker/kubernetes/([\w/]+)", (KUBERNETES / "README.md").read_text())
-    assert set(applied) == set(SETS)
+    readme = (KUBERNETES / "README.md").read_text()
+    assert set(re.findall(r"-k docker/kubernetes/([\w/]+)", readme)) == set(SETS)
+    files = re.findall(r"-f docker/(kubernetes/[\w/.]+)", readme)
+    assert [(ROOT / "docker" / file).is_file() for file in files] == [True] * 3
+
+
+def test_what_must_be_changed_stands_before_the_first_command_and_a_check_after_the_last() -> None:
+    readme = (KUBERNETES / "README.md").read_text()
+    assert "kubectl apply" not in readme.partition("## 2.")[0]
+    headings = re.findall(r"^## (\d.*)$", readme, re.MULTILINE)
+    assert headings == ["1. What to change", "2. Namespace and keys", "3. The repository", "4. Apply", "5. Check"]
+
+
+@pytest.mark.parametrize("release", RELEASES)
+def test_the_pod_that_copies_fits_its_schema_the_namespace_and_the_servers(release: str) -> None:
+    pod = yaml.safe_load((KUBERNETES / "copy.yaml").read_text())
+    validate(pod, release)
+    (container,) = pod["spec"]["containers"]
+    context = {**pod["spec"]["securityContext"], **container["securityContext"]}
+    assert {name: context[name] for name in SECURITY} == SECURITY
+    server = pod_of(named("overlays/gpu", "Deployment", "rfm-triton"))
+    assert pod["spec"]["securityContext"]["fsGroup"] == server["securityContext"]["fsGroup"]
+    (claim,) = (volume["persistentVolumeClaim"] for volume in server["volumes"] if "persistentVolumeClaim" in volume)
+    (volume,) = pod["spec"]["volumes"]
+    assert volume["persistentVolumeClaim"] == {"claimName": claim["claimName"]}  # which it may write
+    (mount,) = container["volumeMounts"]
+    assert (mount["name"], mount["mountPath"]) == (volume["name"], "/models")
+    assert container["readinessProbe"]["exec"]["command"] == ["test", "-d", "/models/model_repository"]
+
+
+def test_the_command_that_copies_the_repository_copies_it_and_adds_a_version(tmp_path: Path) -> None:
+    """Run in a folder in the pod's place."""
+    (command,) = re.findall(r"^    (tar .*)$", (KUBERNETES / "README.md").read_text(), re.MULTILINE)
+    mine, pod = tmp_path / "my_models", tmp_path / "pod" / "models" / "model_repository"
+    shutil.copytree(ROOT / "model_repository" / "rfm", mine / "rfm")
+    pod.mkdir(parents=True)
+    in_the_pod = 'kubectl() { while [ "$1" != -- ]; do shift; done; shift; "$@"; }'
+    script = f"{in_the_pod}\n{command.replace('/models', str(pod.parent))}"
+    for version in ("1", "2"):
+        if version == "2":
+            shutil.copytree(mine / "rfm" / "1", mine / "rfm" / "2")
+        subprocess.run(["bash", "-euo", "pipefail", "-c", script], cwd=tmp_path, check=True)
+        copied = {file.relative_to(pod): file.read_bytes() for file in pod.rglob("*") if file.is_file()}
+        assert copied == {file.relative_to(mine): file.read_bytes() for file in mine.rglob("*") if file.is_file()}
+        assert Path("rfm") / version / "model.py" in copied
 
 
 def test_the_probes_tell_a_living_model_from_a_dead_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

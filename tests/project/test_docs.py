@@ -24,6 +24,7 @@ from click import Command, Context, Parameter
 from typer.main import get_command
 
 import clip
+import toy_dataset
 from labelling import LEROBOT
 from paths import ROOT
 from rfm.launch.triton_server import Endpoints
@@ -94,6 +95,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         f"{episode.index},{episode.index % 2}\n" for episode in open_dataset(tmp_path / "my_dataset").episodes
     )
     (tmp_path / "outcomes.csv").write_text(f"episode,success\n{outcomes}")
+    toy_dataset.write(tmp_path / "demo_output" / "toy", clips=2)
     np.savez(tmp_path / "episode.npz", frames=pictures(0), task="stack the cups")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -153,8 +155,9 @@ def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: 
     for shown, served in SERVED_AS.items():
         command = command.replace(shown, served)
     if command.startswith("rfm-client evaluate"):
-        labels = re.findall(r"my_dataset/(\w+)_progress\.parquet", command) or ["rfm"]
-        command = " && ".join([*(f"rfm-client label my_dataset --name {name}" for name in labels), command])
+        dataset = command.split()[2]
+        labels = re.findall(rf"{dataset}/(\w+)_progress\.parquet", command) or ["rfm"]
+        command = " && ".join([*(f"rfm-client label {dataset} --name {name}" for name in labels), command])
     environment = {
         **os.environ,
         "RFM_URL": demo_server.grpc_url,

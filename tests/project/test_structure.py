@@ -62,6 +62,7 @@ EXCEPTIONS = {
     "benchmarks/contestants.py": {"rfm", "rfm_commands", "rfm_export"},
     "benchmarks/engine.py": {"rfm", "rfm_export"},
     "benchmarks/perf_analyzer.py": {"rfm"},
+    "benchmarks/real_size.py": {"rfm"},
     "benchmarks/peers/engines.py": {"rfm"},  # the peers score with our engine, or weights
     "benchmarks/peers/litserve_server.py": {"rfm"},
     "benchmarks/peers/upstream_forward.py": {"rfm"},
@@ -72,8 +73,9 @@ LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last fo
 EXTRAS = {
     "av": {"video_decoding.py"},
     "async_timeout": {"deadline.py"},  # Python 3.10 only
-    "PIL": {"resize.py", "lerobot.py"},
-    "gymnasium": {"gym.py", "gym_vector.py"},
+    "PIL": {"resize.py", "stored_pictures.py"},
+    "gymnasium": {"gym.py", "gym_vector.py", "sb3.py"},
+    "stable_baselines3": {"sb3.py"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"cli", "plot.py"},

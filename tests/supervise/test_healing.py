@@ -96,7 +96,7 @@ def test_what_dies_stops_hangs_or_is_silent_is_healed_and_no_call_is_lost_until_
 
         wait_for(kill)
     assert served.process.returncode == 1
-    wanted = r"rfm: triton: expected to run, got 6 faults, each within 63 s of a start; the last: .*exit status -9"
+    wanted = r"rfm: triton: expected to run, got 6 faults in a row; the last: .*exit status -9"
     assert re.fullmatch(wanted, served.said[-1]), served.said
 
 
@@ -147,7 +147,7 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
         assert served.said == []
         config.write_text(one_version)
 
-        with pytest.raises(ServerUnavailableError, match="ended under this request twice"):
+        with pytest.raises(ServerUnavailableError, match="ended twice during this request"):
             client.progress(trajectory(99, mark=DEADLY))
         # A process that dies before the supervisor has seen its command line counts as Triton's.
         wait_for(lambda: served.restarts(MODEL, "triton") == 2)
@@ -223,7 +223,7 @@ def test_a_crash_loop_is_many_faults_each_soon_after_a_start(monkeypatch: pytest
     assert [run_for(1.0) for _ in range(MOST)] == [0, 0.5, 1, 2, 4]
     assert run_for(STEADY_S) == 0
     assert [run_for(1.0) for _ in range(MOST - 1)] == [0.5, 1, 2, 4]
-    wanted = r"^gateway: expected to run, got 6 faults, each within 60 s .* last: why$"
+    wanted = r"^gateway: expected to run, got 6 faults in a row; the last: why$"
     with pytest.raises(CrashLoopError, match=wanted):
         run_for(1.0)
     ends = BackOff("triton")

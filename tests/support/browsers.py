@@ -23,6 +23,7 @@ from rfm_client.contract.samples import UInt8Array
 IMAGES_VARIABLE = "RFM_IMAGES"  # a folder for new pictures of the documents
 AXE = Path(__file__).parents[1] / "gateway" / "vendored" / "axe-core" / "axe.min.js"
 WINDOW_PX = (1280, 1400)
+PICTURE_PX = (1440, 900)
 QUIET = (  # nothing but the page asks for anything
     "--disable-background-networking", "--disable-component-update", "--disable-default-apps", "--disable-sync",
     "--no-first-run", "--no-default-browser-check", "--disable-features=OptimizationHints,MediaRouter",
@@ -57,11 +58,11 @@ class Browser:
         self[name].send_keys(text)
 
     def drop(self, files: Sequence[Path]) -> None:
-        """Drops files onto the page, as a person does with the mouse."""
+        """Drops files onto the middle of the page, as a person does with the mouse."""
         data = {"items": [], "files": [str(file) for file in files], "dragOperationsMask": 1}
-        box = self["drop"].rect
+        x, y = self.run("return [innerWidth / 2, innerHeight / 2]")
         for kind in ("dragEnter", "dragOver", "drop"):
-            event = {"type": kind, "x": box["x"] + 20, "y": box["y"] + 20, "data": data}
+            event = {"type": kind, "x": x, "y": y, "data": data}
             self.driver.execute_cdp_cmd("Input.dispatchDragEvent", event)
 
     def until(self, script: str) -> Any:
@@ -83,6 +84,15 @@ class Browser:
         """The text of each cell of the table rows that a selector finds."""
         script = "[...row.children].map((cell) => cell.textContent)"
         return list(self.run(f"return [...document.querySelectorAll('{rows}')].map((row) => {script})"))
+
+    def draw(self) -> None:
+        """Waits until the browser has drawn the page as it is now."""
+        self.driver.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+
+    def values(self, chart: str, signal: str) -> dict[str, str]:
+        """The numbers of a signal beside the lines of a chart, by the names of its curves."""
+        spans = f"document.querySelectorAll('#{chart} .values span[data-signal={signal}]')"
+        return dict(self.run(f"return [...{spans}].map((each) => [each.dataset.curve, each.textContent])"))
 
     def times_s(self, players: str) -> list[float]:
         """Where the videos and sliders are that a selector finds."""
@@ -131,18 +141,24 @@ class Browser:
         )
         return [(each["id"], each["impact"], [node["html"] for node in each["nodes"]]) for each in found]
 
-    def picture(self, name: str) -> None:
-        """Saves a picture of the whole page."""
-        file = Path(os.environ.get(IMAGES_VARIABLE, self.downloads)) / name
-        self.run("document.activeElement.blur(); scrollTo(0, 0)")
-        size = {"width": 1100, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
+    @contextmanager
+    def window(self, width: int, height: int) -> Iterator[None]:
+        """The page in a window of another size."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         try:
-            for _ in range(2):  # its height depends on its width
-                self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-                size["height"] = self.run("return document.documentElement.scrollHeight")
-            assert self.driver.save_screenshot(str(file))
+            yield
         finally:
             self.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+    def picture(self, name: str) -> None:
+        """Saves a picture of the page for the documents."""
+        file = Path(os.environ.get(IMAGES_VARIABLE, self.downloads)) / name
+        self.run("document.activeElement.blur()")
+        with self.window(*PICTURE_PX):
+            self.run("for (const each of document.querySelectorAll('.work')) each.scrollTo(0, 0)")
+            self.draw()
+            assert self.driver.save_screenshot(str(file))
         assert file.read_bytes().startswith(b"\x89PNG\r\n")
 
     def complaints(self) -> list[str]:

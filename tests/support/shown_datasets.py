@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
+import pyarrow as pa
 from pyarrow import parquet
 
 from encoding import encode
@@ -40,3 +42,29 @@ def encoded_anew(video: Path, codec: str, options: dict[str, str], noise: np.ran
     if noise is not None:
         frames = [noise.integers(0, 256, frame.shape, np.uint8) for frame in frames]
     encode(video, frames, codec, options)
+
+
+def large(root: Path, num_episodes: int, seed: int = 0) -> Path:
+    """A LeRobot v3.0 dataset of so many episodes of two frames, without videos, and labels of it."""
+    source, numbers = LEROBOT / "toy_v30_many", np.arange(num_episodes)
+    (root / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
+    (root / "data" / "chunk-000").mkdir(parents=True)
+    shutil.copy(source / "meta" / "tasks.parquet", root / "meta")
+    info = json.loads((source / "meta" / "info.json").read_text())
+    info["features"] = {name: each for name, each in info["features"].items() if each["dtype"] != "video"}
+    info |= {"total_episodes": num_episodes, "total_frames": 2 * num_episodes}
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    zeros, identity = np.zeros_like(numbers), {"index": np.arange(2 * num_episodes), "episode_index": numbers.repeat(2)}
+    identity["frame_index"] = np.tile([0, 1], num_episodes)
+    file = Path("chunk-000", "file-000.parquet")
+    episodes = {"episode_index": numbers, "length": zeros + 2, "data/chunk_index": zeros, "data/file_index": zeros}
+    names = parquet.read_table(root / "meta" / "tasks.parquet").to_pandas().index.tolist()
+    episodes |= {"tasks": [[names[0]]] * num_episodes}
+    episodes |= {"dataset_from_index": 2 * numbers, "dataset_to_index": 2 * numbers + 2}
+    parquet.write_table(pa.table(episodes), root / "meta" / "episodes" / file)
+    rows = {**identity, "timestamp": np.float32(identity["frame_index"] / 10), "task_index": zeros.repeat(2)}
+    parquet.write_table(pa.table(rows), root / "data" / file)
+    random = np.random.default_rng(seed)
+    scores = {name: np.float32(random.random(2 * num_episodes)) for name in ("progress_sparse", "success")}
+    parquet.write_table(pa.table({**identity, **scores}), root / "rfm_progress.parquet")
+    return root

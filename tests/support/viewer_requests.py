@@ -57,15 +57,21 @@ def curve_of(told: Sequence[tuple[str, Json]]) -> Json:
     return {"progress": progress, "success": success, "frame_times_s": video["times_s"]}
 
 
-def by_command_line(folder: Path, command: str) -> Json:
-    """What a command line of ``rfm-client`` writes to the JSON file that it names, run in this folder."""
+def run_line(folder: Path, command: str) -> list[str]:
+    """Runs a command line of ``rfm-client`` in this folder, as a person does who copies it; gives its words."""
     program, *words = shlex.split(command)
     assert program == "rfm-client"
     here = Path.cwd()
-    os.chdir(folder)  # as a person does, who copies the line
+    os.chdir(folder)
     try:
         done = invoke(*words)
-        assert done.exit_code == 0, done.output
-        return dict(json.loads(Path(words[words.index("--json") + 1]).read_text()))
     finally:
         os.chdir(here)
+    assert done.exit_code == 0, done.output
+    return words
+
+
+def by_command_line(folder: Path, command: str) -> Json:
+    """What a command line of ``rfm-client`` writes to the JSON file that it names, run in this folder."""
+    words = run_line(folder, command)
+    return dict(json.loads((folder / words[words.index("--json") + 1]).read_text()))

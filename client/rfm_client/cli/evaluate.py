@@ -22,7 +22,7 @@ HELPS = {"plot": "Draw histograms of progress at the last frame: .png, .pdf or .
 LEGEND = (
     "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, and of progress, at the last frame; "
     "0.5 is chance. Threshold: of success at the last frame, with the best balanced accuracy. Falls: steps on which "
-    "progress falls by more than 0.01."
+    "progress falls by more than 0.01. Frames/s: of the run that labelled, with decoding."
 )
 
 
@@ -68,7 +68,7 @@ def evaluate(
 def tables(comparison: LabelComparison) -> list[Table]:
     """Return a table of the models, and a table of each pair's agreement."""
     known, rows = comparison.is_success, []
-    columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls"]
+    columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls", "frames/s"]
     if known is not None:
         columns[5:5] = ["of successes", "of failures", "AUROC success", "AUROC progress", "threshold", "accuracy"]
     for each in comparison.evaluations:
@@ -80,7 +80,7 @@ def tables(comparison: LabelComparison) -> list[Table]:
             cells += [number(ranking.auroc if ranking else None, 3) for ranking in (success, progress)]
             cells.append(number(success.threshold if success else None, 3))
             cells.append(number(success.balanced_accuracy if success else None, 3))
-        rows.append([*cells, f"{each.backwards:.1%}"])
+        rows.append([*cells, f"{each.backwards:.1%}", number(each.frames_per_s, 1)])
     counts = f"{len(comparison.episodes)} episodes"
     if known is not None:
         counts += f": {int(known.sum())} successes, {int((~known).sum())} failures"

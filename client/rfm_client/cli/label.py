@@ -19,8 +19,9 @@ from rfm_client.cli.options import CredentialsGiven, ServerOptions, credentials_
 from rfm_client.cli.show import print_tables, table
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
-from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode
+from rfm_client.data.datasets.hdf5 import SUFFIXES
+from rfm_client.data.datasets.opening import hdf5_files, open_dataset
+from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode, SeveralTasks, require
 from rfm_client.data.orientation import ORIENTATIONS, Orient
 from rfm_client.labelling.episode_scores import FrameMemory, episode_columns
 from rfm_client.labelling.finished_episodes import Parts
@@ -42,7 +43,8 @@ DatasetArgument = Annotated[
     str,
     typer.Argument(
         metavar="DATASET",
-        help="LeRobot folder or Hub id org/name@revision, HDF5 file, folder of videos with tasks.csv or tasks.json.",
+        help="LeRobot folder or Hub id org/name@revision; HDF5 file, or a folder of them; folder of videos, of folders "
+        "of pictures, or of .npy and .npz files, with tasks.csv or tasks.json.",
     ),
 ]
 
@@ -55,6 +57,11 @@ class EpisodeTexts(Settings):
 
     task: str | None = setting(None, "Task sentence of the episodes that have none.")
     override_task: bool = setting(False, "Put --task in the place of the tasks that episodes have.")
+    several_tasks: SeveralTasks = setting(
+        "each",
+        "LeRobot episodes with several tasks. each: each stretch of frames with one task is scored by itself. "
+        "first: all frames by the first frame's task.",
+    )
     orient: Texts = setting(
         (),
         "Turn stored pictures upright, of all cameras or of one; may be repeated. Else as stored; LIBERO's HDF5 files "
@@ -72,7 +79,12 @@ class EpisodeTexts(Settings):
     @property
     def opening(self) -> dict[str, Any]:
         """Arguments of ``open_dataset`` after the source."""
-        return {"task": self.task, "override_task": self.override_task, "orient": Orient.parse(self.orient)}
+        return {
+            "task": self.task,
+            "override_task": self.override_task,
+            "several_tasks": self.several_tasks,
+            "orient": Orient.parse(self.orient),
+        }
 
 
 @dataclass(frozen=True)
@@ -140,6 +152,8 @@ class LabelCommand:
 
     def run(self) -> ExitCode:
         """Run as the options say. Raises RewardError, OSError and ImportError."""
+        if files := hdf5_files(self.source):
+            return self._run_each(files)
         if self.options.report:
             self._report()
             return ExitCode.OK
@@ -156,6 +170,29 @@ class LabelCommand:
         if self.options.rrd is not None:
             self._record(self.options.rrd, report)
         return status
+
+    def _run_each(self, files: Sequence[Path]) -> ExitCode:
+        """Run for each HDF5 file of a folder, once all can be opened. Raises DatasetError for a file that cannot."""
+        formats = ", ".join(self.labels.formats)
+        require(
+            "format", formats in ("", "hdf5"), "hdf5 for a folder of HDF5 files, each with labels of its own", formats
+        )
+        stems = [file.stem for file in files]
+        twice = [str(file) for file in files if stems.count(file.stem) > 1]
+        got = f"{', '.join(twice)}: leave out --output, and labels lie beside their files"
+        has_room = self.labels.output is None or not twice
+        require("output", has_room, "a folder for files whose names differ", got)
+        commands = []
+        for file in files:
+            rrd = self.options.rrd and self.options.rrd / file.stem
+            commands.append(replace(self, source=str(file), options=replace(self.options, rrd=rrd)))
+        for command in commands:
+            selected(command._dataset(), self.labels)
+        codes = []
+        for command in commands:
+            self.say(f"{command.source}")
+            codes.append(command.run())
+        return next((code for code in codes if code is not ExitCode.OK), ExitCode.OK)
 
     def _label(self) -> Report:
         watch = ProgressBar(self.say)
@@ -219,7 +256,8 @@ class LabelCommand:
             from rfm_client.cli.pictures import draw_summary
 
             beside = file.parent.parent if file.parent.name == "reward_signals" else file.parent
-            picture = (self.labels.output or beside) / f"{self.labels.name}_summary.png"
+            of_file = f"{Path(self.source).stem}." if Path(self.source).suffix.lower() in SUFFIXES else ""
+            picture = (self.labels.output or beside) / f"{of_file}{self.labels.name}_summary.png"
             draw_summary(picture, summary)
             typer.echo(f"{picture}")
 
@@ -314,7 +352,7 @@ def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int) -> f
 
 
 def _plan_rows(plan: Plan, dataset: Dataset, num_bytes: int, took_s: float) -> list[tuple[str, str]]:
-    tasks = sorted({item.episode.task for item in plan.items})
+    tasks = sorted({task for item in plan.items for task, _ in item.episode.stretches})
     cameras = plan.recipe.cameras
     return [
         ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),

@@ -144,9 +144,10 @@ def draw_summary(file: Path, summary: Summary) -> None:
 def draw_evaluation(file: Path, comparison: LabelComparison) -> None:
     """Draw a histogram of final progress for each label file, successes and failures apart."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     figure = Figure(figsize=(WIDTH_IN, SUMMARY_HEIGHT_IN * len(comparison.evaluations) * 0.75), layout="constrained")
-    axes = figure.subplots(len(comparison.evaluations), 1, sharex=True, squeeze=False)
+    axes = figure.subplots(len(comparison.evaluations), 1, sharex=True, sharey=True, squeeze=False)
     for ax, each in zip(axes.flat, comparison.evaluations, strict=True):
         parts = {"episodes": each.final_progress}
         if comparison.is_success is not None:
@@ -160,6 +161,7 @@ def draw_evaluation(file: Path, comparison: LabelComparison) -> None:
         told += "" if each.by_progress is None else f"   AUROC of progress {each.by_progress.auroc:.2f}"
         told += "" if each.by_success is None else f"   AUROC of success {each.by_success.auroc:.2f}"
         ax.set(title=f"{each.name}{told}", ylabel="episodes")
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
         ax.legend(loc="upper left")
     axes.flat[-1].set_xlabel("progress at the last frame")
     figure.savefig(file, dpi=SUMMARY_DOTS_PER_IN)

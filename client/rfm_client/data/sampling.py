@@ -89,7 +89,9 @@ class Sampling:
     def of(
         cls, rule: Rule | None, frames: int | None, trained_frames: int | None, *, trained_padding: bool = True
     ) -> Sampling:
-        """Return the caller's rule and number of frames; where they are None, those of the checkpoint's training.
+        """Return the caller's rule and number of frames.
+
+        None: those of training, but ``rewind_pad16_*`` takes 16 and ``all`` no number
 
         trained_frames, trained_padding: ``max_frames`` and ``trained_padding`` of the checkpoint's ``ModelInfo``
 

@@ -6,6 +6,7 @@ Nothing here sends requests to the server: ``episodes.py`` and the Gymnasium wra
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,15 @@ from rfm_client.episodes.windows import EpisodeFrame, Window
 
 if TYPE_CHECKING:
     from rfm_client.episodes.live import LiveEpisode, LiveView
+
+STILL_FRAMES = 10  # equal pictures in a row, after which an episode warns
+
+_BLACK = (
+    "black ones in a row: simulators in one process can blacken each other's pictures; give each a process of its own"
+)
+_STILL = "equal ones in a row: look at a frame, since the camera may be stuck, or render() may not draw anew"
+
+logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True)
@@ -68,8 +78,8 @@ class EpisodeOptions:
     """How each step of an episode is scored. Raises ValueError for contradictory options.
 
     sampling: a rule of ``rfm_client.data.sampling``; None: the rule of the checkpoint's training
-    frames: the rule's number of frames; None: the checkpoint's ``ModelInfo.max_frames``. If the rule needs a number and
-        the checkpoint has none, the first step raises ValueError
+    frames: the rule's number of frames; None: the rule's own if fixed, else ``ModelInfo.max_frames``. If the rule needs
+        a number and the checkpoint has none, the first step raises ValueError
     cameras: names of the cameras with a frame in each step; empty: a single camera without a name
     fuse: how to combine the scores of several cameras
     orient: rotation or flip that makes frames upright, applied first: an Orientation, or a dict by camera; cameras that
@@ -173,6 +183,7 @@ class EpisodeFrames:
         self._orientations = options.orientations
         self._frames: list[tuple[EpisodeFrame, ...]] = []  # by step and camera
         self._live: LiveEpisode | None = None
+        self._has_warned = False
 
     @property
     def step(self) -> int:
@@ -204,15 +215,30 @@ class EpisodeFrames:
         return tuple(kept)
 
     def append(self, frame: tuple[EpisodeFrame, ...]) -> None:
-        """Add the frames that ``checked`` returned."""
+        """Add the frames that ``checked`` returned. Warn, once an episode, if a camera shows the same picture."""
         self._frames.append(frame)
+        if not self._has_warned:
+            self._warn_of_still_frames()
+
+    def _warn_of_still_frames(self) -> None:
+        last = self._frames[-STILL_FRAMES:]
+        if len(last) < STILL_FRAMES:
+            return
+        for number, camera in enumerate(self._options.cameras or ("",)):
+            newest = last[-1][number].pixels
+            if all(np.array_equal(newest, each[number].pixels) for each in reversed(last[:-1])):
+                self._has_warned = True
+                where = ": ".join(filter(None, [self._where, f"frame[{camera!r}]" if camera else "frame"]))
+                got = _STILL if newest.any() else _BLACK
+                logger.warning("%s: expected pictures that change, got %d %s", where, STILL_FRAMES, got)
+                return
 
     def pop(self) -> None:
         """Remove the newest frame again."""
         self._frames.pop()
 
     def windows(self, prefix: Prefix) -> list[Window]:
-        """Return the window of each camera. Raises InvalidSampleError for an invalid task."""
+        """Return each camera's window: its sampled frames, and the task. Raises InvalidSampleError for a wrong task."""
         shown = [self._frames[index] for index in prefix.indices]
         return [Window(of_camera, self.task) for of_camera in zip(*shown, strict=True)]
 

@@ -158,7 +158,7 @@ class RewardModelVectorWrapper(VectorWrapper):
             frame = self._frame(shown[index])
             fresh[index] = self._begin(index, frame)
             if index in final:
-                _check_differ(index, last[index], copied(frame))
+                check_differ(f"final_obs[{index}]", last[index], copied(frame), _INSTEAD_OF_SAME_STEP)
         return stepped, fresh, final
 
     def _begin(self, index: int, frame: Any) -> RewardedEpisode:
@@ -194,13 +194,16 @@ class RewardModelVectorWrapper(VectorWrapper):
         return infos
 
 
-def _check_differ(index: int, last: Any, first: Any) -> None:
-    """Raise InvalidSampleError if a reset has drawn over the last frame of the episode before."""
+def check_differ(where: str, last: Any, first: Any, instead: str) -> None:
+    """Raise InvalidSampleError if a reset has drawn over the last frame of the episode before.
+
+    instead: remedy where the environment cannot return a copy
+    """
     of_cameras = [(last[camera], first[camera]) for camera in last] if isinstance(last, Mapping) else [(last, first)]
     if any(np.array_equal(*pair) for pair in of_cameras):
         got = "the first frame of the next one: the environment seems to draw into the array that it has returned"
-        remedy = f"let it return a copy of its observation, or {_INSTEAD_OF_SAME_STEP}"
-        raise InvalidSampleError.at(f"final_obs[{index}]", "the last frame of the ended episode", f"{got}; {remedy}")
+        remedy = f"let it return a copy of its observation, or {instead}"
+        raise InvalidSampleError.at(where, "the last frame of the ended episode", f"{got}; {remedy}")
 
 
 def _checked_autoreset_mode(env: VectorEnv, options: RewardOptions) -> AutoresetMode:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -25,8 +25,16 @@ from rfm_client.data.sampling import Rule
 from rfm_client.episodes.live import LiveView
 from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, SuccessRule
 
+Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
 ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
+
+_PAID: dict[Mode, Callable[[float, float, float, bool], float]] = {  # of progress now and before, gamma, the end
+    "absolute": lambda now, before, gamma, is_end: now,
+    "delta": lambda now, before, gamma, is_end: now - before,
+    "shaping": lambda now, before, gamma, is_end: gamma * now - before,
+    "final": lambda now, before, gamma, is_end: now if is_end else 0.0,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +42,16 @@ class RewardOptions:
     """How to score an episode, and to make rewards of progress. Raises ValueError for contradictory options.
 
     mode: ``absolute``: the reward is the newest known progress. ``delta``: its change since the step before, so that an
-        episode's rewards add up to its last known progress minus its first, however late scores come
+        episode's rewards add up to its last known progress minus its first, however late scores come. ``shaping``:
+        ``gamma`` times the newest known progress minus that of the step before (potential-based shaping). ``final``: 0,
+        and at the last step of an episode its progress; without a rule of success, only the reset and the last step
+        are scored
+    gamma: discount of the policy's training, above 0 and at most 1, for ``shaping`` alone
     scale: factor of this reward
+    success_bonus: added once an episode, at the first step that is known to succeed by ``success``, or by
+        ``terminate_on_success``; never at the reset. The reset raises ValueError if the checkpoint does not predict
+        success
+    success: rule of the bonus; None: ``terminate_on_success``, else the default rule
     add_to_env_reward: True: add the environment's own reward; False: replace it
     every: steps from one score to the next; until a new score comes, ``absolute`` repeats its value
         and ``delta`` is 0
@@ -52,8 +68,11 @@ class RewardOptions:
     await_last: True: wait for the score of an episode's last step even when not blocking; False: drop open requests
     """
 
-    mode: Literal["absolute", "delta"] = "absolute"
+    mode: Mode = "absolute"
+    gamma: float | None = None
     scale: float = 1.0
+    success_bonus: float = 0.0
+    success: SuccessRule | None = None
     add_to_env_reward: bool = False
     every: int = 1
     terminate_on_success: SuccessRule | None = None
@@ -70,8 +89,24 @@ class RewardOptions:
     live: LiveView | None = None
 
     def __post_init__(self) -> None:
-        require("mode", self.mode in ("absolute", "delta"), "'absolute' or 'delta'", repr(self.mode))
+        require("mode", self.mode in get_args(Mode), f"one of {', '.join(get_args(Mode))}", repr(self.mode))
         checked_finite("scale", self.scale)
+        checked_finite("success_bonus", self.success_bonus)
+        if self.mode == "shaping":
+            is_discount = self.gamma is not None and 0 < checked_finite("gamma", self.gamma) <= 1
+            require(
+                "gamma", is_discount, "the policy's discount, above 0 and at most 1, with mode 'shaping'", self.gamma
+            )
+        else:
+            require("gamma", self.gamma is None, f"None with mode {self.mode!r}", self.gamma)
+        is_used = self.success is None or self.success_bonus != 0
+        require("success", is_used, "None without success_bonus (terminate_on_success has a rule)", self.success)
+        is_one = None in (self.success, self.terminate_on_success) or self.success == self.terminate_on_success
+        require(
+            "success", is_one, f"None or the rule of terminate_on_success, {self.terminate_on_success}", self.success
+        )
+        has_end = self.mode != "final" or self.await_last
+        require("await_last", has_end, "True with mode 'final', which pays for the last frame", self.await_last)
         for name in ("every", "max_pending", "max_frames"):
             if getattr(self, name) is not None:
                 checked_count(name, getattr(self, name))
@@ -87,9 +122,18 @@ class RewardOptions:
             fuse=self.fuse,
             orient=self.orient,
             resize=self.resize,
-            success=self.terminate_on_success or SuccessRule(),
+            success=self.success_rule or SuccessRule(),
             live=self.live,
         )
+
+    @property
+    def success_rule(self) -> SuccessRule | None:
+        """The rule that ends episodes or decides the bonus; None: success decides nothing."""
+        return self.terminate_on_success or self.success or (SuccessRule() if self.success_bonus else None)
+
+    def is_due(self, step: int) -> bool:
+        """True if a step between the first and the last of an episode is scored."""
+        return (self.mode != "final" or self.success_rule is not None) and step % self.every == 0
 
     @property
     def renders(self) -> bool:
@@ -130,7 +174,8 @@ class RewardedEpisode:
         self.known: StepScore | None = None
         self._paid_progress = np.nan
         self.num_skipped = 0
-        self.succeeded = False
+        self.succeeded = False  # ends the episode
+        self._has_succeeded = self._has_bonus = self._has_ended = False
 
     def add(self, frame: Any) -> None:
         """Add a copy of a frame, uint8 [H, W, 3], or of a dict of these by camera. Raises InvalidSampleError."""
@@ -158,38 +203,45 @@ class RewardedEpisode:
         """Cancel open requests, and tell the live view that the episode has ended."""
         self.cancel()
         self.frames.end()
+        self._has_ended = True
 
     def learn(self, score: StepScore) -> None:
         """Take over a score, unless a newer score is known.
 
-        Raises ValueError if ``terminate_on_success`` is set, but success is not predicted.
+        Raises ValueError if ``terminate_on_success`` or ``success_bonus`` is set, but success is not predicted.
         """
         if self.known is not None and score.step <= self.known.step:
             return
-        rule = self._options.terminate_on_success
+        rule, ending = self._options.success_rule, self._options.terminate_on_success
         if rule is not None and np.isnan(score.success):
-            expected = "None with a checkpoint that does not predict success"
-            raise ValueError(f"terminate_on_success: expected {expected}, got {rule}")
+            name, none = ("success_bonus", "0") if ending is None else ("terminate_on_success", "None")
+            expected = f"{none} with a checkpoint that does not predict success"
+            raise ValueError(f"{name}: expected {expected}, got {getattr(self._options, name)}")
         if self.known is None:
             self._paid_progress = score.progress
         score = replace(score, succeeded=score.succeeded and score.step > 0)  # a reset is no success
         self.known = score
-        self.succeeded |= rule is not None and score.succeeded
+        self._has_succeeded |= rule is not None and score.succeeded
+        self.succeeded |= ending is not None and score.succeeded
         self.frames.report(score)
 
     def reward(self, env_reward: float) -> float:
-        """Return the reward of the newest step."""
+        """Return the reward of the newest step, once it has been scored if it is due."""
+        options = self._options
         progress = np.nan if self.known is None else self.known.progress
-        change, self._paid_progress = progress - self._paid_progress, progress
-        reward = self._options.scale * (progress if self._options.mode == "absolute" else change)
-        return reward + env_reward if self._options.add_to_env_reward else reward
+        before, self._paid_progress = self._paid_progress, progress
+        reward = options.scale * _PAID[options.mode](progress, before, options.gamma or 1.0, self._has_ended)
+        if self._has_succeeded and not self._has_bonus:
+            self._has_bonus = True
+            reward += options.success_bonus
+        return reward + env_reward if options.add_to_env_reward else reward
 
     def info(self) -> Info:
         """Return the newest known scores, and their lag in steps."""
         known = self.known or StepScore(np.nan, np.nan, False, -1, np.nan)
         told = {"progress": known.progress, "success": known.success, "step": known.step}
         told |= {"lag": self.frames.step - known.step, "skipped": self.num_skipped}
-        return told if self._options.terminate_on_success is None else told | {"succeeded": self.succeeded}
+        return told if self._options.success_rule is None else told | {"succeeded": self._has_succeeded}
 
 
 class EpisodeRewarder:
@@ -236,7 +288,7 @@ class EpisodeRewarder:
             episode.collect()
             ends = ends or episode.succeeded
             is_first = episode.known is None
-            due = ends or is_first or episode.frames.step % self._options.every == 0
+            due = ends or is_first or self._options.is_due(episode.frames.step)
             waits = self._options.blocking or is_first or (ends and self._options.await_last)
             if ends:
                 episode.cancel()

@@ -71,23 +71,28 @@ def episode_columns(
 
     memory: shared by all workers, for the frames of one camera at a time; unused if the checkpoint encodes frames
     go_on: called between requests; its exception ends the episode
+
+    Each stretch of frames with one task is scored by itself, as an episode of this task.
     """
-    by_camera = {}
+    by_camera: dict[str, list[ProgressResult]] = {}
     for camera in recipe.cameras:
         frames = _checked(dataset.frames(episode, camera), episode, camera)
-        chunks = _shrunk(frames, recipe, go_on)
-        if recipe.checkpoint.encodes:
-            trajectory = _joined([scorer.encode(chunk, episode.task) for chunk in chunks])
-            by_camera[camera] = _scores(trajectory, scorer, recipe, go_on)
-        else:
-            first = next(chunks)
-            with memory.holding(first[0].nbytes * episode.num_frames):
-                by_camera[camera] = _scores(_held(first, chunks, episode), scorer, recipe, go_on)
+        for number, (task, count) in enumerate(episode.stretches, 1):
+            is_last = number == len(episode.stretches)  # reads on, to find frames too many
+            chunks = _shrunk(frames if is_last else itertools.islice(frames, count), recipe, go_on)
+            if recipe.checkpoint.encodes:
+                result = _scores(_joined([scorer.encode(chunk, task) for chunk in chunks]), scorer, recipe, go_on)
+            else:
+                first = next(chunks)
+                with memory.holding(first[0].nbytes * count):
+                    result = _scores(_held(first, chunks, task, count), scorer, recipe, go_on)
+            by_camera.setdefault(camera, []).append(result)
     columns: Columns = {}
     for name in (PROGRESS, SUCCESS, LOG_PROB):
-        scores = [getattr(result, name) for result in by_camera.values()]
-        if name == LOG_PROB and scores[0] is None:
+        parts = [[getattr(result, name) for result in results] for results in by_camera.values()]
+        if name == LOG_PROB and parts[0][0] is None:
             continue
+        scores = [np.concatenate(of_camera) for of_camera in parts]
         if name == SUCCESS and all(np.isnan(score).all() for score in scores):
             continue
         _check_numbers(name, scores, episode)
@@ -124,13 +129,13 @@ def _joined(parts: Sequence[Trajectory]) -> Trajectory:
     return Trajectory(video_embeddings=embeddings, text_embedding=parts[0].text_embedding)
 
 
-def _held(first: UInt8Array, others: Iterator[UInt8Array], episode: DatasetEpisode) -> Trajectory:
-    frames = np.empty((episode.num_frames, *first.shape[1:]), np.uint8)
+def _held(first: UInt8Array, others: Iterator[UInt8Array], task: str, count: int) -> Trajectory:
+    frames = np.empty((count, *first.shape[1:]), np.uint8)
     start = 0
     for chunk in itertools.chain([first], others):
         frames[start : start + len(chunk)] = chunk
         start += len(chunk)
-    return Trajectory(frames=frames, task=episode.task)
+    return Trajectory(frames=frames, task=task)
 
 
 def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:

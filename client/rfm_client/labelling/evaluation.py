@@ -21,7 +21,7 @@ from rfm_client.data.datasets.lerobot_rows import column_names, read_table
 from rfm_client.data.datasets.lerobot_v21 import EPISODES_FILE, json_lines
 from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
-from rfm_client.labelling.label_files import PROGRESS_ENDING, read_label_table
+from rfm_client.labelling.label_files import PROGRESS_ENDING, read_cost, read_label_table
 from rfm_client.labelling.summary import BACKWARDS_BY
 
 Floats = npt.NDArray[np.floating[Any]]
@@ -57,6 +57,7 @@ class Evaluation:
     final_of_successes, final_of_failures: mean progress at the last frame; None: no such episode
     final: mean progress at the last frame of all episodes
     backwards: mean share of steps on which progress falls by more than 0.01
+    frames_per_s: frames that the labelling run scored in a second; None: the file does not say
     final_progress: float64 [E], progress at the last frame of each episode
     """
 
@@ -72,6 +73,7 @@ class Evaluation:
     final_of_failures: float | None
     final: float
     backwards: float
+    frames_per_s: float | None
     final_progress: Floats
 
 
@@ -131,7 +133,10 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool] | None =
         missing = [episode for episode in common if episode not in outcomes]
         require("outcome", not missing, "one for each labelled episode", f"none for episode {missing[:1]}")
     is_success = None if outcomes is None else np.array([outcomes[episode] for episode in common])
-    evaluations = [_evaluation(name, [read[name][each] for each in common], is_success) for name in names]
+    evaluations = [
+        _evaluation(name, file, [read[name][each] for each in common], is_success)
+        for name, file in zip(names, files, strict=True)
+    ]
     pairs = [(first, second) for index, first in enumerate(names) for second in names[index + 1 :]]
     agreements = [_agreement(first, second, read[first], read[second], common) for first, second in pairs]
     return LabelComparison(evaluations, agreements, common, is_success, len(everywhere) - len(common))
@@ -220,7 +225,10 @@ def _episodes(file: Path) -> dict[int, _Scores]:
     return scores
 
 
-def _evaluation(name: str, scores: Sequence[_Scores], is_success: npt.NDArray[np.bool_] | None) -> Evaluation:
+def _evaluation(
+    name: str, file: Path, scores: Sequence[_Scores], is_success: npt.NDArray[np.bool_] | None
+) -> Evaluation:
+    cost = read_cost(file)
     final = np.array([each.progress[-1] for each in scores], np.float64)
     orders = [_order(each.progress) for index, each in enumerate(scores) if is_success is None or is_success[index]]
     known = [order for order in orders if order is not None]
@@ -239,6 +247,7 @@ def _evaluation(name: str, scores: Sequence[_Scores], is_success: npt.NDArray[np
         final_of_failures=None if is_success is None else _mean(final[~is_success]),
         final=float(final.mean()),
         backwards=float(np.mean(falls)),
+        frames_per_s=None if cost is None else cost.frames_per_s,
         final_progress=final,
     )
 

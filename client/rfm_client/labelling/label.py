@@ -12,21 +12,21 @@ from typing import Any
 
 from rfm_client.data.datasets.hdf5 import Hdf5Dataset
 from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.data.datasets.protocol import Dataset, DatasetError, require
+from rfm_client.data.datasets.protocol import SIGNALS_FOLDER, Dataset, DatasetError, SeveralTasks, require
 from rfm_client.data.orientation import Orient
+from rfm_client.labelling.cost import Cost
 from rfm_client.labelling.finished_episodes import IDENTITY, Parts
 from rfm_client.labelling.hdf5_labels import check_room, hdf5_labels, write_hdf5
 from rfm_client.labelling.label_files import (
     PROGRESS_ENDING,
-    SIGNALS_FOLDER,
     parquet_labels,
     progress_file,
     signals_file,
     write_sidecars,
 )
-from rfm_client.labelling.labelled_before import LabelFile, joined, restore
+from rfm_client.labelling.labelled_before import LabelFile, earlier_cost, joined, restore
 from rfm_client.labelling.options import Format, LabelOptions, RayOptions
-from rfm_client.labelling.plan import Item, Plan, Recipe, make_plan, selected
+from rfm_client.labelling.plan import Item, Plan, Recipe, chosen_numbers, make_plan, selected
 from rfm_client.labelling.ray_engine import Connect, RayJob, finish_all_with_ray
 from rfm_client.labelling.run import FailedEpisode, Run, Watch
 from rfm_client.labelling.scorer import Scorer
@@ -122,11 +122,15 @@ class Outputs:
         found += [hdf5_labels(path, self.options.name) for path in self.hdf5]
         return [each for each in found if each is not None]
 
-    def write(self, plan: Plan, labels: Any) -> list[Path]:
-        """Write ``labels``, the table of ``Parts.read_all``, to all files, and return their paths. Raises OSError."""
+    def write(self, plan: Plan, labels: Any, cost: Cost | None) -> list[Path]:
+        """Write the labels to all files, and return their paths. Raises OSError.
+
+        labels: table of ``Parts.read_all``
+        cost: for the metadata of Parquet files; None: unknown
+        """
         columns = [name for name in labels.column_names if name not in IDENTITY]
-        sidecars = [progress_file(path, plan, columns) for path in self.progress]
-        sidecars += [signals_file(path, plan, columns, self.options.name) for path in self.signals]
+        sidecars = [progress_file(path, plan, columns, cost) for path in self.progress]
+        sidecars += [signals_file(path, plan, columns, self.options.name, cost) for path in self.signals]
         try:
             write_sidecars(labels, sidecars)
         except OSError as error:
@@ -145,9 +149,13 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     recipe = Recipe.of(options, dataset, scorer.checkpoint())
     episodes = selected(dataset, options)
     recipe.check_lengths(episodes)
-    told = " ".join(dataset.notes)
+    several = sum(bool(episode.tasks) for episode in episodes)
+    if several:
+        how = "each stretch of frames with one task is scored by itself (--several-tasks first: all by the first task)"
+        watch.note(f"tasks: {several} episodes have several: {how}")
+    told, faults = " ".join(dataset.notes), dataset.cameras_in(chosen_numbers(dataset, replace(options, shard=None)))[1]
     turned = [f"orient: {name} {turn} (asked for)" for name, turn in recipe.orientations.items() if name not in told]
-    left_out = [] if options.cameras else [f"left out: {name}: {why}" for name, why in dataset.left_out.items()]
+    left_out = [] if options.cameras else [f"left out: {name}: {why}" for name, why in faults.items()]
     for line in (*recipe.told(options), *left_out, *dataset.notes, *turned):
         watch.note(line)
     return make_plan(dataset, recipe, episodes)
@@ -172,9 +180,10 @@ def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = _DEFAULTS, w
     Raises DatasetError, before the first score, for a contradictory dataset or a label file that this run may not
     replace; RewardError if the scorer is gone; OSError for a full disk.
     """
-    outputs, plan = _begin(dataset, scorer, options, watch)
-    failures = Run(plan, dataset, scorer, outputs.parts, watch).finish_all(options.workers)
-    return _put_together(plan, outputs, failures, watch)
+    outputs, plan, earlier = _begin(dataset, scorer, options, watch)
+    run = Run(plan, dataset, scorer, outputs.parts, watch)
+    failures = run.finish_all(options.workers)
+    return _put_together(plan, outputs, failures, run.cost or earlier, watch)
 
 
 def label_with_ray(
@@ -185,25 +194,36 @@ def label_with_ray(
     *,
     task: str | None = None,
     override_task: bool = False,
+    several_tasks: SeveralTasks = "each",
     orient: Orient = Orient(),
     ray: RayOptions = _ANY_CLUSTER,
 ) -> Report:
     """Label as ``label`` does, on a Ray cluster. Each actor opens the dataset and connects by itself.
 
-    source, task, override_task, orient: as in ``open_dataset``
+    The files tell no cost of this run: actors start and end while others label.
+
+    source, task, override_task, several_tasks, orient: as in ``open_dataset``
     connect: returns a context with a scorer, on any node; this process reads the checkpoint's facts with it
     """
-    opening = {"task": task, "override_task": override_task, "orient": orient}
-    dataset = open_dataset(source, task=task, override_task=override_task, orient=orient)
+    opening: dict[str, Any] = {
+        "task": task,
+        "override_task": override_task,
+        "several_tasks": several_tasks,
+        "orient": orient,
+    }
+    dataset = open_dataset(source, **opening)
     with connect() as scorer:
-        outputs, plan = _begin(dataset, scorer, options, watch)
+        outputs, plan, earlier = _begin(dataset, scorer, options, watch)
     job = RayJob(source, opening, connect, plan, outputs.parts.url, options.workers)
     failures = finish_all_with_ray(job, ray, watch)
-    return _put_together(plan, outputs, failures, watch)
+    return _put_together(plan, outputs, failures, earlier, watch)
 
 
-def _begin(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch) -> tuple[Outputs, Plan]:
-    """Make the plan, restore parts from label files, and check the frames of all others."""
+def _begin(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch) -> tuple[Outputs, Plan, Cost | None]:
+    """Make the plan, restore parts from label files, and check the frames of all others.
+
+    Return the cost of the labels that exist, too.
+    """
     outputs = Outputs(options.output or dataset.root, options, dataset)
     before: list[LabelFile] = []
     if options.shard is None:
@@ -217,18 +237,20 @@ def _begin(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
     finished = outputs.parts.finished(plan.items)
     pending = [item for item in plan.items if item.key not in finished]
     check_frames(dataset, plan.recipe, pending, watch)
-    return outputs, plan
+    return outputs, plan, earlier_cost(plan, before)
 
 
-def _put_together(plan: Plan, outputs: Outputs, failures: Sequence[FailedEpisode], watch: Watch) -> Report:
+def _put_together(
+    plan: Plan, outputs: Outputs, failures: Sequence[FailedEpisode], cost: Cost | None, watch: Watch
+) -> Report:
     """Write the label files, unless an episode failed or the run labelled only a shard."""
     report = Report([], failures, outputs.parts.url, None, plan)
     if failures or outputs.options.shard is not None:
         return report
     labels = outputs.parts.read_all(plan)
-    files = outputs.write(plan, labels)
+    files = outputs.write(plan, labels, cost)
     assert outputs.dataset is not None  # ``_begin`` sets it
-    num_episodes = len(outputs.dataset.episodes)
+    num_episodes = len(outputs.dataset.numbers)
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
         watch.note(f"{len(plan.items)} of the dataset's {num_episodes} episodes have labels{others}")

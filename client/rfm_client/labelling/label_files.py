@@ -23,18 +23,19 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.samples import Float32Array
-from rfm_client.data.datasets.protocol import DatasetError, require
+from rfm_client.data.datasets.protocol import SIGNALS_FOLDER, DatasetError, require
+from rfm_client.labelling.cost import Cost
 from rfm_client.labelling.episode_scores import LOG_PROB, PROGRESS, SUCCESS, Columns
 from rfm_client.labelling.finished_episodes import IDENTITY, whole_file
 from rfm_client.labelling.labelled_before import LabelFile
 from rfm_client.labelling.plan import Item, Plan
 
 PROGRESS_ENDING = "_progress.parquet"
-SIGNALS_FOLDER = "reward_signals"
 PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 
 _EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run sees if its labels still hold
+_COST_KEY = b"rfm.cost"  # apart from the provenance, which is equal for equal runs
 _ROWS_AT_A_TIME = 2**17  # in a row group
 _OWN_NAME = "rfm"  # default of ``LabelOptions.name``
 _PROGRESS_NAMES = ("progress_sparse", "progress_dense", "progress")
@@ -59,20 +60,20 @@ class Sidecar:
     metadata: Mapping[bytes, bytes]
 
 
-def progress_file(path: Path, plan: Plan, columns: Sequence[str]) -> Sidecar:
-    """Return the progress file for these columns of the parts."""
+def progress_file(path: Path, plan: Plan, columns: Sequence[str], cost: Cost | None) -> Sidecar:
+    """Return the progress file for these columns of the parts. cost: None: unknown"""
     checkpoint = plan.recipe.checkpoint
     model = checkpoint.source or checkpoint.weights_digest
     metadata = {
         b"reward_model_path": (f"{model}@{checkpoint.revision}" if checkpoint.revision else model).encode(),
         PROVENANCE_KEY: canonical_json(plan.provenance()),
-        _EPISODES_KEY: canonical_json(plan.digests()),
+        **_of_run(plan, cost),
     }
     return Sidecar(path, {name: "progress_sparse" if name == PROGRESS else name for name in columns}, metadata)
 
 
-def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str) -> Sidecar:
-    """Return the file of frame signals for these columns of the parts."""
+def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost: Cost | None) -> Sidecar:
+    """Return the file of frame signals for these columns of the parts. cost: None: unknown"""
     signals = {}
     for column in columns:
         score, dot, camera = column.partition(".")
@@ -86,7 +87,13 @@ def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str) -> S
     }
     ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
     named = {f"lerobot.reward_scoring.{key}".encode(): value for key, value in metadata.items()}
-    return Sidecar(path, ordered, {**named, _EPISODES_KEY: canonical_json(plan.digests())})
+    return Sidecar(path, ordered, {**named, **_of_run(plan, cost)})
+
+
+def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
+    """Return the metadata that both formats share."""
+    digests = {_EPISODES_KEY: canonical_json(plan.digests())}
+    return digests if cost is None else {**digests, _COST_KEY: cost.json()}
 
 
 def _descriptor(column: str) -> dict[str, Any]:
@@ -131,7 +138,8 @@ def parquet_labels(path: Path, option: str = "--name") -> LabelFile | None:
     except (OSError, ArrowException):
         metadata = {}
     provenance = metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY))
-    return LabelFile.of(path, provenance, metadata.get(_EPISODES_KEY), lambda items: _read(path, items), option)
+    cost = Cost.parse(metadata.get(_COST_KEY))
+    return LabelFile.of(path, provenance, metadata.get(_EPISODES_KEY), lambda items: _read(path, items), option, cost)
 
 
 def _read(path: Path, items: Sequence[Item]) -> Iterator[tuple[Item, Columns]]:
@@ -200,6 +208,16 @@ def read_label_table(file: Path, *, episode: int | None = None) -> Any:
     except (OSError, ArrowException) as error:
         raise DatasetError.at(file, "a file of labels", error) from error
     return table.select(list(columns.values())).rename_columns(list(columns))
+
+
+def read_cost(file: Path) -> Cost | None:
+    """Return the cost of a Parquet file's labels; None: the file does not say. Raises DatasetError."""
+    from pyarrow import ArrowException, parquet
+
+    try:
+        return Cost.parse((parquet.read_schema(file).metadata or {}).get(_COST_KEY))
+    except (OSError, ArrowException) as error:
+        raise DatasetError.at(file, "a file of labels", error) from error
 
 
 def read_episode_labels(file: Path, episode: int) -> EpisodeLabels | None:

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from rfm_client.data.datasets.protocol import Dataset, DatasetError, require
+from rfm_client.labelling.cost import Cost
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
 from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item, Plan, make_plan
@@ -30,6 +31,7 @@ class LabelFile:
     digests: digest of each labelled item, by episode number
     read: yields the scores of items, as far as the file has them
     option: command-line option that chooses another name
+    cost: of the last run that scored; None: unknown
     """
 
     path: Path
@@ -38,15 +40,24 @@ class LabelFile:
     digests: Mapping[int, str]
     read: Reader
     option: str
+    cost: Cost | None = None
 
     @classmethod
-    def of(cls, path: Path, provenance: Any, digests: Any, read: Reader, option: str = "--name") -> LabelFile:
-        """Return the label file with these JSON texts of its metadata, None if absent."""
+    def of(
+        cls,
+        path: Path,
+        provenance: Any,
+        digests: Any,
+        read: Reader,
+        option: str = "--name",
+        cost: Cost | None = None,
+    ) -> LabelFile:
+        """Return the label file. provenance, digests: JSON texts of its metadata, None if absent"""
         told, by_episode = _parsed(provenance), _parsed(digests)
         if not str(told.get("writer")).startswith("rfm-client") or not isinstance(told.get("dataset"), dict):
             return cls(path, "labels of another program", {}, {}, read, option)
         flaw = None if by_episode else "no digests of its episodes"
-        return cls(path, flaw, told, {int(index): digest for index, digest in by_episode.items()}, read, option)
+        return cls(path, flaw, told, {int(index): digest for index, digest in by_episode.items()}, read, option, cost)
 
     def check(self, plan: Plan, dataset: Dataset, known: Mapping[int, Item]) -> Mapping[int, Item]:
         """Return the file's items by episode number. Raises DatasetError if labels would be lost, or do not fit.
@@ -59,11 +70,10 @@ class LabelFile:
         got = (self.provenance and differ) or self.flaw or ""
         require(self.path, self.flaw is None and not differ, "no labels, or those of the same recipe", got)
 
-        episodes = {episode.index: episode for episode in dataset.episodes}
-        lost = set(self.digests) - set(episodes)
-        expected = f"labels of the dataset's {len(episodes)} episodes"
+        lost = set(self.digests) - set(dataset.numbers)
+        expected = f"labels of the dataset's {len(dataset.numbers)} episodes"
         require(self.path, not lost, expected, f"some of episode {min(lost, default=None)}")
-        others = [episodes[index] for index in sorted(self.digests) if index not in known]
+        others = [dataset.episode(index) for index in sorted(self.digests) if index not in known]
         items = {item.episode.index: item for item in make_plan(dataset, plan.recipe, others).items}
         found = {index: {**known, **items}[index] for index in self.digests}
         changed = [index for index, digest in self.digests.items() if found[index].digest != digest]
@@ -92,6 +102,12 @@ def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: 
     if len(known) > len(plan.items):
         watch.note(f"labels of {len(known) - len(plan.items)} other episodes are there, and are kept")
     return replace(plan, items=[known[index] for index in sorted(known)])
+
+
+def earlier_cost(plan: Plan, files: Sequence[LabelFile]) -> Cost | None:
+    """Return the first cost that a file with labels of this plan tells; None: no such file does."""
+    digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
+    return next((file.cost for file in files if file.cost and digests & set(file.digests.values())), None)
 
 
 def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:

@@ -55,6 +55,7 @@ class LabelOptions(Settings):
     cameras: empty: all but depth cameras
     sampling, frames: None: those of the checkpoint's training (``Sampling.of``)
     episodes: numbers; None: all
+    filter_key: only these of the episodes; None: all
     shard: (i, n): label share i, from 0, of n equal shares, without label files; a later run without shard writes them
     parts: None: ``.<name>_parts`` in the output folder
     """
@@ -85,6 +86,9 @@ class LabelOptions(Settings):
     resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
     episodes: Sequence[int] | None = setting(
         None, "Some of the episodes, by number.", metavar="0:100,205", parse=parse_episodes
+    )
+    filter_key: str | None = setting(
+        None, "Only the episodes of a filter key of robomimic's HDF5 files, such as train or valid.", metavar="KEY"
     )
     limit: int | None = setting(None, "At most so many episodes.", least=1)
     shard: tuple[int, int] | None = setting(

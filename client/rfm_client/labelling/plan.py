@@ -6,7 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from rfm_client.contract.errors import InvalidSampleError
@@ -54,8 +54,9 @@ class Recipe:
         Raises DatasetError for an unknown camera, ValueError if the rule lacks its number of frames, InvalidSampleError
         for another mode than ``whole`` with a checkpoint that needs the whole episode.
         """
-        require(dataset.source, bool(dataset.cameras), "at least one camera", "none")
-        cameras = chosen_cameras(dataset, options.cameras)
+        numbers = chosen_numbers(dataset, replace(options, shard=None))
+        cameras = chosen_cameras(dataset, options.cameras, numbers)
+        require(dataset.source, bool(cameras), "at least one camera", "none")
         if checkpoint.needs_whole_episode and options.mode != "whole":
             why = "of this model, whose scores are relative to the whole episode"
             raise InvalidSampleError.at("mode", f"whole {why}", options.mode)
@@ -110,11 +111,12 @@ class Recipe:
     def check_lengths(self, episodes: Sequence[DatasetEpisode]) -> None:
         """Raise DatasetError for an episode above the checkpoint's limit, if the recipe shows whole episodes."""
         limit = self.checkpoint.max_frames
-        longest = max(episodes, key=lambda episode: episode.num_frames)
+        lengths = {episode.name: max(count for _, count in episode.stretches) for episode in episodes}
+        longest = max(lengths, key=lambda name: lengths[name])
         shows_all = self.mode == "whole" or self.sampling.frames is None
-        fits = not shows_all or limit is None or longest.num_frames <= limit
-        got = f"{longest.num_frames}: use mode prefix and a rule with a number of frames"
-        require(longest.name, fits, f"at most {limit} frames, as the checkpoint takes", got)
+        fits = not shows_all or limit is None or lengths[longest] <= limit
+        got = f"{lengths[longest]}: use mode prefix and a rule with a number of frames"
+        require(longest, fits, f"at most {limit} frames, as the checkpoint takes", got)
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ class Plan:
         return {str(item.episode.index): item.digest for item in self.items}
 
     def provenance(self) -> dict[str, Any]:
-        """Return writer, dataset and recipe of the labels, without user and time: equal runs give equal files."""
+        """Return writer, dataset and recipe of the labels, without user and time: equal runs give equal provenance."""
         digest = digest_of(item.digest.encode() for item in self.items)
         version = importlib.metadata.version("rfm-client")
         dataset = {**self.dataset, "digest": digest}
@@ -159,13 +161,33 @@ class Plan:
 
 
 def selected(dataset: Dataset, options: LabelOptions) -> list[DatasetEpisode]:
-    """Return the episodes that the options choose. Raises DatasetError for an episode that the dataset lacks."""
-    episodes = {episode.index: episode for episode in dataset.episodes}
-    wanted = sorted(episodes) if options.episodes is None else sorted(set(options.episodes))
-    missing = [index for index in wanted if index not in episodes]
+    """Return the episodes that the options choose; the others are not read.
+
+    Raises DatasetError for an episode that the dataset lacks, or that cannot be read.
+    """
+    episodes = [dataset.episode(number) for number in chosen_numbers(dataset, options)]
+    if options.shard is None:  # the episodes of another shard may need the task
+        dataset.given_task.check_used(episodes)
+    return episodes
+
+
+def chosen_numbers(dataset: Dataset, options: LabelOptions) -> list[int]:
+    """Return the numbers of the episodes that the options choose. Raises DatasetError for an unknown episode."""
+    known = set(dataset.numbers)
+    wanted = sorted(known) if options.episodes is None else sorted(set(options.episodes))
+    missing = [number for number in wanted if number not in known]
     got = ", ".join(map(str, missing[:5])) or "none"
-    require("episodes", bool(wanted) and not missing, f"some of the {len(episodes)} of the dataset", got)
-    chosen = [episodes[index] for index in wanted[: options.limit]]
+    require("episodes", bool(wanted) and not missing, f"some of the {len(known)} of the dataset", got)
+    if options.filter_key is not None:
+        keys = ", ".join(dataset.filter_keys) or "none, since the dataset has no filter keys"
+        is_known = options.filter_key in dataset.filter_keys
+        require("filter_key", is_known, f"one of {keys}", repr(options.filter_key))
+        of_key = dataset.filter_keys[options.filter_key]
+        gone = [number for number in of_key if number not in known]
+        got = f"{', '.join(map(str, gone[:5])) or 'none'} in {options.filter_key}"
+        wanted = sorted(set(wanted) & set(of_key))
+        require("filter_key", bool(wanted) and not gone, f"some of the {len(known)} episodes of the dataset", got)
+    chosen = wanted[: options.limit]
     if options.shard is not None:
         i, n = options.shard
         chosen = chosen[len(chosen) * i // n : len(chosen) * (i + 1) // n]
@@ -178,6 +200,7 @@ def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisod
     items = []
     for episode in episodes:
         about = f"{episode.index} {episode.first_index} {episode.num_frames} {episode.task}"
+        about += f" {episode.tasks}" if episode.tasks else ""
         videos = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.cameras]
         items.append(Item(episode, digest_of(part.encode() for part in (document, about, *videos))))
     return Plan(items, recipe, {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision})

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from rfm_client.contract.errors import (
     ServerUnavailableError,
 )
 from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode
+from rfm_client.labelling.cost import Cost
 from rfm_client.labelling.episode_scores import FrameMemory, episode_columns
 from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item, Plan
@@ -71,6 +73,12 @@ class Run:
         self._lock = threading.Lock()
         self._failures: list[FailedEpisode] = []
         self._cause: Exception | None = None
+        self._frames_scored, self._seconds = 0, 0.0
+
+    @property
+    def cost(self) -> Cost | None:
+        """What ``finish_all`` scored, and its time; None: it scored nothing."""
+        return Cost(self._frames_scored, self._seconds) if self._frames_scored else None
 
     def finish_all(self, workers: int) -> list[FailedEpisode]:
         """Label all items without a part, ``workers`` at a time, and return the failures.
@@ -78,6 +86,7 @@ class Run:
         Raises, once the episodes in progress have ended, RewardError if the server is gone, OSError for a full disk.
         """
         pending = begin(self._plan, self._parts, self._watch)
+        began_s = time.monotonic()
         with ThreadPoolExecutor(workers, thread_name_prefix="rfm-label") as pool:
             try:
                 list(pool.map(self._label, pending))
@@ -85,6 +94,7 @@ class Run:
                 self._stopping.set()
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
+        self._seconds = time.monotonic() - began_s
         if self._cause is not None:
             raise self._cause
         return by_episode(self._failures)
@@ -119,6 +129,8 @@ class Run:
             raise
         self._check_checkpoint()
         self._parts.write(item, columns)
+        with self._lock:
+            self._frames_scored += item.episode.num_frames
 
     def _check_checkpoint(self) -> None:
         """Stop the run and raise _StoppedError if another checkpoint is served now."""

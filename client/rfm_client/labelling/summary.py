@@ -26,6 +26,7 @@ class Summary:
     episodes: int64 [E], numbers of the episodes
     final_progress: float32 [E], at the last frame
     best_success: float32 [E], highest success; None: the checkpoint does not predict success
+    last_success: float32 [E], success at the last frame; None as ``best_success``
     backwards: float64 [E], share of steps on which progress falls by more than 0.01
     disagreement: float64 [E], range of the cameras' progress, mean over frames; None: no scores of several cameras
     num_frames: of all episodes
@@ -34,6 +35,7 @@ class Summary:
     episodes: npt.NDArray[np.int64]
     final_progress: npt.NDArray[np.float32]
     best_success: npt.NDArray[np.float32] | None
+    last_success: npt.NDArray[np.float32] | None
     backwards: npt.NDArray[np.float64]
     disagreement: npt.NDArray[np.float64] | None
     num_frames: int
@@ -72,7 +74,7 @@ def summary_of(labels: Any) -> Summary:
     """Return the summary of labels, a pyarrow Table with the parts' column names."""
     episodes = labels["episode_index"].to_numpy()
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1)).tolist()
-    numbers, final, best, backwards, apart = [], [], [], [], []
+    numbers, final, best, last, backwards, apart = [], [], [], [], [], []
     for start, end in zip(starts, [*starts[1:], len(labels)], strict=True):
         table = labels.slice(start, end - start)
         progress = table[PROGRESS].to_numpy()
@@ -81,13 +83,16 @@ def summary_of(labels: Any) -> Summary:
         final.append(progress[-1])
         backwards.append(np.mean(np.diff(progress) < -BACKWARDS_BY) if len(progress) > 1 else 0.0)
         if SUCCESS in table.column_names:
-            best.append(table[SUCCESS].to_numpy().max())
+            success = table[SUCCESS].to_numpy()
+            best.append(success.max())
+            last.append(success[-1])
         if cameras:
             apart.append(np.ptp(np.stack(cameras), axis=0).mean(dtype=np.float64))
     return Summary(
         episodes=np.array(numbers, np.int64),
         final_progress=np.array(final, np.float32),
         best_success=np.array(best, np.float32) if best else None,
+        last_success=np.array(last, np.float32) if last else None,
         backwards=np.array(backwards, np.float64),
         disagreement=np.array(apart, np.float64) if apart else None,
         num_frames=len(labels),

@@ -227,7 +227,7 @@ class Servers:
                     logger.warning("%s: trying again: %s", server.transport.url, error)
                 self._leave_out(server, model, error)
                 if error.may_have_ended_server and has_ended:
-                    message = f"a process or the connection ended under this request twice: {error.message}"
+                    message = f"a process or the connection ended twice during this request: {error.message}"
                     raise ProcessEndedError(f"{server.transport.url}: {message}") from error
                 others = set(self._servers) - {server, *refusals}
                 has_other = not all(other.is_left_out for other in others)

@@ -40,7 +40,6 @@ from rfm_client.labelling.label_files import (
 from rfm_client.labelling.summary import Summary, summarise
 from rfm_gateway.viewer import numbers_or_null
 
-NUM_BINS = 20  # of final progress, 0 to 1
 _SUMMARIES_AT_A_TIME = 8  # summaries in memory
 
 
@@ -91,7 +90,8 @@ class ShownDataset:
             "orientations": [_orientations(file).get(camera, "none") for camera in self.dataset.info.videos],
             "fps": self.dataset.info.fps,
             "threshold": SUCCESS_THRESHOLD,
-            "bins": None if summary is None else _bins(summary),
+            "provenance": None if file is None else _provenance(file),
+            "written_s": None if file is None else file.stat().st_mtime,
             "episodes": [
                 {
                     "episode": episode.index,
@@ -150,12 +150,16 @@ class ShownDataset:
 
 def _orientations(file: Path | None) -> Mapping[str, str]:
     """Return the orientation that each turned camera had when these labels were made."""
+    found = {} if file is None else _provenance(file).get("orientations", {})  # labels of version 0.1.0 have none
+    return {camera: orientation for camera, orientation in found.items() if orientation in ORIENTATIONS}
+
+
+def _provenance(file: Path) -> dict[str, Any]:
+    """Return writer, dataset and recipe of a label file, as far as it tells them."""
     from pyarrow import parquet
 
-    metadata = {} if file is None else parquet.read_schema(file).metadata or {}
-    provenance = json.loads(metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY, b"{}")))
-    found = provenance.get("orientations", {})  # labels of version 0.1.0 have none
-    return {camera: orientation for camera, orientation in found.items() if orientation in ORIENTATIONS}
+    metadata = parquet.read_schema(file).metadata or {}
+    return dict(json.loads(metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY, b"{}"))))
 
 
 @lru_cache(_SUMMARIES_AT_A_TIME)
@@ -169,20 +173,12 @@ def _rows(summary: Summary) -> list[dict[str, Any]]:
         "final_progress": numbers_or_null(summary.final_progress.tolist()),
         "backwards": numbers_or_null(summary.backwards.tolist()),
     }
-    never = summary.never_succeed
-    if summary.best_success is not None and never is not None:
+    if summary.best_success is not None and summary.last_success is not None:
         columns["best_success"] = numbers_or_null(summary.best_success.tolist())
-        columns["never_succeeds"] = np.isin(summary.episodes, never).tolist()
+        columns["last_success"] = numbers_or_null(summary.last_success.tolist())
     if summary.disagreement is not None:
         columns["disagreement"] = numbers_or_null(summary.disagreement.tolist())
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-
-
-def _bins(summary: Summary) -> dict[str, list[float]]:
-    """Return a histogram of final progress."""
-    final = summary.final_progress[np.isfinite(summary.final_progress)]
-    counts, edges = np.histogram(np.clip(final, 0, 1), NUM_BINS, (0, 1))
-    return {"edges": edges.tolist(), "counts": counts.tolist()}
 
 
 def _curves(labels: EpisodeLabels, num_frames: int) -> list[dict[str, Any]]:

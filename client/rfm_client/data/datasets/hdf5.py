@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """HDF5 files of robomimic and LIBERO: ``data/demo_<i>/obs/<camera>``. Needs ``rfm-client[hdf5]``.
 
-The task is LIBERO's sentence (``problem_info`` of ``data``), robomimic's (``env_args``), or the caller's. LIBERO stores
-its pictures upside down: they are turned, unless the caller says otherwise.
+The task is the demonstration's own (``ep_meta``), else LIBERO's sentence (``problem_info`` of ``data``), robomimic's
+(``env_args``), or the caller's. LIBERO stores its pictures upside down: they are turned, unless the caller says
+otherwise. robomimic's filter keys (``mask/train``) name some of the demonstrations.
 """
 
 from __future__ import annotations
@@ -57,30 +58,57 @@ class Hdf5Dataset(Dataset):
         self.file = file
         self.root = file.parent
         self.source = file.name
-        self._task = task
+        self.given_task = task
         with self._opened() as opened:
             demos = _demos_in(file, opened)
             self._demos = {index: name for index, (name, _) in demos.items()}
-            self.cameras, self.left_out = _cameras_in(file, dict(demos.values()))
+            self._pictures = _pictures_in(demos)
+            self._forms = _forms_in(demos)
+            of_all = _task_of(opened["data"].attrs)
+            self._tasks = {index: _own_task_of(demo) or of_all for index, (_, demo) in demos.items()}
+            self.filter_keys = _filter_keys_in(opened)
+            self.cameras, self.left_out = self._shared(list(demos))
+            self._lengths = {
+                index: _lengths_of(demo, self.cameras or self._cameras_of(index)) for index, (_, demo) in demos.items()
+            }
             attributes = opened["data"].attrs
             is_libero = _is_libero(attributes)
             is_upright = "opencv" in str(attributes.get("macros_image_convention"))  # robosuite then renders upright
-        defaults: dict[str, Orientation] = dict.fromkeys(self.cameras, _LIBERO) if is_libero and not is_upright else {}
-        self.orientations = orientations_of(orient, self.cameras, defaults)
-        untold = [camera for camera in self.cameras if orient.default is None and camera not in orient.cameras]
+        self.numbers = list(demos)
+        known = [camera for camera in self._pictures if any(camera in self._cameras_of(each) for each in self.numbers)]
+        if not known:
+            self.cameras_in(self.numbers)  # raises the reason
+        defaults: dict[str, Orientation] = dict.fromkeys(known, _LIBERO) if is_libero and not is_upright else {}
+        self.orientations = orientations_of(orient, known, defaults)
+        untold = [camera for camera in known if orient.default is None and camera not in orient.cameras]
         self.notes = [] if is_upright else _notes(untold, is_libero)
 
-    def read_episodes(self) -> Sequence[DatasetEpisode]:
-        with self._opened() as opened:
-            task = self._task.of(f"{self.file}: problem_info or env_args", _task_of(opened["data"].attrs))
-            lengths = {name: self._length(opened, name) for name in self._demos.values()}
-        firsts = np.cumsum([0, *lengths.values()]).tolist()
-        episodes = [
-            DatasetEpisode(index, name, task, lengths[name], first)
-            for (index, name), first in zip(self._demos.items(), firsts, strict=False)
-        ]
-        self._task.check_used(episodes)
-        return episodes
+    def read_episode(self, number: int) -> DatasetEpisode:
+        where = f"{self.file}: data/{self._demos[number]}"
+        task = self.given_task.of(f"{where}: ep_meta, or data: problem_info or env_args", self._tasks[number])
+        lengths = self._lengths[number]
+        got = ", ".join(f"{key} {length}" for key, length in lengths.items()) or self._forms[number]
+        require(where, _one_length(lengths) > 0, "one length, above 0", got)
+        first = sum(_one_length(self._lengths[before]) for before in self.numbers if before < number)
+        return DatasetEpisode(number, self._demos[number], task, _one_length(lengths), first)
+
+    def cameras_in(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
+        cameras, left_out = self._shared(numbers)
+        got = "; ".join(f"{picture}: {reason}" for picture, reason in left_out.items())
+        got = got or f"{self._forms[numbers[0]]}: {_NO_PICTURES}"
+        expected = "a camera as uint8 [T, H, W, 3] in every demonstration"
+        require(f"{self.file}: data/{self._demos[numbers[0]]}/obs", bool(cameras), expected, got)
+        return cameras, left_out
+
+    def _shared(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
+        """The cameras of these demonstrations, and the faults of other pictures."""
+        told = {name: [faults[number] for number in numbers] for name, faults in self._pictures.items()}
+        faults = {name: next(filter(None, of_demos), "") for name, of_demos in told.items()}
+        cameras = tuple(name for name, fault in faults.items() if not fault)
+        return cameras, {name: fault for name, fault in faults.items() if fault}
+
+    def _cameras_of(self, number: int) -> list[str]:
+        return [name for name, faults in self._pictures.items() if not faults[number]]
 
     def decoder(self, camera: str) -> str | None:
         return None
@@ -111,16 +139,6 @@ class Hdf5Dataset(Dataset):
     def _where(self, episode: DatasetEpisode, camera: str) -> str:
         return f"{self.file}: data/{episode.name}/obs/{camera}"
 
-    def _length(self, opened: Any, name: str) -> int:
-        """T of a demonstration, equal for its cameras and actions, if present."""
-        demo = opened["data"][name]
-        lengths = {f"obs/{camera}": len(demo["obs"][camera]) for camera in self.cameras}
-        lengths |= {"actions": len(demo["actions"])} if "actions" in demo else {}
-        is_one = len(set(lengths.values())) == 1 and 0 not in lengths.values()
-        got = ", ".join(f"{key} {length}" for key, length in lengths.items())
-        require(f"{self.file}: data/{name}", is_one, "one length, above 0", got)
-        return next(iter(lengths.values()))
-
     def _opened(self) -> Any:
         try:
             import h5py
@@ -143,23 +161,42 @@ def _demos_in(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
     return dict(sorted(demos.items()))
 
 
-def _cameras_in(file: Path, demos: Mapping[str, Any]) -> tuple[Sequence[str], Mapping[str, str]]:
-    """The cameras of all demonstrations, and the faults of other pictures."""
-    observations = {name: demo.get("obs", {}) for name, demo in demos.items()}
-    faults: dict[str, str] = {}
-    for of_demo in observations.values():
-        for name, value in of_demo.items():
-            if name not in faults and _is_picture(value):
-                found = ((demo, stored.get(name)) for demo, stored in observations.items())
-                told = (f"missing in {demo}" if each is None else _fault(each) for demo, each in found)
-                faults[name] = next(filter(None, told), "")
-    cameras = tuple(name for name, reason in faults.items() if not reason)
-    first, stored = next(iter(observations.items()))
-    forms = ", ".join(f"{name} {_form(value)}" for name, value in stored.items()) or "none"
-    got = "; ".join(f"{picture}: {reason}" for picture, reason in faults.items()) or f"{forms}: {_NO_PICTURES}"
-    expected = "a camera as uint8 [T, H, W, 3] in every demonstration"
-    require(f"{file}: data/{first}/obs", bool(cameras), expected, got)
-    return cameras, {name: reason for name, reason in faults.items() if reason}
+def _pictures_in(demos: Mapping[int, tuple[str, Any]]) -> Mapping[str, Mapping[int, str]]:
+    """The fault of each picture in each demonstration; "": none."""
+    observations = {number: (name, _observations(demo)) for number, (name, demo) in demos.items()}
+    found = {name: None for _, stored in observations.values() for name, value in stored.items() if _is_picture(value)}
+    return {
+        picture: {
+            number: _fault(stored[picture]) if picture in stored else f"missing in {name}"
+            for number, (name, stored) in observations.items()
+        }
+        for picture in found
+    }
+
+
+def _forms_in(demos: Mapping[int, tuple[str, Any]]) -> Mapping[int, str]:
+    """The observations of each demonstration, for messages."""
+    found = {number: _observations(demo) for number, (_, demo) in demos.items()}
+    return {
+        n: ", ".join(f"{name} {_form(value)}" for name, value in each.items()) or "none" for n, each in found.items()
+    }
+
+
+def _lengths_of(demo: Any, cameras: Sequence[str]) -> Mapping[str, int]:
+    """Number of frames of each camera, and of actions, if present."""
+    lengths = {f"obs/{camera}": len(demo["obs"][camera]) for camera in cameras}
+    has_actions = bool(lengths) and "actions" in demo
+    return lengths | ({"actions": len(demo["actions"])} if has_actions else {})
+
+
+def _one_length(lengths: Mapping[str, int]) -> int:
+    """The length that all share; 0: they differ, or there is none."""
+    return next(iter(lengths.values())) if len(set(lengths.values())) == 1 else 0
+
+
+def _observations(demo: Any) -> Mapping[str, Any]:
+    observations: Any = demo.get("obs") if hasattr(demo, "keys") else None
+    return dict(observations) if hasattr(observations, "keys") else {}
 
 
 def _fault(value: Any) -> str:
@@ -223,6 +260,27 @@ def _document(attributes: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     except (ValueError, TypeError, RecursionError):
         return {}
     return document if isinstance(document, dict) else {}
+
+
+def _own_task_of(demo: Any) -> Any:
+    """The task in a demonstration's ``ep_meta``, as robomimic reads it, or in an attribute; None: none."""
+    attributes = getattr(demo, "attrs", {})
+    stored = _document(attributes, "ep_meta")
+    own = next((stored[key] for key in _SENTENCES if stored.get(key)), None)
+    own = own or next((attributes[key] for key in _SENTENCES if key in attributes), None)
+    return own.decode() if isinstance(own, bytes) else own
+
+
+def _filter_keys_in(opened: Any) -> Mapping[str, Sequence[int]]:
+    """Numbers of the demonstrations in each dataset of ``mask``, without datasets of anything else."""
+    group = opened.get("mask")
+    found: dict[str, list[int]] = {}
+    for key, names in group.items() if hasattr(group, "keys") else ():
+        told = [name.decode() if isinstance(name, bytes) else str(name) for name in np.ravel(names[()]).tolist()]
+        matches = [_DEMO.match(name) for name in told]
+        if all(matches):
+            found[key] = sorted(int(match[1]) for match in matches if match)
+    return found
 
 
 def _task_of(attributes: Mapping[str, Any]) -> Any:

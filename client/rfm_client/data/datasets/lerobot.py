@@ -7,7 +7,6 @@ offset common to all rows. Otherwise it is refused, because the row of a frame i
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -27,6 +26,7 @@ from rfm_client.data.datasets.protocol import (
     orientations_of,
     require,
 )
+from rfm_client.data.datasets.stored_pictures import decoded_picture, opened_picture, pillow
 from rfm_client.data.datasets.video_frames import Span, Times, decode, video_identity, video_packets
 from rfm_client.data.orientation import Orient
 from rfm_client.data.video_decoding import Packets, decoder
@@ -35,8 +35,6 @@ _VIDEOS_AT_A_TIME = 4  # whose packets stay in memory
 _TOLERANCE_S = 1e-4  # LeRobot's, between a row's time and its frame's
 _CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
 _AGAIN = "write the dataset again, or leave this video's episodes out (--episodes)"
-_COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's modes of at most 8 bits a channel
-_DEEP = ";16"  # Pillow's mark of 16 bits a channel, which it cuts to 8
 
 
 class LeRobotDataset(Dataset):
@@ -60,79 +58,106 @@ class LeRobotDataset(Dataset):
         self.depth_cameras = info.depth
         self.orientations = orientations_of(orient, self.cameras)
         version = lerobot_v30 if info.version == "v3.0" else lerobot_v21
-        entries: Iterator[Entry] = version.read_entries(info)
-        self._entries = {entry.index: entry for entry in entries}
-        self._task = task
+        entries: Iterator[tuple[int, Entry | DatasetError]] = version.read_entries(info)
+        self._entries = dict(entries)
+        self.numbers = sorted(self._entries)
+        self.given_task = task
         self._rows = RowReader({} if task.overrides else version.read_tasks(root), task)
         self._video = lru_cache(_VIDEOS_AT_A_TIME)(self._read_video)
-        is_whole = sorted(self._entries) == list(range(info.total_episodes))
+        is_whole = self.numbers == list(range(info.total_episodes))
         require(root / "meta", is_whole, f"{info.total_episodes} episodes, as info.json says", len(self._entries))
-        num_frames = sum(entry.length for entry in self._entries.values())
-        is_whole = num_frames == info.total_frames
+        lengths = [entry.length for entry in self._entries.values() if isinstance(entry, Entry)]
+        num_frames = sum(lengths)
+        is_whole = num_frames == info.total_frames or len(lengths) < len(self._entries)
         require(root / "meta", is_whole, f"{info.total_frames} frames, as info.json says", num_frames)
 
-    def read_episodes(self) -> Sequence[DatasetEpisode]:
-        episodes = []
-        for _, entry in sorted(self._entries.items()):
-            rows = self._rows.read(entry)
-            episodes.append(DatasetEpisode(entry.index, entry.where, rows.task, len(rows.times_s), rows.first_index))
-        self._task.check_used(episodes)
-        return episodes
+    def read_episode(self, number: int) -> DatasetEpisode:
+        entry = self._entry(number)
+        rows = self._rows.read(entry)
+        tasks = tuple(rows.tasks) if len(rows.tasks) > 1 else ()
+        return DatasetEpisode(number, entry.where, rows.tasks[0][1], len(rows.times_s), rows.first_index, tasks)
 
     def decoder(self, camera: str) -> str | None:
-        return decoder() if camera in self.info.videos else _pillow()
+        return decoder() if camera in self.info.videos else pillow()
 
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         if camera not in self.info.videos:
             return digest_of(self._images(episode, camera))
-        video, from_s = self._entries[episode.index].videos[camera]
+        video, from_s = self._entry(episode.index).videos[camera]
         return f"{video_identity(video, verify=verify, revision=self.revision)} {from_s}"
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
         if camera in self.info.videos:
-            packets, frames = self._video(camera, self.video(episode, camera))
-            return sum(packets.num_bytes[frames[episode.index]])
+            packets, frames = self._in_packets(episode, camera)
+            return sum(packets.num_bytes[frames])
         images = self._images(episode, camera)
         for t, image in enumerate(images):
-            _opened_image(_where(episode, camera, t), image)
+            opened_picture(_where(episode, camera, t), image)
         return sum(map(len, images))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         if camera in self.info.videos:
             return decode(self.span(episode, camera))
         images = self._images(episode, camera)
-        return (_decoded_image(_where(episode, camera, t), image) for t, image in enumerate(images))
+        return (decoded_picture(_where(episode, camera, t), image) for t, image in enumerate(images))
 
     def times_s(self, episode: DatasetEpisode) -> Times:
         """Return float64 [T], each frame's time from the start of the episode. Raises DatasetError."""
-        return self._rows.read(self._entries[episode.index]).times_s
+        return self._rows.read(self._entry(episode.index)).times_s
 
     def video(self, episode: DatasetEpisode, camera: str) -> Path:
         """Return the episode's video file of a camera in ``info.videos``."""
-        return self._entries[episode.index].videos[camera][0]
+        return self._entry(episode.index).videos[camera][0]
 
     def span(self, episode: DatasetEpisode, camera: str) -> Span:
         """Return the episode's frames in that video. Raises DatasetError if frames and rows differ."""
         file = self.video(episode, camera)
-        packets, frames = self._video(camera, file)
+        packets, frames = self._in_packets(episode, camera)
         where, container = f"{episode.name}: {camera}", _CONTAINER.get(file.suffix.lower())
-        return Span(file, packets.times_s[frames[episode.index]], 0.5 / self.info.fps, where, container)
+        return Span(file, packets.times_s[frames], 0.5 / self.info.fps, where, container)
+
+    def _entry(self, number: int) -> Entry:
+        entry = self._entries[number]
+        if isinstance(entry, DatasetError):
+            raise entry
+        return entry
+
+    def _in_packets(self, episode: DatasetEpisode, camera: str) -> tuple[Packets, slice]:
+        """The packets of an episode's video, and the slice of its frames."""
+        file = self.video(episode, camera)
+        packets, frames = self._video(camera, file)
+        return packets, self._alone(episode, camera, packets) if frames is None else frames[episode.index]
+
+    def _alone(self, episode: DatasetEpisode, camera: str, packets: Packets) -> slice:
+        """The slice of an episode in a video of which another episode cannot be read: frames at its rows' times."""
+        file, from_s = self._entry(episode.index).videos[camera]
+        expected_s = packets.times_s[0] + from_s + self.times_s(episode)
+        first = int(np.argmin(np.abs(packets.times_s - expected_s[0])))
+        frames = slice(first, first + len(expected_s))
+        found_s = packets.times_s[frames]
+        tolerance_s = min(max(_TOLERANCE_S, packets.tick_s), 0.25 / self.info.fps)
+        are_there = len(found_s) == len(expected_s) and bool((np.abs(found_s - expected_s) <= tolerance_s).all())
+        got = f"others, and another episode of this video that cannot be read; {_AGAIN}"
+        where = f"{episode.name}: {camera}: {file}"
+        require(where, are_there, f"frames from {expected_s[0]:.4f} to {expected_s[-1]:.4f} s, one for each row", got)
+        return frames
 
     @cached_property
     def _in_video(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
         found: dict[tuple[str, Path], list[Entry]] = {}
-        for entry in self._entries.values():
+        for entry in [each for each in self._entries.values() if isinstance(each, Entry)]:
             for camera, (file, _) in entry.videos.items():
                 found.setdefault((camera, file), []).append(entry)
         return found
 
-    def _read_video(self, camera: str, file: Path) -> tuple[Packets, Mapping[int, slice]]:
-        """The packets of a video and each episode's slice of its frames."""
-        entries = self._in_video[camera, file]
-        parts = [(entry, entry.videos[camera][1] + self._rows.read(entry).times_s) for entry in entries]
+    def _read_video(self, camera: str, file: Path) -> tuple[Packets, Mapping[int, slice] | None]:
+        """The packets of a video and each episode's slice of its frames; None: an episode cannot be read."""
+        packets = video_packets(file, _CONTAINER.get(file.suffix.lower()))
+        parts = self._rows_in(camera, file)
+        if parts is None:
+            return packets, None
         parts.sort(key=lambda part: float(part[1][0]))
         rows_s = np.concatenate([times_s for _, times_s in parts])
-        packets = video_packets(file, _CONTAINER.get(file.suffix.lower()))
         fps, rates = self.info.fps, ""
         if packets.fps and f"{packets.fps:.2f}" != f"{self.info.fps:.2f}":
             rates = f" (the video has {packets.fps:.2f} frames a second, meta/info.json says {fps:g})"
@@ -155,8 +180,19 @@ class LeRobotDataset(Dataset):
             entry.index: slice(end - len(times_s), end) for (entry, times_s), end in zip(parts, ends, strict=True)
         }
 
+    def _rows_in(self, camera: str, file: Path) -> list[tuple[Entry, Times]] | None:
+        """The episodes of a video, with the times of their frames in it; None: one of them cannot be read."""
+        entries = self._in_video[camera, file]
+        is_known = all(isinstance(entry, Entry) for entry in self._entries.values())
+        if not is_known and self.info.version == "v3.0":  # the video may have an episode whose metadata are broken
+            return None
+        try:
+            return [(entry, entry.videos[camera][1] + self._rows.read(entry).times_s) for entry in entries]
+        except DatasetError:  # raised again if that episode is read
+            return None
+
     def _images(self, episode: DatasetEpisode, camera: str) -> list[bytes]:
-        file = self._entries[episode.index].data_file
+        file = self._entry(episode.index).data_file
         stored = read_table(file, [camera], filters=[("episode_index", "=", episode.index)])[camera].to_pylist()
         require(f"{file}: {camera}", len(stored) == episode.num_frames, f"{episode.num_frames} images", len(stored))
         return [self._image_bytes(_where(episode, camera, t), image) for t, image in enumerate(stored)]
@@ -176,35 +212,3 @@ class LeRobotDataset(Dataset):
 
 def _where(episode: DatasetEpisode, camera: str, t: int) -> str:
     return f"{episode.name}: {camera}: frame {t}"
-
-
-def _decoded_image(where: str, image: bytes) -> UInt8Array:
-    with _opened_image(where, image) as opened:
-        try:
-            return np.asarray(opened.convert("RGB"))
-        except OSError as error:
-            raise DatasetError.at(where, "an image", error) from error
-
-
-def _opened_image(where: str, image: bytes) -> Any:
-    """Open a picture of 8-bit colours, and read only its header."""
-    _pillow()
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        opened = Image.open(io.BytesIO(image))
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise DatasetError.at(where, "an image", error) from error
-    is_deep = _DEEP in str(opened.tile)
-    expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
-    got = f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}"
-    require(where, opened.mode in _COLOURS and not is_deep, expected, got)
-    return opened
-
-
-def _pillow() -> str:
-    try:
-        import PIL
-    except ImportError as error:
-        raise ImportError('datasets of images need Pillow: pip install "./client[label]"') from error
-    return f"Pillow {PIL.__version__}"

@@ -127,11 +127,15 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeRows:
-    """The rows of one episode. times_s: float64 [T], rising, from the start of the episode"""
+    """The rows of one episode.
+
+    times_s: float64 [T], rising, from the start of the episode
+    tasks: the first row and the task of each stretch of rows with one task
+    """
 
     first_index: int
     times_s: npt.NDArray[np.float64]
-    task: str
+    tasks: Sequence[tuple[int, str]]
 
 
 class RowReader:
@@ -161,15 +165,19 @@ class RowReader:
         times_s = rows["timestamp"].astype(np.float64)
         is_rising = bool(np.isfinite(times_s).all() and (np.diff(times_s) > 0).all())
         require(f"{where}: timestamp", is_rising, "rising numbers", "others")
-        return EpisodeRows(first, times_s, self._task(entry, where, rows["task_index"]))
+        return EpisodeRows(first, times_s, self._tasks_of(entry, where, rows["task_index"]))
 
-    def _task(self, entry: Entry, where: str, task_indices: npt.NDArray[np.int64]) -> str:
+    def _tasks_of(self, entry: Entry, where: str, task_indices: npt.NDArray[np.int64]) -> Sequence[tuple[int, str]]:
         if self._given.overrides:
-            return self._given.of(where, None)
-        used = np.unique(task_indices).tolist()
-        require(f"{where}: task_index", len(used) == 1, "one task in an episode", f"{len(used)}: {used}")
-        own = self._tasks.get(used[0])
-        task = self._given.of(f"{entry.where}: task {used[0]} in meta/tasks", own)
+            return [(0, self._given.of(where, None))]
+        firsts = np.flatnonzero(np.diff(task_indices, prepend=task_indices[0] - 1)).tolist()
+        if self._given.several == "first":
+            firsts = firsts[:1]
+        return [(first, self._task(entry, int(task_indices[first]))) for first in firsts]
+
+    def _task(self, entry: Entry, index: int) -> str:
+        own = self._tasks.get(index)
+        task = self._given.of(f"{entry.where}: task {index} in meta/tasks", own)
         is_named = not entry.tasks or task != own or task in entry.tasks
         require(f"{entry.where}: meta/episodes: tasks", is_named, repr(task), repr(list(entry.tasks)))
         return task

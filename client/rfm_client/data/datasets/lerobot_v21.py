@@ -16,20 +16,14 @@ EPISODES_FILE = Path("meta", "episodes.jsonl")
 TASKS_FILE = Path("meta", "tasks.jsonl")
 
 
-def read_entries(info: Info) -> Iterator[Entry]:
-    """Yield the episodes in the metadata. Raises DatasetError."""
+def read_entries(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
+    """Yield the number of each episode with its metadata, or with their fault. Raises DatasetError."""
     for where, line in json_lines(info.root / EPISODES_FILE):
-        index, length = _number(where, line, "episode_index"), _number(where, line, "length")
-        values = {"episode_chunk": index // info.chunks_size, "episode_index": index}
-        tasks = line.get("tasks")
-        yield Entry(
-            index=index,
-            tasks=[task for task in tasks if isinstance(task, str)] if isinstance(tasks, list) else [],
-            length=length,
-            first_index=None,
-            data_file=info.path(info.data_path, **values),
-            videos={key: (info.path(info.video_path, **values, video_key=key), 0.0) for key in info.videos},
-        )
+        index = _number(where, line, "episode_index")
+        try:
+            yield index, _entry(info, where, index, line)
+        except DatasetError as error:
+            yield index, error
 
 
 def read_tasks(root: Path) -> dict[int, str | None]:
@@ -55,6 +49,19 @@ def json_lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
             raise DatasetError.at(where, "a JSON object", str(error)) from error
         require(where, isinstance(line, dict), "a JSON object", type(line).__name__)
         yield where, line
+
+
+def _entry(info: Info, where: str, index: int, line: Mapping[str, Any]) -> Entry:
+    values = {"episode_chunk": index // info.chunks_size, "episode_index": index}
+    tasks = line.get("tasks")
+    return Entry(
+        index=index,
+        tasks=[task for task in tasks if isinstance(task, str)] if isinstance(tasks, list) else [],
+        length=_number(where, line, "length"),
+        first_index=None,
+        data_file=info.path(info.data_path, **values),
+        videos={key: (info.path(info.video_path, **values, video_key=key), 0.0) for key in info.videos},
+    )
 
 
 def _number(where: str, line: Mapping[str, Any], name: str) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rfm_client.data.datasets.lerobot_rows import Entry, Info, read_table
-from rfm_client.data.datasets.protocol import require
+from rfm_client.data.datasets.protocol import DatasetError, require
 
 EPISODES_FOLDER = Path("meta", "episodes")
 TASKS_FILE = Path("meta", "tasks.parquet")
@@ -20,14 +20,19 @@ _OF_AN_EPISODE = (
 _OF_A_VIDEO = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 
 
-def read_entries(info: Info) -> Iterator[Entry]:
-    """Yield the episodes in the metadata. Raises DatasetError."""
+def read_entries(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
+    """Yield the number of each episode with its metadata, or with their fault. Raises DatasetError."""
     files = sorted((info.root / EPISODES_FOLDER).rglob("*.parquet"))
     require(info.root / EPISODES_FOLDER, bool(files), "Parquet files", "none")
     of_videos = [f"videos/{key}/{name}" for key in info.videos for name in _OF_A_VIDEO]
     for file in files:
         for row in read_table(file, [*_OF_AN_EPISODE, *of_videos]).to_pylist():
-            yield _entry(info, file, row)
+            index = row["episode_index"]
+            require(f"{file}: episode_index", index is not None, "a value", "none")
+            try:
+                yield index, _entry(info, file, row)
+            except DatasetError as error:
+                yield index, error
 
 
 def read_tasks(root: Path) -> dict[int, str | None]:

@@ -6,19 +6,33 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from rfm_client.data.datasets.array_files import ArrayFiles
+from rfm_client.data.datasets.episode_files import (
+    TABLES,
+    Contents,
+    EpisodeFiles,
+    in_natural_order,
+    read_table_of_tasks,
+    table_in,
+)
+from rfm_client.data.datasets.frame_folders import FrameFolders, is_picture
 from rfm_client.data.datasets.hdf5 import ALOHA, ALOHA_GROUP, SUFFIXES, Hdf5Dataset
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.datasets.lerobot_rows import INFO_FILE
-from rfm_client.data.datasets.protocol import Dataset, DatasetError, TaskOverride, require
-from rfm_client.data.datasets.videos import TABLES, VideoFolder
+from rfm_client.data.datasets.protocol import SIGNALS_FOLDER, Dataset, DatasetError, SeveralTasks, TaskOverride, require
+from rfm_client.data.datasets.videos import VideoFolder
+from rfm_client.data.inputs import ARRAY_SUFFIXES
 from rfm_client.data.orientation import Orient
 
 _HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
 _LAYOUTS = (
-    f"a LeRobot dataset ({INFO_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), "
-    f"a folder of videos with {' or '.join(TABLES)}, or a Hub id org/name[@revision]"
+    f"a LeRobot dataset ({INFO_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), a folder of videos, of folders "
+    f"of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {' or '.join(TABLES)}, "
+    "or a Hub id org/name[@revision]"
 )
 _TABLE = "list the videos in tasks.csv (columns video, task)"
+_GIVE_TASK = '--task "SENTENCE"'
+_FILL = "put a video, an array or a folder of pictures for each episode in it"
 _UNREAD = {  # remedies for layouts without a reader, by pattern of file names
     r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with convert_dataset_v1_to_v2.py of lerobot/datasets/v2 "
     "(LeRobot 0.3), and label that",
@@ -30,30 +44,40 @@ _UNREAD = {  # remedies for layouts without a reader, by pattern of file names
     r".*\.(bag|mcap|db3)": "a rosbag: convert it to LeRobot with https://github.com/arpitg1304/forge, or write each "
     f"camera's topic to a video (the package rosbags reads it without ROS) and {_TABLE}",
 }
-_PICTURES, _VIDEOS = ("png", "jpg", "jpeg"), ("mp4", "mkv", "mov", "webm", "avi")
+_VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")
+_KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and the name of an episode
+    "videos": (VideoFolder, "video"),
+    "folders of pictures": (FrameFolders, "folder"),
+    "arrays": (ArrayFiles, "file"),
+}
+_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside the episodes, once they have labels
 
 
 def open_dataset(
-    source: str | Path, *, task: str | None = None, override_task: bool = False, orient: Orient = Orient()
+    source: str | Path,
+    *,
+    task: str | None = None,
+    override_task: bool = False,
+    several_tasks: SeveralTasks = "each",
+    orient: Orient = Orient(),
 ) -> Dataset:
     """Return the dataset at a path, or download the Hub id ``org/name[@revision]``. An existing path wins.
 
     task: task of episodes without their own
     override_task: True: ``task`` is the task of all episodes
+    several_tasks: of a LeRobot episode with several tasks: ``each``: each frame has its own; ``first``: all frames have
+        the first frame's, as in LeRobot's own scripts
     orient: turn of each camera's frames. HDF5 files marked as LIBERO's are turned by default
 
     Raises DatasetError.
     """
-    path, given = Path(source), TaskOverride(task, override_task)
+    path, given = Path(source), TaskOverride(task, override_task, several_tasks)
     if path.is_file() and path.suffix.lower() in SUFFIXES:
         return Hdf5Dataset(path, task=given, orient=orient)
     if (path / INFO_FILE).is_file():
         return LeRobotDataset(path, task=given, orient=orient)
     if path.exists():
-        has_table = path.suffix.lower() in (".csv", ".json") or any((path / table).is_file() for table in TABLES)
-        other = None if has_table else _unread(path)
-        require(path, has_table or (other is None and path.is_dir()), _LAYOUTS, other or "another file")
-        return VideoFolder(path, task=given, orient=orient)
+        return _open_files(path, given, orient)
     match = _HUB_ID.fullmatch(str(source))
     if match is None:
         raise DatasetError.at(source, _LAYOUTS, "none")
@@ -75,6 +99,81 @@ def _from_hub(name: str, revision: str | None, task: TaskOverride, orient: Orien
     return LeRobotDataset(folder, source=name, revision=commit, task=task, orient=orient)
 
 
+def hdf5_files(folder: str | Path) -> list[Path]:
+    """Return the HDF5 datasets of a folder and the folders in it; empty if it is no folder, or holds other data.
+
+    Files of labels and hidden files are left out. The order is that of the paths, with 2 before 10.
+    """
+    root = Path(folder)
+    if not root.is_dir() or (root / INFO_FILE).is_file() or table_in(root) or set(_found(root)) - {"HDF5 files"}:
+        return []
+    names = (str(file.relative_to(root)) for file in root.rglob("*") if file.suffix.lower() in SUFFIXES)
+    shown = [name for name in names if "/." not in f"/{name}" and not _FILES_OF_OURS.fullmatch(name)]
+    return [root / name for name in in_natural_order(shown)]
+
+
+def _open_files(path: Path, task: TaskOverride, orient: Orient) -> Dataset:
+    """The dataset of a folder with a file or a folder for each episode, or of its table. Raises DatasetError."""
+    if path.is_file() and path.suffix.lower() not in (".csv", ".json"):
+        raise DatasetError.at(path, _LAYOUTS, _unread(path) or "another file")
+    table = table_in(path) if path.is_dir() else path
+    if table is not None:
+        tasks = read_table_of_tasks(table, has_tasks=task.text is None)
+        kinds = {_kind_of(table.parent / name): name for name in reversed(list(tasks))}
+        told = " and ".join(f"{kind} ({name})" for kind, name in sorted(kinds.items()))
+        require(table, len(kinds) == 1, "episodes of one kind", f"{told}: write a table for each kind")
+        (kind,) = kinds
+        return _KINDS[kind][0](Contents(table.parent, tasks, table, task, orient))
+    kind, names = _listed(path)
+    reader, episode = _KINDS[kind]
+    is_told = task.text is not None or kind == "arrays"
+    got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
+    require(path, is_told, f"one of {' and '.join(TABLES)} with the task of each {episode}", got)
+    return reader(Contents(path, dict.fromkeys(names), path, task, orient))
+
+
+def _kind_of(path: Path) -> str:
+    if path.is_dir():
+        return "folders of pictures"
+    return "arrays" if path.suffix.lower() in ARRAY_SUFFIXES else "videos"
+
+
+def _listed(folder: Path) -> tuple[str, list[str]]:
+    """The kind of a folder's episodes, and their names. Raises DatasetError for several kinds, or none."""
+    found = _found(folder)
+    told = " and ".join(f"{kind} ({names[0]})" for kind, names in found.items())
+    got = f"{told}: give each kind a folder of its own, or list the episodes of one kind in tasks.csv"
+    require(folder, len(found) < 2, "episodes of one kind", got)
+    if not any(kind in _KINDS for kind in found):
+        other = f"{'other files' if _names_in(folder) else 'an empty folder'}: {_FILL}"
+        raise DatasetError.at(folder, _LAYOUTS, _unread(folder) or other)
+    return next(iter(found.items()))
+
+
+def _found(folder: Path) -> dict[str, list[str]]:
+    """Names of what may be episodes, by kind, without hidden files and files of labels."""
+    shown = [folder / name for name in _names_in(folder)]
+    files = [each for each in shown if each.is_file() and not _FILES_OF_OURS.fullmatch(each.name)]
+    folders = [each for each in shown if each.is_dir() and each.name != SIGNALS_FOLDER]
+    found = {
+        kind: [each.name for each in files if each.suffix.lower() in suffixes]
+        for kind, suffixes in (("videos", _VIDEO_SUFFIXES), ("arrays", ARRAY_SUFFIXES), ("HDF5 files", SUFFIXES))
+    }
+    has_frames = any(_is_frame(file) for each in folders for file in each.iterdir())
+    found["folders of pictures"] = [each.name for each in folders] if has_frames else []
+    if has_frames or not any(found.values()):  # elsewhere a picture is no frame
+        found["pictures"] = [each.name for each in files if _is_frame(each)]
+    return {kind: in_natural_order(names) for kind, names in found.items() if names}
+
+
+def _is_frame(file: Path) -> bool:
+    return is_picture(file) and not _FILES_OF_OURS.fullmatch(file.name)
+
+
+def _names_in(folder: Path) -> list[str]:
+    return [each.name for each in folder.iterdir() if not each.name.startswith(".")]
+
+
 def _unread(path: Path) -> str | None:
     """A known layout without a reader, and its remedy; None: the layout is unknown."""
     found = [path] if path.is_file() else [each for below in ("*", "*/*") for each in path.glob(below)]
@@ -83,33 +182,25 @@ def _unread(path: Path) -> str | None:
         if any(re.fullmatch(pattern, name, re.IGNORECASE) for name in names):
             return what
     if path.is_file():
-        is_video = path.suffix.lower().lstrip(".") in _VIDEOS
-        return "a video: label its folder, with tasks.csv in it (columns video, task)" if is_video else None
-    if files := _pattern(path, [suffix.lstrip(".") for suffix in SUFFIXES]):
-        loop = f'for f in {files}; do rfm-client label "$f"; done'
-        return ALOHA if _is_aloha(path, files) else f"a folder of HDF5 files, each a dataset of its own: {loop}"
-    pictures = None if _pattern(path, _VIDEOS) else _pattern(path, _PICTURES)
-    if pictures is None:
-        return None
-    encoding = "ffmpeg -framerate 10 -i - -c:v libx264rgb -crf 0"
-    if pictures.parent == path:
-        video = f"cat $(ls -v {pictures}) | {encoding} {path}/0.mp4"
-    else:
-        video = f"for e in {pictures.parent}/; do cat $(ls -v $e{pictures.name}) | {encoding} ${{e%/}}.mp4; done"
-    return f"a folder of pictures: make a video of each episode ({video}) and {_TABLE}"
+        is_video = path.suffix.lower() in _VIDEO_SUFFIXES
+        return f"a video: label its folder, with {_GIVE_TASK} or with tasks.csv in it" if is_video else None
+    files = hdf5_files(path)
+    if files:
+        remedy = "rfm-client label takes the folder, open_dataset each file"
+        return ALOHA if _is_aloha(files[0]) else f"a folder of HDF5 files, each a dataset of its own: {remedy}"
+    if pictures := [file for file in path.iterdir() if _is_frame(file)]:
+        moved = f"mkdir {path}/0 && mv {path}/*{pictures[0].suffix} {path}/0"
+        return f"pictures outside of the folder of an episode: {moved}"
+    deeper = next((file for file in path.glob("*/*/*") if is_picture(file)), None)
+    listed = deeper and deeper.parent.relative_to(path)
+    return f"pictures two levels down: list the folders of one camera ({listed}) in tasks.csv" if deeper else None
 
 
-def _is_aloha(folder: Path, pattern: Path) -> bool:
+def _is_aloha(file: Path) -> bool:
     try:
         import h5py
 
-        with h5py.File(next(iter(folder.glob(str(pattern.relative_to(folder))))), "r") as opened:
+        with h5py.File(file, "r") as opened:
             return ALOHA_GROUP in opened
     except (ImportError, OSError):  # treated as any folder of HDF5 files
         return False
-
-
-def _pattern(folder: Path, suffixes: tuple[str, ...] | list[str]) -> Path | None:
-    """Glob pattern of files with one of these suffixes, in the folder or a level below; None: no such files."""
-    patterns = [f"{below}*.{suffix}" for below in ("", "*/") for suffix in suffixes]
-    return next((folder / pattern for pattern in patterns if any(folder.glob(pattern))), None)

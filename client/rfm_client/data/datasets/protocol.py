@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -19,6 +20,10 @@ from rfm_client.contract import checks
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.samples import Trajectory, UInt8Array
 from rfm_client.data.orientation import Orient, Orientation, turned
+
+SIGNALS_FOLDER = "reward_signals"  # folder of labels in a dataset's folder
+
+SeveralTasks: TypeAlias = Literal["each", "first"]
 
 _CAMERA_PREFIX = "observation.images."
 
@@ -43,7 +48,9 @@ class DatasetEpisode:
 
     index: its number in the dataset
     name: its name in the dataset
+    task: of all frames, or of the first frame
     first_index: the dataset's number of its first frame; the others follow
+    tasks: the first frame and the task of each stretch of frames with one task; empty: one task for all frames
     """
 
     index: int
@@ -51,6 +58,51 @@ class DatasetEpisode:
     task: str
     num_frames: int
     first_index: int
+    tasks: tuple[tuple[int, str], ...] = ()
+
+    @property
+    def stretches(self) -> list[tuple[str, int]]:
+        """Task and number of frames of each stretch of frames with one task, in order."""
+        tasks = self.tasks or ((0, self.task),)
+        ends = [*(first for first, _ in tasks[1:]), self.num_frames]
+        return [(task, end - first) for (first, task), end in zip(tasks, ends, strict=True)]
+
+
+@dataclass(frozen=True)
+class TaskOverride:
+    """The caller's task for episodes. Raises DatasetError for an empty text, or an override without a text.
+
+    text: task of episodes without their own; None: not given
+    overrides: True: ``text`` is the task of all episodes
+    several: of an episode with several tasks: ``each``: each frame has its own; ``first``: all have the first frame's
+    """
+
+    text: str | None = None
+    overrides: bool = False
+    several: SeveralTasks = "each"
+
+    def __post_init__(self) -> None:
+        is_said = self.text is not None and bool(self.text.strip())
+        got = "none" if self.text is None else repr(self.text)
+        kinds = get_args(SeveralTasks)
+        require("several_tasks", self.several in kinds, f"one of {', '.join(kinds)}", repr(self.several))
+        require("task", is_said or (self.text is None and not self.overrides), "a sentence", got)
+
+    def of(self, where: object, own: object) -> str:
+        """Return the task of an episode; ``own`` is its own. Raises DatasetError without a task."""
+        is_missing = not own or (isinstance(own, str) and not own.strip())
+        if self.text is not None and (self.overrides or is_missing):
+            return self.text
+        if is_missing or not isinstance(own, str):
+            got = "none" if not own else repr(own)
+            raise DatasetError.at(where, "a task as a sentence", f'{got}: add --task "SENTENCE"')
+        return own
+
+    def check_used(self, episodes: Sequence[DatasetEpisode]) -> None:
+        """Raise DatasetError if the text is given, but is no episode's task."""
+        is_used = self.text is None or any(task == self.text for episode in episodes for task, _ in episode.stretches)
+        got = f"{self.text!r}: leave it out, or put it in the place of theirs with --override-task"
+        require("task", is_used, "none for episodes that all have tasks of their own", got)
 
 
 class Dataset(ABC):
@@ -63,6 +115,9 @@ class Dataset(ABC):
     cameras: names, in the dataset's order
     depth_cameras: cameras of distances instead of colours, used only if named
     left_out: pictures that cannot be scored, with the reason; not in ``cameras``
+    numbers: of all episodes, in order
+    filter_keys: numbers of the episodes of each filter key, such as ``train``
+    given_task: the caller's task
     orientations: turn that ``frames`` makes, by camera; others are not turned
     notes: lines for the caller to read before scoring
     """
@@ -74,17 +129,36 @@ class Dataset(ABC):
     cameras: Sequence[str] = ()
     depth_cameras: Sequence[str] = ()
     left_out: Mapping[str, str] = {}
+    numbers: Sequence[int] = ()
+    filter_keys: Mapping[str, Sequence[int]] = {}
+    given_task: TaskOverride = TaskOverride()
     orientations: Mapping[str, Orientation] = {}
     notes: Sequence[str] = ()
 
     @cached_property
     def episodes(self) -> Sequence[DatasetEpisode]:
         """All episodes, by index. Raises DatasetError."""
-        return self.read_episodes()
+        episodes = [self.episode(number) for number in self.numbers]
+        self.given_task.check_used(episodes)
+        return episodes
+
+    def episode(self, number: int) -> DatasetEpisode:
+        """Return one of the episodes in ``numbers``. Only the first call reads it. Raises DatasetError."""
+        if number not in self._read:
+            self._read[number] = self.read_episode(number)
+        return self._read[number]
+
+    @cached_property
+    def _read(self) -> dict[int, DatasetEpisode]:
+        return {}
 
     @abstractmethod
-    def read_episodes(self) -> Sequence[DatasetEpisode]:
-        """Read and check the tables of all episodes."""
+    def read_episode(self, number: int) -> DatasetEpisode:
+        """Read and check the tables of an episode. A fault of another episode is no error. Raises DatasetError."""
+
+    def cameras_in(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
+        """Return ``cameras`` and ``left_out`` of these episodes alone. Raises DatasetError if they share no camera."""
+        return self.cameras, self.left_out
 
     @abstractmethod
     def decoder(self, camera: str) -> str | None:
@@ -115,22 +189,25 @@ class Dataset(ABC):
         return (turned(frame, orientation) for frame in self.stored_frames(episode, camera))
 
 
-def chosen_cameras(dataset: Dataset, names: Iterable[str]) -> tuple[str, ...]:
+def chosen_cameras(dataset: Dataset, names: Iterable[str], numbers: Sequence[int] | None = None) -> tuple[str, ...]:
     """Return the dataset's cameras of these names; without names, all but depth cameras.
+
+    numbers: episodes that need the cameras; None: all
 
     A name may omit LeRobot's ``observation.images.``. Raises DatasetError for an unknown camera, or if all
     are depth cameras and none is named.
     """
-    some = f"some of {', '.join(dataset.cameras)}"
+    cameras, left_out = dataset.cameras_in(dataset.numbers if numbers is None else numbers)
+    some = f"some of {', '.join(cameras)}"
     chosen = []
     for name in names:
-        camera = _camera_named(name, dataset.cameras)
+        camera = _camera_named(name, cameras)
         if camera is None:
-            reason = f", which is left out: {dataset.left_out[name]}" if name in dataset.left_out else ""
+            reason = f", which is left out: {left_out[name]}" if name in left_out else ""
             raise DatasetError.at("cameras", some, f"{name!r}{reason}")
         chosen.append(camera)
-    chosen = chosen or [camera for camera in dataset.cameras if camera not in dataset.depth_cameras]
-    require("cameras", bool(chosen or not dataset.cameras), f"{some} named: all are depth cameras", "none")
+    chosen = chosen or [camera for camera in cameras if camera not in dataset.depth_cameras]
+    require("cameras", bool(chosen or not cameras), f"{some} named: all are depth cameras", "none")
     return tuple(chosen)
 
 
@@ -180,36 +257,3 @@ def digest_of(parts: Iterable[bytes]) -> str:
         digest.update(len(part).to_bytes(8, "little"))
         digest.update(part)
     return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class TaskOverride:
-    """The caller's task for episodes. Raises DatasetError for an empty text, or an override without a text.
-
-    text: task of episodes without their own; None: not given
-    overrides: True: ``text`` is the task of all episodes
-    """
-
-    text: str | None = None
-    overrides: bool = False
-
-    def __post_init__(self) -> None:
-        is_said = self.text is not None and bool(self.text.strip())
-        got = "none" if self.text is None else repr(self.text)
-        require("task", is_said or (self.text is None and not self.overrides), "a sentence", got)
-
-    def of(self, where: object, own: object) -> str:
-        """Return the task of an episode; ``own`` is its own. Raises DatasetError without a task."""
-        is_missing = not own or (isinstance(own, str) and not own.strip())
-        if self.text is not None and (self.overrides or is_missing):
-            return self.text
-        if is_missing or not isinstance(own, str):
-            got = "none" if not own else repr(own)
-            raise DatasetError.at(where, "a task as a sentence", f'{got}: add --task "SENTENCE"')
-        return own
-
-    def check_used(self, episodes: Sequence[DatasetEpisode]) -> None:
-        """Raise DatasetError if the text is given, but is no episode's task."""
-        is_used = self.text is None or any(episode.task == self.text for episode in episodes)
-        got = f"{self.text!r}: leave it out, or put it in the place of theirs with --override-task"
-        require("task", is_used, "none for episodes that all have tasks of their own", got)

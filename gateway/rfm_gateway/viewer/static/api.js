@@ -58,6 +58,11 @@ export async function videoOf(number, episode, camera, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}/videos/${camera}`, { signal })).blob();
 }
 
+/** A clip that comes with the gateway, as a Blob. */
+export async function exampleVideo(path) {
+  return (await answer(path)).blob();
+}
+
 /** The running episodes, and what is new of them since a cursor. */
 export async function liveNews(cursor) {
   return (await answer(`viewer/live?after=${encodeURIComponent(cursor)}`)).json();

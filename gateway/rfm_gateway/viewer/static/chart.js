@@ -1,53 +1,81 @@
 // SPDX-License-Identifier: MIT
-// The chart: progress and success of each curve over the time in its video or over its steps, drawn by uPlot.
+// The chart: progress of each curve above, success in a band below, over time or over steps, drawn by uPlot.
 
+import { pointAt } from "./curves.js";
+import { shown } from "./text.js";
 import uPlot from "./uplot/uPlot.esm.js";
 
-const HEIGHT_PX = 300;
 const NUM_COLOURS = 8;
-const PNG_LINE_PX = 22;
+const VALUE_PX = 16; // height of a number beside a line
+const VALUE_WIDTH_PX = 48;
+const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
+const LOW_PX = 240; // a chart so low has fewer marks
+const TICKS = { progress: [0, 0.25, 0.5, 0.75, 1], success: [0, 0.5, 1] };
+const FEW_TICKS = { progress: [0, 0.5, 1], success: [0, 1] };
+const WITH_SUCCESS = { progress: [0.37, 0.98], success: [0.03, 0.27] }; // shares of the height, from 0 to 1 of the signal
+const WITHOUT_SUCCESS = { progress: [0.03, 0.98] };
 
 /** The name of the colour of curve number `index`, which the style sheet has for each theme. */
 export function colourName(index) {
   return `curve-${index % NUM_COLOURS}`;
 }
 
-function colour(index) {
-  return themed(`--${colourName(index)}`);
+/** What the style sheet says for this theme, or within an element. */
+export function themed(name, element = document.documentElement) {
+  return getComputedStyle(element).getPropertyValue(name).trim();
 }
 
-/** What the style sheet says for this theme. */
-export function themed(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+/** The colour of a signal of a curve: its own, or that of its number. */
+export function colourOf({ colour, index, successIndex }, signal = "progress", element = undefined) {
+  return colour ?? themed(`--${colourName(signal === "success" ? successIndex ?? index : index)}`, element);
+}
+
+/** Where the signals of the curves lie in a chart: shares of its height, for 0 and for 1. */
+export function panesOf(curves) {
+  return curves.some(({ success }) => success.some((value) => value !== null)) ? WITH_SUCCESS : WITHOUT_SUCCESS;
+}
+
+/** The share of a chart's height at which a value of a signal lies; null: it has none. */
+export function heightOf(panes, signal, value) {
+  if (value === null || value === undefined || !panes[signal]) return null;
+  const [from, to] = panes[signal];
+  return from + value * (to - from);
 }
 
 /**
  * A chart in `host`. `onTime(seconds, isDragged)` is called when somebody points at it or drags in it.
- * label: of the axis to the right; null: none
+ * label: of the axis below; null: none. onThreshold(value): somebody drags the line at which success counts
+ * isOfSteps: the axis below counts steps
  */
 export class Chart {
   #host;
   #onTime;
-  #plot = null;
-  #numCurves = 0;
-  #heightPx;
+  #onThreshold;
   #label;
+  #isOfSteps;
+  #plot = null;
+  #curves = [];
+  #panes = WITHOUT_SUCCESS;
+  #shape = "";
   #begin = 0;
   #end = 1;
   #threshold = 0.5;
   #time = 0;
-  #playhead = document.createElement("div");
+  #playhead = made("playhead");
+  #line = made("threshold");
+  #values = made("values");
   #leaving = new AbortController();
   #resizing = new ResizeObserver(() => this.#host.clientWidth && this.#plot?.setSize(this.#size()));
 
-  constructor(host, onTime, { heightPx = HEIGHT_PX, label = "seconds" } = {}) {
+  constructor(host, onTime, { label = "seconds", onThreshold = null, isOfSteps = false } = {}) {
     this.#host = host;
-    this.#heightPx = heightPx;
     this.#label = label;
+    this.#isOfSteps = isOfSteps;
     this.#onTime = onTime;
-    this.#playhead.className = "playhead";
+    this.#onThreshold = onThreshold;
+    this.#line.classList.toggle("movable", onThreshold !== null);
     this.#resizing.observe(host);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#plot?.redraw(), this.#leaving);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw(), this.#leaving);
   }
 
   /** Frees what it holds. */
@@ -57,107 +85,201 @@ export class Chart {
     this.#plot?.destroy();
   }
 
-  /** Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`; some have a `begin`. */
+  /**
+   * Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`.
+   * Some have a `begin`, a `colour`, a `successIndex` of another colour for success, or are `isDashed`.
+   */
   show(curves) {
-    const drawn = curves.filter(({ times }) => times.length);
-    this.#begin = Math.min(...drawn.map(({ begin }) => begin ?? 0), Infinity);
-    this.#end = Math.max(0, ...drawn.map(({ allTimes }) => allTimes.at(-1))); // so that the axis does not grow
+    this.#curves = curves.filter(({ times }) => times.length);
+    this.#panes = panesOf(this.#curves);
+    this.#begin = Math.min(...this.#curves.map(({ begin }) => begin ?? 0), Infinity);
+    this.#end = Math.max(0, ...this.#curves.map(({ allTimes }) => allTimes.at(-1))); // so that the axis does not grow
+    if (this.#isOfSteps) this.#end = Math.max(this.#end, this.#begin + FEWEST_STEPS);
     if (this.#end <= this.#begin) this.#end = this.#begin + 1; // uPlot divides an axis of no length for ever
-    const tables = drawn.map(({ times, progress, success }) => [times, progress, success]);
+    const signals = Object.keys(this.#panes);
+    const tables = this.#curves.map((curve) => [
+      curve.times, ...signals.map((signal) => curve[signal].map((value) => heightOf(this.#panes, signal, value))),
+    ]);
     const data = tables.length ? uPlot.join(tables) : [[], []];
-    if (drawn.length !== this.#numCurves || !this.#plot) {
+    const shape = `${signals} ${this.#curves.map(({ isDashed }) => (isDashed ? "-" : "_")).join("")}`;
+    if (shape !== this.#shape || !this.#plot) {
       this.#plot?.destroy();
-      this.#plot = drawn.length ? this.#newPlot(drawn.map(({ index }) => index), data) : null;
-      this.#numCurves = drawn.length;
+      this.#plot = this.#curves.length ? this.#newPlot(signals, data) : null;
+      this.#shape = shape;
     } else {
       this.#plot.setData(data);
     }
+    this.setThreshold(this.#threshold);
+    this.moveTo(this.#time);
+  }
+
+  /** Draws everything in the colours of now. */
+  redraw() {
+    this.#plot?.redraw();
     this.moveTo(this.#time);
   }
 
   /** Draws the line at which success counts; null: none. */
   setThreshold(value) {
     this.#threshold = value;
-    this.#plot?.redraw(false);
+    this.#line.hidden = value === null || !this.#panes.success;
+    if (!this.#plot || this.#line.hidden) return;
+    this.#line.dataset.value = value.toFixed(2);
+    this.#line.style.transform = `translateY(${this.#top("success", value)}px)`;
   }
 
-  /** Moves the vertical line to a time. */
+  /** Moves the vertical line to a time, and the numbers beside it. */
   moveTo(seconds) {
     this.#time = seconds;
     if (!this.#plot) return;
+    const width = this.#plot.over.clientWidth;
     const left = this.#plot.valToPos(seconds, "x");
-    this.#playhead.hidden = !Number.isFinite(left) || left < 0 || left > this.#plot.over.clientWidth + 1;
+    const isHidden = !Number.isFinite(left) || left < 0 || left > width + 1;
+    this.#playhead.hidden = this.#values.hidden = isHidden;
     this.#playhead.style.transform = `translateX(${left}px)`;
+    if (isHidden) return;
+    this.#values.classList.toggle("left", left > width - VALUE_WIDTH_PX - 8);
+    this.#values.style.transform = `translateX(${left}px)`;
+    this.#showValues(seconds);
   }
 
-  /** A picture of the chart with the names of its curves below, as a Blob. */
-  png(curves) {
-    const chart = this.#plot.ctx.canvas;
-    const scale = devicePixelRatio;
-    const canvas = document.createElement("canvas");
-    canvas.width = chart.width;
-    canvas.height = chart.height + (curves.length + 1) * PNG_LINE_PX * scale;
-    const context = canvas.getContext("2d");
-    context.fillStyle = themed("--page");
-    context.fillRect(0, 0, canvas.width, canvas.height);
-    context.drawImage(chart, 0, 0);
-    context.font = `${14 * scale}px sans-serif`;
-    curves.forEach(({ index, label }, line) => {
-      context.fillStyle = colour(index);
-      context.fillText(label, 50 * scale, chart.height + (line + 1) * PNG_LINE_PX * scale);
+  /** Writes the number of each curve beside its line, one below the other where lines meet. */
+  #showValues(seconds) {
+    const labels = Object.keys(this.#panes).flatMap((signal) => {
+      const here = this.#curves.map((curve) => {
+        const index = pointAt(curve.times, seconds);
+        return { curve, signal, value: index === null ? null : curve[signal][index] };
+      });
+      const known = here.filter(({ value }) => value !== null && value !== undefined);
+      for (const each of known) each.top = this.#top(signal, each.value) - VALUE_PX / 2;
+      const [lowest, highest] = [0, 1].map((value) => this.#top(signal, value));
+      return apart(known, highest - VALUE_PX, lowest + VALUE_PX);
     });
-    return new Promise((done) => canvas.toBlob(done, "image/png"));
+    while (this.#values.children.length > labels.length) this.#values.lastChild.remove();
+    labels.forEach(({ curve, signal, value, top }, place) => {
+      const element = this.#values.children[place] ?? this.#values.appendChild(document.createElement("span"));
+      element.textContent = shown(value);
+      element.dataset.signal = signal;
+      element.dataset.curve = curve.label;
+      element.style.color = colourOf(curve, signal);
+      element.style.transform = `translateY(${top.toFixed(1)}px)`;
+    });
+  }
+
+  #top(signal, value) {
+    return (1 - heightOf(this.#panes, signal, value)) * this.#plot.over.clientHeight;
   }
 
   #size() {
-    return { width: this.#host.clientWidth, height: this.#heightPx };
+    return { width: this.#host.clientWidth, height: this.#host.clientHeight };
   }
 
-  #newPlot(indices, data) {
-    const axis = { stroke: () => themed("--text"), grid: { stroke: () => themed("--grid"), width: 1 } };
-    const series = indices.flatMap((index) => {
-      const line = { stroke: () => colour(index), width: 2, points: { fill: () => themed("--page") } };
-      return [line, { ...line, dash: [7, 5] }];
-    });
+  #newPlot(signals, data) {
+    const isLow = this.#host.clientHeight < LOW_PX;
+    const panes = this.#panes; // a plot is drawn once more after the curves have gone
+    const ticks = isLow ? FEW_TICKS : TICKS;
+    const marks = signals.flatMap((signal) => ticks[signal].map((value) => [heightOf(panes, signal, value), value]));
+    const axis = {
+      stroke: () => themed("--faint"), font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif",
+      grid: { stroke: () => themed("--grid"), width: 1 }, ticks: { show: false }, labelSize: 18, gap: 4,
+    };
+    const number = new Map(marks);
+    const left = {
+      ...axis, size: 52, splits: () => marks.map(([height]) => height), filter: (_, splits) => splits,
+      values: (_, splits) => splits.map((height) => `${number.get(height)}`),
+    };
+    const series = this.#curves.flatMap((curve, place) => signals.map((signal) => {
+      const stroke = () => colourOf(this.#curves[place] ?? curve, signal);
+      return { stroke, width: 2, dash: curve.isDashed ? [6, 4] : undefined, points: { fill: () => themed("--page") } };
+    }));
     const options = {
       ...this.#size(),
+      padding: [4, this.#onThreshold ? 44 : 12, this.#label === null ? 0 : 4, 0], // to the right the threshold is written
       legend: { show: false },
-      cursor: { x: false, y: false, drag: { x: false, y: false } },
-      scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [-0.02, 1.02] } },
-      axes: [{ ...axis, label: this.#label }, axis],
+      cursor: { x: false, y: false, points: { show: false }, drag: { x: false, y: false } },
+      scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [0, 1] } },
+      axes: [{ ...axis, size: 24, label: this.#label, ...(this.#isOfSteps ? { incrs: STEPS } : {}) }, left],
       series: [{}, ...series],
-      hooks: { draw: [(plot) => this.#drawThreshold(plot)], setSize: [() => this.moveTo(this.#time)] },
+      hooks: { draw: [(plot) => drawNames(plot, panes)], setSize: [() => this.#placeAgain()] },
     };
     const plot = new uPlot(options, data, this.#host);
-    plot.over.append(this.#playhead);
+    plot.over.append(this.#line, this.#playhead, this.#values);
     this.#listen(plot);
     return plot;
+  }
+
+  #placeAgain() {
+    if (!this.#plot) return;
+    this.setThreshold(this.#threshold);
+    this.moveTo(this.#time);
   }
 
   #listen(plot) {
     const tell = (event) => {
       const bounds = plot.over.getBoundingClientRect();
       const seconds = plot.posToVal(event.clientX - bounds.left, "x");
-      this.#onTime(Math.max(seconds, 0), event.buttons > 0);
+      this.#onTime(Math.min(Math.max(seconds, this.#begin), this.#end), event.buttons > 0);
     };
     plot.over.addEventListener("pointerdown", (event) => {
       plot.over.setPointerCapture(event.pointerId);
       tell(event);
     });
     plot.over.addEventListener("pointermove", tell);
+    this.#line.onpointerdown = (event) => {
+      if (!this.#onThreshold) return;
+      event.stopPropagation();
+      this.#line.setPointerCapture(event.pointerId);
+    };
+    this.#line.onpointermove = (event) => {
+      if (!this.#onThreshold || !this.#line.hasPointerCapture(event.pointerId)) return;
+      event.stopPropagation();
+      const { top, height } = plot.over.getBoundingClientRect();
+      const [from, to] = this.#panes.success;
+      const value = ((1 - (event.clientY - top) / height) - from) / (to - from);
+      this.#onThreshold(Math.round(100 * Math.min(Math.max(value, 0), 1)) / 100);
+    };
   }
+}
 
-  #drawThreshold({ ctx, bbox, valToPos }) {
-    if (this.#threshold === null) return;
-    const y = valToPos(this.#threshold, "y", true);
+const STEPS = [1, 2, 5].flatMap((digit) => [1, 10, 100, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8].map((power) => digit * power))
+  .sort((one, other) => one - other);
+
+/** Writes the name of each signal beside its part of the axis. */
+function drawNames({ ctx, bbox }, panes) {
+  const scale = devicePixelRatio;
+  ctx.save();
+  ctx.fillStyle = themed("--faint");
+  ctx.font = `${12 * scale}px system-ui, sans-serif`;
+  ctx.textAlign = "center";
+  for (const [signal, [from, to]] of Object.entries(panes)) {
     ctx.save();
-    ctx.strokeStyle = themed("--faint");
-    ctx.lineWidth = devicePixelRatio;
-    ctx.setLineDash([2 * devicePixelRatio, 4 * devicePixelRatio]);
-    ctx.beginPath();
-    ctx.moveTo(bbox.left, y);
-    ctx.lineTo(bbox.left + bbox.width, y);
-    ctx.stroke();
+    ctx.translate(bbox.left - 50 * scale, bbox.top + (1 - (from + to) / 2) * bbox.height);
+    ctx.rotate(-Math.PI / 2);
+    if ((to - from) * bbox.height > ctx.measureText(signal).width) ctx.fillText(signal, 0, 8 * scale);
     ctx.restore();
   }
+  ctx.restore();
+}
+
+function made(name) {
+  const element = document.createElement("div");
+  element.className = name;
+  return element;
+}
+
+/** Those numbers that fit between two heights, moved so that none hides another. */
+function apart(labels, from, to) {
+  const fitting = Math.max(Math.floor((to - from) / VALUE_PX), 1);
+  const placed = [...labels].sort((one, other) => one.top - other.top).slice(0, fitting);
+  let free = from;
+  for (const each of placed) {
+    each.top = Math.max(each.top, free);
+    free = each.top + VALUE_PX;
+  }
+  let end = to;
+  for (const each of placed.reverse()) {
+    each.top = Math.min(each.top, end - VALUE_PX);
+    end = each.top;
+  }
+  return labels.filter((each) => placed.includes(each));
 }

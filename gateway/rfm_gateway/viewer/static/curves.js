@@ -1,6 +1,11 @@
 // SPDX-License-Identifier: MIT
 // What is known of each curve: what was asked, the points that have come, and how it stands.
 
+import { cut } from "./text.js";
+
+const SEPARATOR = ", ";
+const TOLD_APART_BY = ["name", "task", "model", "sampling", "fps"];
+
 /** One question about one video, and its points. */
 export class Curve {
   times = [];
@@ -11,6 +16,9 @@ export class Curve {
   version = null;
   numFrames = null;
   sampledFrames = null;
+  title = null; // that somebody gave it
+  colour = null; // that somebody gave it
+  leaving = new AbortController(); // aborted as soon as the curve is removed
 
   /** settings: task, model, rule, frames, fps, orient, resize, as in the form */
   constructor(index, video, settings) {
@@ -29,8 +37,12 @@ export class Curve {
     return [this.rule, ...frames, ...(this.orient === "none" ? [] : [this.orient])].join(", ");
   }
 
+  get name() {
+    return this.video.title;
+  }
+
   get label() {
-    return `${this.video.name}: ${this.task} (${this.model}, ${this.sampling})`;
+    return this.title ?? `${this.name}: ${this.task} (${this.model}, ${this.sampling})`;
   }
 
   /** Takes an event of the gateway. */
@@ -50,16 +62,32 @@ export class Curve {
     }
   }
 
-  /** The index of the point at a time: the last one that is not after it; null: there is none. */
-  at(seconds) {
-    const after = this.times.findIndex((time) => time > seconds + 1e-3);
-    const index = after < 0 ? this.times.length - 1 : after - 1;
-    return index < 0 ? null : index;
-  }
-
   /** When success first reaches a threshold; null: it does not. */
   succeedsAt(threshold) {
     const index = this.success.findIndex((value) => value !== null && value >= threshold);
     return index < 0 ? null : this.times[index];
   }
+}
+
+/** The index of the point at a time: the last one that is not after it; null: there is none. */
+export function pointAt(times, seconds) {
+  let [low, high] = [0, times.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (times[middle] > seconds + 1e-3) high = middle;
+    else low = middle + 1;
+  }
+  return low ? low - 1 : null;
+}
+
+/** A short name of each curve: what tells it from the others, in at most `most` letters. */
+export function shortNames(curves, most) {
+  const drawn = curves.filter(({ times }) => times.length); // of the others the sampling is not known
+  const told = TOLD_APART_BY.filter((field) => new Set(drawn.map((curve) => curve[field])).size > 1);
+  const fields = told.length ? told : ["name"];
+  return curves.map((curve) => {
+    const parts = fields.map((field) => (field === "fps" ? `${curve.fps} fps` : curve[field]));
+    const each = Math.floor((most + SEPARATOR.length) / parts.length) - SEPARATOR.length;
+    return cut(curve.title ?? parts.map((part) => cut(part, each)).join(SEPARATOR), most);
+  });
 }

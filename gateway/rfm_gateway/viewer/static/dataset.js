@@ -1,14 +1,17 @@
 // SPDX-License-Identifier: MIT
-// The tab of datasets: how their episodes end, which one wants to see first, and one that is watched.
+// The tab of datasets: how their episodes end, which one wants to see first, one that is watched, some that are taken along.
 
 import { curvesOf, datasets, episodesOf, videoOf } from "./api.js";
-import { EpisodeTable, ORDER_NAMES, PLAIN_ORDER, sorted } from "./episodes.js";
+import { colourName } from "./chart.js";
+import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, WORST_FIRST } from "./episodes.js";
+import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
-import { cell, named, shown } from "./table.js";
+import { save } from "./takeaway.js";
+import { shown } from "./text.js";
 import { Timeline } from "./timeline.js";
 
 const CAMERA_PREFIX = "observation.images.";
-const NOTHING = { episodes: [], cameras: [], orientations: [], bins: null, threshold: 0.5 };
+const NOTHING = { episodes: [], cameras: [], orientations: [], threshold: 0.5, provenance: null, written_s: null };
 
 export class DatasetTab {
   #page;
@@ -19,28 +22,61 @@ export class DatasetTab {
   #timeline;
   #datasets = [];
   #told = NOTHING;
+  #others = null; // rows of the labels beside them, by episode
+  #episodes = []; // as the threshold judges them
+  #shown = []; // those that are kept, in their order
+  #chosen = new Set(); // numbers of the episodes that are selected
+  #isTurned = false; // the order is the other way round
   #watched = null;
-  #curves = [];
   #stopping = new AbortController();
 
-  /** onScore({ files, task, fps, orientations }): somebody wants an episode scored; onError(error): something went wrong */
+  /** onScore({ files, task, fps, orientations, origins }): somebody wants an episode scored; onError(error): something went wrong */
   constructor(page, { onScore, onError }) {
     this.#page = page;
     this.#onScore = onScore;
     this.#onError = onError;
     this.#histogram = new Histogram(page.histogram);
-    this.#table = new EpisodeTable(page.episodes, page["more-episodes"], (episode) => this.#watch(episode));
+    const rows = { scroller: page["episode-list"], body: page.episodes, above: page["episodes-above"], below: page["episodes-below"] };
+    this.#table = new EpisodeTable(rows, {
+      onWatch: (episode) => this.#watch(episode), chosen: this.#chosen, onChoose: () => this.#showChosen(),
+    });
     const elements = {
       videos: page["episode-videos"], chart: page["episode-chart"], slider: page["episode-time"], button: page["episode-play"],
     };
-    this.#timeline = new Timeline(elements, (seconds) => this.#showNumbers(seconds));
-    page.dataset.addEventListener("change", () => this.#choose());
-    page.labels.addEventListener("change", () => this.#load(this.#labels));
-    page.shelf.addEventListener("change", () => page.errors.replaceChildren());
-    page.order.addEventListener("change", () => this.#showTable());
-    page.shelf.addEventListener("submit", (event) => event.preventDefault());
-    page["score-episode"].addEventListener("click", () => this.#score());
-    page.order.replaceChildren(...ORDER_NAMES.map((name) => new Option(name)));
+    this.#timeline = new Timeline(elements, { onThreshold: (value) => this.#cutAt(value) });
+    this.#listen();
+  }
+
+  #listen() {
+    const page = this.#page;
+    const on = (name, event, action) => page[name].addEventListener(event, action);
+    on("shelf", "submit", (event) => event.preventDefault());
+    on("shelf", "change", () => page.errors.replaceChildren());
+    on("dataset", "change", () => this.#choose());
+    on("labels", "change", () => this.#load());
+    on("others", "change", () => this.#load());
+    on("cutoff", "input", () => this.#cutAt(Number(page.cutoff.value)));
+    on("order", "change", () => this.#orderBy(page.order.value, false));
+    on("task-part", "input", () => this.#showTable());
+    for (const name of FILTER_NAMES) {
+      on(`only-${name}`, "change", () => this.#showTable());
+      page[`number-${name}`]?.addEventListener("input", () => this.#judge());
+    }
+    for (const head of page["episode-list"].querySelectorAll("th[data-order]")) {
+      head.querySelector("button").addEventListener("click", () => {
+        const { order } = head.dataset;
+        this.#orderBy(order, page.order.value === order && !this.#isTurned);
+      });
+    }
+    on("choose-shown", "click", () => this.#select(this.#shown.map(({ episode }) => episode)));
+    on("choose-none", "click", () => this.#select([]));
+    on("use", "change", () => this.#showChosen());
+    on("episodes-text", "click", () => save("episodes.txt", episodesText(this.#taken.map(({ episode }) => episode)), "text/plain"));
+    on("episodes-json", "click", () => save("episodes.json", this.#json(), "application/json"));
+    on("score-episode", "click", () => this.#score());
+    on("episode-close", "click", () => this.#close());
+    on("episode-before", "click", () => this.#step(-1));
+    on("episode-after", "click", () => this.#step(1));
   }
 
   /** Asks which datasets there are, and shows the first. */
@@ -53,7 +89,7 @@ export class DatasetTab {
     }
     const { dataset } = this.#page;
     dataset.replaceChildren(...this.#datasets.map(({ name, kind }, index) => new Option(`${name} (${kind})`, index)));
-    this.#page.datasets.hidden = !this.#datasets.length;
+    this.#page.datasets.hidden = this.#page["dataset-side"].hidden = !this.#datasets.length;
     this.#page["no-datasets"].hidden = this.#datasets.length > 0;
     if (this.#datasets.length) await this.#choose();
   }
@@ -66,26 +102,145 @@ export class DatasetTab {
     return this.#page.labels.value || null;
   }
 
-  async #choose() {
-    const { labels } = this.#datasets[this.#number];
-    this.#page.labels.replaceChildren(...(labels.length ? labels.map((name) => new Option(name)) : [new Option("none", "")]));
-    await this.#load(this.#labels);
+  get #threshold() {
+    return Number(this.#page.cutoff.value);
   }
 
-  async #load(labels) {
+  /** The episodes that are taken along: those that are selected, else all that are shown. */
+  get #taken() {
+    const taken = this.#chosen.size ? this.#episodes.filter(({ episode }) => this.#chosen.has(episode)) : [...this.#shown];
+    return taken.sort((one, other) => one.episode - other.episode);
+  }
+
+  async #choose() {
+    const { labels } = this.#datasets[this.#number];
+    const options = (none) => [...(none ? [new Option("none", "")] : []), ...labels.map((name) => new Option(name))];
+    this.#page.labels.replaceChildren(...options(!labels.length));
+    this.#page.others.replaceChildren(...options(true));
+    await this.#load();
+  }
+
+  /** Asks what the chosen labels say. */
+  async #load() {
     this.#leave();
+    this.#chosen.clear();
     const { signal } = this.#stopping;
+    const page = this.#page;
+    const other = page.others.value;
     try {
-      this.#told = await episodesOf(this.#number, labels, signal);
+      const asked = [episodesOf(this.#number, this.#labels, signal), ...(other ? [episodesOf(this.#number, other, signal)] : [])];
+      const [told, beside] = await Promise.all(asked);
+      this.#told = told;
+      this.#others = beside ? new Map(beside.episodes.map((row) => [row.episode, row])) : null;
     } catch (error) {
       if (signal.aborted) return;
-      this.#told = NOTHING;
+      [this.#told, this.#others] = [NOTHING, null];
       this.#onError(error);
     }
-    this.#page.order.value = this.#told.bins ? ORDER_NAMES[0] : PLAIN_ORDER;
-    this.#timeline.chart.setThreshold(this.#told.threshold);
-    this.#showTable();
+    const isLabelled = this.#told.episodes.some(({ final_progress: final }) => final !== undefined);
+    page.cutoff.value = this.#told.threshold;
+    page.order.value = isLabelled ? WORST_FIRST : PLAIN_ORDER;
+    this.#isTurned = false;
+    page["filter-differ"].hidden = !other;
+    if (!other) page["only-differ"].checked = false;
+    page["episode-list"].classList.toggle("beside", Boolean(other));
+    page.ends.hidden = !isLabelled;
+    this.#showMade();
+    this.#cutAt(this.#told.threshold);
+  }
+
+  /** Judges all episodes by another threshold. */
+  #cutAt(threshold) {
+    this.#page.cutoff.value = threshold;
+    this.#page["cutoff-told"].textContent = this.#threshold.toFixed(2);
+    this.#timeline.chart.setThreshold(this.#threshold);
+    this.#judge();
+  }
+
+  #judge() {
+    this.#episodes = judged(this.#told.episodes, this.#threshold, this.#others);
+    for (const name of FILTER_NAMES) this.#page[`count-${name}`].textContent = kept(this.#episodes, [this.#filter(name)], "").length;
     this.#showEnds();
+    this.#showTable();
+  }
+
+  #filter(name) {
+    return [name, Number(this.#page[`number-${name}`]?.value)];
+  }
+
+  #orderBy(order, isTurned) {
+    this.#page.order.value = order;
+    this.#isTurned = isTurned;
+    this.#showTable();
+  }
+
+  #showTable() {
+    const page = this.#page;
+    const filters = FILTER_NAMES.filter((name) => page[`only-${name}`].checked).map((name) => this.#filter(name));
+    this.#shown = sorted(kept(this.#episodes, filters, page["task-part"].value), page.order.value, this.#isTurned);
+    this.#table.show(this.#shown, this.#threshold);
+    page["shown-told"].textContent = `${this.#shown.length} of ${this.#episodes.length}`;
+    for (const head of page["episode-list"].querySelectorAll("th[data-order]")) {
+      const isFalling = ["backwards", "disagreement", "difference"].includes(head.dataset.order) !== this.#isTurned;
+      if (head.dataset.order === page.order.value) head.setAttribute("aria-sort", isFalling ? "descending" : "ascending");
+      else head.removeAttribute("aria-sort");
+    }
+    if (this.#watched) this.#table.mark(this.#watched.episode, this.#shown);
+    this.#showChosen();
+  }
+
+  #select(numbers) {
+    this.#chosen.clear();
+    for (const number of numbers) this.#chosen.add(number);
+    this.#table.markChosen();
+    this.#showChosen();
+  }
+
+  /** Shows what is taken along. */
+  #showChosen() {
+    const page = this.#page;
+    const numbers = this.#taken.map(({ episode }) => episode);
+    page["chosen-told"].textContent = this.#chosen.size ? `${numbers.length} that are selected` : `${numbers.length} that are shown; select some for fewer`;
+    page["choose-none"].disabled = !this.#chosen.size;
+    page["episodes-text"].disabled = page["episodes-json"].disabled = !numbers.length;
+    const dataset = this.#datasets[this.#number];
+    const all = this.#episodes.map(({ episode }) => episode);
+    page["use-words"].textContent = dataset ? lerobotWords(page.use.value, dataset, numbers, all) : "";
+  }
+
+  #json() {
+    const { name } = this.#datasets[this.#number];
+    const about = { dataset: name, labels: this.#labels, beside: this.#page.others.value || null, threshold: this.#threshold };
+    return episodesJson(about, this.#taken);
+  }
+
+  #showEnds() {
+    const labelled = this.#episodes.filter(({ final_progress: final }) => final !== undefined && final !== null);
+    const judgedOnes = labelled.filter(({ never_succeeds: never }) => never !== null);
+    const never = judgedOnes.filter(({ never_succeeds: each }) => each).length;
+    const told = [`${labelled.length} of ${this.#episodes.length} episodes are labelled.`];
+    if (judgedOnes.length) told.push(`${never} never ${never === 1 ? "succeeds" : "succeed"}: success stays below ${this.#threshold}.`);
+    this.#page["ends-told"].textContent = told.join(" ");
+    this.#histogram.show(labelled);
+  }
+
+  /** Shows checkpoint, recipe and date of the labels. */
+  #showMade() {
+    const { provenance, written_s: writtenS } = this.#told;
+    this.#page["made-box"].hidden = writtenS === null;
+    const { checkpoint, sampling, mode, cameras, fuse, orientations, writer } = provenance ?? {};
+    const turned = Object.entries(orientations ?? {}).map(([camera, orient]) => `${short(camera)} ${orient}`);
+    const rows = {
+      Checkpoint: checkpoint && [checkpoint.source ?? checkpoint.weights_digest, checkpoint.revision].filter(Boolean).join("@"),
+      Sampling: sampling && [sampling.rule, sampling.frames && `${sampling.frames} frames`].filter(Boolean).join(", "),
+      Mode: mode,
+      Cameras: cameras && `${cameras.map(short).join(", ")}${cameras.length > 1 ? `; ${fuse}` : ""}`,
+      Turned: turned.join(", "),
+      "Written by": writer,
+      Written: writtenS === null ? "" : new Date(1000 * writtenS).toISOString().slice(0, 16).replace("T", " ") + " UTC",
+    };
+    const known = Object.entries(rows).filter(([, text]) => text);
+    this.#page.made.replaceChildren(...known.flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
   }
 
   /** Ends what is shown of an episode. */
@@ -95,40 +250,38 @@ export class DatasetTab {
     this.#timeline.videos.clear();
     this.#watched = null;
     this.#page.episode.hidden = true;
+    this.#page.datasets.classList.remove("watching");
     this.#page["score-episode"].disabled = true;
-    this.#table.mark(null);
+    this.#table.mark(null, []);
   }
 
-  #showTable() {
-    const { order } = this.#page;
-    this.#table.show(sorted(this.#told.episodes, order.value), this.#watched?.episode ?? null);
+  #close() {
+    const { episode } = this.#watched;
+    this.#leave();
+    this.#page.episodes.querySelector(`tr[data-episode="${episode}"] button`)?.focus();
   }
 
-  #showEnds() {
-    const { bins, episodes } = this.#told;
-    this.#page.ends.hidden = !bins;
-    if (!bins) return;
-    const labelled = episodes.filter(({ backwards }) => backwards !== undefined);
-    const never = labelled.filter(({ never_succeeds }) => never_succeeds).length;
-    const hasSuccess = labelled.some(({ best_success }) => best_success !== undefined);
-    const told = [`${labelled.length} of ${episodes.length} episodes are labelled.`];
-    if (hasSuccess) told.push(`${never} never ${never === 1 ? "succeeds" : "succeed"}: success stays below ${this.#told.threshold}.`);
-    this.#page["ends-told"].textContent = told.join(" ");
-    const bars = bins.counts.map((count, index) => `${count} from ${bins.edges[index].toFixed(2)}`);
-    this.#page.histogram.setAttribute("aria-label", `Episodes by final progress: ${bars.join(", ")}`);
-    this.#histogram.show(bins);
+  /** Watches the next episode of the table, or the one before. */
+  #step(direction) {
+    const place = this.#shown.findIndex(({ episode }) => episode === this.#watched.episode);
+    const next = this.#shown[place + direction];
+    if (next) this.#watch(next);
   }
 
   async #watch(episode) {
     this.#leave();
     this.#watched = { ...episode, files: [] };
-    this.#table.mark(episode.episode);
     const page = this.#page;
     const { signal } = this.#stopping;
     page.errors.replaceChildren();
     page.episode.hidden = false;
+    page.datasets.classList.add("watching");
+    this.#table.mark(episode.episode, this.#shown);
     page["episode-title"].textContent = `Episode ${episode.episode}`;
-    page["episode-told"].textContent = episode.task;
+    page["episode-told"].textContent = page["episode-told"].title = episode.task;
+    const place = this.#shown.findIndex((each) => each.episode === episode.episode);
+    page["episode-before"].disabled = place <= 0;
+    page["episode-after"].disabled = place < 0 || place === this.#shown.length - 1;
     page["episode-title"].focus({ preventScroll: true });
     page.episode.scrollIntoView({ block: "nearest" });
     try {
@@ -140,11 +293,14 @@ export class DatasetTab {
 
   async #fetch({ episode }, signal) {
     const { cameras, orientations } = this.#told;
-    const told = await curvesOf(this.#number, episode, this.#labels, signal);
-    this.#curves = curvesIn(told);
+    const other = this.#page.others.value;
+    const names = [this.#labels, ...(other ? [other] : [])];
+    const told = await Promise.all(names.map((name) => curvesOf(this.#number, episode, name, signal)));
+    const curves = [...curvesIn(told[0], null), ...told.slice(1).flatMap((each) => curvesIn(each, other).slice(0, 1))];
     this.#timeline.time = 0;
-    this.#timeline.show(this.#curves);
-    this.#page["episode-chart"].setAttribute("aria-label", describe(this.#curves));
+    this.#timeline.show(curves.length ? curves : [emptyCurve(told[0])]);
+    this.#page["episode-chart"].setAttribute("aria-label", describe(curves));
+    this.#page["episode-legend"].replaceChildren(...curves.map(legendItem));
     const blobs = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
     const { name } = this.#datasets[this.#number];
@@ -157,39 +313,53 @@ export class DatasetTab {
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
   }
 
-  #showNumbers(seconds) {
-    const rows = this.#curves.filter(({ isLabelled }) => isLabelled).map((curve) => {
-      const row = document.createElement("tr");
-      const after = curve.times.findIndex((time) => time > seconds + 1e-3);
-      const here = after < 0 ? curve.times.length - 1 : Math.max(after - 1, 0);
-      const numbers = [curve.progress[here], curve.success[here], curve.progress.at(-1), curve.success.at(-1)];
-      row.append(named(curve.index, curve.label), ...numbers.map((value) => cell(shown(value), "number")));
-      return row;
-    });
-    this.#page["episode-curves"].replaceChildren(...rows);
-  }
-
   #score() {
     this.#timeline.videos.pause();
-    const { fps, orientations } = this.#told;
-    this.#onScore({ files: this.#watched.files, task: this.#watched.task, fps, orientations });
+    const { fps, orientations, cameras } = this.#told;
+    const { files, task, episode } = this.#watched;
+    const origins = cameras.map((camera) => ({ dataset: this.#datasets[this.#number].name, episode, camera, fps, task }));
+    this.#onScore({ files, task, fps, orientations, origins });
   }
 }
 
-/** The curves as a chart takes them; without labels one that is empty, so that there is a time to move in. */
-function curvesIn({ times_s: times, curves }) {
+/** The labelled curves as a chart takes them. file: of other labels, which are dashed; null: the first labels */
+function curvesIn({ times_s: times, curves }, file) {
   const none = times.map(() => null);
-  const labelled = curves.map(({ camera, progress, success }, index) => {
-    const label = camera ? short(camera) : curves.length > 1 ? "all cameras" : "labels";
-    return { index, label, progress, success: success ?? none, times, allTimes: times, isLabelled: true };
+  return curves.map(({ camera, progress, success }, index) => {
+    const name = camera ? short(camera) : curves.length > 1 ? "all cameras" : "labels";
+    const label = file === null ? name : `${name} (${reward(file)})`;
+    return { index, label, progress, success: success ?? none, times, allTimes: times, isDashed: file !== null };
   });
-  return labelled.length ? labelled : [{ index: 0, label: "", progress: none, success: none, times, allTimes: times }];
+}
+
+/** A curve without a number, so that there is a time to move in. */
+function emptyCurve({ times_s: times }) {
+  const none = times.map(() => null);
+  return { index: 0, label: "", progress: none, success: none, times, allTimes: times };
 }
 
 function describe(curves) {
-  const labelled = curves.filter(({ isLabelled }) => isLabelled);
-  const told = labelled.map(({ label, progress }) => `${label}: last progress ${shown(progress.at(-1))}`);
+  const told = curves.map(({ label, progress }) => `${label}: last progress ${shown(progress.at(-1))}`);
   return told.length ? told.join("; ") : "This episode has no labels.";
+}
+
+function legendItem({ index, label, isDashed }) {
+  const item = document.createElement("li");
+  const swatch = document.createElement("span");
+  swatch.className = `swatch ${colourName(index)}${isDashed ? " dashed" : ""}`;
+  item.append(swatch, label);
+  return item;
+}
+
+function element(name, text) {
+  const made = document.createElement(name);
+  made.textContent = text;
+  return made;
+}
+
+/** The name of the reward whose labels a file has. */
+function reward(file) {
+  return file.replace(/^.*\//, "").replace(/(_progress)?\.parquet$/, "");
 }
 
 function short(camera) {

@@ -1,97 +1,163 @@
 // SPDX-License-Identifier: MIT
-// The episodes of a dataset as a table, sorted by what one wants to see first.
+// The episodes of a dataset: which ones somebody wants to see, in which order, and a table of them.
 
-import { cell, shown } from "./table.js";
+import { cell, label } from "./table.js";
+import { shown } from "./text.js";
+import { VirtualRows } from "./virtual.js";
 
-const ROWS_AT_A_TIME = 200;
+export const WORST_FIRST = "worst first";
+export const PLAIN_ORDER = "episode"; // of episodes that nothing is known of
 
-/** By name: what an order compares, the first field first; true: the highest value comes first. */
+/** By name: what an order compares; true: the highest value comes first. */
 const ORDERS = {
-  "never succeeds, then goes backwards, then cameras disagree": [
-    ["never_succeeds", true], ["backwards", true], ["disagreement", true],
-  ],
-  "goes backwards most": [["backwards", true]],
-  "cameras disagree most": [["disagreement", true]],
-  "lowest final progress": [["final_progress", false]],
-  "lowest best success": [["best_success", false]],
-  "episode number": [],
+  [WORST_FIRST]: [["never_succeeds", true], ["backwards", true], ["disagreement", true]],
+  episode: [],
+  task: [["task", false]],
+  num_frames: [["num_frames", false]],
+  final_progress: [["final_progress", false]],
+  best_success: [["best_success", false]],
+  last_success: [["last_success", false]],
+  backwards: [["backwards", true]],
+  disagreement: [["disagreement", true]],
+  difference: [["difference", true]],
 };
 
-export const ORDER_NAMES = Object.keys(ORDERS);
-export const PLAIN_ORDER = ORDER_NAMES.at(-1); // of episodes that nothing is known of
+const NAMES = ["", "", "Task", "Frames", "Final", "Best", "Last", "Back", "Apart", "Differ"]; // of columns, on a telephone
+
+/** What a filter keeps, by name; the second argument is the number beside it */
+const FILTERS = {
+  never: ({ never_succeeds: never }) => never === true,
+  low: ({ never_succeeds: never, final_progress: final }, least) => never === false && isKnown(final) && final < least,
+  backwards: ({ backwards }, percent) => isKnown(backwards) && 100 * backwards >= percent,
+  apart: ({ disagreement }, least) => isKnown(disagreement) && disagreement >= least,
+  differ: ({ difference, verdict_differs: differs }, least) => differs === true || (isKnown(difference) && difference >= least),
+};
+
+export const FILTER_NAMES = Object.keys(FILTERS);
+
+/** The episodes with what follows from a threshold, and from other labels: rows by episode, or null. */
+export function judged(episodes, threshold, others) {
+  return episodes.map((episode) => {
+    const never = neverSucceeds(episode, threshold);
+    const other = others?.get(episode.episode);
+    const isBoth = isKnown(episode.final_progress) && isKnown(other?.final_progress);
+    return {
+      ...episode,
+      never_succeeds: never,
+      difference: isBoth ? Math.abs(episode.final_progress - other.final_progress) : null,
+      verdict_differs: other && never !== null ? neverSucceeds(other, threshold) === !never : null,
+    };
+  });
+}
+
+/** Those that every filter keeps. chosen: [name, number] of each filter; task: a part of the task */
+export function kept(episodes, chosen, task) {
+  const part = task.trim().toLowerCase();
+  return episodes.filter((episode) =>
+    episode.task.toLowerCase().includes(part) && chosen.every(([name, number]) => FILTERS[name](episode, number)));
+}
 
 /** The episodes in an order; those of which nothing is known come last. */
-export function sorted(episodes, order) {
+export function sorted(episodes, order, isTurned) {
+  const turn = isTurned ? -1 : 1;
   return [...episodes].sort((one, other) => {
     for (const [field, isFalling] of ORDERS[order]) {
       const [a, b] = [one[field] ?? null, other[field] ?? null];
       if (a === b) continue;
       if (a === null || b === null) return a === null ? 1 : -1;
-      return isFalling ? b - a : a - b;
+      return turn * (isFalling ? -1 : 1) * (a < b ? -1 : 1);
     }
-    return one.episode - other.episode;
+    return (order === PLAIN_ORDER ? turn : 1) * (one.episode - other.episode);
   });
 }
 
-/** A table in `body`, and a button for more rows than fit. `onChoose(episode)` is called when somebody chooses one. */
+/**
+ * A table of episodes. elements: as `VirtualRows` takes them
+ * onWatch(episode): somebody wants to watch one; chosen: the numbers of those that are selected; onChoose(): they are others
+ */
 export class EpisodeTable {
   #body;
-  #more;
+  #rows;
+  #onWatch;
+  #chosen;
   #onChoose;
-  #episodes = [];
-  #chosen = null;
+  #watched = null;
+  #threshold = 0.5;
 
-  constructor(body, more, onChoose) {
-    this.#body = body;
-    this.#more = more;
+  constructor(elements, { onWatch, chosen, onChoose }) {
+    this.#body = elements.body;
+    this.#onWatch = onWatch;
+    this.#chosen = chosen;
     this.#onChoose = onChoose;
-    more.addEventListener("click", () => this.#add());
+    this.#rows = new VirtualRows(elements, (episode) => this.#row(episode));
   }
 
-  /** Shows episodes in their order. chosen: the number of the one that is watched, or null */
-  show(episodes, chosen) {
-    this.#episodes = episodes;
-    this.#chosen = chosen;
-    this.#body.replaceChildren();
-    this.#add();
+  show(episodes, threshold) {
+    this.#threshold = threshold;
+    this.#rows.show(episodes);
   }
 
-  /** Marks the row of an episode. */
-  mark(chosen) {
-    this.#chosen = chosen;
-    for (const row of this.#body.rows) this.#markRow(row, Number(row.dataset.episode));
+  /** Marks the row of an episode, by its number, and scrolls to it. */
+  mark(watched, episodes) {
+    this.#watched = watched;
+    for (const [episode, row] of this.#rows.rows) this.#markRow(row, episode);
+    const episode = episodes.find((each) => each.episode === watched);
+    if (episode) this.#rows.reveal(episode);
   }
 
-  #add() {
-    const from = this.#body.rows.length;
-    this.#body.append(...this.#episodes.slice(from, from + ROWS_AT_A_TIME).map((episode) => this.#row(episode)));
-    this.#more.hidden = this.#body.rows.length >= this.#episodes.length;
+  /** Shows which are selected. */
+  markChosen() {
+    for (const [{ episode }, row] of this.#rows.rows) row.querySelector("input").checked = this.#chosen.has(episode);
   }
 
   #row(episode) {
-    const row = document.createElement("tr");
-    const header = document.createElement("th");
-    const button = document.createElement("button");
+    const [row, header, button, box] = ["tr", "th", "button", "input"].map((tag) => document.createElement(tag));
     row.dataset.episode = episode.episode;
     header.scope = "row";
     button.type = "button";
     button.textContent = `Watch ${episode.episode}`;
     header.append(button);
-    const never = { true: "never", false: "" }[episode.never_succeeds] ?? shown(null);
-    row.append(header, cell(episode.task), cell(episode.num_frames, "number"));
-    row.append(cell(shown(episode.final_progress), "number"), cell(shown(episode.best_success), "number"), cell(never));
+    box.type = "checkbox";
+    box.checked = this.#chosen.has(episode.episode);
+    box.setAttribute("aria-label", `Select episode ${episode.episode}`);
+    box.addEventListener("click", (event) => event.stopPropagation());
+    box.addEventListener("change", () => {
+      if (box.checked) this.#chosen.add(episode.episode);
+      else this.#chosen.delete(episode.episode);
+      this.#onChoose();
+    });
+    const first = cell("", "choose");
+    first.append(box);
+    first.addEventListener("click", (event) => event.stopPropagation());
+    const task = cell(episode.task, "task");
+    task.title = episode.task;
+    row.append(first, header, task, cell(episode.num_frames, "number frames"));
+    const scores = [episode.final_progress, episode.best_success, episode.last_success];
+    scores.forEach((value, place) => {
+      const isBelow = place > 0 && value !== undefined && value !== null && value < this.#threshold;
+      row.append(cell(shown(value), isBelow ? "number below" : "number"));
+    });
     row.append(cell(percent(episode.backwards), "number"), cell(shown(episode.disagreement), "number"));
-    row.addEventListener("click", () => this.#onChoose(episode));
-    this.#markRow(row, episode.episode);
-    return row;
+    row.append(cell(`${shown(episode.difference)}${episode.verdict_differs ? " ≠" : ""}`, "number difference"));
+    row.addEventListener("click", () => this.#onWatch(episode));
+    this.#markRow(row, episode);
+    return label(row, NAMES);
   }
 
-  #markRow(row, number) {
-    row.classList.toggle("shown", number === this.#chosen);
-    row.querySelector("button").setAttribute("aria-pressed", number === this.#chosen);
+  #markRow(row, { episode }) {
+    row.classList.toggle("shown", episode === this.#watched);
+    row.querySelector("button").setAttribute("aria-pressed", episode === this.#watched);
   }
 }
 
+function neverSucceeds({ best_success: best }, threshold) {
+  return isKnown(best) ? best < threshold : null;
+}
+
+function isKnown(value) {
+  return value !== null && value !== undefined;
+}
+
 function percent(share) {
-  return share === null || share === undefined ? shown(null) : `${(100 * share).toFixed(1)} %`;
+  return isKnown(share) ? `${(100 * share).toFixed(1)} %` : shown(null);
 }

@@ -1,16 +1,17 @@
 // SPDX-License-Identifier: MIT
-// How many episodes end with which progress, as bars drawn by uPlot.
+// How many episodes end with which progress, and how many of them succeed, as bars drawn by uPlot.
 
-import { colourName, themed } from "./chart.js";
+import { themed } from "./chart.js";
 import uPlot from "./uplot/uPlot.esm.js";
 
-const HEIGHT_PX = 170;
+const NUM_BINS = 20;
 const COUNTS = [1, 2, 5].flatMap((digit) => [1, 10, 100, 1e3, 1e4, 1e5].map((power) => digit * power)).sort((a, b) => a - b);
 
-/** Bars in `host`. */
+/** Bars in `host`: what succeeds below, what does not above. */
 export class Histogram {
   #host;
   #plot = null;
+  #most = 1;
 
   constructor(host) {
     this.#host = host;
@@ -18,23 +19,44 @@ export class Histogram {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#plot?.redraw());
   }
 
-  /** Draws the bars: `edges` has one number more than `counts`. */
-  show({ edges, counts }) {
-    this.#plot?.destroy();
-    const axis = { stroke: () => themed("--text"), grid: { stroke: () => themed("--grid"), width: 1 } };
-    const fill = () => themed(`--${colourName(0)}`);
-    const options = {
+  /** Draws episodes: each with a `final_progress`; of some it is known whether they never succeed. */
+  show(episodes) {
+    const [all, good] = [new Array(NUM_BINS).fill(0), new Array(NUM_BINS).fill(0)];
+    for (const { final_progress: final, never_succeeds: never } of episodes) {
+      const bin = Math.min(Math.floor(Math.min(Math.max(final, 0), 1) * NUM_BINS), NUM_BINS - 1);
+      all[bin] += 1;
+      if (never === false) good[bin] += 1;
+    }
+    const edges = all.map((_, index) => index / NUM_BINS);
+    this.#most = Math.max(1, ...all);
+    const told = edges.map((edge, bin) => `${all[bin]} from ${edge.toFixed(2)}${good[bin] ? ` of which ${good[bin]} succeed` : ""}`);
+    this.#host.setAttribute("aria-label", `Episodes by final progress: ${told.join(", ")}`);
+    const data = [edges, all, good];
+    if (this.#plot) this.#plot.setData(data);
+    else this.#plot = this.#newPlot(data);
+  }
+
+  #newPlot(data) {
+    const axis = {
+      stroke: () => themed("--faint"), font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif",
+      grid: { stroke: () => themed("--grid"), width: 1 }, ticks: { show: false }, gap: 4, labelSize: 18,
+    };
+    const bars = (name) => {
+      const fill = () => themed(name);
+      return { stroke: fill, fill, width: 0, paths: uPlot.paths.bars({ size: [0.9], align: 1 }), points: { show: false } };
+    };
+    return new uPlot({
       ...this.#size(),
+      padding: [8, 12, 0, 0],
       legend: { show: false },
       cursor: { show: false },
-      scales: { x: { time: false, range: [edges[0], edges.at(-1)] }, y: { range: [0, Math.max(1, ...counts) * 1.05] } },
-      axes: [{ ...axis, label: "final progress" }, { ...axis, label: "episodes", incrs: COUNTS }],
-      series: [{}, { stroke: fill, fill, width: 0, paths: uPlot.paths.bars({ size: [0.9], align: 1 }), points: { show: false } }],
-    };
-    this.#plot = new uPlot(options, [edges.slice(0, -1), counts], this.#host);
+      scales: { x: { time: false, range: [0, 1] }, y: { range: () => [0, this.#most * 1.05] } },
+      axes: [{ ...axis, size: 24, label: "final progress" }, { ...axis, size: 44, incrs: COUNTS }],
+      series: [{}, bars("--curve-1"), bars("--curve-2")],
+    }, data, this.#host);
   }
 
   #size() {
-    return { width: this.#host.clientWidth, height: HEIGHT_PX };
+    return { width: this.#host.clientWidth, height: this.#host.clientHeight };
   }
 }

@@ -3,10 +3,12 @@
 
 import { hasKey, KeyWanted, liveNews } from "./api.js";
 import { LiveCard } from "./livecard.js";
+import { cell, label } from "./table.js";
+import { NONE, shown } from "./text.js";
 
 const ASK_EVERY_MS = 500;
 const ASK_AGAIN_AFTER_MS = 5000;
-const ENDED_SHOWN = 12;
+const ENDED_AT_A_TIME = 12;
 
 export class LiveTab {
   #page;
@@ -16,11 +18,17 @@ export class LiveTab {
   #timer = null;
   #isAway = false;
   #asking = 0; // number of the loop that asks
+  #mostEnded = ENDED_AT_A_TIME;
 
   /** onError(error): something went wrong */
   constructor(page, { onError }) {
     this.#page = page;
     this.#onError = onError;
+    page["live-more"].addEventListener("click", () => {
+      this.#mostEnded += ENDED_AT_A_TIME;
+      this.#show();
+    });
+    page["live-last"].addEventListener("input", () => this.#show());
   }
 
   /** Asks from now on what is new, as long as the tab is to be seen. */
@@ -79,16 +87,50 @@ export class LiveTab {
     const running = cards.filter(({ hasEnded }) => !hasEnded);
     const ended = cards.filter(({ hasEnded }) => hasEnded).sort((one, other) => other.rank - one.rank);
     running.sort((one, other) => one.title.localeCompare(other.title, "en", { numeric: true }));
-    const shown = [...running, ...ended.slice(0, ENDED_SHOWN)];
+    const visible = [...running, ...ended.slice(0, this.#mostEnded)];
     const { children } = this.#page["live-episodes"];
-    const elements = shown.map(({ element }) => element);
+    const elements = visible.map(({ element }) => element);
     if (elements.length !== children.length || elements.some((each, index) => each !== children[index])) {
       this.#page["live-episodes"].replaceChildren(...elements);
     }
-    for (const card of shown) card.show();
-    this.#page["no-live"].hidden = cards.length > 0;
-    const told = `Running: ${running.length}. Ended: ${ended.length}${ended.length > ENDED_SHOWN ? `, the newest ${ENDED_SHOWN} are shown` : ""}.`;
-    if (this.#page["live-told"].textContent !== told) this.#page["live-told"].textContent = told;
-    this.#page["live-told"].hidden = !cards.length;
+    for (const card of visible) card.show();
+    const page = this.#page;
+    const numHidden = cards.length - visible.length;
+    page["no-live"].hidden = cards.length > 0;
+    page["live-summary"].hidden = !cards.length;
+    page["live-more"].hidden = !numHidden;
+    page["live-more"].textContent = `Show more of ${numHidden} ended episodes`;
+    const told = `Running: ${running.length}. Ended: ${ended.length}.`;
+    if (page["live-told"].textContent !== told) page["live-told"].textContent = told;
+    this.#showRuns(cards, ended);
   }
+
+  /** Shows the means of each run. ended: the newest first */
+  #showRuns(cards, ended) {
+    const last = Math.max(Math.floor(Number(this.#page["live-last"].value)) || 1, 1);
+    const head = this.#page["live-runs"].closest("table").querySelectorAll("thead th");
+    const names = [...head].map(({ textContent }) => textContent);
+    const rows = [...new Set(cards.map(({ run }) => run))].sort().map((run) => {
+      const own = ended.filter((card) => card.run === run).slice(0, last);
+      const numRunning = cards.filter((card) => card.run === run && !card.hasEnded).length;
+      const rate = own.length ? `${(100 * mean(own.map(({ succeeded }) => Number(succeeded)))).toFixed(0)} %` : NONE;
+      const means = ["lastProgress", "lastSuccess"].map((name) => shown(mean(own.map((card) => card[name]))));
+      const steps = mean(own.map(({ numSteps }) => numSteps));
+      const texts = [numRunning, own.length, rate, ...means, steps === null ? NONE : steps.toFixed(1)];
+      const row = document.createElement("tr");
+      const header = document.createElement("th");
+      header.scope = "row";
+      header.textContent = run;
+      row.append(header, ...texts.map((text) => cell(text, "number")));
+      return label(row, names);
+    });
+    const text = (each) => each.map(({ textContent }) => textContent).join("\n");
+    if (text(rows) !== text([...this.#page["live-runs"].rows])) this.#page["live-runs"].replaceChildren(...rows);
+  }
+}
+
+/** The mean of the numbers that are there; null: none is. */
+function mean(values) {
+  const there = values.filter((value) => value !== null && value !== undefined);
+  return there.length ? there.reduce((sum, value) => sum + value, 0) / there.length : null;
 }

@@ -3,16 +3,15 @@
 
 import { liveFrame } from "./api.js";
 import { Chart } from "./chart.js";
-import { shown } from "./table.js";
+import { shown } from "./text.js";
 
-const HEIGHT_PX = 160;
 const NUMBERS = ["Step", "Progress", "Success", "Lag", "Last step"];
 
 export class LiveCard {
   #id;
   #mostPoints;
   #about = {};
-  #curve = { index: 0, times: [], progress: [], success: [] };
+  #curve = { index: 0, successIndex: 1, times: [], progress: [], success: [] };
   #newest = null;
   #heardMs = 0;
   #frame = null;
@@ -47,12 +46,34 @@ export class LiveCard {
       this.#numbers.set(name, value);
     }
     this.element.append(this.#heading, this.#state, this.#task, this.#image, this.#chartHost, list);
-    this.#chart = new Chart(this.#chartHost, () => {}, { heightPx: HEIGHT_PX, label: null });
-    this.#chart.moveTo(NaN); // there is no time to mark
+    this.#chart = new Chart(this.#chartHost, (step) => this.#chart.moveTo(step), { label: null, isOfSteps: true });
+    this.#chart.moveTo(NaN); // there is no step to mark
+    this.#chartHost.addEventListener("pointerleave", () => this.#chart.moveTo(NaN));
+  }
+
+  /** The name of its run. */
+  get run() {
+    return this.#about.name || "Episode";
+  }
+
+  get succeeded() {
+    return this.#newest?.succeeded ?? false;
+  }
+
+  get lastProgress() {
+    return this.#newest?.progress ?? null;
+  }
+
+  get lastSuccess() {
+    return this.#newest?.success ?? null;
+  }
+
+  get numSteps() {
+    return this.#newest === null ? null : this.#newest.step + 1;
   }
 
   get title() {
-    return `${this.#about.name || "Episode"}, environment ${this.#about.env}`;
+    return `${this.run}, environment ${this.#about.env}`;
   }
 
   get hasEnded() {
@@ -72,7 +93,7 @@ export class LiveCard {
     const most = (values) => values.slice(-this.#mostPoints);
     const { times, progress: oldProgress, success: oldSuccess } = this.#curve;
     this.#curve = {
-      index: 0, times: most([...times, ...steps]),
+      index: 0, successIndex: 1, times: most([...times, ...steps]),
       progress: most([...oldProgress, ...progress]), success: most([...oldSuccess, ...success]),
     };
     this.#about = about;

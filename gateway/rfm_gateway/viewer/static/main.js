@@ -4,21 +4,31 @@
 import { compare, KeyWanted, score, served, useKey } from "./api.js";
 import { Curve } from "./curves.js";
 import { DatasetTab } from "./dataset.js";
+import { exampleFiles } from "./examples.js";
+import { pngFigure, svgFigure } from "./figure.js";
+import { Legend } from "./legend.js";
 import { LiveTab } from "./live.js";
 import { Queue } from "./queue.js";
-import { showTable, shown } from "./table.js";
+import { Sidebar } from "./sidebar.js";
+import { showTable } from "./table.js";
 import { Tabs } from "./tabs.js";
 import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
+import { shown } from "./text.js";
 import { addVerdict } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
 
 const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((element) => [element.id, element]));
 const queue = new Queue(CURVES_AT_A_TIME);
-const timeline = new Timeline({ videos: page.videos, chart: page.chart, slider: page.time, button: page.play }, showTime);
+const timeline = new Timeline(
+  { videos: page.videos, chart: page.chart, slider: page.time, button: page.play },
+  { changing: { onName: update, onRemove: removeVideo }, onThreshold: dragThreshold },
+);
+const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurve });
+const sidebar = new Sidebar(page.fold);
 const { videos, chart } = timeline;
-const tabs = new Tabs(["score", "dataset", "live"].map((name) => [page[`${name}-tab`], page[`${name}-panel`]]));
+const tabs = new Tabs(["score", "dataset", "live"].map((name) => [page[`${name}-tab`], page[`${name}-panel`]]), shownTab);
 const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, onError: failed });
 const liveTab = new LiveTab(page, { onError: failed });
 let curves = [];
@@ -46,6 +56,7 @@ async function begin() {
   page.fps.value = gateway.fps;
   if (gateway.models.some(({ name }) => name === gateway.model)) page.model.value = gateway.model;
   chooseRule();
+  page.examples.hidden = !gateway.models.length;
   const none = "model: expected one that scores frames of videos, got none";
   page.status.textContent = gateway.models.length ? "Ready." : none;
 }
@@ -74,7 +85,7 @@ function showLimits() {
   const isOpen = rule?.frames === "any";
   page.frames.disabled = !isOpen;
   if (!isOpen) page.frames.value = "";
-  page.frames.placeholder = isOpen ? `as trained${model?.max_frames ? `: ${model.max_frames}` : ""}` : `${rule?.frames ?? "all"}`;
+  page.frames.placeholder = isOpen ? `${model?.max_frames ?? ""} as trained`.trim() : `${rule?.frames ?? "all"}`;
 }
 
 function settings() {
@@ -93,22 +104,44 @@ function form(fields, files) {
   return data;
 }
 
-/** Adds files, and scores them at once if a task is there. */
-function addFiles(files, orientations = []) {
-  [...files].forEach((file, index) => videos.add(file, file.name, orientations[index] ?? page.orient.value));
-  page["no-videos"].hidden = videos.all.length > 0;
+/** Adds files, and scores them at once if a task is there. about: orientation and origin of each */
+function addFiles(files, about = []) {
+  [...files].forEach((file, index) => {
+    const { orient = page.orient.value, origin = null } = about[index] ?? {};
+    videos.add(file, file.name, orient, { origin });
+  });
+  page.files.value = "";
   update();
-  if (tasks().length && page.model.value) scoreAll();
+  if (!videos.all.length || !page.model.value) return;
+  if (tasks().length) scoreAll();
+  else askForTask();
 }
 
-/** Scores an episode of a dataset in place of what was there. fps: frames a second; orientations: of each file */
-function scoreEpisode({ files, task, fps, orientations }) {
+/** Asks for the task of videos that are there without one. */
+function askForTask() {
+  sidebar.open();
+  page["task-wanted"].textContent = "What is the robot to do? Type it, then press Score.";
+  page.tasks.focus();
+}
+
+/** Scores an episode of a dataset in place of what was there. fps: frames a second; orientations, origins: of each file */
+function scoreEpisode({ files, task, fps, orientations, origins }) {
   clear();
   page.tasks.value = task;
   page.fps.value = fps;
   page.orient.value = orientations[0] ?? "none";
   tabs.select(0);
-  addFiles(files, orientations);
+  addFiles(files, files.map((_, index) => ({ orient: orientations[index], origin: origins[index] })));
+}
+
+async function scoreExamples(names) {
+  try {
+    const { files, origins, task } = await exampleFiles(names);
+    page.tasks.value = task;
+    addFiles(files, origins.map((origin) => ({ origin })));
+  } catch (error) {
+    failed(error);
+  }
 }
 
 /** Asks about each video and task that was not yet asked about with these settings. */
@@ -123,6 +156,7 @@ function scoreAll() {
     failed(new Error(missing[1]));
     return;
   }
+  page["task-wanted"].textContent = "";
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
@@ -131,13 +165,14 @@ function scoreAll() {
       curves = curves.filter(({ identity }) => identity !== curve.identity); // one that failed is asked again
       curves.push(curve);
       numCurves += 1;
-      queue.add(() => ask(curve, stopping.signal));
+      queue.add(() => ask(curve, AbortSignal.any([stopping.signal, curve.leaving.signal])));
     }
   }
   update();
 }
 
 async function ask(curve, signal) {
+  if (signal.aborted) return;
   const { video, task, model, rule, frames, fps, orient, resize } = curve;
   const fields = { task, model, sampling: rule, frames, fps, orient, resize };
   try {
@@ -194,21 +229,70 @@ function clear() {
   numCurves = 0;
   page.pairs.replaceChildren();
   page.errors.replaceChildren();
-  page.files.value = "";
-  page["no-videos"].hidden = false;
+  page["task-wanted"].textContent = "";
+  page.status.textContent = "Ready.";
   timeline.moveTo(0);
   update();
+}
+
+function removeVideo(video) {
+  videos.remove(video);
+  for (const curve of curves.filter((each) => each.video === video)) forget(curve);
+  verdicts = verdicts.filter((verdict) => !verdict.videos.includes(video));
+  page.pairs.replaceChildren();
+  for (const verdict of verdicts) addVerdict(page.pairs, verdict);
+  update();
+}
+
+function removeCurve(curve) {
+  forget(curve);
+  update();
+}
+
+/** Ends a curve, which is shown no more. */
+function forget(curve) {
+  curve.leaving.abort();
+  curves = curves.filter((each) => each !== curve);
+}
+
+/** Shows a curve in another colour or under another name. */
+function changed() {
+  update();
+  chart.redraw();
+}
+
+function dragThreshold(value) {
+  page.threshold.value = value;
+  showThreshold();
+}
+
+function showThreshold() {
+  const value = Number(page.threshold.value);
+  chart.setThreshold(value);
+  showTable(page.curves, curves, value);
+}
+
+/** The title of the figure: what all curves have in common. */
+function figure() {
+  const scored = curves.filter(({ times }) => times.length);
+  const common = new Set(scored.map(({ task }) => task));
+  return svgFigure(page.figure, scored, { title: common.size === 1 ? [...common][0] : "", threshold: Number(page.threshold.value) });
 }
 
 /** Shows everything anew that depends on the curves. */
 function update() {
   const scored = curves.filter(({ times }) => times.length);
+  page.empty.hidden = videos.all.length > 0;
+  page.stage.hidden = !videos.all.length;
+  page.numbers.hidden = !curves.length;
   timeline.show(curves);
+  legend.show(curves);
+  showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle;
   page.compare.disabled = videos.all.length !== 2 || !page.model.value;
   page.take.hidden = !scored.length && !verdicts.length;
   page.verdicts.hidden = !verdicts.length;
-  page.png.disabled = page.csv.disabled = !scored.length;
+  page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
   page.command.textContent = commands(gateway.url, scored, verdicts);
   const done = curves.filter(({ state }) => state === "done").length;
   if (curves.length) page.status.textContent = `${done} of ${curves.length} curves are done.`;
@@ -217,8 +301,9 @@ function update() {
     : "No curves yet.");
 }
 
-function showTime(seconds) {
-  showTable(page.curves, curves, seconds, Number(page.threshold.value));
+/** The settings belong to the tabs that have some. */
+function shownTab(index) {
+  page.fold.hidden = index === 2;
 }
 
 async function copy(element, name) {
@@ -243,21 +328,29 @@ listen(page.orient, { change: () => videos.turn(page.orient.value) });
 listen(page.stop, { click: stop });
 listen(page.clear, { click: clear });
 listen(page.compare, { click: comparePair });
-listen(page.threshold, { input: () => { chart.setThreshold(Number(page.threshold.value)); showTime(timeline.time); } });
+listen(page.threshold, { input: showThreshold });
+listen(page.tasks, { keydown: (event) => { if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) scoreAll(); } });
+listen(page.examples, { click: ({ target }) => {
+  const button = target.closest("button");
+  if (button) scoreExamples(button.dataset.example.split(" "));
+} });
 listen(page.csv, { click: () => save("curves.csv", csv(curves), "text/csv") });
 listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, verdicts), "application/json") });
-listen(page.png, { click: async () => save("curves.png", await chart.png(curves.filter(({ times }) => times.length))) });
+listen(page.png, { click: async () => save("curves.png", await pngFigure(figure())) });
+listen(page.svg, { click: () => save("curves.svg", figure(), "image/svg+xml") });
 listen(page.copy, { click: () => copy(page.command, "command line is") });
+listen(page["use-copy"], { click: () => copy(page["use-words"], "words are") });
 listen(page["live-copy"], { click: () => copy(page["live-code"], "lines are") });
 listen(document, {
-  dragover: (event) => { event.preventDefault(); page.drop.classList.add("over"); },
-  dragleave: () => page.drop.classList.remove("over"),
+  dragover: (event) => { event.preventDefault(); page.dropping.hidden = false; },
+  dragleave: (event) => { if (!event.relatedTarget) page.dropping.hidden = true; },
   drop: (event) => {
     event.preventDefault();
-    page.drop.classList.remove("over");
+    page.dropping.hidden = true;
     tabs.select(0);
     addFiles(event.dataTransfer.files);
   },
 });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", update);
 
 begin();

@@ -1,27 +1,29 @@
 // SPDX-License-Identifier: MIT
 // The curves as a table: what was asked, and the numbers at the time that is shown.
 
-import { colourName } from "./chart.js";
+import { colourOf } from "./chart.js";
+import { cut, NONE, shown } from "./text.js";
 
-const NONE = "-";
+const NAME_LETTERS = 28;
 
-/** A number as the page writes it. */
-export function shown(value) {
-  return value === null || value === undefined ? NONE : value.toFixed(3);
+/** Writes a row for each curve into `body`. threshold: at which success counts */
+export function showTable(body, curves, threshold) {
+  const names = [...body.closest("table").querySelectorAll("thead th")].map((head) => head.textContent);
+  body.replaceChildren(...curves.map((curve) => label(row(curve, threshold), names)));
 }
 
-/** Writes a row for each curve into `body`. */
-export function showTable(body, curves, seconds, threshold) {
-  body.replaceChildren(...curves.map((curve) => row(curve, seconds, threshold)));
+/** A row whose cells have the names of their columns, which stand before them where rows are shown as cards. */
+export function label(element, names) {
+  [...element.cells].forEach((one, place) => { one.dataset.name = names[place]; });
+  return element;
 }
 
-function row(curve, seconds, threshold) {
+function row(curve, threshold) {
   const element = document.createElement("tr");
-  const here = curve.at(seconds);
   const from = curve.succeedsAt(threshold);
   const frames = curve.numFrames === null ? NONE : `${curve.progress.length} of ${curve.numFrames}`;
-  element.append(named(curve.index, curve.video.name), ...[curve.task, curve.model, curve.sampling, frames].map((text) => cell(text)));
-  const numbers = [curve.progress[here], curve.success[here], curve.progress.at(-1), curve.success.at(-1)];
+  element.append(named(curve, curve.name), ...[curve.task, curve.model, curve.sampling].map((text) => cell(text)), cell(frames, "number"));
+  const numbers = [curve.progress.at(-1), curve.success.at(-1)];
   element.append(...numbers.map((value) => cell(shown(value), "number")));
   element.append(cell(from === null ? NONE : `${from.toFixed(2)} s`, "number"));
   element.append(cell(curve.error ?? curve.state, curve.error ? "failed" : ""));
@@ -29,12 +31,14 @@ function row(curve, seconds, threshold) {
 }
 
 /** The head of a curve's row: its colour and a name. */
-export function named(index, name) {
+export function named(curve, name) {
   const header = document.createElement("th");
   const swatch = document.createElement("span");
   header.scope = "row";
-  swatch.className = `swatch ${colourName(index)}`;
-  header.append(swatch, name);
+  swatch.className = "swatch";
+  swatch.style.background = colourOf(curve);
+  header.title = name;
+  header.append(swatch, cut(name, NAME_LETTERS));
   return header;
 }
 

@@ -5,10 +5,12 @@ const KEYS = { ArrowRight: 1, ArrowLeft: -1 };
 
 export class Tabs {
   #pairs;
+  #onSelect;
 
-  /** pairs: each tab with its panel */
-  constructor(pairs) {
+  /** pairs: each tab with its panel; onSelect(index): another one is shown */
+  constructor(pairs, onSelect) {
     this.#pairs = pairs;
+    this.#onSelect = onSelect;
     pairs.forEach(([tab], index) => {
       tab.addEventListener("click", () => this.select(index));
       tab.addEventListener("keydown", ({ key }) => {
@@ -27,5 +29,6 @@ export class Tabs {
       tab.tabIndex = index === chosen ? 0 : -1;
       panel.hidden = index !== chosen;
     });
+    this.#onSelect(chosen);
   }
 }

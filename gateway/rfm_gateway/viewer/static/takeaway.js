@@ -43,29 +43,62 @@ export function json(url, curves, verdicts) {
   return JSON.stringify({ servers: [url], videos, comparisons }, null, 2) + "\n";
 }
 
-/** The command lines that give the same numbers: one for all videos that were asked about alike. */
+/**
+ * The command lines that give the same numbers: one for all videos that were asked about alike, and one for the
+ * cameras of an episode of a dataset. A comment stands for what no command can do.
+ */
 export function commands(url, curves, verdicts) {
-  const alike = new Map();
-  for (const curve of curves) alike.set(asked(curve), [...(alike.get(asked(curve)) ?? []), curve]);
-  const scores = [...alike.values()].map((group, index) => {
+  const ofEpisodes = grouped(curves.filter(({ video }) => video.origin?.dataset), askedOfEpisode).map((group) => labelLine(group, url));
+  const groups = grouped(curves.filter(({ video }) => !video.origin?.dataset), asked);
+  const scores = groups.map((group, index) => {
     const [{ rule, sampledFrames }] = group;
-    const sampling = ["--sampling", rule, ...(sampledFrames === null ? [] : ["--frames", sampledFrames])];
-    const target = `scores${alike.size > 1 ? `_${index + 1}` : ""}.json`;
-    return line("score", group.map(({ video }) => video), group[0], url, [...sampling, "--json", target]);
+    const target = `scores${groups.length > 1 ? `_${index + 1}` : ""}.json`;
+    return line("score", group.map(({ video }) => video), group[0], url, [...sampling(rule, sampledFrames), "--json", target]);
   });
   const comparisons = verdicts.flatMap((verdict) => [
     line("compare", verdict.videos, verdict, url, []),
     line("compare", [...verdict.videos].reverse(), verdict, url, []),
   ]);
-  return [...scores, ...comparisons].join("\n");
+  return [...scores, ...ofEpisodes, ...comparisons].join("\n");
+}
+
+function grouped(curves, askedOf) {
+  const alike = new Map();
+  for (const curve of curves) alike.set(askedOf(curve), [...(alike.get(askedOf(curve)) ?? []), curve]);
+  return [...alike.values()];
 }
 
 function asked({ task, model, rule, sampledFrames, fps, orient, resize }) {
   return JSON.stringify([task, model, rule, sampledFrames, fps, orient, resize]);
 }
 
+function askedOfEpisode({ video, task, model, rule, sampledFrames, fps, resize }) {
+  const { dataset, episode } = video.origin;
+  return JSON.stringify([dataset, episode, task, model, rule, sampledFrames, fps, resize]);
+}
+
+function sampling(rule, frames) {
+  return ["--sampling", rule, ...(frames === null ? [] : ["--frames", frames])];
+}
+
+/** The command that labels an episode of a dataset as the page has scored it. */
+function labelLine(group, url) {
+  const [{ video: { origin }, task, model, rule, sampledFrames, fps, resize }] = group;
+  const about = `episode ${origin.episode} of ${origin.dataset}`;
+  if (fps !== origin.fps) return `# ${about}: a command scores all of its frames, ${origin.fps} a second, not ${fps}`;
+  const cameras = group.map(({ video }) => video.origin.camera);
+  const turns = group.flatMap(({ video, orient }) => (orient === "none" ? [] : ["--orient", `${video.origin.camera}=${orient}`]));
+  const options = ["--episodes", origin.episode, "--cameras", cameras.join(","), ...turns, ...sampling(rule, sampledFrames)];
+  const given = task === origin.task ? [] : ["--task", task, "--override-task"];
+  const words = ["rfm-client", "label", origin.dataset, "--url", url, "--model", model, ...given, ...options];
+  const target = ["--output", `${origin.dataset}_episode_${origin.episode}`, "--format", "progress"];
+  return [...words, ...(resize ? ["--resize"] : []), ...target].map(quoted).join(" ");
+}
+
 function line(command, videos, { task, model, fps, orient, resize }, url, options) {
-  const files = videos.map(({ name }) => (name.startsWith("-") ? `./${name}` : name));
+  const cut = videos.find(({ origin }) => origin?.dataset);
+  if (cut) return `# ${command}: no file holds episode ${cut.origin.episode} of ${cut.origin.dataset} alone`;
+  const files = videos.map(({ name, origin }) => origin?.url ?? (name.startsWith("-") ? `./${name}` : name));
   const words = ["rfm-client", command, ...files, "--url", url, "--model", model, "--task", task, "--fps", fps];
   const turned = orient === "none" ? [] : ["--orient", orient];
   return [...words, ...turned, ...(resize ? ["--resize"] : []), ...options].map(quoted).join(" ");

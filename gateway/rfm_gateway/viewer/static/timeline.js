@@ -2,6 +2,8 @@
 // One time for a chart, for videos and for the controls below them: whatever moves moves the others.
 
 import { Chart } from "./chart.js";
+import { pointAt } from "./curves.js";
+import { shown } from "./text.js";
 import { Videos } from "./videos.js";
 
 const KEYS = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 };
@@ -9,21 +11,19 @@ const NEAR_S = 1e-3;
 
 /**
  * elements: `videos` and `chart` hold what is shown, `slider` is an input, `button` plays and pauses
- * `onMove(seconds)` is called with each new time
+ * changing: of the videos, as `Videos` takes it; chartOptions: as `Chart` takes them
  */
 export class Timeline {
   #slider;
   #button;
-  #onMove;
   #curves = [];
   time = 0;
 
-  constructor({ videos, chart, slider, button }, onMove) {
-    this.videos = new Videos(videos, (seconds, video) => this.moveTo(seconds, video));
-    this.chart = new Chart(chart, (seconds, isDragged) => this.#pointedAt(seconds, isDragged));
+  constructor({ videos, chart, slider, button }, { changing = null, ...chartOptions } = {}) {
+    this.videos = new Videos(videos, (seconds, video) => this.moveTo(seconds, video), changing);
+    this.chart = new Chart(chart, (seconds, isDragged) => this.#pointedAt(seconds, isDragged), chartOptions);
     this.#slider = slider;
     this.#button = button;
-    this.#onMove = onMove;
     button.addEventListener("click", () => this.#play());
     slider.addEventListener("input", () => {
       this.videos.pause();
@@ -51,9 +51,16 @@ export class Timeline {
   #showTime() {
     this.#button.textContent = this.videos.isPlaying ? "Pause" : "Play";
     this.#slider.value = this.time;
-    this.#slider.setAttribute("aria-valuetext", `${this.time.toFixed(2)} seconds`);
+    this.#slider.setAttribute("aria-valuetext", [`${this.time.toFixed(2)} seconds`, ...this.#numbers()].join("; "));
     this.chart.moveTo(this.time);
-    this.#onMove(this.time);
+  }
+
+  /** What stands beside the lines, for somebody who hears the page. */
+  #numbers() {
+    return this.#curves.map(({ label, times, progress, success }) => {
+      const index = pointAt(times, this.time);
+      return `${label}: progress ${shown(progress[index])}, success ${shown(success[index])}`;
+    });
   }
 
   #pointedAt(seconds, isDragged) {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // Which of two videos does a task better: the model is asked in both orders, and both answers are shown.
 
-import { shown } from "./table.js";
+import { shown } from "./text.js";
 
 /** Writes what the model says of a pair into `host`. verdict: videos, task, model, answer of the gateway */
 export function addVerdict(host, { videos, task, model, answer }) {

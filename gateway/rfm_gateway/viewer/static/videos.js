@@ -1,19 +1,26 @@
 // SPDX-License-Identifier: MIT
 // The videos of the page, which move together: one time for all of them.
 
+import { nameable, remover } from "./nameable.js";
+
 const NEAR_S = 0.05; // a video that is so near to a time shows it
 const INSIDE_S = 0.001; // behind the begin of a frame, so that rounding does not show the one before
 
-/** Videos in `host`. `onTime(seconds, video)` is called as long as one plays. The page has the controls. */
+/**
+ * Videos in `host`. `onTime(seconds, video)` is called as long as one plays. The page has the controls.
+ * Where videos can be changed: onName(): one has another title; onRemove(video): somebody wants one away
+ */
 export class Videos {
   #host;
   #onTime;
+  #changing;
   #entries = [];
   #numAdded = 0;
 
-  constructor(host, onTime) {
+  constructor(host, onTime, changing = null) {
     this.#host = host;
     this.#onTime = onTime;
+    this.#changing = changing;
   }
 
   get all() {
@@ -24,22 +31,20 @@ export class Videos {
     return this.#entries.some(({ player }) => !player.paused && !player.ended);
   }
 
-  /** Shows a file under a name, turned, and gives what is known of it. */
-  add(file, name = file.name, orient = "none") {
-    const figure = document.createElement("figure");
-    const player = document.createElement("video");
-    const caption = document.createElement("figcaption");
-    const entry = { id: (this.#numAdded += 1), file, name, figure, player, orient, wanted: null };
+  /** Shows a file under a name, turned, and gives what is known of it. more: what else is known */
+  add(file, name = file.name, orient = "none", more = {}) {
+    const [figure, player, caption, trouble] = ["figure", "video", "figcaption", "p"].map((tag) => document.createElement(tag));
+    const entry = { id: (this.#numAdded += 1), file, name, title: name, figure, player, orient, wanted: null, ...more };
     Object.assign(player, { src: URL.createObjectURL(file), muted: true, playsInline: true, preload: "auto" });
     player.setAttribute("aria-label", `Video ${name}`);
     player.className = orient;
-    caption.textContent = name;
-    player.addEventListener("error", () => {
-      caption.textContent = `${name}: this browser cannot show it; its curve counts all the same`;
-    });
+    trouble.textContent = "This browser cannot show it; its curve counts all the same.";
+    trouble.hidden = true;
+    player.addEventListener("error", () => { trouble.hidden = false; });
+    caption.append(...(this.#changing ? this.#controls(entry) : [name]));
     player.addEventListener("play", () => this.#follow(entry));
     player.addEventListener("seeked", () => this.#arrived(entry));
-    figure.append(player, caption);
+    figure.append(caption, player, trouble);
     this.#host.append(figure);
     this.#entries.push(entry);
     return entry;
@@ -66,12 +71,34 @@ export class Videos {
     for (const { player } of this.#entries) player.pause();
   }
 
+  /** Removes a video. */
+  remove(entry) {
+    entry.player.pause();
+    URL.revokeObjectURL(entry.player.src);
+    entry.figure.remove();
+    this.#entries = this.#entries.filter((each) => each !== entry);
+  }
+
   /** Removes all videos. */
   clear() {
     this.pause();
     for (const { player } of this.#entries) URL.revokeObjectURL(player.src);
     this.#entries = [];
     this.#host.replaceChildren();
+  }
+
+  /** What changes the title of a video, and what removes it. */
+  #controls(entry) {
+    const title = nameable((text) => {
+      entry.title = text || entry.name;
+      title.show(entry.title, entry.name);
+      away.setAttribute("aria-label", `Remove ${entry.title}`);
+      this.#changing.onName();
+    });
+    const away = remover(() => this.#changing.onRemove(entry));
+    title.show(entry.title);
+    away.setAttribute("aria-label", `Remove ${entry.title}`);
+    return [title.element, away];
   }
 
   #move(entry, seconds) {

@@ -1,0 +1,40 @@
+// SPDX-License-Identifier: MIT
+// Episodes of a dataset as other programs take them.
+
+/** One number a line. */
+export function episodesText(numbers) {
+  return numbers.map((number) => `${number}\n`).join("");
+}
+
+/** What is known of the episodes, as JSON. about: dataset, labels and threshold */
+export function episodesJson(about, episodes) {
+  return JSON.stringify({ ...about, episodes }, null, 2) + "\n";
+}
+
+/** By name: what LeRobot is to do with the episodes. */
+const USES = {
+  train: (_, numbers) => `--dataset.episodes="${list(numbers)}"`,
+  delete: (dataset, numbers, all) => edited(dataset, numbers, all, "cleaned"),
+  keep: (dataset, numbers, all) => edited(dataset, all.filter((number) => !numbers.includes(number)), all, "kept"),
+};
+
+/** The words for LeRobot's command line. all: the numbers of all episodes of the dataset */
+export function lerobotWords(use, dataset, numbers, all) {
+  if (!numbers.length) return "# no episode is chosen";
+  return USES[use](dataset, numbers, all);
+}
+
+function edited({ name, kind }, away, all, ending) {
+  if (!away.length) return "# these are all episodes: nothing is to be deleted";
+  if (away.length === all.length) return "# no episode would be left";
+  const early = kind.includes("v3") ? [] : [`# lerobot-edit-dataset reads v3.0, and this is ${kind}: convert it before`];
+  const target = `${name}_${ending}`;
+  return [...early, [
+    `lerobot-edit-dataset --repo_id ${name} --root ${name}`, `--new_repo_id ${target} --new_root ${target}`,
+    "--operation.type delete_episodes", `--operation.episode_indices "${list(away)}"`,
+  ].join(" ")].join("\n");
+}
+
+function list(numbers) {
+  return `[${numbers.join(", ")}]`;
+}

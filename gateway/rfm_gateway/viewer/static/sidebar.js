@@ -1,0 +1,36 @@
+// SPDX-License-Identifier: MIT
+// The settings beside what is shown: a button folds them away, and the browser remembers that.
+
+const KEY = "rfm.settings";
+const CLOSED = "closed";
+const WIDE = "(min-width: 720px)"; // elsewhere the settings would hide what is shown, so they begin folded away
+
+export class Sidebar {
+  #button;
+
+  constructor(button) {
+    this.#button = button;
+    const told = localStorage.getItem(KEY);
+    this.#show(told === null ? matchMedia(WIDE).matches : told !== CLOSED);
+    button.addEventListener("click", () => this.#set(!this.#isOpen));
+  }
+
+  /** Shows the settings. */
+  open() {
+    if (!this.#isOpen) this.#set(true);
+  }
+
+  get #isOpen() {
+    return this.#button.getAttribute("aria-expanded") === "true";
+  }
+
+  #set(isOpen) {
+    localStorage.setItem(KEY, isOpen ? "open" : CLOSED);
+    this.#show(isOpen);
+  }
+
+  #show(isOpen) {
+    this.#button.setAttribute("aria-expanded", isOpen);
+    document.body.classList.toggle("folded", !isOpen);
+  }
+}

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""LeRobot episodes with several tasks: each stretch of frames by its own task, or all by the first."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from labelling import LEROBOT, WRIST, BrightnessScorer, Notes
+from rfm_client import ProgressResult, ProgressSample, Trajectory
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.datasets.lerobot_v30 import read_tasks
+from rfm_client.labelling import CheckpointFacts, DatasetError, LabelOptions, label, open_dataset
+
+CUTS = (0, 20, 30)  # first frames of the stretches of episode 0
+TASKS = (0, 4, 0)  # and their numbers
+
+
+class SinceTheFirst(BrightnessScorer):
+    """Progress is by how much the newest frame is brighter than the first that is shown; keeps each sample's task."""
+
+    def __init__(self, encodes: bool = False) -> None:
+        super().__init__()
+        self.encodes = encodes
+        self.asked: list[str] = []
+
+    def checkpoint(self) -> CheckpointFacts:
+        return replace(super().checkpoint(), encodes=self.encodes)
+
+    def encode(self, frames: UInt8Array, task: str) -> Trajectory:
+        self.asked.append(task)
+        embeddings = frames.reshape(len(frames), -1).mean(axis=1, dtype=np.float32)[:, None]
+        return Trajectory(video_embeddings=embeddings, text_embedding=np.zeros(1, np.float32))
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        self.asked += [sample.trajectory.task for sample in samples if sample.trajectory.task]
+        return super().evaluate(samples)
+
+    def _result(self, sample: ProgressSample) -> ProgressResult:
+        shown = sample.trajectory.positions
+        means = shown.reshape(len(shown), -1).mean(axis=1, dtype=np.float32) / 255
+        return ProgressResult(progress=means - means[0], success=means)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Episode 0 has two tasks in three stretches, all other episodes have one."""
+    root = shutil.copytree(LEROBOT / "toy_v30_many", tmp_path / "toy")
+    rows = root / "data" / "chunk-000" / "file-000.parquet"
+    change(rows, "task_index", lambda values: [*numbers(58), *values[58:]])
+    sentences = read_tasks(root)
+    episodes = root / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    change(episodes, "tasks", lambda values: [[sentences[0], sentences[4]], *values[1:]])
+    return root
+
+
+def numbers(count: int) -> list[int]:
+    return [TASKS[max(k for k, cut in enumerate(CUTS) if cut <= t)] for t in range(count)]
+
+
+def change(file: Path, column: str, change: Any) -> None:
+    table = parquet.read_table(file, partitioning=None)
+    place = table.column_names.index(column)
+    values = pa.array(change(table[column].to_pylist()), table.schema.field(column).type)
+    parquet.write_table(table.set_column(place, table.schema.field(column), values), file)
+
+
+def options(output: Path, **more: Any) -> LabelOptions:
+    few: dict[str, Any] = {"cameras": (WRIST,), "episodes": [0, 1], "frames": 4, "formats": ("progress",)}
+    return LabelOptions(output=output, **{**few, **more})
+
+
+@pytest.mark.parametrize("encodes", [False, True])
+@pytest.mark.parametrize("mode", ["prefix", "whole"])
+def test_each_stretch_of_frames_is_scored_as_an_episode_of_its_task(
+    root: Path, output: Path, mode: Any, encodes: bool
+) -> None:
+    dataset, notes, scorer = open_dataset(root), Notes(), SinceTheFirst(encodes)
+    scorer.max_frames = None
+    sentences = read_tasks(root)
+    first = dataset.episode(0)
+    assert (first.task, first.tasks) == (
+        sentences[0],
+        tuple((cut, sentences[t]) for cut, t in zip(CUTS, TASKS, strict=True)),
+    )
+    report = label(dataset, scorer, options(output, mode=mode, frames=4 if mode == "prefix" else None), notes)
+    table = parquet.read_table(report.files[0])
+    means = np.array([frame.mean() / 255 for frame in dataset.frames(first, WRIST)], np.float32)
+    since = np.array([means[max(cut for cut in CUTS if cut <= t)] for t in range(len(means))])
+    np.testing.assert_allclose(table["progress_sparse"].to_numpy()[: len(means)], means - since, atol=1e-5)
+    assert table["frame_index"].to_pylist()[: len(means)] == list(range(len(means)))
+    assert set(scorer.asked) == {sentences[0], sentences[4], dataset.episode(1).task}
+    assert [line for line in notes.lines if line.startswith("tasks: 1 episodes have several: each stretch")]
+
+
+def test_all_frames_have_the_first_task_by_choice(root: Path, output: Path) -> None:
+    dataset, scorer = open_dataset(root, several_tasks="first"), SinceTheFirst()
+    assert dataset.episode(0).tasks == ()
+    report = label(dataset, scorer, options(output))
+    means = np.array([frame.mean() / 255 for frame in dataset.frames(dataset.episode(0), WRIST)], np.float32)
+    progress = parquet.read_table(report.files[0])["progress_sparse"].to_numpy()[: len(means)]
+    np.testing.assert_allclose(progress, means - means[0], atol=1e-5)
+    assert read_tasks(root)[4] not in scorer.asked
+    with pytest.raises(DatasetError, match="episode 0: expected the frames and rows of its labels"):
+        label(open_dataset(root), scorer, options(output, episodes=[1]))
+    with pytest.raises(DatasetError, match="several_tasks: expected one of each, first, got 'last'"):
+        open_dataset(root, several_tasks="last")  # type: ignore[arg-type]
+
+
+def test_a_task_of_the_caller_is_that_of_all_frames(root: Path) -> None:
+    episode = open_dataset(root, task="open the box", override_task=True).episode(0)
+    assert (episode.task, episode.tasks) == ("open the box", ())
