@@ -279,7 +279,7 @@ USAGE: dict[str, tuple[list[str], str]] = {
     "key after": (["status", "--api-key-file", "/nowhere"], "api_key_file: expected a text file, got [Errno 2]"),
     "seconds": (["wait", "--timeout", "0"], "'--timeout': expected at least 0.001, got 0.0"),
     "picture": (["score", "a.mp4", "--plot", "a.gif"], "expected a file that ends in .png, .pdf, .svg, got a.gif"),
-    "many pictures": (["score", *["a.mp4"] * 51, "--plot", "a.png"], "expected at most 50 videos, got 51"),
+    "many pictures": (["score", *["a.mp4"] * 41, "--plot", "a.png"], "expected at most 40 videos, got 41"),
     "array": (["score", "a.mp4", "--npy", "a.npz"], "expected a .npy file or a folder, got a.npz"),
     "one array": (["score", "a.mp4", "b.mp4", "--npy", "a.npy"], "expected a folder for 2 videos, got a.npy"),
     "lengths": (["sample", "--num-frames", "8-4"], LENGTHS),

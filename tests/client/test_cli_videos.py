@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import clip
 from client_commands import (
@@ -38,10 +39,12 @@ from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import Source
 from rfm_client.data.inputs import load_trajectory
+from rfm_client.plot import plot_scores, save
 from shelves import Shelf
 from trajectories import random_trajectory
 
 MAX_FRAMES = 16  # of that checkpoint
+SHADES = 16  # between two answers of a server
 FILE_OF_SEVERAL = "data/videos/observation.images.top/chunk-000/file-000.mp4"
 
 
@@ -59,7 +62,16 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
     plotted = tmp_path / "new" / "plots" / "plot.png"
     result = run(
         *("score", video, missing, embeddings, "--task", TASK, "--fps", 10, "--model", MODEL),
-        *("--json", target, "--npy", tmp_path / "new" / "arrays", "--plot", plotted),
+        *(
+            "--json",
+            target,
+            "--npy",
+            tmp_path / "new" / "arrays",
+            "--plot",
+            plotted,
+            "--strips",
+            tmp_path / "strips.png",
+        ),
         RFM_URL=f"{served.url('http')} {served.url('grpc')}",
     )
     assert result.returncode == ExitCode.FAILED
@@ -98,7 +110,13 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
     array = np.load(tmp_path / "new" / "arrays" / "clip.npy")
     assert array.dtype == np.float32
     np.testing.assert_array_equal(array, np.float32([first["progress"], first["success"]]).T)
-    assert plotted.read_bytes().startswith(b"\x89PNG")
+    times_s = [EVENLY / clip.FPS, None]
+    figure = plot_scores([filmed, embedded], ["clip.mp4", "embeddings.npz"], title=f'"{TASK}"', times_s=times_s)
+    save(figure, tmp_path / "own.png")
+    with Image.open(plotted) as drawn, Image.open(tmp_path / "own.png") as own:
+        assert np.abs(np.asarray(drawn, np.int16) - np.asarray(own)).max() <= SHADES
+    with Image.open(tmp_path / "strips.png") as strips:
+        assert strips.width == 2000
 
 
 OPTIONS: dict[str, tuple[list[object], dict[str, Any]]] = {

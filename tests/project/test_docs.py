@@ -32,7 +32,7 @@ from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajector
 from rfm_client.cli.commands import app
 from rfm_client.contract import wire
 from rfm_client.contract.settings import Setting, settings_of
-from rfm_client.labelling import open_dataset
+from rfm_client.labelling import ClientScorer, LabelOptions, label, open_dataset
 from rfm_commands.cli import app as rfm
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 
@@ -59,7 +59,11 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.*)", re.MULTILINE)
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
 PATH = re.compile(r"[` ](?!\.venv)([\w.-]+/[\w./-]*\w/?)(?=[` ])")
-SERVED_AS = {"--model first": "--model rfm", "--model second": "--model rfm"}  # the guides', by this server's names
+SERVED_AS = {  # the guides' words, by what this server and this dataset have
+    "--model first": "--model rfm",
+    "--model second": "--model rfm",
+    "--episodes 0:20": "--episodes 0:8",
+}
 
 
 def found(pattern: re.Pattern[str], files: Iterable[Path] = RUN) -> list[Any]:
@@ -87,7 +91,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         clip.write(tmp_path / name)
     shutil.copytree(LEROBOT / "toy_v21", tmp_path / "my_dataset")
     shutil.copytree(ROOT / "tests" / "videos", tmp_path / "tests" / "videos")
-    outcomes = "".join(f"{episode.index},1\n" for episode in open_dataset(tmp_path / "my_dataset").episodes)
+    outcomes = "".join(
+        f"{episode.index},{episode.index % 2}\n" for episode in open_dataset(tmp_path / "my_dataset").episodes
+    )
     (tmp_path / "outcomes.csv").write_text(f"episode,success\n{outcomes}")
     toy_dataset.write(tmp_path / "demo_output" / "toy", clips=2)
     np.savez(tmp_path / "episode.npz", frames=pictures(0), task="stack the cups")
@@ -129,6 +135,9 @@ def names() -> dict[str, Any]:
 @pytest.mark.parametrize("code", found(BLOCK))
 def test_every_example_runs(demo_server: Endpoints, folder: Path, code: str) -> None:
     code = code.replace("grpc://localhost:8001", demo_server.grpc_url)
+    for name in re.findall(r"my_dataset/(\w+)_progress\.parquet", code):
+        with RewardClient(demo_server.grpc_url) as client:
+            label(open_dataset("my_dataset"), ClientScorer(client), LabelOptions(name=name, frames=4))
     shown: dict[str, Any] = names()
     exec(compile(code, "README", "exec"), shown)
     if "envs" in shown:
@@ -146,7 +155,9 @@ def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: 
     for shown, served in SERVED_AS.items():
         command = command.replace(shown, served)
     if command.startswith("rfm-client evaluate"):
-        command = f"rfm-client label {command.split()[2]} && {command}"
+        dataset = command.split()[2]
+        labels = re.findall(rf"{dataset}/(\w+)_progress\.parquet", command) or ["rfm"]
+        command = " && ".join([*(f"rfm-client label {dataset} --name {name}" for name in labels), command])
     environment = {
         **os.environ,
         "RFM_URL": demo_server.grpc_url,

@@ -78,7 +78,7 @@ EXTRAS = {
     "stable_baselines3": {"sb3.py"},
     "typer": {"cli"},
     "rich": {"cli"},
-    "matplotlib": {"cli"},
+    "matplotlib": {"cli", "plot.py"},
     "pyarrow": {"label_files.py", "lerobot_rows.py", "finished_episodes.py"},
     "fsspec": {"finished_episodes.py"},
     "huggingface_hub": {"opening.py"},

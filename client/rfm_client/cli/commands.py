@@ -41,6 +41,7 @@ from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.settings import ConfigError
+from rfm_client.plot import save
 
 MIN_COMPARED = 2
 
@@ -110,11 +111,13 @@ def score(
         outcomes = scoring.SourceScorer(client, video, prefix, record).score_all(videos, tell)
     rows.end(prefix.rule)
     output.write_json(documents.score_document(server, video, prefix, outcomes))
-    panels = [outcome.panel for outcome in outcomes if isinstance(outcome, scoring.Scored)]
-    if output.plot is not None and panels:
+    scored = [outcome for outcome in outcomes if isinstance(outcome, scoring.Scored)]
+    if output.plot is not None and scored:
+        save(scoring.figure(scored, video.task), output.plot)
+    if output.strips is not None and scored:
         from rfm_client.cli.pictures import plot
 
-        plot(output.plot, panels)
+        plot(output.strips, [outcome.panel for outcome in scored])
     raise typer.Exit(scoring.exit_code_of_outcomes(outcomes))
 
 
@@ -126,7 +129,14 @@ def compare(
     server: ServerOptions,
     files: CredentialsGiven,
     video: VideoOptions,
-    output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json", "plot"))],
+    output: Annotated[
+        OutputOptions,
+        OptionsOf(
+            OutputOptions,
+            only=("json", "plot"),
+            helps={"plot": "Draw frames of each video above its scores, the best first: .png, .pdf or .svg."},
+        ),
+    ],
 ) -> None:
     """Rank several videos by how well they do the task.
 

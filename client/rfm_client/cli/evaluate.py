@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from rfm_client.labelling import LabelComparison
 
+HELPS = {"plot": "Draw histograms of progress at the last frame: .png, .pdf or .svg."}
 LEGEND = (
     "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, and of progress, at the last frame; "
     "0.5 is chance. Threshold: of success at the last frame, with the best balanced accuracy. Falls: steps on which "
@@ -28,7 +29,7 @@ LEGEND = (
 @with_options
 def evaluate(
     dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder of the labelled dataset.")],
-    output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json", "plot"))],
+    output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json", "plot"), helps=HELPS)],
     labels: Annotated[
         list[Path] | None,
         typer.Option(help="Parquet label file; repeat the option for more (all in DATASET).", show_default=False),

@@ -21,13 +21,15 @@ from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.data.orientation import Orientation
 from rfm_client.data.sampling import RULES, Rule, Sampling
+from rfm_client.plot import MAX_CURVES
 from rfm_client.transport.credentials import Credentials
 
 DEFAULT_URL = "grpc://localhost:8001"
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 86_400
 FRAMES = "Frames"  # heading of all options that decide which frames are scored, and on what
-MAX_PICTURED = 50  # videos; a larger picture is unreadable, and soon cannot be drawn
-_ENDINGS = {"json": (".json",), "plot": (".png", ".pdf", ".svg"), "rrd": (".rrd",)}
+MAX_PICTURED = MAX_CURVES  # videos; a larger picture is unreadable, and soon cannot be drawn
+_PICTURES = (".png", ".pdf", ".svg")
+_ENDINGS = {"json": (".json",), "plot": _PICTURES, "strips": _PICTURES, "rrd": (".rrd",)}
 
 
 @dataclass(frozen=True)
@@ -200,7 +202,12 @@ class OutputOptions(Settings):
     json: str | None = setting(
         None, "Write JSON to a .json file; alone or -: print it, and no table.", metavar="[FILE|-]"
     )
-    plot: Path | None = setting(None, "Draw frames and scores: .png, .pdf or .svg.", metavar="FILE")
+    plot: Path | None = setting(
+        None, "Draw the curves of all videos in one figure, sized for a paper: .png, .pdf or .svg.", metavar="FILE"
+    )
+    strips: Path | None = setting(
+        None, "Draw frames of each video above its scores: .png, .pdf or .svg.", metavar="FILE"
+    )
     rrd: Path | None = setting(
         None, "Record frames and scores on one timeline for Rerun's viewer: .rrd.", metavar="FILE"
     )
@@ -239,8 +246,9 @@ class OutputOptions(Settings):
 
     def begin(self, videos: Sequence[str]) -> None:
         """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
-        if self.plot is not None and len(videos) > MAX_PICTURED:
-            raise ConfigError("plot", f"expected at most {MAX_PICTURED} videos, got {len(videos)}")
+        for name in ("plot", "strips"):
+            if getattr(self, name) is not None and len(videos) > MAX_PICTURED:
+                raise ConfigError(name, f"expected at most {MAX_PICTURED} videos, got {len(videos)}")
         if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
             raise ConfigError("npy", f"expected a folder for {len(videos)} videos, got {self.npy}")
         self.make_folders()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.results import FrameScores
 from rfm_client.contract.samples import Float32Array, UInt8Array
+from rfm_client.plot import save
 
 if TYPE_CHECKING:
     from matplotlib.figure import SubFigure
@@ -25,7 +25,6 @@ STRIP_FRAMES = 8
 WIDTH_IN = 10.0
 COLUMN_WIDTH_IN = 7.0  # of panels side by side
 PANEL_HEIGHT_IN = 4.0
-DOTS_PER_IN = 200
 SUMMARY_HEIGHT_IN = 3.5
 SUMMARY_DOTS_PER_IN = 150
 BINS = 20
@@ -83,7 +82,7 @@ def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, colum
 
     rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
     heights_in = [PANEL_HEIGHT_IN * (1 if any(panel.strip is not None for panel in row) else 0.7) for row in rows]
-    with matplotlib.rc_context({"pdf.fonttype": 42, "text.parse_math": False}):  # TrueType, which journals accept
+    with matplotlib.rc_context({"text.parse_math": False}):
         figure = Figure(
             figsize=(WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN * columns, sum(heights_in)), layout="constrained"
         )
@@ -92,9 +91,7 @@ def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, colum
         parts = figure.subfigures(len(rows), columns, squeeze=False, height_ratios=heights_in)
         for part, panel in zip(parts.flat, panels):  # noqa: B905 - the last row may have room left
             _draw(part, panel)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph")  # letters that the font lacks are drawn as boxes
-            figure.savefig(file, dpi=DOTS_PER_IN)
+        save(figure, file)
 
 
 def _draw(part: SubFigure, panel: Panel) -> None:

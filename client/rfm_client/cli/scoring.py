@@ -12,7 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
-from typing import TypeAlias, cast
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,10 @@ from rfm_client.contract.results import FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.data.fit_to_checkpoint import FittedSample, fitted, with_frame_indices
 from rfm_client.data.sampling import Sampling, of_prefixes, prefix_samples
+from rfm_client.plot import plot_scores
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PREFIXES_AT_A_TIME = 64  # of one video, since their frames are in memory
 WORKERS = 8  # videos in memory at a time
@@ -245,6 +249,18 @@ def _evaluate(
         results += client.evaluate(part)
     told = of_prefixes(cast("list[ProgressResult]", results), sampling)
     return cast(ProgressResult, with_frame_indices(told, fit.frame_indices))
+
+
+def figure(scored: Sequence[Scored], task: str) -> Figure:
+    """Return one figure with the curves of these sources. Raises ImportError without matplotlib."""
+    files = [PurePath(each.name).name for each in scored]
+    is_unique = len(set(files)) == len(files)
+    return plot_scores(
+        [each.result for each in scored],
+        files if is_unique else [each.name for each in scored],
+        title=f'"{task}"' if task else None,
+        times_s=[each.times_s for each in scored],
+    )
 
 
 @contextmanager

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: MIT
+"""Curves of several results in one figure, sized for a paper's column. Needs ``rfm-client[cli]`` (matplotlib)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.results import FrameScores
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MAX_CURVES = 40  # colours times line styles
+DOTS_PER_IN = 200
+
+_WIDTH_IN = 3.5  # a column of two
+_HEIGHT_IN = 1.8
+_SUCCESS_IN = 0.9
+_LINE_IN = 0.17  # a line of text
+_LONGEST = 44  # characters of a name that a column has room for
+_COLOURS = tuple(f"C{index}" for index in range(10))
+_LINES = ("-", "--", "-.", ":")
+_STYLE = {"font.size": 8, "axes.titlesize": 8, "text.parse_math": False, "axes.grid": True, "grid.alpha": 0.3}
+
+
+def plot_scores(
+    results: Sequence[FrameScores],
+    names: Sequence[str],
+    *,
+    title: str | None = None,
+    times_s: Sequence[npt.NDArray[np.float64] | None] | None = None,
+) -> Figure:
+    """Return a figure with a curve of progress for each result and, below it, of success where it is predicted.
+
+    It is light, whatever style is set, and 3.5 inches wide. ``save`` writes it.
+
+    names: of the curves, in the legend; long names lose their middle
+    times_s: for each result float64 [T], the times of its T scored frames; the axis counts frames if one is unknown
+
+    Raises ValueError for no result, for more than 40, and for another number of names or times; ImportError without
+    matplotlib.
+    """
+    if not 0 < len(results) <= MAX_CURVES:
+        raise ValueError(f"results: expected 1 to {MAX_CURVES}, got {len(results)}")
+    times_s = [None] * len(results) if times_s is None else times_s
+    for name, values in (("names", names), ("times_s", times_s)):
+        if len(values) != len(results):
+            raise ValueError(f"{name}: expected {len(results)}, as many as results, got {len(values)}")
+    try:
+        import matplotlib.style
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('plots need matplotlib: pip install "./client[cli]"') from error
+
+    positions = [each for each in times_s if each is not None]
+    has_times = len(positions) == len(results)
+    if not has_times:
+        positions = [_frames(result) for result in results]
+    has_success = not all(np.isnan(result.success).all() for result in results)
+    heights_in = [_HEIGHT_IN, _SUCCESS_IN] if has_success else [_HEIGHT_IN]
+    with matplotlib.style.context(["default", _STYLE]):
+        figure = Figure(figsize=(_WIDTH_IN, sum(heights_in) + _LINE_IN * (len(results) + 2)), layout="constrained")
+        axes = figure.subplots(len(heights_in), 1, sharex=True, squeeze=False, height_ratios=heights_in)[:, 0]
+        for ax, score in zip(axes, ("progress", "success"), strict=False):
+            for number, (result, x) in enumerate(zip(results, positions, strict=True)):
+                colour, line = _COLOURS[number % len(_COLOURS)], _LINES[number // len(_COLOURS)]
+                marker = "o" if len(x) == 1 else ""  # a point alone makes no line
+                label = _shortened(names[number]) if score == "progress" else None
+                ax.plot(x, getattr(result, score), color=colour, linestyle=line, marker=marker, lw=1.2, label=label)
+            ax.set(ylabel=score, ylim=(-0.02, 1.02))
+        axes[-1].set_xlabel("time (s)" if has_times else "frame")
+        if title is not None:
+            figure.suptitle(title, fontsize=9, wrap=True)
+        figure.legend(loc="outside lower left", fontsize=7, frameon=False)
+    return figure
+
+
+def save(figure: Figure, file: Path | str) -> None:
+    """Write a figure in the format of the file's suffix, such as .png (200 dots an inch), .pdf or .svg."""
+    import matplotlib
+
+    with matplotlib.rc_context({"pdf.fonttype": 42}), warnings.catch_warnings():  # TrueType, which journals accept
+        warnings.filterwarnings("ignore", message="Glyph")  # letters that the font lacks are drawn as boxes
+        figure.savefig(file, dpi=DOTS_PER_IN)
+
+
+def _frames(result: FrameScores) -> npt.NDArray[np.float64]:
+    scored = np.arange(len(result.progress)) if result.frame_indices is None else result.frame_indices
+    return scored.astype(np.float64)
+
+
+def _shortened(name: str) -> str:
+    half = _LONGEST // 2
+    return name if len(name) <= _LONGEST else f"{name[: half - 1]}…{name[-half:]}"

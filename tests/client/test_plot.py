@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: MIT
+"""Figures of several results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.style
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from PIL import Image
+
+from rfm_client import FrameScores
+from rfm_client.plot import plot_scores, save
+
+
+def scores(num_frames: int, *, success: float = 0.5, frame_indices: list[int] | None = None) -> FrameScores:
+    return FrameScores(
+        progress=np.linspace(0, 1, num_frames, dtype=np.float32),
+        success=np.full(num_frames, success, np.float32),
+        frame_indices=None if frame_indices is None else np.array(frame_indices),
+    )
+
+
+def test_every_result_has_a_curve_of_progress_in_one_axes_and_of_success_below() -> None:
+    results = [scores(4), scores(3, frame_indices=[0, 5, 10])]
+    figure = plot_scores(results, ["a_$1.mp4", "b" * 60], title='"stack the cups"')
+    progress, success = figure.axes
+    for ax, name in ((progress, "progress"), (success, "success")):
+        assert ax.get_ylabel() == name
+        for line, result in zip(ax.get_lines(), results, strict=True):
+            np.testing.assert_array_equal(line.get_ydata(), getattr(result, name))
+    np.testing.assert_array_equal(progress.get_lines()[1].get_xdata(), [0, 5, 10])
+    assert success.get_xlabel() == "frame"
+    assert figure.get_suptitle() == '"stack the cups"'
+    told = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert told == ["a_$1.mp4", f"{'b' * 21}…{'b' * 22}"]
+
+
+def test_seconds_stand_on_the_axis_if_all_are_known_and_success_only_if_predicted() -> None:
+    results = [scores(2, success=np.nan), scores(2, success=np.nan)]
+    times_s = [np.array([0.0, 0.5]), np.array([0.0, 0.25])]
+    (ax,) = plot_scores(results, ["a", "b"], times_s=times_s).axes
+    assert ax.get_xlabel() == "time (s)"
+    np.testing.assert_array_equal(ax.get_lines()[1].get_xdata(), [0, 0.25])
+    (ax,) = plot_scores(results, ["a", "b"], times_s=[times_s[0], None]).axes
+    assert ax.get_xlabel() == "frame"
+
+
+def test_forty_curves_differ_and_the_figure_stays_light_in_a_dark_style(tmp_path: Path) -> None:
+    with matplotlib.style.context("dark_background"):
+        figure = plot_scores([scores(3)] * 40, [f"{index}" for index in range(40)])
+        save(figure, tmp_path / "curves.png")
+    styles = {(line.get_color(), line.get_linestyle()) for line in figure.axes[0].get_lines()}
+    assert len(styles) == 40
+    assert to_hex(figure.get_facecolor()) == to_hex(figure.axes[0].get_facecolor()) == "#ffffff"
+    with Image.open(tmp_path / "curves.png") as picture:
+        assert picture.width == 700
+        assert picture.convert("RGB").getpixel((0, 0)) == (255, 255, 255)
+
+
+@pytest.mark.parametrize(("suffix", "start"), [(".pdf", b"%PDF"), (".svg", b"<?xml"), (".png", b"\x89PNG")])
+def test_it_is_written_in_the_format_of_the_suffix(tmp_path: Path, suffix: str, start: bytes) -> None:
+    file = tmp_path / f"curves{suffix}"
+    save(plot_scores([scores(1)], ["an episode of 木"]), file)
+    assert file.read_bytes().startswith(start)
+
+
+@pytest.mark.parametrize(
+    ("results", "names", "message"),
+    [
+        ([], [], "results: expected 1 to 40, got 0"),
+        ([scores(2)] * 41, ["a"] * 41, "results: expected 1 to 40, got 41"),
+        ([scores(2)], [], "names: expected 1, as many as results, got 0"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(results: list[FrameScores], names: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        plot_scores(results, names)
