@@ -103,7 +103,6 @@ def test_a_missing_package_is_told_with_the_command_that_installs_it(
 
 
 def test_a_recording_has_the_ending_that_the_viewer_opens(video: Path, tmp_path: Path) -> None:
-    for target, told in (("out.mp4", "a file that ends in .rrd"), ("nowhere/out.rrd", "a folder at")):
-        result = invoke("score", video, "--rrd", tmp_path / target)
-        assert result.exit_code == ExitCode.USAGE
-        assert told in " ".join(result.stderr.split())
+    result = invoke("score", video, "--rrd", tmp_path / "out.mp4")
+    assert result.exit_code == ExitCode.USAGE
+    assert "a file that ends in .rrd" in " ".join(result.stderr.split())
