@@ -47,6 +47,11 @@ def cells(output: str) -> dict[str, str]:
     return {row[0]: row[1] for row in rows if len(row) == 2}
 
 
+def test_a_shard_without_an_episode_has_nothing_to_do(output: Path) -> None:
+    result = own(DATASET, *ENGINE, "--output", output, "--limit", 1, "--shard", "0/2", "--no-picture")
+    assert result.exit_code == 0, result.output
+
+
 @pytest.mark.triton
 def test_both_commands_write_the_same_labels_and_tell_what_they_did(demo_server: Endpoints, output: Path) -> None:
     words = ("--episodes", "2,3,9", "--frames", 8, "--cameras", "front", "--alias", "sarm_progress")

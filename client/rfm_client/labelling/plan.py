@@ -112,10 +112,15 @@ class Recipe:
         """Raise DatasetError for an episode above the checkpoint's limit, if the recipe shows whole episodes."""
         limit = self.checkpoint.max_frames
         lengths = {episode.name: max(count for _, count in episode.stretches) for episode in episodes}
+        if not lengths:  # a shard without an episode
+            return
         longest = max(lengths, key=lambda name: lengths[name])
         shows_all = self.mode == "whole" or self.sampling.frames is None
         fits = not shows_all or limit is None or lengths[longest] <= limit
-        got = f"{lengths[longest]}: use mode prefix and a rule with a number of frames"
+        remedy = "use mode prefix and a rule with a number of frames"
+        if self.checkpoint.needs_whole_episode:
+            remedy = "name a checkpoint that takes more (--as topreward,max_frames=N)"
+        got = f"{lengths[longest]}: {remedy}"
         require(longest, fits, f"at most {limit} frames, as the checkpoint takes", got)
 
 
