@@ -43,7 +43,7 @@ Outcome: TypeAlias = Result | RewardError
 class Prepared:
     """A sample that is ready for its forward pass.
 
-    rows: the sample's rows; an error: why the network cannot score it
+    rows: the sample's rows, or the error that says why the network cannot score it
     num_tokens: tokens in all rows
     """
 
@@ -118,7 +118,7 @@ class Engine:
     ) -> Engine:
         """Return the engine for a checkpoint in memory.
 
-        dtype: of the network; None: float32, or a vision-language checkpoint's own on a GPU
+        dtype: of the network; None: a vision-language checkpoint's own on a GPU, else float32
         feature_cache_mib: MiB for features of raw frames; 0: no cache
         others: as in the class
         Raises CheckpointError.

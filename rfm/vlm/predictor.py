@@ -47,7 +47,7 @@ class VlmPredictor:
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
         """Return the conversations of a sample. Raises InvalidSampleError, also for unknown frame references."""
         rows = self.collator.rows(self._completed(sample) if isinstance(sample, ProgressSampleRefs) else sample)
-        # Scores would mean nothing: the backbone has learned no positions beyond this limit.
+        # Beyond this limit the backbone has learned no positions, so scores would mean nothing.
         longest = max(row.num_tokens for row in rows)
         if longest > self._max_tokens:
             expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"

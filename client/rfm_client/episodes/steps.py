@@ -137,7 +137,7 @@ class StepScore:
     progress: how much of the task is done, 0..1
     success: probability that the task is done; NaN: the checkpoint does not predict it
     succeeded: True if the success rule holds; False where success is NaN
-    step: number of the frame among the episode's, from 0
+    step: index of the scored frame in the episode, from 0
     ms: milliseconds to the answer, without the wait for an open ``add_nowait`` request
     """
 

@@ -7,9 +7,9 @@ env = RewardModelWrapper(env, partial(RewardClient, "grpc://localhost:8001"), "b
 A wrapper keeps all frames of the running episode, H * W * 3 bytes a step. The rule ``sampling`` selects from them.
 
 A wrapper scores the reset, every ``every``-th step (not in mode ``final`` without a success rule), and the last step of
-an episode. With ``blocking``, a step waits for its score. Without, it uses the newest known score, and its own score is
-not requested while ``max_pending`` steps have open requests. The reset always waits for its score. The last step waits,
-too, and cancels older requests; without ``blocking``, ``await_last=False`` leaves it unscored.
+an episode. With ``blocking``, a step waits for its score. Without ``blocking``, a step uses the newest known score. It
+requests its own only if fewer than ``max_pending`` steps have open requests. The reset always waits for its score. The
+last step waits, too, and cancels older requests; without ``blocking``, ``await_last=False`` leaves it unscored.
 
 ``info["reward_model"]`` has ``progress`` and ``success`` of the newest known score (success is NaN if the checkpoint
 does not predict it), its ``step``, its ``lag`` in steps, and the steps ``skipped`` in this episode. With
