@@ -64,7 +64,8 @@ class Options:
 
 def _value(name: str, text: str, known: Mapping[str, type]) -> Any:
     if name not in known:
-        raise CheckpointError(f"--as: expected settings among {', '.join(known)}, got {name!r}")
+        expected = f"settings among {', '.join(known)}" if known else "no settings of this reward model"
+        raise CheckpointError(f"--as: expected {expected}, got {name!r}")
     try:
         return {"true": True, "false": False}[text] if known[name] is bool else known[name](text)
     except (KeyError, ValueError):

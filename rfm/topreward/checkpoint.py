@@ -112,6 +112,8 @@ def load(folder: Path, options: Options) -> TopRewardCheckpoint:
             **of_lerobot,
             **options.settings(_OF_USER),
         }
+        if not is_lerobot and "fps" in given:
+            raise CheckpointError(f"--as: fps: expected none for {ROBOMETER}, which takes each video for 24 frames/s")
         _check(settings)
         base = source_name(options.base_model or folder)
         config = TopRewardConfig(files.backbone, files.dtype, base, **settings)
@@ -167,7 +169,7 @@ def _check(settings: Mapping[str, Any]) -> None:
     if settings["max_frames"] < 1:
         raise CheckpointError(f"max_frames: expected at least 1, got {settings['max_frames']}")
     if not 0 < float(fps) < float("inf"):
-        raise CheckpointError(f"fps: expected a number above 0, got {shown(fps)}")
+        raise CheckpointError(f"fps: expected a finite number above 0, got {shown(fps)}")
     try:
         is_good = suffix.format(instruction="TASK") != suffix.format(instruction="")
     except (AttributeError, IndexError, LookupError, ValueError):

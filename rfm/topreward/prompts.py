@@ -143,8 +143,7 @@ class TopRewardCollator(LanguageCollator):
             raise InvalidSampleError.at("frame_steps", expected, str(frame_steps))
         num_frames, most = sample.trajectories[0].num_frames, self.config.max_frames
         if num_frames > most:
-            expected = f"at most {most} (max_frames of this model): send fewer frames, evenly spaced (subsample=True)"
-            raise InvalidSampleError.at("num_frames", expected, str(num_frames))
+            raise InvalidSampleError.at("num_frames", f"at most {most} (max_frames of this model)", str(num_frames))
         return super().rows(sample)
 
     def prompts(self, video: VlmVideo, task: str) -> list[VlmRow]:

@@ -308,6 +308,8 @@ class LanguageFolder:
         weights = {
             name: tensor for name, tensor in renamed(read_weights(folder), _NAMES).items() if "inv_freq" not in name
         }
+        if any(name.startswith("progress_head") for name in weights):
+            raise CheckpointError(f"{folder}: expected an ordinary Qwen3-VL, got reward heads: leave out --as")
         if content.get(_TIED, content["text_config"].get(_TIED)):
             weights.pop(_HEAD, None)
         elif _HEAD not in weights:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from paths import GOLDEN
 from reward_models import ROOT, Reference, references
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
@@ -207,7 +208,9 @@ WRONG: dict[str, tuple[str, str]] = {
     ),
     "no value": ("topreward,fps", "--as: expected setting=value, got 'fps'"),
     "no number": ("topreward,fps=fast", "--as: fps: expected a value of type float, got 'fast'"),
-    "no frames a second": ("topreward,fps=0", "fps: expected a number above 0, got 0.0"),
+    "no frames a second": ("topreward,fps=0", "fps: expected a finite number above 0, got 0.0"),
+    "an ignored setting": ("topreward-robometer,fps=2", "--as: fps: expected none for topreward-robometer"),
+    "a setting of RoboReward": ("roboreward,fps=2", "--as: expected no settings of this reward model, got 'fps'"),
     "one prefix": ("topreward,num_prefixes=1", "num_prefixes: expected at least 2, the first and the last, got 1"),
 }
 
@@ -235,6 +238,11 @@ def test_a_template_without_the_video_is_refused(tmp_path: Path) -> None:
     file.write_text(json.dumps({"chat_template": "<|im_start|>system\nHelp.<|im_end|>\n" + template}))
     with pytest.raises(CheckpointError, match="chat template: expected one video in a prompt, got 0"):
         Engine.from_checkpoint(str(changed), reward_model="topreward")
+
+
+def test_a_robometer_needs_no_as() -> None:
+    with pytest.raises(CheckpointError, match="expected an ordinary Qwen3-VL, got reward heads: leave out --as"):
+        families.load(GOLDEN / "vlm" / "q3_tok_disc10" / "checkpoint", reward_model="topreward")
 
 
 def test_an_ordinary_model_is_no_reward_model_by_itself() -> None:

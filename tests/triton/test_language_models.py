@@ -216,6 +216,9 @@ def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path)
     assert "mode: expected whole of this model, whose scores are relative to the whole episode, got prefix" in (
         refused.output + refused.stderr
     )
+    unknown = CliRunner().invoke(app, ["robo" if word == "top" else str(word) for word in words])
+    assert unknown.exit_code != 0
+    assert "name them (--frames), or show all (--sampling all)" in " ".join((unknown.output + unknown.stderr).split())
     done = CliRunner().invoke(app, [*map(str, words), "--mode", "whole"])
     assert done.exit_code == 0, done.output
     labels = parquet.read_table(tmp_path / "rfm_progress.parquet")

@@ -51,8 +51,8 @@ class Recipe:
     def of(cls, options: LabelOptions, dataset: Dataset, checkpoint: CheckpointFacts) -> Recipe:
         """Return the recipe of the options; the dataset and the checkpoint decide the rest.
 
-        Raises DatasetError for an unknown camera, ValueError if the rule lacks its number of frames, InvalidSampleError
-        for another mode than ``whole`` with a checkpoint that needs the whole episode.
+        Raises DatasetError for an unknown camera, InvalidSampleError if the rule lacks its number of frames, or for
+        another mode than ``whole`` with a checkpoint that needs the whole episode.
         """
         numbers = chosen_numbers(dataset, replace(options, shard=None))
         cameras = chosen_cameras(dataset, options.cameras, numbers)
@@ -61,14 +61,17 @@ class Recipe:
             why = "of this model, whose scores are relative to the whole episode"
             raise InvalidSampleError.at("mode", f"whole {why}", options.mode)
         rule = "all" if options.mode == "whole" else options.sampling
+        trained = {"trained_padding": checkpoint.trained_padding}
+        try:
+            sampling = Sampling.of(rule, options.frames, checkpoint.max_frames, **trained)
+        except ValueError as error:
+            raise InvalidSampleError(f"{error}: name them (--frames), or show all (--sampling all)") from error
         return cls(
             checkpoint,
             cameras,
             decoders={camera: dataset.decoder(camera) for camera in cameras},
             orientations={camera: turn for camera, turn in dataset.orientations.items() if camera in cameras},
-            sampling=Sampling.of(
-                rule, options.frames, checkpoint.max_frames, trained_padding=checkpoint.trained_padding
-            ),
+            sampling=sampling,
             mode=options.mode,
             fuse=options.fuse,
             resize=options.resize,
