@@ -21,6 +21,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import typer
+from engine import ALL_LAYERS, TEXT, VISION
 
 from rfm import families
 from rfm.engine import Engine
@@ -33,15 +34,6 @@ from rfm.vlm.predictor import VlmPredictor
 from rfm_client import ProgressSample, Trajectory
 
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
-TEXT = {
-    "hidden_size": 2560, "intermediate_size": 9728, "num_hidden_layers": 36, "num_attention_heads": 32,
-    "num_key_value_heads": 8, "head_dim": 128, "max_position_embeddings": 262_144,
-    "rope_scaling": {"rope_type": "default", "mrope_interleaved": True, "mrope_section": [24, 20, 20]},
-}  # fmt: skip
-VISION = {
-    "hidden_size": 1024, "intermediate_size": 4096, "depth": 24, "num_heads": 16, "patch_size": 16,
-    "out_hidden_size": 2560, "deepstack_visual_indexes": [5, 11, 17], "num_position_embeddings": 2304,
-}  # fmt: skip
 VOCABULARY = 151_936
 SMALL_PX, USUAL_PX = (224, 224), (480, 640)
 ROUNDS = 3
@@ -50,7 +42,7 @@ TASK = "put the red block in the bowl"
 
 def of_real_size(config: Any, num_tokens: int) -> Any:
     """Return a small checkpoint's configuration with the sizes above."""
-    text = {**config.backbone["text_config"], **TEXT, "vocab_size": num_tokens}
+    text = {**config.backbone["text_config"], **TEXT, "num_hidden_layers": ALL_LAYERS, "vocab_size": num_tokens}
     vision = {**config.backbone["vision_config"], **VISION}
     return replace(config, backbone={**config.backbone, "text_config": text, "vision_config": vision}, dtype="bfloat16")
 

@@ -168,7 +168,8 @@ def _verify(source: _Source, version: Version, staged: Path, named: torch.device
 
     samples = probes(description, with_encoders=source.encoders is not None)
     with needing_room(device):
-        verify(lambda: engine(source.checkpoint, encoders=source.encoders), exported, samples)
+        original = partial(engine, source.checkpoint, encoders=source.encoders)
+        verify(original, exported, samples, may_not_answer=description.may_not_answer)
 
 
 def _checkpoint_folder(description: Description, version: Version, repository: Path) -> Path:

@@ -7,7 +7,6 @@ B conversations of L tokens in a batch, padded behind their tokens; N tokens wri
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,9 +59,8 @@ class RoboRewardPredictor(VlmPredictor):
         else:
             answers, made = self._written(rows, batch, execution)
             scores = [self._read(answer, row) for answer, row in zip(answers, rows, strict=True)]
-        if batch.layout is not None and (made is None or bool(made.isfinite().all())):
-            with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are complete without the cache
-                self._keep(rows, batch.layout, made)
+        if made is None or bool(made.isfinite().all()):
+            self._keep(rows, batch.layout, made)
         return scores
 
     def _written(
@@ -78,6 +76,7 @@ class RoboRewardPredictor(VlmPredictor):
         num_slots = batch.inputs["input_ids"].shape[1]
         is_seen = torch.arange(num_slots, device=logits.device) < lengths[:, None]
         stops = torch.tensor(self._config.stops, device=logits.device)
+        known = torch.tensor(self.collator.digits, device=logits.device)
         tokens: list[Tensor] = []
         digits: list[Tensor] = []
         has_ended = torch.zeros(len(rows), dtype=torch.bool, device=logits.device)
@@ -85,7 +84,7 @@ class RoboRewardPredictor(VlmPredictor):
         for step in range(self._config.max_new_tokens):
             is_finite &= has_ended | logits.isfinite().all(-1)
             tokens.append(logits.argmax(-1))
-            digits.append(logits[:, self.collator.digits].float())
+            digits.append(logits[:, known].float())
             has_ended |= torch.isin(tokens[-1], stops)
             execution.on_forward()
             if step == self._config.max_new_tokens - 1 or bool(has_ended.all()):

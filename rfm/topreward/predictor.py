@@ -4,13 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import torch
 
-from rfm.engine.device import memory_errors
 from rfm.engine.execution import Execution
 from rfm.engine.predictor import RowScores, no_success
 from rfm.topreward.prompts import TopRewardConfig
@@ -34,9 +32,8 @@ class TopRewardPredictor(VlmPredictor):
         answers = torch.tensor([int(row.input_ids[-1]) for row in rows], device=output.logits.device)
         logits = output.logits.float() if self._config.variant == "lerobot" else output.logits
         log_probs = logits.log_softmax(-1).gather(1, answers[:, None])[:, 0].float().cpu().numpy()
-        if batch.layout is not None and np.isfinite(log_probs).all():
-            with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are complete without the cache
-                self._keep(rows, batch.layout, output.made)
+        if np.isfinite(log_probs).all():
+            self._keep(rows, batch.layout, output.made)
         return [_of_row(log_probs[index : index + 1]) for index in range(len(rows))]
 
     def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:

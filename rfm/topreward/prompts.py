@@ -27,7 +27,7 @@ from rfm.vlm.images import (
     scaled_video,
 )
 from rfm.vlm.language import LanguageCollator, LanguageConfig
-from rfm.vlm.video import Indices, VlmVideo, shots_of
+from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import InvalidSampleError, Sample
 from rfm_client.contract.frame_refs import ProgressSampleRefs
 
@@ -185,7 +185,7 @@ class TopRewardCollator(LanguageCollator):
     def grid(self, video: VlmVideo) -> Grid:
         """Return the grid of the longest conversation about a video."""
         size = self.images.size(*video.size, video.num_shown)
-        return self.images.grid(len(list(shots_of(video.conversations[-1], are_images=False))), *size)
+        return self.images.grid(math.ceil(video.num_shown / FRAMES_PER_GROUP), *size)
 
     def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
         frames = video.stack(needed)

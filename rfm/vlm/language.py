@@ -50,7 +50,7 @@ from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, normalisation_of, read_processor, save_processor
 from rfm.vlm.qwen import Box, KeyValues, positions
 from rfm.vlm.run_config import DTYPES
-from rfm.vlm.video import Indices, VlmVideo, shots_of
+from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample
 from rfm_client.contract.frame_refs import ProgressSampleRefs
 
@@ -168,11 +168,6 @@ class LanguageCollator(QwenCollator):
                 [{"role": "user", "content": parts}], tokenize=False, add_generation_prompt=add_generation_prompt
             )
         )
-
-
-def num_patches(shown: Indices) -> int:
-    """Return the number of temporal patches of a conversation that shows these frames."""
-    return len(list(shots_of(shown, are_images=False)))
 
 
 @dataclass(frozen=True)

@@ -95,9 +95,8 @@ class VlmPredictor:
                 query = (similarity if row.is_similarity else preference)[num_queries]
                 num_queries += 1
             of_rows.append(RowScores(frames, query))
-        if batch.layout is not None and may_keep:
-            with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are complete without the cache
-                self._keep(rows, batch.layout, output.made)
+        if may_keep:
+            self._keep(rows, batch.layout, output.made)
         return checked(of_rows, has_success=output.success is not None)
 
     def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
@@ -121,20 +120,28 @@ class VlmPredictor:
         pixels = {digest: frame for digest, frame in found.items() if frame is not None}
         return replace(sample, trajectory=replace(named, pixels=pixels))
 
-    def _keep(self, rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
-        """Cache each video's frames and its new features; skip a video that is larger than the cache."""
-        if self.cache is None:
+    def _keep(self, rows: Sequence[VlmRow], layout: Layout | None, made: torch.Tensor | None) -> None:
+        """Cache each video's frames and its new features; skip a video that is larger than the cache.
+
+        layout: of a Qwen backbone's shots; None: nothing can be cached
+        """
+        if self.cache is None or layout is None:
             return
+        with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are complete without the cache
+            self._keep_all(self.cache, rows, layout, made)
+
+    @staticmethod
+    def _keep_all(cache: FeatureCache[Any], rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
         for video in dict.fromkeys(video for row in rows for video in row.videos):
             frames = dict(zip(video.digests, video.frames, strict=True))
-            if sum(frame.nbytes for frame in frames.values()) > self.cache.limit_bytes:
+            if sum(frame.nbytes for frame in frames.values()) > cache.limit_bytes:
                 continue
-            known = self.cache.found(frames)
+            known = cache.found(frames)
             for digest in frames.keys() - known.keys():
-                self.cache.keep({digest: frames[digest].copy()})
+                cache.keep({digest: frames[digest].copy()})
             for key in video.ready.keys.values():
                 if made is not None and key in layout.made:
-                    self.cache.keep({key: made[layout.made[key]].clone()})
+                    cache.keep({key: made[layout.made[key]].clone()})
 
     def _per_frame(self, scores: FrameScores, num_frames: int) -> FrameScores:
         """Return the scores of each frame; in video mode both frames of a temporal patch share its score."""

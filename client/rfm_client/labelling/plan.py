@@ -61,9 +61,9 @@ class Recipe:
             why = "of this model, whose scores are relative to the whole episode"
             raise InvalidSampleError.at("mode", f"whole {why}", options.mode)
         rule = "all" if options.mode == "whole" else options.sampling
-        trained = {"trained_padding": checkpoint.trained_padding}
+        padding = checkpoint.trained_padding
         try:
-            sampling = Sampling.of(rule, options.frames, checkpoint.max_frames, **trained)
+            sampling = Sampling.of(rule, options.frames, checkpoint.max_frames, trained_padding=padding)
         except ValueError as error:
             raise InvalidSampleError(f"{error}: name them (--frames), or show all (--sampling all)") from error
         return cls(
