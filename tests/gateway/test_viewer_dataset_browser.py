@@ -22,11 +22,12 @@ from gateway_requests import TOLERANCE
 from gateways import poll, running
 from labelling import BrightnessScorer
 from rfm.launch.triton_server import Endpoints
-from rfm_client import RewardClient
+from rfm_client import LiveView, RewardClient
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.orientation import Orient
 from rfm_client.labelling import ClientScorer, LabelOptions, label, open_dataset, summarise
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, large
+from toy_world import Task, make_clip
 from viewer_requests import run_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -35,12 +36,16 @@ SHOWN = 5e-4  # three decimals, and a tenth of a per cent
 KEY = "open sesame"
 OTHER = "brightness"  # the second reward of the first dataset
 NUM_LARGE = 10_000
+CLIP_TASK, CLIP_SEED = Task("red", "bowl"), 2_000_000
 DEMO, BRIGHT, PLAIN, *CODED = range(3 + len(CODINGS))  # labelled by the demo, by brightness, not; coded otherwise
 VIDEOS = "#episode-videos video"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
 BEYOND = """
 return [document.documentElement, ...document.querySelectorAll(".work")].map((each) => each.scrollWidth - each.clientWidth);
 """  # how far the page and what each tab shows reach to the right of what can be seen
+PICTURES_ARE_THERE = """[...document.querySelectorAll("#live-episodes article")]
+  .filter((card) => card.getBoundingClientRect().top < innerHeight)
+  .every((card) => card.querySelector("img").naturalWidth)"""  # the page fetches none that is out of sight
 ARE_THERE = f"[...document.querySelectorAll('{VIDEOS}')].every((video) => !video.seeking && video.readyState >= 2)"
 
 
@@ -68,7 +73,7 @@ class Page:
     @property
     def episodes(self) -> list[int]:
         """The episodes of the table, in its order."""
-        return [int(row[1].removeprefix("Watch ")) for row in self.rows]
+        return [int(row[1]) for row in self.rows]
 
     @property
     def numbers(self) -> list[list[float]]:
@@ -168,7 +173,7 @@ def test_the_table_has_the_numbers_of_the_labels(page: Page, number: int) -> Non
     assert summary.best_success is not None and summary.last_success is not None
     assert summary.disagreement is not None and summary.never_succeed is not None
     for row in page.rows:
-        episode = int(row[1].removeprefix("Watch "))
+        episode = int(row[1])
         told = dataset.episodes[episode]
         assert (row[2], int(row[3])) == (told.task, told.num_frames)
         numbers = [*map(float, row[4:7]), float(row[7].removesuffix(" %")) / 100, float(row[8])]
@@ -324,7 +329,7 @@ def test_two_label_files_are_overlaid_and_their_differences_listed(page: Page) -
     differs = (ours.best_success >= 0.5) != (theirs.best_success >= 0.5)
     page.browser.until("document.querySelector('#episodes tr td:last-child').textContent !== '-'")
     for row in page.rows:
-        episode = int(row[1].removeprefix("Watch "))
+        episode = int(row[1])
         assert float(row[9].removesuffix(" ≠")) == pytest.approx(apart[episode], abs=SHOWN)
         assert row[9].endswith("≠") == differs[episode]
     Select(page.browser["order"]).select_by_visible_text("labels differ")
@@ -485,20 +490,53 @@ def test_episodes_without_labels_can_be_watched_and_scored(page: Page) -> None:
     page.score_episode()
 
 
+@pytest.fixture
+def running_episodes(url: str, demo_server: Endpoints) -> Iterator[None]:
+    """Episodes of four environments, of which one has ended and three still run."""
+    kinds = ("success", "dropped", "rewound", "success")
+    clips = [make_clip(kind, CLIP_TASK, CLIP_SEED + n).frames for n, kind in enumerate(kinds)]
+    with RewardClient(demo_server.grpc_url) as client, LiveView(url, name="policy 7") as view:
+        episodes = client.episodes(len(clips), CLIP_TASK.sentence(), live=view)
+        for frames in zip(*clips, strict=True):
+            episodes.add(list(frames))
+        episodes.reset([True, False, False, False])
+        for t in range(9):
+            episodes.add([frames[t] for frames in clips], [True, False, False, False])
+        yield
+
+
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
+@pytest.mark.usefixtures("running_episodes")
 def test_no_tab_is_wider_than_the_window(page: Page, size: tuple[int, int], theme: str) -> None:
-    """It leaves a picture of each tab among the downloads."""
-    page.choose(DEMO)
-    page.at_rest(3)
-    page.score_episode()
+    """It leaves pictures of each tab among the downloads."""
+
+    def fits(name: str) -> None:
+        file = page.browser.downloads / f"{name}_{size[0]}x{size[1]}_{theme}.png"
+        page.browser.draw()
+        assert page.browser.driver.save_screenshot(str(file))
+        assert page.browser.run(BEYOND) == [0] * 4, name
+
     with page.browser.window(*size), page.browser.theme(theme):
-        for tab in ("score", "dataset", "live"):
-            page.browser[f"{tab}-tab"].click()
-            page.browser.draw()
-            name = f"{tab}_{size[0]}x{size[1]}_{theme}.png"
-            assert page.browser.driver.save_screenshot(str(page.browser.downloads / name))
-            assert page.browser.run(BEYOND) == [0] * 4, name
+        page.browser.run("localStorage.clear()")
+        page.browser.open(page.url)
+        page.browser.until("!document.getElementById('examples').hidden")
+        fits("empty")
+        page.browser.all("#examples .first")[0].click()
+        page.browser.until_text("status", "3 of 3 curves are done.")
+        page.browser["play"].click()
+        page.browser.until("Number(document.getElementById('time').value) > 1")
+        page.browser["play"].click()
+        fits("score")
+        page.show()
+        page.choose(DEMO)
+        fits("dataset")
+        page.at_rest(1)
+        page.move_to(1.2)
+        fits("episode")
+        page.browser["live-tab"].click()
+        page.browser.until(f"document.querySelector('#live-episodes article') && {PICTURES_ARE_THERE}")
+        fits("live")
 
 
 def test_axe_finds_nothing_in_either_theme(page: Page) -> None:

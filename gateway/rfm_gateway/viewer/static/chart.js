@@ -9,6 +9,7 @@ const NUM_COLOURS = 8;
 const VALUE_PX = 16; // height of a number beside a line
 const VALUE_WIDTH_PX = 48;
 const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
+export const MARK_PX = 72; // at least between the marks of the axis below
 const LOW_PX = 240; // a chart so low has fewer marks
 const TICKS = { progress: [0, 0.25, 0.5, 0.75, 1], success: [0, 0.5, 1] };
 const FEW_TICKS = { progress: [0, 0.5, 1], success: [0, 1] };
@@ -153,7 +154,7 @@ export class Chart {
       const known = here.filter(({ value }) => value !== null && value !== undefined);
       for (const each of known) each.top = this.#top(signal, each.value) - VALUE_PX / 2;
       const [lowest, highest] = [0, 1].map((value) => this.#top(signal, value));
-      return apart(known, highest - VALUE_PX, lowest + VALUE_PX);
+      return apart(known, highest - VALUE_PX, lowest + VALUE_PX / 2);
     });
     while (this.#values.children.length > labels.length) this.#values.lastChild.remove();
     labels.forEach(({ curve, signal, value, top }, place) => {
@@ -198,7 +199,7 @@ export class Chart {
       legend: { show: false },
       cursor: { x: false, y: false, points: { show: false }, drag: { x: false, y: false } },
       scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [0, 1] } },
-      axes: [{ ...axis, size: 24, label: this.#label, ...(this.#isOfSteps ? { incrs: STEPS } : {}) }, left],
+      axes: [{ ...axis, size: 24, space: MARK_PX, label: this.#label, ...(this.#isOfSteps ? { incrs: STEPS } : {}) }, left],
       series: [{}, ...series],
       hooks: { draw: [(plot) => drawNames(plot, panes)], setSize: [() => this.#placeAgain()] },
     };

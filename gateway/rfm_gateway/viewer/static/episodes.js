@@ -115,7 +115,8 @@ export class EpisodeTable {
     row.dataset.episode = episode.episode;
     header.scope = "row";
     button.type = "button";
-    button.textContent = `Watch ${episode.episode}`;
+    button.textContent = `${episode.episode}`;
+    button.setAttribute("aria-label", `Watch episode ${episode.episode}`);
     header.append(button);
     box.type = "checkbox";
     box.checked = this.#chosen.has(episode.episode);

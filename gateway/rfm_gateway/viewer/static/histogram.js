@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // How many episodes end with which progress, and how many of them succeed, as bars drawn by uPlot.
 
-import { themed } from "./chart.js";
+import { MARK_PX, themed } from "./chart.js";
 import uPlot from "./uplot/uPlot.esm.js";
 
 const NUM_BINS = 20;
@@ -51,7 +51,7 @@ export class Histogram {
       legend: { show: false },
       cursor: { show: false },
       scales: { x: { time: false, range: [0, 1] }, y: { range: () => [0, this.#most * 1.05] } },
-      axes: [{ ...axis, size: 24, label: "final progress" }, { ...axis, size: 44, incrs: COUNTS }],
+      axes: [{ ...axis, size: 24, space: MARK_PX, label: "final progress" }, { ...axis, size: 44, incrs: COUNTS }],
       series: [{}, bars("--curve-1"), bars("--curve-2")],
     }, data, this.#host);
   }

@@ -301,9 +301,11 @@ function update() {
     : "No curves yet.");
 }
 
-/** The settings belong to the tabs that have some. */
+/** The settings belong to the tabs that have some, and what is said of curves to the first. */
 function shownTab(index) {
   page.fold.hidden = index === 2;
+  page.status.textContent = "";
+  if (index === 0) update();
 }
 
 async function copy(element, name) {
