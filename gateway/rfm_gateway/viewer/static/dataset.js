@@ -7,10 +7,11 @@ import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, WORST_FI
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
 import { save } from "./takeaway.js";
-import { shown } from "./text.js";
+import { cut, shown } from "./text.js";
 import { Timeline } from "./timeline.js";
 
 const CAMERA_PREFIX = "observation.images.";
+const MOST_LETTERS = 400; // that are shown of words for LeRobot: thousands of numbers slow the page down
 const NOTHING = { episodes: [], cameras: [], orientations: [], threshold: 0.5, provenance: null, written_s: null };
 
 export class DatasetTab {
@@ -27,6 +28,7 @@ export class DatasetTab {
   #shown = []; // those that are kept, in their order
   #chosen = new Set(); // numbers of the episodes that are selected
   #isTurned = false; // the order is the other way round
+  #words = "";
   #watched = null;
   #stopping = new AbortController();
 
@@ -104,6 +106,11 @@ export class DatasetTab {
 
   get #threshold() {
     return Number(this.#page.cutoff.value);
+  }
+
+  /** What LeRobot's command line needs for them, whole. */
+  get words() {
+    return this.#words;
   }
 
   /** The episodes that are taken along: those that are selected, else all that are shown. */
@@ -206,7 +213,8 @@ export class DatasetTab {
     page["episodes-text"].disabled = page["episodes-json"].disabled = !numbers.length;
     const dataset = this.#datasets[this.#number];
     const all = this.#episodes.map(({ episode }) => episode);
-    page["use-words"].textContent = dataset ? lerobotWords(page.use.value, dataset, numbers, all) : "";
+    this.#words = dataset ? lerobotWords(page.use.value, dataset, numbers, all) : "";
+    page["use-words"].textContent = cut(this.#words, MOST_LETTERS);
   }
 
   #json() {

@@ -15,7 +15,10 @@ export function episodesJson(about, episodes) {
 const USES = {
   train: (_, numbers) => `--dataset.episodes="${list(numbers)}"`,
   delete: (dataset, numbers, all) => edited(dataset, numbers, all, "cleaned"),
-  keep: (dataset, numbers, all) => edited(dataset, all.filter((number) => !numbers.includes(number)), all, "kept"),
+  keep: (dataset, numbers, all) => {
+    const left = new Set(numbers);
+    return edited(dataset, all.filter((number) => !left.has(number)), all, "kept");
+  },
 };
 
 /** The words for LeRobot's command line. all: the numbers of all episodes of the dataset */

@@ -308,9 +308,9 @@ function shownTab(index) {
   if (index === 0) update();
 }
 
-async function copy(element, name) {
+async function copy(text, name) {
   try {
-    await navigator.clipboard.writeText(element.textContent);
+    await navigator.clipboard.writeText(text);
     page.status.textContent = `The ${name} copied.`;
   } catch { // there is none where the page comes over plain HTTP from another machine
     failed(new Error("clipboard: expected leave to write to it, got none: mark the text and copy it"));
@@ -340,9 +340,9 @@ listen(page.csv, { click: () => save("curves.csv", csv(curves), "text/csv") });
 listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, verdicts), "application/json") });
 listen(page.png, { click: async () => save("curves.png", await pngFigure(figure())) });
 listen(page.svg, { click: () => save("curves.svg", figure(), "image/svg+xml") });
-listen(page.copy, { click: () => copy(page.command, "command line is") });
-listen(page["use-copy"], { click: () => copy(page["use-words"], "words are") });
-listen(page["live-copy"], { click: () => copy(page["live-code"], "lines are") });
+listen(page.copy, { click: () => copy(page.command.textContent, "command line is") });
+listen(page["use-copy"], { click: () => copy(datasetTab.words, "words are") });
+listen(page["live-copy"], { click: () => copy(page["live-code"].textContent, "lines are") });
 listen(document, {
   dragover: (event) => { event.preventDefault(); page.dropping.hidden = false; },
   dragleave: (event) => { if (!event.relatedTarget) page.dropping.hidden = true; },
