@@ -355,6 +355,24 @@ def test_an_example_is_scored_with_a_click_and_its_command_line_runs(page: Page)
     assert shown["progress"][-1] > 0.9
 
 
+@pytest.mark.parametrize(
+    ("triton", "shown_by", "options"),
+    [
+        ("grpc://127.0.0.1:8001", "http://localhost:8100/", ["--url", "grpc://127.0.0.1:8001"]),
+        ("grpc://localhost:8001", "https://gpu-box.lan:8443/", []),
+        ("grpc://triton:8001", "https://gpu-box.lan:8443/", ["--url", "grpc://triton:8001"]),
+    ],
+)
+def test_the_command_line_names_a_triton_that_can_be_reached(
+    page: Page, triton: str, shown_by: str, options: list[str]
+) -> None:
+    script = """
+    const [triton, page, done] = arguments;
+    import("/viewer/takeaway.js").then(({ serverOption }) => done(serverOption(triton, page)));
+    """
+    assert page.browser.driver.execute_async_script(script, triton, shown_by) == options
+
+
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page, theme: str) -> None:
     with page.browser.theme(theme):

@@ -190,7 +190,7 @@ def test_keys_and_certificates_are_for_their_readers_alone(papers: Path) -> None
 
 @pytest.mark.triton
 def test_the_checks_of_the_guide_say_what_it_promises(box: Box) -> None:
-    script = here(commands("7. nginx").partition("reload nginx\n")[2], "7").replace(
+    script = here(commands("7. nginx").partition("restart nginx\n")[2], "7").replace(
         f":{PORTS['proxy']}", f":{box.port}"
     )
     assert script.count("curl ") == 3
@@ -203,11 +203,15 @@ def test_the_checks_of_the_guide_say_what_it_promises(box: Box) -> None:
 
 
 @pytest.mark.triton
-def test_the_commands_of_another_machine_get_answers_with_the_key_and_none_without(box: Box) -> None:
+def test_the_commands_of_another_machine_get_answers_with_the_key_and_none_without(
+    box: Box, monkeypatch: pytest.MonkeyPatch
+) -> None:
     script = here(commands("8. From another machine"), "8").replace(f":{PORTS['proxy']}", f":{box.port}")
-    in_python = re.compile(r"^(?:key|client) = .*$", re.MULTILINE)
-    names: dict[str, Any] = {"Path": lambda name: box.folder / "keys" / name, "RewardClient": RewardClient}
-    exec("\n".join(in_python.findall(script)).replace('"ca.pem"', 'Path("ca.pem")'), names)
+    script = re.sub(r"^.*(?:venv|pip install).*\n", "", script, flags=re.MULTILINE)  # these tests have the client
+    in_python = re.compile(r"^(?:from|key|client) .*$", re.MULTILINE)
+    names: dict[str, Any] = {}
+    monkeypatch.chdir(box.folder / "keys")
+    exec("\n".join(in_python.findall(script)), names)
     with closing(names["client"]) as client:
         assert client.is_ready()
     *granted, denied = in_python.sub("", script).strip().splitlines()
@@ -288,6 +292,7 @@ def test_the_gateway_is_asked_with_the_same_key(box: Box, header: str) -> None:
 @pytest.mark.triton
 def test_the_page_s_files_need_no_key_and_all_else_does(box: Box) -> None:
     files = [f"viewer/{file.name}" for file in VIEWER.iterdir() if file.name != "index.html"]
+    files += [f"viewer/examples/{file.name}" for file in (VIEWER.parent / "examples").glob("*.mp4")]
     files += [f"viewer/uplot/{name}" for name in ("uPlot.esm.js", "uPlot.min.css")]
     files += ["", "docs", "openapi.json", "docs/show.js", "docs/swagger-ui/swagger-ui.css", "health"]
     with box.http() as stranger:
@@ -319,9 +324,44 @@ def test_a_server_behind_the_proxy_that_is_down_is_unavailable(papers: Path) -> 
             url = f"{scheme}://{IP}:{port}"
             with (
                 RewardClient(url, ca_file=papers / "keys" / "ca.pem", api_key=key, retry=False) as asked,
-                pytest.raises(ServerUnavailableError),
+                pytest.raises(
+                    ServerUnavailableError, match="502" if scheme == "grpcs" else "it is down or still loads"
+                ),
             ):
                 asked.progress(FILMED)
+
+
+@pytest.fixture
+def copied(papers: Path, tmp_path: Path) -> Path:
+    """A copy of the folder after steps 5 and 6, to be changed."""
+    for name in ("keys", "etc"):
+        shutil.copytree(papers / name, tmp_path / name)
+    return tmp_path
+
+
+def test_nginx_does_not_start_with_an_empty_key(copied: Path) -> None:
+    with (copied / "etc/rfm/keys.map").open("a") as keys:
+        keys.write('"Bearer " mallory;\n')
+    with pytest.raises(AssertionError, match='conflicting parameter "bearer "'), nginx(copied, {}):
+        pass
+
+
+def test_a_caller_s_second_key_is_refused_while_the_first_counts(copied: Path) -> None:
+    keys = copied / "etc/rfm/keys.map"
+    before = keys.read_text()
+    refused = shell("set +e\n" + commands("5. A key").partition("\n")[2], copied)
+    assert "cannot overwrite existing file" in refused.stderr
+    assert keys.read_text() == before
+
+
+def test_a_renewal_without_the_authority_s_key_leaves_the_certificate_as_it_was(copied: Path) -> None:
+    certificate = copied / "etc/rfm/server.pem"
+    before = certificate.read_bytes()
+    (copied / "keys/ca.key").unlink()
+    step = here(commands("6. A certificate"), "6")
+    done = shell(f"set +e\nname={NAME}\nip={IP}\n{step[step.index('printf') :]}", copied)
+    assert "ca.key" in done.stderr
+    assert certificate.read_bytes() == before
 
 
 def unit() -> configparser.SectionProxy:
@@ -340,7 +380,7 @@ def test_the_unit_runs_what_nginx_and_the_guide_expect() -> None:
     assert (given["http_port"], given["grpc_port"], given["gateway_port"]) == (None, None, PORTS["gateway"])
     assert arguments[0] == "/srv/rfm/my_models"
     assert f"--repository {arguments[0]} " in GUIDE
-    assert f"python3 -m venv {Path(program).parents[1]} " in GUIDE
+    assert f"/usr/bin/python3 -m venv {Path(program).parents[1]} " in GUIDE
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="systemd is not installed")

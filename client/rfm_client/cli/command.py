@@ -21,6 +21,7 @@ from rfm_client.contract import errors
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of, settings_of
 
 STANDARD_OUTPUT = "-"
+LABEL_PACKAGES = ("fsspec", "huggingface_hub", "pyarrow")  # of the extra "label"
 
 Given: TypeAlias = dict[str, Any]  # values of the given options, by setting
 
@@ -258,7 +259,10 @@ def usage_errors(option: str) -> Iterator[None]:
 
 def missing_package(error: ImportError) -> str:
     """Return the error's message with the command that installs the package."""
-    return str(error) if "pip install" in str(error) else f'{error}: pip install "./client[cli]"'
+    if "pip install" in str(error):
+        return str(error)
+    package = (error.name or "").partition(".")[0]
+    return f'{error}: pip install "./client[{"label" if package in LABEL_PACKAGES else "cli"}]"'
 
 
 def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:

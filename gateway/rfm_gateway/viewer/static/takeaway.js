@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: MIT
 // What can be taken along: CSV, JSON, files, and the command lines that give the same numbers.
 
+const LOOPBACK = /^\w+:\/\/(localhost|127\.[\d.]+|\[::1\])([:/]|$)/;
+
 /** The curves as CSV, one line a point. */
 export function csv(curves) {
   const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "orient", "frame", "time_s", "progress", "success"];
@@ -90,7 +92,7 @@ function labelLine(group, url) {
   const turns = group.flatMap(({ video, orient }) => (orient === "none" ? [] : ["--orient", `${video.origin.camera}=${orient}`]));
   const options = ["--episodes", origin.episode, "--cameras", cameras.join(","), ...turns, ...sampling(rule, sampledFrames)];
   const given = task === origin.task ? [] : ["--task", task, "--override-task"];
-  const words = ["rfm-client", "label", origin.dataset, "--url", url, "--model", model, ...given, ...options];
+  const words = ["rfm-client", "label", origin.dataset, ...serverOption(url), "--model", model, ...given, ...options];
   const target = ["--output", `${origin.dataset}_episode_${origin.episode}`, "--format", "progress"];
   return [...words, ...(resize ? ["--resize"] : []), ...target].map(quoted).join(" ");
 }
@@ -99,9 +101,14 @@ function line(command, videos, { task, model, fps, orient, resize }, url, option
   const cut = videos.find(({ origin }) => origin?.dataset);
   if (cut) return `# ${command}: no file holds episode ${cut.origin.episode} of ${cut.origin.dataset} alone`;
   const files = videos.map(({ name, origin }) => origin?.url ?? (name.startsWith("-") ? `./${name}` : name));
-  const words = ["rfm-client", command, ...files, "--url", url, "--model", model, "--task", task, "--fps", fps];
+  const words = ["rfm-client", command, ...files, ...serverOption(url), "--model", model, "--task", task, "--fps", fps];
   const turned = orient === "none" ? [] : ["--orient", orient];
   return [...words, ...turned, ...(resize ? ["--resize"] : []), ...options].map(quoted).join(" ");
+}
+
+/** The option that says where Triton is. On a loopback address only a page of the same machine reaches it. */
+export function serverOption(url, pageUrl = location.href) {
+  return LOOPBACK.test(url) && !LOOPBACK.test(pageUrl) ? [] : ["--url", url];
 }
 
 /** A word as a shell reads it. */
