@@ -134,7 +134,7 @@ def test_without_episodes_the_page_tells_how_to_report_them(page: Page, client: 
     page.shows("Episode", {"Step": "0", "Progress": number(score.progress), "task": "stack the cups"})
     assert not page.browser["no-live"].is_displayed()
     names["live"].close()
-    page.shows("Episode", {"state": "ended"})
+    page.shows("Episode", {"state": "ended, no success"})
 
 
 def test_a_curve_has_the_numbers_that_add_returned(page: Page, client: RewardClient) -> None:
@@ -159,7 +159,7 @@ def test_a_curve_has_the_numbers_that_add_returned(page: Page, client: RewardCli
                 assert drawn["success"] == [score.success for score in scores]
                 poll(lambda newest_frame=frame: page.has_pictures("exact", newest_frame))  # type: ignore[misc]
     (card,) = page.cards("exact")
-    last = f"last progress {number(scores[-1].progress)}, last success {number(scores[-1].success)}"
+    last = f"final progress {number(scores[-1].progress)}, final success {number(scores[-1].success)}"
     assert card["chart"] == f"{len(FRAMES)} steps: {last}"
 
 
@@ -274,7 +274,7 @@ def test_text_of_others_is_text(page: Page) -> None:
         view.episode(ATTACK).add(FRAMES[0], SCORE)
         page.shows(ATTACK, {"task": ATTACK, "Step": "0"})
     assert page.browser.all("#live-episodes script") == []
-    assert page.browser.run("return document.title") == "Rewards of robot videos"
+    assert page.browser.run("return document.title") == "Robot video rewards"
 
 
 def test_axe_finds_nothing_in_either_theme(page: Page) -> None:

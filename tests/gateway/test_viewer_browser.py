@@ -118,7 +118,11 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
     )
     assert "success.mp4: put the red block in the bowl" in page.browser["chart"].get_attribute("aria-label")
     for threshold in (0.5, 1.0):
-        page.browser.write("threshold", str(threshold))
+        page.browser.run(
+            "const slider = document.getElementById('threshold'); slider.value = arguments[0]; "
+            "slider.dispatchEvent(new Event('input'))",
+            threshold,
+        )
         first = [np.flatnonzero(np.array(video["success"]) >= threshold) for video in document["videos"]]
         told = [f"{index[0] / FPS:.2f} s" if len(index) else "-" for index in first]
         assert [row[7] for row in page.browser.cells("#curves tr")] == told
@@ -283,7 +287,7 @@ def test_a_telephone_has_one_column_and_cards_for_rows(page: Page) -> None:
             "return [...document.querySelectorAll('#curves tr:first-child td')].map((cell) => "
             "getComputedStyle(cell, '::before').content)"
         )
-        assert names[-2:] == ['"Success from"', '"State"']
+        assert names[-2:] == ['"Success at"', '"State"']
 
 
 def test_the_settings_fold_away_and_stay_so(page: Page) -> None:

@@ -207,11 +207,11 @@ def test_the_rows_are_sorted_by_what_one_wants_to_see_first(page: Page, number: 
     worst = episodes_by(-never.astype(int), backwards, apart)
     assert page.episodes == worst
     expected = {
-        "Goes backwards": episodes_by(backwards),
+        "Backward steps": episodes_by(backwards),
         "Cameras disagree": episodes_by(apart),
         "Final progress": episodes_by(summary.final_progress),
         "Best success": episodes_by(summary.best_success),
-        "Last success": episodes_by(summary.last_success),
+        "Final success": episodes_by(summary.last_success),
         "Episode": list(range(len(never))),
     }
     heads = {
@@ -316,7 +316,7 @@ def test_selected_episodes_are_taken_along(page: Page) -> None:
     page.browser.write("task-part", "green")
     page.browser["choose-shown"].click()
     green = [each.index for each in dataset.episodes if "green" in each.task]
-    assert page.browser["chosen-told"].text == f"{len(green)} that are selected"
+    assert page.browser["chosen-told"].text == f"{len(green)} episodes selected"
 
 
 def test_two_label_files_are_overlaid_and_their_differences_listed(page: Page) -> None:
@@ -381,7 +381,7 @@ def test_ten_thousand_episodes_are_a_few_rows_of_the_document(
             assert abs(middle - share * NUM_LARGE) < 50
         assert numbers[-1] == NUM_LARGE - 1
         page.browser["choose-shown"].click()
-        assert page.browser["chosen-told"].text == f"{NUM_LARGE} that are selected"
+        assert page.browser["chosen-told"].text == f"{NUM_LARGE} episodes selected"
         assert len(page.browser["use-words"].text) == 400
         for name in ("clipboard-read", "clipboard-write"):
             granted = {"origin": page.url, "permission": {"name": name}, "setting": "granted"}
@@ -530,7 +530,7 @@ def test_no_tab_is_wider_than_the_window(page: Page, size: tuple[int, int], them
         page.browser.open(page.url)
         page.browser.until("!document.getElementById('examples').hidden")
         fits("empty")
-        page.browser.all("#examples .first")[0].click()
+        page.browser.all("#examples > button")[0].click()
         page.browser.until_text("status", "3 of 3 curves are done.")
         page.browser["play"].click()
         page.browser.until("Number(document.getElementById('time').value) > 1")

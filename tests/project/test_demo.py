@@ -72,8 +72,8 @@ def test_the_served_checkpoint_keeps_its_bounds_on_clips_it_never_saw(tmp_path: 
         shown = example("evaluate_demo_checkpoint.py", "--repository", REPOSITORY, "--clips", 48, "--output", output)
     assert shown.count("holds") == 8
     figures = json.loads(output.read_text())["figures"]
-    assert figures["last progress: successes, mean"] > 0.9
-    assert figures["last progress: wrong sentence, mean"] < 0.2
+    assert figures["final progress: successes, mean"] > 0.9
+    assert figures["final progress: wrong sentence, mean"] < 0.2
 
 
 def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,7 +83,7 @@ class Comparison:
 
     def tables(self) -> list[Table | str]:
         """Return a table of sources, the best first, a table of pairs, and without a ranking a legend."""
-        columns = ("video", "rank", "P(wins)", "its last progress", "its last success", "frames")
+        columns = ("video", "rank", "P(wins)", "its final progress", "its final success", "frames")
         pairs = ("first", "second", "P(first wins)", "asked second first", "mean", "orders")
         return [
             table("", columns, [self._row(index) for index in self._shown]),

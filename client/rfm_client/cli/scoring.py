@@ -43,7 +43,7 @@ WORKERS = 8  # videos in memory at a time
 PROBE_S = 2.0  # timeout of the check for a live server
 NOT_ASKED = "not asked, since no server answers any more"
 COLUMNS = (  # headers of ``Scored.row``, and their widths
-    *(("video", 0), ("last progress", 8), ("last success", 7), ("frames", 13)),
+    *(("video", 0), ("final progress", 8), ("final success", 7), ("frames", 13)),
     *(("last at s", 7), ("took s", 6), ("version", 7)),
 )
 

@@ -10,10 +10,12 @@ const VALUE_PX = 16; // height of a number beside a line
 const VALUE_WIDTH_PX = 48;
 const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
 export const MARK_PX = 72; // at least between the marks of the axis below
+const MOST_POINTS = 64; // of a curve, that are drawn as dots
 const LOW_PX = 240; // a chart so low has fewer marks
 const TICKS = { progress: [0, 0.25, 0.5, 0.75, 1], success: [0, 0.5, 1] };
 const FEW_TICKS = { progress: [0, 0.5, 1], success: [0, 1] };
 const WITH_SUCCESS = { progress: [0.37, 0.98], success: [0.03, 0.27] }; // shares of the height, from 0 to 1 of the signal
+const LOW_WITH_SUCCESS = { progress: [0.42, 0.98], success: [0.04, 0.26] };
 const WITHOUT_SUCCESS = { progress: [0.03, 0.98] };
 
 /** The name of the colour of curve number `index`, which the style sheet has for each theme. */
@@ -32,8 +34,9 @@ export function colourOf({ colour, index, successIndex }, signal = "progress", e
 }
 
 /** Where the signals of the curves lie in a chart: shares of its height, for 0 and for 1. */
-export function panesOf(curves) {
-  return curves.some(({ success }) => success.some((value) => value !== null)) ? WITH_SUCCESS : WITHOUT_SUCCESS;
+export function panesOf(curves, isLow = false) {
+  if (!curves.some(({ success }) => success.some((value) => value !== null))) return WITHOUT_SUCCESS;
+  return isLow ? LOW_WITH_SUCCESS : WITH_SUCCESS;
 }
 
 /** The share of a chart's height at which a value of a signal lies; null: it has none. */
@@ -65,6 +68,7 @@ export class Chart {
   #playhead = made("playhead");
   #line = made("threshold");
   #values = made("values");
+  #dots = made("dots");
   #leaving = new AbortController();
   #resizing = new ResizeObserver(() => this.#host.clientWidth && this.#plot?.setSize(this.#size()));
 
@@ -92,17 +96,17 @@ export class Chart {
    */
   show(curves) {
     this.#curves = curves.filter(({ times }) => times.length);
-    this.#panes = panesOf(this.#curves);
+    this.#panes = panesOf(this.#curves, this.#isLow);
     this.#begin = Math.min(...this.#curves.map(({ begin }) => begin ?? 0), Infinity);
     this.#end = Math.max(0, ...this.#curves.map(({ allTimes }) => allTimes.at(-1))); // so that the axis does not grow
     if (this.#isOfSteps) this.#end = Math.max(this.#end, this.#begin + FEWEST_STEPS);
     if (this.#end <= this.#begin) this.#end = this.#begin + 1; // uPlot divides an axis of no length for ever
     const signals = Object.keys(this.#panes);
-    const tables = this.#curves.map((curve) => [
+    const tables = this.#drawn.map((curve) => [
       curve.times, ...signals.map((signal) => curve[signal].map((value) => heightOf(this.#panes, signal, value))),
     ]);
     const data = tables.length ? uPlot.join(tables) : [[], []];
-    const shape = `${signals} ${this.#curves.map(({ isDashed }) => (isDashed ? "-" : "_")).join("")}`;
+    const shape = `${signals} ${this.#isLow} ${this.#curves.map(({ isDashed }) => (isDashed ? "-" : "_")).join("")}`;
     if (shape !== this.#shape || !this.#plot) {
       this.#plot?.destroy();
       this.#plot = this.#curves.length ? this.#newPlot(signals, data) : null;
@@ -136,7 +140,7 @@ export class Chart {
     const width = this.#plot.over.clientWidth;
     const left = this.#plot.valToPos(seconds, "x");
     const isHidden = !Number.isFinite(left) || left < 0 || left > width + 1;
-    this.#playhead.hidden = this.#values.hidden = isHidden;
+    this.#playhead.hidden = this.#values.hidden = this.#dots.hidden = isHidden;
     this.#playhead.style.transform = `translateX(${left}px)`;
     if (isHidden) return;
     this.#values.classList.toggle("left", left > width - VALUE_WIDTH_PX - 8);
@@ -146,16 +150,19 @@ export class Chart {
 
   /** Writes the number of each curve beside its line, one below the other where lines meet. */
   #showValues(seconds) {
+    const dots = [];
     const labels = Object.keys(this.#panes).flatMap((signal) => {
       const here = this.#curves.map((curve) => {
         const index = pointAt(curve.times, seconds);
-        return { curve, signal, value: index === null ? null : curve[signal][index] };
+        return { curve, signal, time: curve.times[index], value: index === null ? null : curve[signal][index] };
       });
       const known = here.filter(({ value }) => value !== null && value !== undefined);
+      dots.push(...known.map(({ curve, time, value }) => this.#dot(curve, signal, time, value)));
       for (const each of known) each.top = this.#top(signal, each.value) - VALUE_PX / 2;
       const [lowest, highest] = [0, 1].map((value) => this.#top(signal, value));
       return apart(known, highest - VALUE_PX, lowest + VALUE_PX / 2);
     });
+    this.#dots.replaceChildren(...dots);
     while (this.#values.children.length > labels.length) this.#values.lastChild.remove();
     labels.forEach(({ curve, signal, value, top }, place) => {
       const element = this.#values.children[place] ?? this.#values.appendChild(document.createElement("span"));
@@ -167,6 +174,23 @@ export class Chart {
     });
   }
 
+  /** The point of a curve that a number beside it tells. */
+  #dot(curve, signal, time, value) {
+    const element = document.createElement("i");
+    element.style.background = colourOf(curve, signal);
+    element.style.transform = `translate(${this.#plot.valToPos(time, "x").toFixed(1)}px, ${this.#top(signal, value).toFixed(1)}px)`;
+    return element;
+  }
+
+  get #isLow() {
+    return this.#host.clientHeight < LOW_PX;
+  }
+
+  /** The curves as they are drawn: the first one last, so that none hides it. */
+  get #drawn() {
+    return [...this.#curves].reverse();
+  }
+
   #top(signal, value) {
     return (1 - heightOf(this.#panes, signal, value)) * this.#plot.over.clientHeight;
   }
@@ -176,9 +200,8 @@ export class Chart {
   }
 
   #newPlot(signals, data) {
-    const isLow = this.#host.clientHeight < LOW_PX;
     const panes = this.#panes; // a plot is drawn once more after the curves have gone
-    const ticks = isLow ? FEW_TICKS : TICKS;
+    const ticks = this.#isLow ? FEW_TICKS : TICKS;
     const marks = signals.flatMap((signal) => ticks[signal].map((value) => [heightOf(panes, signal, value), value]));
     const axis = {
       stroke: () => themed("--faint"), font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif",
@@ -189,9 +212,10 @@ export class Chart {
       ...axis, size: 52, splits: () => marks.map(([height]) => height), filter: (_, splits) => splits,
       values: (_, splits) => splits.map((height) => `${number.get(height)}`),
     };
-    const series = this.#curves.flatMap((curve, place) => signals.map((signal) => {
-      const stroke = () => colourOf(this.#curves[place] ?? curve, signal);
-      return { stroke, width: 2, dash: curve.isDashed ? [6, 4] : undefined, points: { fill: () => themed("--page") } };
+    const series = this.#drawn.flatMap((curve, place) => signals.map((signal) => {
+      const stroke = () => colourOf(this.#drawn[place] ?? curve, signal);
+      const points = { show: (_, __, first, last) => last - first < MOST_POINTS, size: 5, fill: stroke };
+      return { stroke, width: 2, dash: curve.isDashed ? [6, 4] : undefined, points };
     }));
     const options = {
       ...this.#size(),
@@ -204,7 +228,7 @@ export class Chart {
       hooks: { draw: [(plot) => drawNames(plot, panes)], setSize: [() => this.#placeAgain()] },
     };
     const plot = new uPlot(options, data, this.#host);
-    plot.over.append(this.#line, this.#playhead, this.#values);
+    plot.over.append(this.#line, this.#playhead, this.#dots, this.#values);
     this.#listen(plot);
     return plot;
   }

@@ -44,6 +44,7 @@ export class DatasetTab {
     });
     const elements = {
       videos: page["episode-videos"], chart: page["episode-chart"], slider: page["episode-time"], button: page["episode-play"],
+      told: page["episode-time-told"],
     };
     this.#timeline = new Timeline(elements, { onThreshold: (value) => this.#cutAt(value) });
     this.#listen();
@@ -207,8 +208,8 @@ export class DatasetTab {
   #showChosen() {
     const page = this.#page;
     const numbers = this.#taken.map(({ episode }) => episode);
-    const which = this.#chosen.size ? "selected" : "shown; select some for fewer";
-    page["chosen-told"].textContent = `${numbers.length} that are ${which}`;
+    const which = this.#chosen.size ? "selected" : "shown; select rows to export fewer";
+    page["chosen-told"].textContent = `${numbers.length} episodes ${which}`;
     page["choose-none"].disabled = !this.#chosen.size;
     page["episodes-text"].disabled = page["episodes-json"].disabled = !numbers.length;
     const dataset = this.#datasets[this.#number];
@@ -349,7 +350,7 @@ function emptyCurve({ times_s: times }) {
 }
 
 function describe(curves) {
-  const told = curves.map(({ label, progress }) => `${label}: last progress ${shown(progress.at(-1))}`);
+  const told = curves.map(({ label, progress }) => `${label}: final progress ${shown(progress.at(-1))}`);
   return told.length ? told.join("; ") : "This episode has no labels.";
 }
 

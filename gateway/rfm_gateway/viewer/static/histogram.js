@@ -51,8 +51,8 @@ export class Histogram {
       legend: { show: false },
       cursor: { show: false },
       scales: { x: { time: false, range: [0, 1] }, y: { range: () => [0, this.#most * 1.05] } },
-      axes: [{ ...axis, size: 24, space: MARK_PX, label: "final progress" }, { ...axis, size: 44, incrs: COUNTS }],
-      series: [{}, bars("--curve-1"), bars("--curve-2")],
+      axes: [{ ...axis, size: 24, space: MARK_PX, label: "final progress" }, { ...axis, size: 36, label: "episodes", incrs: COUNTS }],
+      series: [{}, bars("--error"), bars("--line")],
     }, data, this.#host);
   }
 

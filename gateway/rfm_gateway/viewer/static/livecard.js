@@ -33,7 +33,6 @@ export class LiveCard {
     this.#mostPoints = mostPoints;
     this.#heading.id = `live-${id}`;
     this.element.setAttribute("aria-labelledby", this.#heading.id);
-    this.#state.className = "state";
     this.#image.hidden = true;
     this.#chartHost.className = "chart";
     this.#chartHost.setAttribute("role", "img");
@@ -45,7 +44,10 @@ export class LiveCard {
       list.append(group);
       this.#numbers.set(name, value);
     }
-    this.element.append(this.#heading, this.#state, this.#task, this.#image, this.#chartHost, list);
+    const head = document.createElement("div");
+    head.className = "head";
+    head.append(this.#heading, this.#state);
+    this.element.append(head, this.#task, this.#image, this.#chartHost, list);
     this.#chart = new Chart(this.#chartHost, (step) => this.#chart.moveTo(step), { label: null, isOfSteps: true });
     this.#chart.moveTo(NaN); // there is no step to mark
     this.#chartHost.addEventListener("pointerleave", () => this.#chart.moveTo(NaN));
@@ -122,7 +124,8 @@ export class LiveCard {
     const { task, has_ended: hasEnded, threshold } = this.#about;
     const { step, progress, success, succeeded, ms } = this.#newest ?? {};
     this.#heading.textContent = this.title;
-    this.#state.textContent = `${hasEnded ? "ended" : "running"}${succeeded ? ", succeeded" : ""}`;
+    this.#state.textContent = `${hasEnded ? "ended" : "running"}${succeeded ? ", succeeded" : hasEnded ? ", no success" : ""}`;
+    this.#state.className = `state ${succeeded ? "good" : hasEnded ? "bad" : ""}`;
     this.#task.textContent = task;
     this.element.classList.toggle("ended", hasEnded);
     this.#image.alt = `Newest frame of ${this.title}: ${task}`;
@@ -131,7 +134,7 @@ export class LiveCard {
     const { times } = this.#curve;
     this.#chart.setThreshold(threshold);
     this.#chart.show([{ ...this.#curve, label: this.title, begin: times[0], allTimes: times }]);
-    this.#chartHost.setAttribute("aria-label", `${times.length} steps: last progress ${shown(progress)}, last success ${shown(success)}`);
+    this.#chartHost.setAttribute("aria-label", `${times.length} steps: final progress ${shown(progress)}, final success ${shown(success)}`);
   }
 
   /** Fetches the newest frame if somebody can see it. */

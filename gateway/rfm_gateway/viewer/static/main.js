@@ -22,7 +22,7 @@ const CURVES_AT_A_TIME = 3;
 const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((element) => [element.id, element]));
 const queue = new Queue(CURVES_AT_A_TIME);
 const timeline = new Timeline(
-  { videos: page.videos, chart: page.chart, slider: page.time, button: page.play },
+  { videos: page.videos, chart: page.chart, slider: page.time, button: page.play, told: page["time-told"] },
   { changing: { onName: update, onRemove: removeVideo }, onThreshold: dragThreshold },
 );
 const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurve });
@@ -58,7 +58,7 @@ async function begin() {
   chooseRule();
   page.examples.hidden = !gateway.models.length;
   const none = "model: expected one that scores frames of videos, got none";
-  page.status.textContent = gateway.models.length ? "Ready." : none;
+  page.status.textContent = gateway.models.length ? "" : none;
 }
 
 /** Shows an error, and the form for the key if that is what is wrong. */
@@ -230,7 +230,7 @@ function clear() {
   page.pairs.replaceChildren();
   page.errors.replaceChildren();
   page["task-wanted"].textContent = "";
-  page.status.textContent = "Ready.";
+  page.status.textContent = "";
   timeline.moveTo(0);
   update();
 }
@@ -268,6 +268,7 @@ function dragThreshold(value) {
 
 function showThreshold() {
   const value = Number(page.threshold.value);
+  page["threshold-told"].textContent = value.toFixed(2);
   chart.setThreshold(value);
   showTable(page.curves, curves, value);
 }
@@ -283,10 +284,12 @@ function figure() {
 function update() {
   const scored = curves.filter(({ times }) => times.length);
   page.empty.hidden = videos.all.length > 0;
+  page.clear.hidden = !videos.all.length;
   page.stage.hidden = !videos.all.length;
   page.numbers.hidden = !curves.length;
   timeline.show(curves);
   legend.show(curves);
+  for (const video of videos.all) videos.mark(video, curves.filter((curve) => curve.video === video));
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle;
   page.compare.disabled = videos.all.length !== 2 || !page.model.value;
@@ -297,13 +300,13 @@ function update() {
   const done = curves.filter(({ state }) => state === "done").length;
   if (curves.length) page.status.textContent = `${done} of ${curves.length} curves are done.`;
   page.chart.setAttribute("aria-label", scored.length
-    ? scored.map((curve) => `${curve.label}: last progress ${shown(curve.progress.at(-1))}`).join("; ")
+    ? scored.map((curve) => `${curve.label}: final progress ${shown(curve.progress.at(-1))}`).join("; ")
     : "No curves yet.");
 }
 
 /** The settings belong to the tabs that have some, and what is said of curves to the first. */
 function shownTab(index) {
-  page.fold.hidden = index === 2;
+  page.fold.disabled = index === 2;
   page.status.textContent = "";
   if (index === 0) update();
 }
@@ -355,4 +358,5 @@ listen(document, {
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", update);
 
+showThreshold();
 begin();

@@ -10,20 +10,23 @@ const KEYS = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 };
 const NEAR_S = 1e-3;
 
 /**
- * elements: `videos` and `chart` hold what is shown, `slider` is an input, `button` plays and pauses
+ * elements: `videos` and `chart` hold what is shown, `slider` is an input, `button` plays and pauses,
+ * `told` says the time
  * changing: of the videos, as `Videos` takes it; chartOptions: as `Chart` takes them
  */
 export class Timeline {
   #slider;
   #button;
+  #told;
   #curves = [];
   time = 0;
 
-  constructor({ videos, chart, slider, button }, { changing = null, ...chartOptions } = {}) {
+  constructor({ videos, chart, slider, button, told }, { changing = null, ...chartOptions } = {}) {
     this.videos = new Videos(videos, (seconds, video) => this.moveTo(seconds, video), changing);
     this.chart = new Chart(chart, (seconds, isDragged) => this.#pointedAt(seconds, isDragged), chartOptions);
     this.#slider = slider;
     this.#button = button;
+    this.#told = told;
     button.addEventListener("click", () => this.#play());
     slider.addEventListener("input", () => {
       this.videos.pause();
@@ -51,6 +54,7 @@ export class Timeline {
   #showTime() {
     this.#button.textContent = this.videos.isPlaying ? "Pause" : "Play";
     this.#slider.value = this.time;
+    this.#told.textContent = this.#slider.disabled ? "" : `${this.time.toFixed(2)} / ${Number(this.#slider.max).toFixed(2)} s`;
     this.#slider.setAttribute("aria-valuetext", [`${this.time.toFixed(2)} seconds`, ...this.#numbers()].join("; "));
     this.chart.moveTo(this.time);
   }

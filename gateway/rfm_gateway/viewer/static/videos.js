@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 // The videos of the page, which move together: one time for all of them.
 
+import { colourOf } from "./chart.js";
 import { nameable, remover } from "./nameable.js";
 
 const NEAR_S = 0.05; // a video that is so near to a time shows it
@@ -35,13 +36,16 @@ export class Videos {
   add(file, name = file.name, orient = "none", more = {}) {
     const [figure, player, caption, trouble] = ["figure", "video", "figcaption", "p"].map((tag) => document.createElement(tag));
     const entry = { id: (this.#numAdded += 1), file, name, title: name, figure, player, orient, wanted: null, ...more };
+    entry.swatch = document.createElement("span");
     Object.assign(player, { src: URL.createObjectURL(file), muted: true, playsInline: true, preload: "auto" });
     player.setAttribute("aria-label", `Video ${name}`);
     player.className = orient;
     trouble.textContent = "This browser cannot show it; its curve counts all the same.";
     trouble.hidden = true;
     player.addEventListener("error", () => { trouble.hidden = false; });
-    caption.append(...(this.#changing ? this.#controls(entry) : [name]));
+    entry.swatch.className = "swatch";
+    entry.swatch.hidden = true;
+    caption.append(entry.swatch, ...(this.#changing ? this.#controls(entry) : [name]));
     player.addEventListener("play", () => this.#follow(entry));
     player.addEventListener("seeked", () => this.#arrived(entry));
     figure.append(caption, player, trouble);
@@ -53,6 +57,12 @@ export class Videos {
   /** Turns all videos, as their frames are turned before they are scored. */
   turn(orient) {
     for (const entry of this.#entries) entry.player.className = entry.orient = orient;
+  }
+
+  /** Shows the colour of a video's curve, where it has one alone. */
+  mark(entry, curves) {
+    entry.swatch.hidden = curves.length !== 1;
+    if (curves.length === 1) entry.swatch.style.background = colourOf(curves[0]);
   }
 
   /** Moves all videos to a time, but for `but`. */
