@@ -231,7 +231,7 @@ def test_means_and_success_rate_over_the_last_episodes_and_all_of_them_are_reach
         def expected(last: int) -> list[str]:
             rate = f"{100 * np.mean(succeeded[-last:]):.0f} %"
             steps = np.mean(np.arange(1, 31)[-last:])
-            return ["0", f"{last}", rate, number(float(np.mean(progress[-last:]))), "0.250", f"{steps:.1f}"]
+            return ["0", "30", rate, number(float(np.mean(progress[-last:]))), "0.250", f"{steps:.1f}"]
 
         poll(lambda: row() == expected(20))
         page.browser.write("live-last", "5")

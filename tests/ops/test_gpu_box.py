@@ -325,7 +325,8 @@ def test_a_server_behind_the_proxy_that_is_down_is_unavailable(papers: Path) -> 
             with (
                 RewardClient(url, ca_file=papers / "keys" / "ca.pem", api_key=key, retry=False) as asked,
                 pytest.raises(
-                    ServerUnavailableError, match="502" if scheme == "grpcs" else "it is down or still loads"
+                    ServerUnavailableError,
+                    match="502: start the server" if scheme == "grpcs" else "it is down or still loads",
                 ),
             ):
                 asked.progress(FILMED)
@@ -352,6 +353,19 @@ def test_a_caller_s_second_key_is_refused_while_the_first_counts(copied: Path) -
     refused = shell("set +e\n" + commands("5. A key").partition("\n")[2], copied)
     assert "cannot overwrite existing file" in refused.stderr
     assert keys.read_text() == before
+
+
+def test_step_6_once_more_keeps_the_authority(copied: Path) -> None:
+    before = (copied / "keys/ca.pem").read_bytes()
+    assert said(here(commands("6. A certificate"), "6"), copied).count("server.pem: OK") == 2
+    assert (copied / "keys/ca.pem").read_bytes() == before
+
+
+def test_a_key_that_is_taken_back_leaves_the_others(copied: Path) -> None:
+    (command,) = re.findall("`(sudo sed .*?keys.map)`", section("Later"))
+    said(command, copied)
+    (line,) = (copied / "etc/rfm/keys.map").read_text().splitlines()
+    assert line.endswith(f'" {LATER};')
 
 
 def test_a_renewal_without_the_authority_s_key_leaves_the_certificate_as_it_was(copied: Path) -> None:

@@ -10,12 +10,13 @@ const VALUE_PX = 16; // height of a number beside a line
 const VALUE_WIDTH_PX = 48;
 const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
 export const MARK_PX = 72; // at least between the marks of the axis below
-const MOST_POINTS = 64; // of a curve, that are drawn as dots
+const POINT_PX = 20; // nearer to each other, points are not drawn as dots
+const HIGH_PX = 400; // a chart so high has larger letters
 const LOW_PX = 240; // a chart so low has fewer marks
 const TICKS = { progress: [0, 0.25, 0.5, 0.75, 1], success: [0, 0.5, 1] };
 const FEW_TICKS = { progress: [0, 0.5, 1], success: [0, 1] };
 const WITH_SUCCESS = { progress: [0.37, 0.98], success: [0.03, 0.27] }; // shares of the height, from 0 to 1 of the signal
-const LOW_WITH_SUCCESS = { progress: [0.42, 0.98], success: [0.04, 0.26] };
+const LOW_WITH_SUCCESS = { progress: [0.46, 0.98], success: [0.03, 0.36] };
 const WITHOUT_SUCCESS = { progress: [0.03, 0.98] };
 
 /** The name of the colour of curve number `index`, which the style sheet has for each theme. */
@@ -160,16 +161,23 @@ export class Chart {
       dots.push(...known.map(({ curve, time, value }) => this.#dot(curve, signal, time, value)));
       for (const each of known) each.top = this.#top(signal, each.value) - VALUE_PX / 2;
       const [lowest, highest] = [0, 1].map((value) => this.#top(signal, value));
-      return apart(known, highest - VALUE_PX, lowest + VALUE_PX / 2);
+      const texts = known.map(({ value }) => shown(value));
+      known.forEach((each, place) => { // equal numbers are seen once
+        each.isAgain = texts.indexOf(texts[place]) < place;
+        each.isShared = texts.lastIndexOf(texts[place]) > place;
+      });
+      const seen = apart(known.filter(({ isAgain }) => !isAgain), highest - VALUE_PX, lowest + VALUE_PX / 2);
+      return known.filter((each) => each.isAgain || seen.includes(each));
     });
     this.#dots.replaceChildren(...dots);
     while (this.#values.children.length > labels.length) this.#values.lastChild.remove();
-    labels.forEach(({ curve, signal, value, top }, place) => {
+    labels.forEach(({ curve, signal, value, top, isAgain, isShared }, place) => {
       const element = this.#values.children[place] ?? this.#values.appendChild(document.createElement("span"));
       element.textContent = shown(value);
       element.dataset.signal = signal;
       element.dataset.curve = curve.label;
-      element.style.color = colourOf(curve, signal);
+      element.hidden = isAgain;
+      element.style.color = isShared ? themed("--text") : colourOf(curve, signal);
       element.style.transform = `translateY(${top.toFixed(1)}px)`;
     });
   }
@@ -203,8 +211,10 @@ export class Chart {
     const panes = this.#panes; // a plot is drawn once more after the curves have gone
     const ticks = this.#isLow ? FEW_TICKS : TICKS;
     const marks = signals.flatMap((signal) => ticks[signal].map((value) => [heightOf(panes, signal, value), value]));
+    const font = `${this.#host.clientHeight < HIGH_PX ? 12 : 14}px system-ui, sans-serif`;
+    const isRoomy = ({ over }, _, first, last) => over.clientWidth > POINT_PX * (last - first);
     const axis = {
-      stroke: () => themed("--faint"), font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif",
+      stroke: () => themed("--faint"), font, labelFont: font,
       grid: { stroke: () => themed("--grid"), width: 1 }, ticks: { show: false }, labelSize: 18, gap: 4,
     };
     const number = new Map(marks);
@@ -214,7 +224,7 @@ export class Chart {
     };
     const series = this.#drawn.flatMap((curve, place) => signals.map((signal) => {
       const stroke = () => colourOf(this.#drawn[place] ?? curve, signal);
-      const points = { show: (_, __, first, last) => last - first < MOST_POINTS, size: 5, fill: stroke };
+      const points = { show: isRoomy, size: 5, fill: stroke };
       return { stroke, width: 2, dash: curve.isDashed ? [6, 4] : undefined, points };
     }));
     const options = {
@@ -225,7 +235,7 @@ export class Chart {
       scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [0, 1] } },
       axes: [{ ...axis, size: 24, space: MARK_PX, label: this.#label, ...(this.#isOfSteps ? { incrs: STEPS } : {}) }, left],
       series: [{}, ...series],
-      hooks: { draw: [(plot) => drawNames(plot, panes)], setSize: [() => this.#placeAgain()] },
+      hooks: { drawAxes: [(plot) => clearBetween(plot, panes)], draw: [(plot) => drawNames(plot, panes)], setSize: [() => this.#placeAgain()] },
     };
     const plot = new uPlot(options, data, this.#host);
     plot.over.append(this.#line, this.#playhead, this.#dots, this.#values);
@@ -268,6 +278,13 @@ export class Chart {
 
 const STEPS = [1, 2, 5].flatMap((digit) => [1, 10, 100, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8].map((power) => digit * power))
   .sort((one, other) => one - other);
+
+/** Ends the grid between two signals. */
+function clearBetween({ ctx, bbox }, { progress, success }) {
+  if (!success) return;
+  const [top, bottom] = [1 - progress[0], 1 - success[1]].map((share) => bbox.top + share * bbox.height + devicePixelRatio);
+  ctx.clearRect(bbox.left, top, bbox.width, bottom - top - 2 * devicePixelRatio);
+}
 
 /** Writes the name of each signal beside its part of the axis. */
 function drawNames({ ctx, bbox }, panes) {

@@ -12,6 +12,7 @@ import { Timeline } from "./timeline.js";
 
 const CAMERA_PREFIX = "observation.images.";
 const MOST_LETTERS = 400; // that are shown of words for LeRobot: thousands of numbers slow the page down
+const NARROW = "(max-width: 719px)";
 const NOTHING = { episodes: [], cameras: [], orientations: [], threshold: 0.5, provenance: null, written_s: null };
 
 export class DatasetTab {
@@ -91,7 +92,7 @@ export class DatasetTab {
       return;
     }
     const { dataset } = this.#page;
-    dataset.replaceChildren(...this.#datasets.map(({ name, kind }, index) => new Option(`${name} (${kind})`, index)));
+    dataset.replaceChildren(...this.#datasets.map(({ name, kind }, index) => new Option(`${name} (${kind.replace("LeRobot ", "")})`, index)));
     this.#page.datasets.hidden = this.#page["dataset-side"].hidden = !this.#datasets.length;
     this.#page["no-datasets"].hidden = this.#datasets.length > 0;
     if (this.#datasets.length) await this.#choose();
@@ -228,9 +229,10 @@ export class DatasetTab {
     const labelled = this.#episodes.filter(({ final_progress: final }) => final !== undefined && final !== null);
     const judgedOnes = labelled.filter(({ never_succeeds: never }) => never !== null);
     const never = judgedOnes.filter(({ never_succeeds: each }) => each).length;
-    const told = [`${labelled.length} of ${this.#episodes.length} episodes are labelled.`];
+    const [numAll, isWhole] = [this.#episodes.length, labelled.length === this.#episodes.length];
+    const told = isWhole ? [] : [`${labelled.length} of ${numAll} episodes are labelled.`];
     const verb = never === 1 ? "succeeds" : "succeed";
-    if (judgedOnes.length) told.push(`${never} never ${verb}: success stays below ${this.#threshold}.`);
+    if (judgedOnes.length) told.push(`${never} of ${judgedOnes.length} ${isWhole ? "episodes" : "of them"} never ${verb}.`);
     this.#page["ends-told"].textContent = told.join(" ");
     this.#histogram.show(labelled);
   }
@@ -294,7 +296,7 @@ export class DatasetTab {
     page["episode-before"].disabled = place <= 0;
     page["episode-after"].disabled = place < 0 || place === this.#shown.length - 1;
     page["episode-title"].focus({ preventScroll: true });
-    page.episode.scrollIntoView({ block: "nearest" });
+    page.episode.scrollIntoView({ block: matchMedia(NARROW).matches ? "start" : "nearest" });
     try {
       await this.#fetch(episode, signal);
     } catch (error) {

@@ -22,7 +22,7 @@ const ORDERS = {
   difference: [["difference", true]],
 };
 
-const NAMES = ["", "", "Task", "Frames", "Final", "Best", "Last", "Back", "Apart", "Differ"]; // of columns, on a telephone
+const NAMES = ["", "", "Task", "Frames", "Progress", "Best", "End", "Back", "Cameras", "Differ"]; // of columns, on a telephone
 
 /** What a filter keeps, by name; the second argument is the number beside it */
 const FILTERS = {

@@ -52,7 +52,7 @@ export class Histogram {
       cursor: { show: false },
       scales: { x: { time: false, range: [0, 1] }, y: { range: () => [0, this.#most * 1.05] } },
       axes: [{ ...axis, size: 24, space: MARK_PX, label: "final progress" }, { ...axis, size: 36, label: "episodes", incrs: COUNTS }],
-      series: [{}, bars("--error"), bars("--line")],
+      series: [{}, bars("--bad-bar"), bars("--line")],
     }, data, this.#host);
   }
 

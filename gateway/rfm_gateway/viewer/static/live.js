@@ -111,12 +111,13 @@ export class LiveTab {
     const head = this.#page["live-runs"].closest("table").querySelectorAll("thead th");
     const names = [...head].map(({ textContent }) => textContent);
     const rows = [...new Set(cards.map(({ run }) => run))].sort().map((run) => {
-      const own = ended.filter((card) => card.run === run).slice(0, last);
+      const all = ended.filter((card) => card.run === run);
+      const own = all.slice(0, last);
       const numRunning = cards.filter((card) => card.run === run && !card.hasEnded).length;
       const rate = own.length ? `${(100 * mean(own.map(({ succeeded }) => Number(succeeded)))).toFixed(0)} %` : NONE;
       const means = ["lastProgress", "lastSuccess"].map((name) => shown(mean(own.map((card) => card[name]))));
       const steps = mean(own.map(({ numSteps }) => numSteps));
-      const texts = [numRunning, own.length, rate, ...means, steps === null ? NONE : steps.toFixed(1)];
+      const texts = [numRunning, all.length, rate, ...means, steps === null ? NONE : steps.toFixed(1)];
       const row = document.createElement("tr");
       const header = document.createElement("th");
       header.scope = "row";

@@ -53,6 +53,7 @@ export class Timeline {
 
   #showTime() {
     this.#button.textContent = this.videos.isPlaying ? "Pause" : "Play";
+    this.#button.classList.toggle("pauses", this.videos.isPlaying);
     this.#slider.value = this.time;
     this.#told.textContent = this.#slider.disabled ? "" : `${this.time.toFixed(2)} / ${Number(this.#slider.max).toFixed(2)} s`;
     this.#slider.setAttribute("aria-valuetext", [`${this.time.toFixed(2)} seconds`, ...this.#numbers()].join("; "));
