@@ -11,7 +11,7 @@ const VALUE_WIDTH_PX = 48;
 const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
 export const MARK_PX = 72; // at least between the marks of the axis below
 const POINT_PX = 20; // nearer to each other, points are not drawn as dots
-const HIGH_PX = 400; // a chart so high has larger letters
+const LARGE_PX = 400; // a chart so high and so wide has larger letters
 const LOW_PX = 240; // a chart so low has fewer marks
 const TICKS = { progress: [0, 0.25, 0.5, 0.75, 1], success: [0, 0.5, 1] };
 const FEW_TICKS = { progress: [0, 0.5, 1], success: [0, 1] };
@@ -169,7 +169,7 @@ export class Chart {
       const seen = apart(known.filter(({ isAgain }) => !isAgain), highest - VALUE_PX, lowest + VALUE_PX / 2);
       return known.filter((each) => each.isAgain || seen.includes(each));
     });
-    this.#dots.replaceChildren(...dots);
+    this.#dots.replaceChildren(...dots.reverse()); // as the lines: the first one on top
     while (this.#values.children.length > labels.length) this.#values.lastChild.remove();
     labels.forEach(({ curve, signal, value, top, isAgain, isShared }, place) => {
       const element = this.#values.children[place] ?? this.#values.appendChild(document.createElement("span"));
@@ -211,7 +211,9 @@ export class Chart {
     const panes = this.#panes; // a plot is drawn once more after the curves have gone
     const ticks = this.#isLow ? FEW_TICKS : TICKS;
     const marks = signals.flatMap((signal) => ticks[signal].map((value) => [heightOf(panes, signal, value), value]));
-    const font = `${this.#host.clientHeight < HIGH_PX ? 12 : 14}px system-ui, sans-serif`;
+    const { clientWidth, clientHeight } = this.#host;
+    const letterPx = Math.min(clientWidth, clientHeight) < LARGE_PX ? 12 : 14;
+    const font = `${letterPx}px system-ui, sans-serif`;
     const isRoomy = ({ over }, _, first, last) => over.clientWidth > POINT_PX * (last - first);
     const axis = {
       stroke: () => themed("--faint"), font, labelFont: font,
@@ -235,7 +237,7 @@ export class Chart {
       scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [0, 1] } },
       axes: [{ ...axis, size: 24, space: MARK_PX, label: this.#label, ...(this.#isOfSteps ? { incrs: STEPS } : {}) }, left],
       series: [{}, ...series],
-      hooks: { drawAxes: [(plot) => clearBetween(plot, panes)], draw: [(plot) => drawNames(plot, panes)], setSize: [() => this.#placeAgain()] },
+      hooks: { drawAxes: [(plot) => clearBetween(plot, panes)], draw: [(plot) => drawNames(plot, panes, letterPx)], setSize: [() => this.#placeAgain()] },
     };
     const plot = new uPlot(options, data, this.#host);
     plot.over.append(this.#line, this.#playhead, this.#dots, this.#values);
@@ -287,11 +289,11 @@ function clearBetween({ ctx, bbox }, { progress, success }) {
 }
 
 /** Writes the name of each signal beside its part of the axis. */
-function drawNames({ ctx, bbox }, panes) {
+function drawNames({ ctx, bbox }, panes, letterPx) {
   const scale = devicePixelRatio;
   ctx.save();
   ctx.fillStyle = themed("--faint");
-  ctx.font = `${12 * scale}px system-ui, sans-serif`;
+  ctx.font = `${letterPx * scale}px system-ui, sans-serif`;
   ctx.textAlign = "center";
   for (const [signal, [from, to]] of Object.entries(panes)) {
     ctx.save();

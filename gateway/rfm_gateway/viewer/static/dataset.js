@@ -320,7 +320,8 @@ export class DatasetTab {
     cameras.forEach((camera, index) => {
       const file = `${name}_episode_${`${episode}`.padStart(6, "0")}.${short(camera)}.mp4`;
       this.#watched.files.push(new File([blobs[index]], file, { type: blobs[index].type }));
-      this.#timeline.videos.add(this.#watched.files.at(-1), short(camera), orientations[index]);
+      const video = this.#timeline.videos.add(this.#watched.files.at(-1), short(camera), orientations[index]);
+      this.#timeline.videos.mark(video, curves.filter(({ label }) => label === short(camera)));
     });
     this.#page["score-episode"].disabled = !cameras.length;
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
