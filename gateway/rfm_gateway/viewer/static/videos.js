@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // The videos of the page, which move together: one time for all of them.
 
-import { colourOf } from "./chart.js";
+import { colourName } from "./chart.js";
 import { nameable, remover } from "./nameable.js";
 
 const NEAR_S = 0.05; // a video that is so near to a time shows it
@@ -62,7 +62,8 @@ export class Videos {
   /** Shows the colour of a video's curve, where it has one alone. */
   mark(entry, curves) {
     entry.swatch.hidden = curves.length !== 1;
-    if (curves.length === 1) entry.swatch.style.background = colourOf(curves[0]);
+    const [{ colour, index } = {}] = curves;
+    entry.swatch.style.background = colour ?? `var(--${colourName(index)})`;
   }
 
   /** Moves all videos to a time, but for `but`. */
