@@ -313,31 +313,31 @@ def test_the_log_names_the_caller_and_no_key(box: Box) -> None:
         assert box.key(caller) not in box.log()
 
 
-@pytest.mark.triton
-def test_a_server_behind_the_proxy_that_is_down_is_unavailable(papers: Path) -> None:
-    """Not denied, so the client tries again."""
-    port = Endpoints.free().http_port
-    ports = {shown: Endpoints.free().http_port for shown in (PORTS["grpc"], PORTS["http"], PORTS["gateway"])}
-    key = (papers / "keys" / f"{CALLER}.key").read_text().strip()
-    with nginx(papers, {**ports, PORTS["proxy"]: port}):
-        for scheme in ("grpcs", "https"):
-            url = f"{scheme}://{IP}:{port}"
-            with (
-                RewardClient(url, ca_file=papers / "keys" / "ca.pem", api_key=key, retry=False) as asked,
-                pytest.raises(
-                    ServerUnavailableError,
-                    match="502: start the server" if scheme == "grpcs" else "it is down or still loads",
-                ),
-            ):
-                asked.progress(FILMED)
-
-
 @pytest.fixture
 def copied(papers: Path, tmp_path: Path) -> Path:
     """A copy of the folder after steps 5 and 6, to be changed."""
     for name in ("keys", "etc"):
         shutil.copytree(papers / name, tmp_path / name)
     return tmp_path
+
+
+@pytest.mark.triton
+def test_a_server_behind_the_proxy_that_is_down_is_unavailable(copied: Path) -> None:
+    """Not denied, so the client tries again."""
+    port = Endpoints.free().http_port
+    ports = {shown: Endpoints.free().http_port for shown in (PORTS["grpc"], PORTS["http"], PORTS["gateway"])}
+    key = (copied / "keys" / f"{CALLER}.key").read_text().strip()
+    with nginx(copied, {**ports, PORTS["proxy"]: port}):
+        for scheme in ("grpcs", "https"):
+            url = f"{scheme}://{IP}:{port}"
+            with (
+                RewardClient(url, ca_file=copied / "keys" / "ca.pem", api_key=key, retry=False) as asked,
+                pytest.raises(
+                    ServerUnavailableError,
+                    match="502: start the server" if scheme == "grpcs" else "it is down or still loads",
+                ),
+            ):
+                asked.progress(FILMED)
 
 
 def test_nginx_does_not_start_with_an_empty_key(copied: Path) -> None:

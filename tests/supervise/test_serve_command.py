@@ -73,7 +73,7 @@ def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(monkey
             wait_for(lambda: answer_of(f"http://[::1]:{status}/ready") or process.poll() is not None)
             wait_for(lambda: httpx.get(f"http://[::1]:{status}/ready").json()["ready"])
             wait_for(lambda: answer_of(page))
-            assert "<title>Rewards of robot videos</title>" in httpx.get(page).text
+            assert "<title>Robot video rewards</title>" in httpx.get(page).text
             assert httpx.get(f"{page}health").json()["status"] == "healthy"
             assert "nv_inference_count" in httpx.get(endpoints.metrics_url).text
             scores = []
