@@ -175,7 +175,8 @@ class TritonWatch:
 
     def _keep_up(self) -> None:
         """Read Triton's index. Raises NO_ANSWER."""
-        versions = versions_of(self._http.json(INDEX_PATH, _INDEX_TIMEOUT_S, "POST"))
+        timeout_s = min(_INDEX_TIMEOUT_S, self._silent_s / LOOKS)  # a silent Triton is no hung model
+        versions = versions_of(self._http.json(INDEX_PATH, timeout_s, "POST"))
         for model in {entry.name for entry in versions}:
             self._keep_up_with(model, [entry for entry in versions if entry.name == model])
         self.reasons = {name: self._reason(name, versions) for name in self.served}
