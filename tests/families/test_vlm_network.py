@@ -68,8 +68,6 @@ def test_shots_of_one_size_are_one_call_of_attention(name: str, monkeypatch: pyt
 
 @pytest.mark.gpu
 def test_bfloat16_on_a_gpu_is_near_float32_on_the_cpu() -> None:
-    """As near as the original's own bfloat16 is to its float32. Seen on an H200: 5.8e-3."""
-    _, tolerance = goldens.ROUNDED_TOLERANCES
     config = goldens.config(BFLOAT16)
     samples = [sample for case in config.cases() for sample in case.samples()]
     engine = Engine.from_checkpoint(config.checkpoint, **config.sources, device="cuda")
@@ -77,8 +75,8 @@ def test_bfloat16_on_a_gpu_is_near_float32_on_the_cpu() -> None:
         assert not isinstance(left, Exception), left
         assert not isinstance(right, Exception), right
         for a, b in zip(goldens.frame_scores(left), goldens.frame_scores(right), strict=True):
-            np.testing.assert_allclose(a.progress, b.progress, rtol=0, atol=tolerance)
-            np.testing.assert_allclose(a.success, b.success, rtol=0, atol=tolerance)
+            np.testing.assert_allclose(a.progress, b.progress, rtol=0, atol=5e-3)
+            np.testing.assert_allclose(a.success, b.success, rtol=0, atol=1.5e-2)
 
 
 @pytest.mark.gpu

@@ -40,7 +40,7 @@ LATE = "no answer in time"
 _NO_CONNECTION = re.compile(  # gRPC's own words: nothing was sent
     "failed to connect|connections to all backends failing|errors resolving|resolution failed"
 )
-_PROXY_ALONE = re.compile("http2 header with status: 50[24]")  # a proxy answered: the server behind it did not
+_PROXY_ALONE = "http2 header with status: 502"  # a proxy answered: the server behind it did not
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or a proxy's
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
 _WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not make
@@ -101,7 +101,7 @@ def _error_of_answer(
     status, message = str(answer.status()), answer.message() or ""
     if is_denied(status, message):
         return denied(url, status, message)
-    if status == "StatusCode.UNAVAILABLE" and (_NO_CONNECTION.search(message) or _PROXY_ALONE.search(message)):
+    if status == "StatusCode.UNAVAILABLE" and (_NO_CONNECTION.search(message) or _PROXY_ALONE in message):
         return unreachable(url, message, proxy)
     return error_of(status, message, bad_request)
 

@@ -22,9 +22,10 @@ ResetNeeded. A step after an episode's end does, too, unless the environment res
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
@@ -154,6 +155,13 @@ def _check_shows_its_end(info: Info) -> None:
         expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"
         remedy = "turn off its own reset, and wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
         raise InvalidSampleError.at("info", expected, f"{', '.join(found)}; {remedy}")
+
+
+def tasks_of(task: str | Sequence[str], num_envs: int) -> list[str]:
+    """Return a task sentence for each environment of a vector. Raises ValueError for another number of sentences."""
+    tasks = [task] * num_envs if isinstance(task, str) else list(task)
+    require("task", len(tasks) == num_envs, f"one for each of the {num_envs} environments", len(tasks))
+    return tasks
 
 
 def check_frame_source(options: RewardOptions, render_mode: str | None, space: gymnasium.Space[Any]) -> None:

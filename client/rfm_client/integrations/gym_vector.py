@@ -15,7 +15,7 @@ from gymnasium.vector.utils import iterate
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.episodes.steps import copied
-from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind
+from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind, tasks_of
 from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
 OfEnvs: TypeAlias = dict[int, RewardedEpisode]  # by number of the environment
@@ -55,8 +55,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         check_kind(env, VectorEnv)
         check_frame_source(options, env.render_mode, env.single_observation_space)
         autoreset_mode = _checked_autoreset_mode(env, options)
-        tasks = [task] * env.num_envs if isinstance(task, str) else list(task)
-        require("task", len(tasks) == env.num_envs, f"one for each of the {env.num_envs} environments", len(tasks))
+        tasks = tasks_of(task, env.num_envs)
         super().__init__(env)  # after the checks: a refused wrapper must not close the environments when collected
         self._rewarder = EpisodeRewarder(client, options)
         self._options = options

@@ -20,7 +20,7 @@ from gymnasium.error import ResetNeeded
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.episodes.steps import copied
-from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source
+from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, tasks_of
 from rfm_client.integrations.gym_vector import check_differ
 from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
@@ -82,8 +82,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         )
         instead = f"{options.terminate_on_success}; wrap each environment in RewardModelWrapper instead"
         require("terminate_on_success", options.terminate_on_success is None, "None, since a VecEnv resets", instead)
-        tasks = [task] * venv.num_envs if isinstance(task, str) else list(task)
-        require("task", len(tasks) == venv.num_envs, f"one for each of the {venv.num_envs} environments", len(tasks))
+        tasks = tasks_of(task, venv.num_envs)
         self._rewarder = EpisodeRewarder(client, options)  # before super, which reads the attributes
         self._reward_options, self._tasks = options, tasks
         self._episodes: list[RewardedEpisode] = []
