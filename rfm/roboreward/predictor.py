@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: MIT
 """The predictor of RoboReward: writes a batch's answers together, or computes their expected scores.
 
-B conversations of L tokens in a batch, padded behind their tokens; N tokens written so far.
+The pass over the prompts also checks a draft of the answer's usual beginning: its tokens are accepted up to the first
+that is not the likeliest. So a draft saves passes and changes no answer.
+
+B conversations in a batch, N tokens of the draft, V rows of the language head.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -21,21 +24,27 @@ from rfm.roboreward.prompts import SCORES, RoboRewardCollator, RoboRewardConfig,
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import VlmRow
 from rfm.vlm.predictor import VlmPredictor
-from rfm.vlm.qwen import KeyValues, next_hidden_state
+from rfm.vlm.qwen import Indices, KeyValues, next_hidden_state
 from rfm_client.contract import FrameScores, InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.samples import Float32Array
 
+NOT_FINITE = -1  # instead of a token: some of its logits are not finite
 
-@dataclass(frozen=True)
+
+@dataclass
 class WrittenAnswer:
-    """A written answer.
+    """An answer while it is written.
 
-    tokens: without the token that ends it; None: some logits were not finite
+    tokens: without the token that ends it
     digit_logits: float32 [5], logits of SCORES where the first of these digits is written; None: there is none
+    has_ended: no further token belongs to it
+    is_finite: all logits of its tokens are finite
     """
 
-    tokens: list[int] | None
-    digit_logits: Float32Array | None
+    tokens: list[int] = field(default_factory=list)
+    digit_logits: Float32Array | None = None
+    has_ended: bool = False
+    is_finite: bool = True
 
 
 class RoboRewardPredictor(VlmPredictor):
@@ -47,7 +56,7 @@ class RoboRewardPredictor(VlmPredictor):
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
         """Return each row's scores, or its error.
 
-        execution: its ``on_forward`` is called after each written token
+        execution: its ``on_forward`` is called after each forward pass
         """
         self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         if self._config.is_expected:
@@ -57,59 +66,67 @@ class RoboRewardPredictor(VlmPredictor):
             scores = [_scores(float(progress[i]), logits[i].cpu().numpy(), row) for i, row in enumerate(rows)]
             made = output.made
         else:
-            answers, made = self._written(rows, batch, execution)
+            answers, made = self.write(rows, batch, execution)
             scores = [self._read(answer, row, execution) for answer, row in zip(answers, rows, strict=True)]
         if made is None or bool(made.isfinite().all()):
             self._keep(rows, batch.layout, made)
         return scores
 
-    def _written(
+    def num_tokens(self, row: VlmRow) -> int:
+        """Return the number of tokens in the row's first pass, which include the draft."""
+        return row.num_tokens + len(self.collator.draft)
+
+    @torch.inference_mode()
+    def write(
         self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution
     ) -> tuple[list[WrittenAnswer], Tensor | None]:
-        """Return the answers, token by token the likeliest, and the features that the vision tower computed."""
-        key_values = KeyValues()
+        """Return the answers, token by token the likeliest, and the features that the vision tower computed.
+
+        execution: its ``on_forward`` is called after each forward pass
+        """
+        key_values, draft = KeyValues(), self.collator.draft
         output = self._output(batch, key_values)
-        logits, language = output.logits, self.network.model.language_model
-        lengths = torch.tensor([row.num_tokens for row in rows], device=logits.device)
-        last = [int(row.position_ids[0, -1]) for row in rows if row.position_ids is not None]
-        following = torch.tensor(last, device=logits.device) + 1
-        num_slots = batch.inputs["input_ids"].shape[1]
-        is_seen = torch.arange(num_slots, device=logits.device) < lengths[:, None]
-        stops = torch.tensor(self._config.stops, device=logits.device)
-        known = torch.tensor(self.collator.digits, device=logits.device)
-        tokens: list[Tensor] = []
-        digits: list[Tensor] = []
-        has_ended = torch.zeros(len(rows), dtype=torch.bool, device=logits.device)
-        is_finite = ~has_ended
-        for step in range(self._config.max_new_tokens):
-            is_finite &= has_ended | logits.isfinite().all(-1)
-            tokens.append(logits.argmax(-1))
-            digits.append(logits[:, known].float())
-            has_ended |= torch.isin(tokens[-1], stops)
-            execution.on_forward()
-            if step == self._config.max_new_tokens - 1 or bool(has_ended.all()):
-                break
-            is_seen = torch.cat([is_seen, is_seen.new_ones(len(rows), 1)], dim=1)
+        tokens, digit_logits = self._likeliest(output.logits.unflatten(0, (len(rows), len(draft) + 1)))
+        num_right = (tokens[:, :-1] == draft).cumprod(axis=1).sum(axis=1)
+        answers = [WrittenAnswer() for _ in rows]
+        for index, answer in enumerate(answers):
+            for step in range(num_right[index] + 1):
+                self._add(answer, tokens[index, step], digit_logits[index, step])
+        execution.on_forward()
+        tokens = tokens[np.arange(len(rows)), num_right]
+        lengths = np.array([row.num_tokens for row in rows]) + num_right
+        positions = np.array([row.position_ids[0, -1] for row in rows if row.position_ids is not None]) + 1 + num_right
+        while not all(answer.has_ended for answer in answers):
             with memory_errors():
-                hidden = next_hidden_state(language, tokens[-1], following + step, is_seen, key_values)
-                logits = self.network.lm_head(hidden)
-        of_rows = torch.stack(tokens, dim=1).cpu().tolist()
-        of_digits = torch.stack(digits, dim=1).cpu().numpy()
-        answers = [
-            self._ended(ids, each) if is_good else WrittenAnswer(None, None)
-            for ids, each, is_good in zip(of_rows, of_digits, is_finite.cpu().tolist(), strict=True)
-        ]
+                fed = tokens.clip(min=0)  # instead of NOT_FINITE
+                hidden = next_hidden_state(self.network.model.language_model, fed, positions, lengths, key_values)
+                tokens, digit_logits = self._likeliest(self.network.lm_head(hidden))
+            for answer, token, logits in zip(answers, tokens, digit_logits, strict=True):
+                self._add(answer, token, logits)
+            execution.on_forward()
+            lengths, positions = lengths + 1, positions + 1
         return answers, output.made
 
-    def _ended(self, tokens: list[int], digits: Float32Array) -> WrittenAnswer:
-        """Return the answer up to its end. digits: float32 [N, 5], logits of SCORES at each token"""
-        end = next((index for index, token in enumerate(tokens) if token in self._config.stops), len(tokens))
-        known = self.collator.digits
-        at = next((index for index, token in enumerate(tokens[:end]) if token in known), None)
-        return WrittenAnswer(tokens[:end], None if at is None else digits[at])
+    def _likeliest(self, logits: Tensor) -> tuple[Indices, Float32Array]:
+        """Return the likeliest tokens, or NOT_FINITE, and the logits of SCORES: [..., V] -> int64 [...], [..., 5]."""
+        tokens = torch.where(logits.isfinite().all(-1), logits.argmax(-1), NOT_FINITE)
+        return tokens.cpu().numpy(), logits[..., self.collator.digits].float().cpu().numpy()
+
+    def _add(self, answer: WrittenAnswer, token: int, digit_logits: Float32Array) -> None:
+        """Add the next token to an answer that has not ended. digit_logits: float32 [5], logits of SCORES"""
+        if answer.has_ended:
+            return
+        answer.is_finite = token != NOT_FINITE
+        if not answer.is_finite or token in self._config.stops:
+            answer.has_ended = True
+            return
+        if answer.digit_logits is None and token in self.collator.digits:
+            answer.digit_logits = digit_logits
+        answer.tokens.append(int(token))
+        answer.has_ended = len(answer.tokens) == self._config.max_new_tokens
 
     def _read(self, answer: WrittenAnswer, row: VlmRow, execution: Execution) -> RowScores | RewardError:
-        if answer.tokens is None:
+        if not answer.is_finite:
             return InferenceFailedError("the network gave a score that is not finite")
         text = self.collator.tokenizer.decode(answer.tokens, skip_special_tokens=True)
         score = parsed(text)

@@ -6,13 +6,17 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import VlmRow, group_times
+from rfm.vlm.images import QwenImages
 from rfm.vlm.language import LanguageCollator, LanguageConfig
 from rfm.vlm.video import VlmVideo
 from rfm_client.contract.samples import UInt8Array
@@ -55,11 +59,19 @@ class RoboRewardConfig(LanguageConfig):
 
 
 class RoboRewardCollator(LanguageCollator):
-    """The collator of RoboReward: one conversation about all frames, in dense mode one for each prefix."""
+    """The collator of RoboReward: one conversation about all frames, in dense mode one for each prefix.
+
+    draft: int64 [N], the tokens with which a written answer usually begins
+    """
 
     config: RoboRewardConfig  # type: ignore[assignment]  # no heads, so no VlmConfig
 
-    @property
+    def __init__(self, config: RoboRewardConfig, tokenizer: Any, images: QwenImages) -> None:
+        super().__init__(config, tokenizer, images)
+        self._before_answer = self._chat.tokens(BEFORE_ANSWER)
+        self.draft = self._before_answer[:0] if config.is_expected else self._before_answer
+
+    @cached_property
     def digits(self) -> list[int]:
         """The tokens of SCORES."""
         return [int(self.tokenizer.convert_tokens_to_ids(str(score))) for score in SCORES]
@@ -71,9 +83,32 @@ class RoboRewardCollator(LanguageCollator):
     def prompts(self, video: VlmVideo, task: str) -> list[VlmRow]:
         """Return the conversations about a video. Raises ValueError for frames that cannot be resized."""
         text = self.template(PROMPT.replace("{task}", task), add_generation_prompt=True)
-        more = self._chat.tokens(BEFORE_ANSWER) if self.config.is_expected else ()
+        more = self._before_answer if self.config.is_expected else ()
         times_s = group_times(self.grid(video).groups)
         return [self.row(video, text, shown, times_s, more) for shown in video.conversations]
+
+    def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
+        """Return the batch of conversations with the draft behind each.
+
+        Its queries: each conversation's last token, and the tokens of the draft.
+        """
+        batch = super().collate([self._drafted(row) for row in rows])
+        back = torch.arange(-len(self.draft), 1)
+        return replace(
+            batch,
+            query_rows=batch.query_rows.repeat_interleave(len(back)),
+            query_tokens=(batch.query_tokens[:, None] + back).flatten(),
+        )
+
+    def _drafted(self, row: VlmRow) -> VlmRow:
+        assert row.position_ids is not None
+        at = row.position_ids[:, -1:] + 1 + np.arange(len(self.draft))
+        return replace(
+            row,
+            input_ids=np.concatenate([row.input_ids, self.draft]),
+            position_ids=np.concatenate([row.position_ids, at], axis=1),
+            query=row.num_tokens + len(self.draft) - 1,
+        )
 
     def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
         frames = [as_jpeg(video.frames[index]) for index in needed]

@@ -277,19 +277,55 @@ def _windows(grids: Sequence[Grid], side: int) -> tuple[Runs, Indices]:
 FULL_ATTENTION = "full_attention"
 
 
+ROOM = 16  # slots that KeyValues adds at a time
+
+
 class KeyValues:
-    """The keys and values of all tokens so far, of each layer, in the form of transformers' cache."""
+    """The keys and values of all tokens so far, of each layer, in the form of transformers' cache.
+
+    Each conversation has S slots and fills them from the first. After the pass over the prompts, call ``place`` before
+    the pass over each further token.
+    """
 
     def __init__(self) -> None:
-        self._of_layers: dict[int, tuple[Tensor, Tensor]] = {}
+        self._of_layers: dict[int, tuple[Tensor, Tensor]] = {}  # [B, S, heads, D / heads] each
+        self._next: Tensor | None = None  # int64 [B], the slots of the next tokens among all B * S
+        self._num_seen = 0
+
+    def place(self, lengths: Tensor, longest: int) -> None:
+        """Put the next token of each conversation behind its first tokens. Forget what was there.
+
+        lengths: int64 [B], number of tokens to keep
+        longest: the largest of them
+        """
+        self._num_seen = longest + 1
+        if self._num_seen > self._of_layers[0][0].shape[1]:
+            for layer, (keys, values) in self._of_layers.items():
+                self._of_layers[layer] = _with_room(keys), _with_room(values)
+        num_slots = self._of_layers[0][0].shape[1]
+        self._next = torch.arange(len(lengths), device=lengths.device) * num_slots + lengths
 
     def update(self, keys: Tensor, values: Tensor, layer: int, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
-        """Add the keys and values of new tokens, [B, heads, L, D / heads]; return those of all tokens."""
-        if layer in self._of_layers:
-            before = self._of_layers[layer]
-            keys, values = torch.cat([before[0], keys], dim=2), torch.cat([before[1], values], dim=2)
-        self._of_layers[layer] = keys, values
-        return keys, values
+        """Add the keys and values of new tokens, [B, heads, L, D / heads]; return those of all tokens.
+
+        Behind a conversation's own tokens, the result has those of padding or of forgotten tokens, or zeros.
+        """
+        new = keys.transpose(1, 2), values.transpose(1, 2)
+        if self._next is None:
+            self._of_layers[layer] = _with_room(new[0]), _with_room(new[1])
+            return keys, values
+        kept = self._of_layers[layer]
+        for slots, tokens in zip(kept, new, strict=True):
+            slots.flatten(0, 1).index_copy_(0, self._next, tokens.flatten(0, 1))
+        return kept[0][:, : self._num_seen].transpose(1, 2), kept[1][:, : self._num_seen].transpose(1, 2)
+
+
+def _with_room(slots: Tensor) -> Tensor:
+    """Return a copy with ROOM more slots: [B, S, heads, D / heads] -> [B, S + ROOM, heads, D / heads].
+
+    The new slots are zeros: attention must not meet a NaN, even where a mask gives it no weight.
+    """
+    return F.pad(slots, (0, 0, 0, 0, 0, ROOM))
 
 
 def last_hidden_state(
@@ -318,20 +354,26 @@ def last_hidden_state(
 
 
 def next_hidden_state(
-    language: Any, tokens: Tensor, position_ids: Tensor, is_seen: Tensor, key_values: KeyValues
+    language: Any, tokens: Indices, position_ids: Indices, lengths: Indices, key_values: KeyValues
 ) -> Tensor:
     """Return the hidden state of each conversation's next token behind the final norm, [B, D].
 
     tokens: int64 [B]
     position_ids: int64 [B], equal in time, row and column, since the token is text
-    is_seen: bool [B, L], the tokens so far, this one included, that are not padding
-    key_values: of the tokens before; receives this token's
+    lengths: int64 [B], number of tokens before
+    key_values: of the tokens before; receives this token's, and forgets those of all others
     """
-    hidden = language.embed_tokens(tokens[:, None])
-    turned = language.rotary_emb(hidden, position_ids[None, :, None].expand(3, -1, -1))
+    device = language.embed_tokens.weight.device
+    ids, at, before = torch.from_numpy(np.stack([tokens, position_ids, lengths])).to(device)
+    longest, is_seen = int(lengths.max()), None
+    if int(lengths.min()) < longest:  # else no mask, with which PyTorch's fastest attention would not do
+        is_seen = (torch.arange(longest + 1, device=device) <= before[:, None])[:, None, None]
+    key_values.place(before, longest)
+    hidden = language.embed_tokens(ids[:, None])
+    turned = language.rotary_emb(hidden, at[None, :, None].expand(3, -1, -1))
     options = _cached(language, key_values)
     for layer in language.layers:
-        hidden = layer(hidden, position_embeddings=turned, attention_mask=is_seen[:, None, None], **options)
+        hidden = layer(hidden, position_embeddings=turned, attention_mask=is_seen, **options)
         hidden = hidden[0] if isinstance(hidden, tuple) else hidden
     return language.norm(hidden)[:, 0]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,10 @@ from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
+from rfm.roboreward.predictor import RoboRewardPredictor, WrittenAnswer
 from rfm.roboreward.prompts import is_unclear, parsed
+from rfm.vlm.collator import VlmRow
+from rfm.vlm.qwen import ROOM
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Trajectory
 from rfm_client.contract import InferenceFailedError, InvalidSampleError
 
@@ -195,11 +199,115 @@ def test_dense_mode_scores_each_prefix_alone(engine: Engine) -> None:
         assert dense.progress[end] == alone.progress[-1]
 
 
-def test_every_token_is_progress_of_the_batch(engine: Engine) -> None:
+PASSES = {"score4_T7": 2, "fallback_digits_T2": 8, "lower_T2": 8}  # 'ANSWER: 4', 'Score 2 of 5', 'answer: 3'
+
+
+@pytest.mark.parametrize("name", PASSES)
+def test_a_usual_answer_takes_two_passes_and_every_pass_is_progress_of_the_batch(engine: Engine, name: str) -> None:
     steps: list[int] = []
-    case = next(case for case in CASES if case.file.stem == "score4_T7")
-    engine.evaluate(case.samples(), Execution(on_forward=lambda: steps.append(1)))
-    assert len(steps) == len(case.content["generations"][0]["generated_tokens"]) + 1  # and the pass as a whole
+    engine.evaluate(samples_named(name), Execution(on_forward=lambda: steps.append(1)))
+    assert len(steps) == PASSES[name] + 1  # and the batch as a whole
+
+
+def writer(dtype: torch.dtype = torch.float32, **settings: Any) -> RoboRewardPredictor:
+    checkpoint: Any = families.load(CHECKPOINT, reward_model="roboreward")
+    changed = replace(checkpoint, config=replace(checkpoint.config, **settings))
+    predictor = Engine.of(changed, dtype=dtype).predictor
+    assert isinstance(predictor, RoboRewardPredictor)
+    return predictor
+
+
+def written(
+    predictor: RoboRewardPredictor, rows: Sequence[VlmRow], draft: Sequence[int]
+) -> tuple[list[WrittenAnswer], int]:
+    """The answers, and the number of passes."""
+    predictor.collator.draft = np.array(draft, np.int64)
+    passes: list[int] = []
+    answers, _ = predictor.write(rows, predictor.collate(rows), Execution(on_forward=lambda: passes.append(1)))
+    return answers, len(passes)
+
+
+OTHER = 5  # a token that no answer has
+# The draft, and the number of its tokens that are accepted, for an answer and the token that ends it.
+DRAFTS: dict[str, Callable[[list[int], int], tuple[list[int], int]]] = {
+    "beginning": lambda answer, _: (answer[:3], 3),
+    "whole answer": lambda answer, _: (answer, len(answer)),
+    "half right": lambda answer, _: ([*answer[:2], OTHER, *answer[3:]], 2),
+    "wrong": lambda answer, _: ([OTHER] * 4, 0),
+    "goes on behind the end": lambda answer, end: ([*answer, end, OTHER, OTHER], len(answer) + 1),
+}
+SETTINGS: dict[str, dict[str, Any]] = {
+    "as published": {},
+    "shorter than a draft": {"max_new_tokens": 2},
+    "longer than the room for keys and values": {"max_new_tokens": 2 * ROOM + 3, "stops": ()},
+}
+MIXED = ("T1_single", "fallback_digits_T2", "odd_task_T3")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_a_draft_changes_no_answer(settings: dict[str, Any], dtype: torch.dtype) -> None:
+    predictor = writer(dtype, **settings)
+    rows = [row for name in MIXED for sample in samples_named(name) for row in predictor.rows(sample)]
+    plain = [written(predictor, [row], []) for row in rows]
+    expected, num_passes = [answer for (answer,), _ in plain], plain[0][1]
+    for name, drafted in DRAFTS.items():
+        draft, num_right = drafted(expected[0].tokens, CASES[0].summary["eos_token_id"][0])
+        alone, num_drafted = written(predictor, rows[:1], draft)
+        assert num_drafted == max(1, num_passes - num_right), name
+        together, _ = written(predictor, rows, draft)
+        for answer, told in zip([*alone, *together], [expected[0], *expected], strict=True):
+            assert answer.tokens == told.tokens, name
+            assert answer.is_finite
+            assert (answer.digit_logits is None) == (told.digit_logits is None)
+            if answer.digit_logits is not None:
+                atol = EXACT if dtype == torch.float32 else ROUNDED
+                np.testing.assert_allclose(answer.digit_logits, told.digit_logits, rtol=0, atol=atol)
+
+
+NOT_FINITE_AT = {  # for each draft, after how many of its tokens, and whether the answer is lost
+    "behind an accepted token": ("whole answer", 2, True),
+    "behind a rejected token": ("wrong", 2, False),
+    "behind the end": ("goes on behind the end", 6, False),
+}
+
+
+@pytest.mark.parametrize(("kind", "at", "is_lost"), NOT_FINITE_AT.values(), ids=NOT_FINITE_AT)
+def test_only_the_logits_of_an_answer_s_own_tokens_must_be_finite(kind: str, at: int, is_lost: bool) -> None:
+    predictor = writer()
+    rows = predictor.rows(samples_named("T1_single")[0])
+    (expected,), _ = written(predictor, rows, [])
+    draft, _ = DRAFTS[kind](expected.tokens, CASES[0].summary["eos_token_id"][0])
+    is_first = iter([True])
+
+    def spoil(_: Any, __: Any, logits: torch.Tensor) -> None:
+        if next(is_first, False):
+            logits[at] = torch.nan
+
+    predictor.network.lm_head.register_forward_hook(spoil)
+    (answer,), _ = written(predictor, rows, draft)
+    assert answer.is_finite is not is_lost
+    assert is_lost or answer.tokens == expected.tokens
+
+
+@pytest.mark.parametrize(
+    ("names", "has_mask"),
+    [(["score4_T7"], False), (["lower_T2"], False), (["score1_T4"] * 2, False), (["score1_T4", "score4_T7"], True)],
+    ids=["alone", "alone, with a wrong draft", "equal lengths", "other lengths"],
+)
+def test_only_conversations_of_other_lengths_need_a_mask(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, names: list[str], has_mask: bool
+) -> None:
+    masks: list[bool] = []
+    attend = torch.nn.functional.scaled_dot_product_attention
+
+    def attending(*arguments: Any, attn_mask: Any = None, **options: Any) -> torch.Tensor:
+        masks.append(attn_mask is not None)
+        return attend(*arguments, attn_mask=attn_mask, **options)
+
+    monkeypatch.setattr(torch.nn.functional, "scaled_dot_product_attention", attending)
+    engine.evaluate([sample for name in names for sample in samples_named(name)])
+    assert any(masks) is has_mask
 
 
 def test_logits_that_are_not_finite_are_a_failure_and_no_answer() -> None:
