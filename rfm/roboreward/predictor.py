@@ -62,8 +62,8 @@ class RoboRewardPredictor(VlmPredictor):
         if self._config.is_expected:
             output = self._output(batch)
             logits = output.logits[:, self.collator.digits].float()
-            progress = progress_from_logits(logits).cpu().numpy()
-            scores = [_scores(float(progress[i]), logits[i].cpu().numpy(), row) for i, row in enumerate(rows)]
+            read = zip(progress_from_logits(logits).tolist(), logits.cpu().numpy(), rows, strict=True)
+            scores = [_scores(progress, of_digits, row) for progress, of_digits, row in read]
             made = output.made
         else:
             answers, made = self.write(rows, batch, execution)
@@ -84,14 +84,10 @@ class RoboRewardPredictor(VlmPredictor):
 
         execution: its ``on_forward`` is called after each forward pass
         """
-        key_values, draft = KeyValues(), self.collator.draft
+        key_values = KeyValues()
         output = self._output(batch, key_values)
-        tokens, digit_logits = self._likeliest(output.logits.unflatten(0, (len(rows), len(draft) + 1)))
-        num_right = (tokens[:, :-1] == draft).cumprod(axis=1).sum(axis=1)
-        answers = [WrittenAnswer() for _ in rows]
-        for index, answer in enumerate(answers):
-            for step in range(num_right[index] + 1):
-                self._add(answer, tokens[index, step], digit_logits[index, step])
+        tokens, digit_logits = self._likeliest(output.logits.unflatten(0, (len(rows), -1)))
+        answers, num_right = self._begun(tokens, digit_logits)
         execution.on_forward()
         tokens = tokens[np.arange(len(rows)), num_right]
         lengths = np.array([row.num_tokens for row in rows]) + num_right
@@ -106,6 +102,18 @@ class RoboRewardPredictor(VlmPredictor):
             execution.on_forward()
             lengths, positions = lengths + 1, positions + 1
         return answers, output.made
+
+    def _begun(self, tokens: Indices, digit_logits: Float32Array) -> tuple[list[WrittenAnswer], Indices]:
+        """Return the answers after the first pass, and how many of the draft's tokens each answer accepts.
+
+        tokens, digit_logits: int64 [B, N + 1], float32 [B, N + 1, 5], behind the prompt and each token of the draft
+        """
+        num_right: Indices = (tokens[:, :-1] == self.collator.draft).cumprod(axis=1).sum(axis=1)
+        answers = [WrittenAnswer() for _ in tokens]
+        for index, answer in enumerate(answers):
+            for step in range(num_right[index] + 1):
+                self._add(answer, tokens[index, step], digit_logits[index, step])
+        return answers, num_right
 
     def _likeliest(self, logits: Tensor) -> tuple[Indices, Float32Array]:
         """Return the likeliest tokens, or NOT_FINITE, and the logits of SCORES: [..., V] -> int64 [...], [..., 5]."""

@@ -12,11 +12,12 @@ import torch
 import goldens
 from engines import TRANSFORMERS, load_engine
 from pretended import CUDA, Seen, pretended
+from reward_models import references
 from rfm import families
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.triton_model.placement import Placement
-from rfm_client import PreferenceSample, ProgressSample, Sample
+from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Sample
 from vlm import PLAIN, assert_close, video
 
 
@@ -65,6 +66,19 @@ def test_a_device_gives_the_reference_answers_and_waits_no_more_often_than_it_mu
     if config.name in WAITS:
         assert seen.asked.total() - asked <= WAITS[config.name][0]
         assert seen.awaited - awaited <= WAITS[config.name][1]
+
+
+def test_a_device_writes_the_answers_of_the_original(seen: Seen) -> None:
+    names = ["T1_single", "fallback_digits_T2", "lower_T2"]  # 'ANSWER: 2', 'Score 2 of 5', 'answer: 3'
+    cases = [next(case for case in references("roboreward") if case.file.stem == name) for name in names]
+    checkpoint = families.load(cases[0].config / "checkpoint", reward_model="roboreward")
+    with torch.inference_mode():
+        engine = Engine.of(checkpoint, device=CUDA, dtype=torch.float32)
+    results = engine.evaluate([case.samples()[0] for case in cases])
+    assert seen.num_operators > 100
+    for result, case in zip(results, cases, strict=True):
+        assert isinstance(result, ProgressResult), result
+        assert result.last_progress == case.content["generations"][0]["parsed_score"] / 4 - 0.25
 
 
 MIXED: list[Sample] = [

@@ -223,7 +223,9 @@ def written(
     """The answers, and the number of passes."""
     predictor.collator.draft = np.array(draft, np.int64)
     passes: list[int] = []
-    answers, _ = predictor.write(rows, predictor.collate(rows), Execution(on_forward=lambda: passes.append(1)))
+    batch = predictor.collate(rows)
+    assert batch.inputs["input_ids"].shape[1] == max(map(predictor.num_tokens, rows))
+    answers, _ = predictor.write(rows, batch, Execution(on_forward=lambda: passes.append(1)))
     return answers, len(passes)
 
 
