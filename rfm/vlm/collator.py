@@ -116,14 +116,16 @@ class VlmCollator:
     def to_size(
         self, video: VlmVideo, cache: FeatureCache[Any] | None = None, threads: FrameThreads = IN_TURN
     ) -> SizedFrames:
-        """Resize a video's frames for the backbone.
+        """Resize the frames of a video's shots for the backbone.
 
         cache: frames of shots in it need no resizing; None: no cache
         threads: prepare the frames
         """
-        frames = np.arange(len(video.frames))
         keys = {shot: (id(video), shot) for shot in video.shots(are_images=self.config.multi_image)}
-        return SizedFrames(self._all_to_size(video, frames.tolist(), threads), frames, keys)
+        needed = sorted({frame for shot in keys for frame in shot})
+        places = np.full(len(video.frames), -1)
+        places[needed] = np.arange(len(needed))
+        return SizedFrames(self._all_to_size(video, needed, threads), places, keys)
 
     def _all_to_size(self, video: VlmVideo, needed: Sequence[int], threads: FrameThreads) -> Tensor:
         parts = threads.parts(partial(self._to_size, video), needed)

@@ -41,7 +41,7 @@ def engine_there(name: str, feature_cache_mib: int = 0) -> Engine:
 WAITS = {
     "c1_t1_disc10": (5, 11),  # progress, its logits, success, questions twice; the parts of a batch
     "legacy_keys_l2": (4, 11),
-    "enc_c1_t1_disc10": (12, 16),
+    "enc_c1_t1_disc10": (8, 15),
     **{config.name: (40 if config.name.startswith("smol") else 1, 0) for config in goldens.VLM},
 }
 

@@ -112,6 +112,15 @@ def test_the_frames_of_a_lone_sample_are_divided_among_the_threads(monkeypatch: 
     assert_close(result, expected, 1e-5)
 
 
+def test_only_frames_that_the_model_sees_are_resized() -> None:
+    collator = Engine.from_checkpoint(str(ASKED), reward_model="topreward-robometer,num_prefixes=3").predictor.collator  # type: ignore[attr-defined]
+    rows = collator.rows(ProgressSample(video(0, 20, 64, 64)))
+    sized = collator.to_size(rows[0].videos[0])
+    seen = {int(frame) for row in rows for frame in row.picked}
+    assert len(sized.pixels) == len(seen) < 20
+    assert {int(frame) for frame in np.flatnonzero(sized.places >= 0)} == seen
+
+
 def test_a_frame_of_several_prefixes_makes_one_round_trip_through_jpeg(monkeypatch: pytest.MonkeyPatch) -> None:
     as_jpeg, made = prompts.as_jpeg, []
 
