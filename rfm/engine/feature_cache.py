@@ -10,8 +10,10 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from rfm.engine.threads import FrameThreads
 from rfm_client.contract import RewardError
-from rfm_client.contract.samples import Float32Array
+from rfm_client.contract.frame_refs import frame_digest
+from rfm_client.contract.samples import Float32Array, UInt8Array
 
 BYTES_PER_MIB = 2**20
 _ENTRY_BYTES = 256  # of a key, the array's header and the entry in the ordered dict
@@ -73,6 +75,12 @@ class FeatureCache(Generic[Kept]):
                 self.num_bytes -= array.nbytes + _ENTRY_BYTES
 
 
+def digests_of(frames: Sequence[UInt8Array], threads: FrameThreads) -> list[bytes]:
+    """Return the digest of each frame, uint8 [H, W, 3], computed in these threads."""
+    parts = threads.parts(lambda part: [frame_digest(frame) for frame in part], frames)
+    return [digest for part in parts for digest in part]
+
+
 def get_or_make(
     cache: FeatureCache[Float32Array],
     wanted: Iterable[bytes],
@@ -88,8 +96,8 @@ def get_or_make(
     is_always_made: True for a source whose cached features must not be used
     """
     wanted = list(dict.fromkeys(wanted))
-    kept = cache.found(key for key in wanted if key not in sources or not is_always_made(sources[key]))
-    found = {key: kept[key] for key in wanted if key in kept}
+    kept = cache.found(wanted)
+    found = {key: kept[key] for key in wanted if key in kept and not (key in sources and is_always_made(sources[key]))}
     missing = [key for key in wanted if key not in found and key in sources]
     made = dict(zip(missing, make([sources[key] for key in missing]) if missing else [], strict=True))
     good = {key: each for key, each in made.items() if not isinstance(each, RewardError)}

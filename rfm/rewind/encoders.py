@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import groupby, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,11 @@ import torch
 from torch import Tensor
 
 from rfm.checkpoint.content import PREPROCESSOR_CONFIG, read_json
+from rfm.engine.device import Copies
 from rfm.engine.execution import Execution
-from rfm.engine.feature_cache import FeatureCache, get_or_make
+from rfm.engine.feature_cache import FeatureCache, digests_of, get_or_make
 from rfm.engine.layers import as_tensor, speed_up
+from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.family import EncodersDescription
 from rfm.rewind.pretrained import (
     IMAGE_MODELS,
@@ -39,7 +41,6 @@ from rfm_client.contract.samples import EncoderSample, Float32Array, UInt8Array
 IMAGE_ENCODER_FOLDER = "image_encoder"  # in an exported version of a model with encoders
 TEXT_ENCODER_FOLDER = "text_encoder"
 IMAGES_PER_FORWARD = 64
-FRAMES_TOGETHER = 16  # frames that are stacked (a copy) and resized in one call
 MAX_ENCODER_ASPECT_RATIO = 50
 
 
@@ -53,6 +54,7 @@ class Encoders:
         for model in (image_model, text_model):
             speed_up(model)
         self.tokenizer = tokenizer
+        self.threads, self._copies = IN_TURN, Copies(torch.device("cpu"))
 
     @classmethod
     def from_pretrained(
@@ -108,6 +110,7 @@ class Encoders:
         """Move both encoders to ``device``, and return them."""
         self.image_model.to(device)
         self.text_model.to(device)
+        self.threads, self._copies = FrameThreads.of(device), Copies(device)
         return self
 
     @property
@@ -173,17 +176,14 @@ class Encoders:
             execution.num_encoded += sum(map(len, whole))
             return self.encode_frames(whole, execution), self.encode_tasks(tasks, execution)
         with execution.collating():
-            named = [
-                each if isinstance(each, TrajectoryRefs) else TrajectoryRefs.of(each.positions, each.task)
-                for each in trajectories
-            ]
+            named = self._named(trajectories)
             pixels = dict(pair for each in named for pair in each.pixels.items())
         wanted = (digest for each in named for digest in each.digests)
         images, num_made = get_or_make(
             cache,
             wanted,
             pixels,
-            lambda frames: self._each_frame(frames, execution),
+            lambda frames: self._images(frames, execution),
             is_always_made=lambda frame: not frame.any(),  # the probe's frames: a cached result would prove nothing
         )
         execution.num_encoded += num_made
@@ -193,41 +193,43 @@ class Encoders:
         execution.cache_bytes = cache.num_bytes
         return [_of_named(each, images) for each in named], [texts[task_digest(task)] for task in tasks]
 
-    def _each_frame(
-        self, frames: Sequence[UInt8Array], execution: Execution
-    ) -> Sequence[Float32Array | InferenceFailedError]:
-        """Return float32 [Dv] of each frame [H, W, 3], or its error."""
-        by_size = sorted(range(len(frames)), key=lambda index: frames[index].shape)
-        sizes = groupby(by_size, key=lambda index: frames[index].shape)
-        same = [list(of_size) for _, of_size in sizes]
-        parts = [each[at : at + FRAMES_TOGETHER] for each in same for at in range(0, len(each), FRAMES_TOGETHER)]
-        images = self._images([np.stack([frames[index] for index in part]) for part in parts], execution)
-        made = [image for image in images if isinstance(image, Tensor)]
-        read = iter(torch.stack(made).float().cpu().numpy() if made else ())
-        outcomes = [next(read) if isinstance(image, Tensor) else image for image in images]
-        of_index = dict(zip([index for part in parts for index in part], outcomes, strict=True))
-        return [of_index[index] for index in range(len(frames))]
+    def _named(self, trajectories: Sequence[Trajectory | TrajectoryRefs]) -> list[TrajectoryRefs]:
+        """Return each trajectory with the digests of its frames."""
+        whole = [each.positions for each in trajectories if isinstance(each, Trajectory)]
+        digests = iter(digests_of([frame for frames in whole for frame in frames], self.threads))
+        return [
+            each
+            if isinstance(each, TrajectoryRefs)
+            else TrajectoryRefs.of(each.positions, each.task, islice(digests, each.num_frames))
+            for each in trajectories
+        ]
 
-    @torch.inference_mode()
     def encode_frames(
         self, videos: Sequence[UInt8Array], execution: Execution | None = None
-    ) -> list[Float32Array | InferenceFailedError]:
+    ) -> list[Float32Array | RewardError]:
         """Encode videos, uint8 [T, H, W, 3] each; return float32 [T, Dv] or an error for each."""
-        images = iter(self._images(videos, execution or Execution()))
+        images = iter(self._images([frame for video in videos for frame in video], execution or Execution()))
         return [_of_video(list(islice(images, len(video)))) for video in videos]
 
     @torch.inference_mode()
-    def _images(self, videos: Sequence[UInt8Array], execution: Execution) -> list[Tensor | InferenceFailedError]:
-        """Return [Dv] of each frame of all videos, on the device, or its error."""
+    def _images(
+        self, frames: Sequence[UInt8Array], execution: Execution
+    ) -> Sequence[Float32Array | InferenceFailedError]:
+        """Return float32 [Dv] of each frame [H, W, 3], or its error. The frames may differ in size."""
 
         def forward(crops: Tensor) -> list[Tensor]:
-            output = self.image_model(pixel_values=crops.to(self.image_model.device))
+            sent = self._copies.send(crops)
+            self._copies.wait_for([sent])
+            output = self.image_model(pixel_values=self.preprocessor.normalised(sent))
             num_tokens = output.last_hidden_state.shape[:2].numel()
             execution.add_tokens(num_tokens, num_tokens)
             return list(output.pooler_output.clone())  # a view would keep the states of all tokens in memory
 
-        batches = self._crop_batches(videos, execution)
-        return [image for crops in batches for image in execution.run(forward, crops)]
+        # A GPU computes these while the CPU prepares the next crops, until the embeddings are read.
+        images = [image for crops in self._crop_batches(frames, execution) for image in execution.run(forward, crops)]
+        made = [image for image in images if isinstance(image, Tensor)]
+        read = iter(torch.stack(made).float().cpu().numpy() if made else ())
+        return [next(read) if isinstance(image, Tensor) else image for image in images]
 
     @torch.inference_mode()
     def encode_tasks(
@@ -237,30 +239,26 @@ class Encoders:
         execution = execution or Execution()
 
         def forward(part: list[str]) -> list[Float32Array]:
-            tokens = self._tokenize(part, padding=True, return_tensors="pt").to(self.text_model.device)
+            tokens = self._tokenize(part, padding=True, return_tensors="pt")
+            num_tokens = int(tokens["attention_mask"].sum())
+            tokens = tokens.to(self.text_model.device)
             hidden = self.text_model(**tokens).last_hidden_state
-            execution.add_tokens(int(tokens["attention_mask"].sum()), tokens["attention_mask"].numel())
+            execution.add_tokens(num_tokens, tokens["attention_mask"].numel())
             mask = tokens["attention_mask"].unsqueeze(-1).to(hidden.dtype)
             return list(((hidden * mask).sum(dim=1) / mask.sum(dim=1)).float().cpu().numpy())
 
         return execution.run(forward, list(tasks))
 
-    def _crop_batches(self, videos: Sequence[UInt8Array], execution: Execution) -> Iterator[Tensor]:
-        """Yield the crops of all videos' frames in order, IMAGES_PER_FORWARD at a time across videos."""
-        waiting: list[Tensor] = []
-        room = IMAGES_PER_FORWARD
-        for video in videos:
-            start = 0
-            while start < len(video):
-                images = as_tensor(video[start : start + room])
-                with execution.collating():  # on the CPU: only there PyTorch resizes uint8 with antialiasing
-                    waiting.append(self.preprocessor(images))
-                start, room = start + len(images), room - len(images)
-                if not room:
-                    yield torch.cat(waiting)
-                    waiting, room = [], IMAGES_PER_FORWARD
-        if waiting:
-            yield torch.cat(waiting)
+    def _crop_batches(self, frames: Sequence[UInt8Array], execution: Execution) -> Iterator[Tensor]:
+        """Yield the crops of the frames in order, uint8 [N, H', W', 3], IMAGES_PER_FORWARD at a time."""
+        for start in range(0, len(frames), IMAGES_PER_FORWARD):
+            with execution.collating():
+                parts = self.threads.parts(self._crops, frames[start : start + IMAGES_PER_FORWARD])
+                crops = parts[0] if len(parts) == 1 else torch.cat(parts)
+            yield crops
+
+    def _crops(self, frames: Sequence[UInt8Array]) -> Tensor:
+        return torch.cat([self.preprocessor.crops(as_tensor(frame)[None]) for frame in frames])
 
     def _check_task(self, task: str) -> None:
         """Raise InvalidSampleError for an empty task, or a task beyond the text encoder's limit: none is truncated."""
@@ -285,24 +283,16 @@ def _of_named(
     trajectory: TrajectoryRefs, images: Mapping[bytes, Float32Array | RewardError]
 ) -> Float32Array | RewardError:
     """Return float32 [T, Dv] of a trajectory, or its error."""
-    frames = []
-    for digest in trajectory.digests:
-        if digest not in images:
-            unknown = sum(each not in images for each in trajectory.digests)
-            return InvalidSampleError.at(wire.FRAME_DIGESTS, wire.UNKNOWN_FRAMES, f"{unknown} others")
-        image = images[digest]
-        if isinstance(image, RewardError):
-            return image
-        frames.append(image)
-    return np.stack(frames)
+    unknown = sum(digest not in images for digest in trajectory.digests)
+    if unknown:
+        return InvalidSampleError.at(wire.FRAME_DIGESTS, wire.UNKNOWN_FRAMES, f"{unknown} others")
+    return _of_video([images[digest] for digest in trajectory.digests])
 
 
-def _of_video(images: Sequence[Tensor | InferenceFailedError]) -> Float32Array | InferenceFailedError:
+def _of_video(images: Sequence[Float32Array | RewardError]) -> Float32Array | RewardError:
     """Stack the frames' embeddings to float32 [T, Dv]; the first error replaces them."""
-    for image in images:
-        if isinstance(image, InferenceFailedError):
-            return image
-    return torch.stack(images).float().cpu().numpy()  # type: ignore[arg-type]  # all are tensors
+    error = next((image for image in images if isinstance(image, RewardError)), None)
+    return np.stack(images) if error is None else error  # type: ignore[arg-type]  # all are arrays
 
 
 def _embedded(

@@ -15,6 +15,7 @@ from torch import Tensor
 from rfm.checkpoint.content import MAX_UINT8, PIL_BICUBIC, PREPROCESSOR_CONFIG, is_there, read_json
 from rfm.checkpoint.hub import local_copy
 from rfm.checkpoint.weights import check_one_form, check_values
+from rfm.engine.pixels import Normalisation
 from rfm_client.contract.frame_size import FrameSize
 
 IMAGE_MODELS = ("dinov2", "dinov2_with_registers")  # types whose pooled output is that of the class token
@@ -117,9 +118,18 @@ class ImagePreprocessor:
 
     def __call__(self, images: Tensor) -> Tensor:
         """Preprocess images on the CPU: uint8 [N, H, W, C = 3] -> float32 [N, C, *crop_px]."""
-        crops = self._crop(self._resize(images.permute(0, 3, 1, 2))).float()
-        mean, std = (torch.tensor(values).view(-1, 1, 1) * MAX_UINT8 for values in (self.mean, self.std))
-        return (crops - mean) / std
+        return self.normalised(self.crops(images))
+
+    def crops(self, images: Tensor) -> Tensor:
+        """Resize and crop images: uint8 [N, H, W, C] -> [N, *crop_px, C].
+
+        On the CPU: only there PyTorch resizes uint8 with antialiasing.
+        """
+        return self._crop(self._resize(images.permute(0, 3, 1, 2))).permute(0, 2, 3, 1)
+
+    def normalised(self, crops: Tensor) -> Tensor:
+        """Normalise crops on any device: uint8 [N, *crop_px, C] -> float32 [N, C, *crop_px]."""
+        return Normalisation(self.mean, self.std)(crops)
 
     def _resize(self, images: Tensor) -> Tensor:
         height, width = images.shape[-2:]

@@ -13,11 +13,12 @@ from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, re
 from rfm.checkpoint.provenance import HUB_FOLDER, Decision
 from rfm.checkpoint.run_config import find_run_config
 from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.pixels import Normalisation
 from rfm.family import Description, Options
 from rfm.roboreward.predictor import RoboRewardPredictor
 from rfm.roboreward.prompts import SCORES, RoboRewardCollator, RoboRewardConfig
 from rfm.vlm.collator import QWEN3
-from rfm.vlm.images import Normalisation, QwenImages
+from rfm.vlm.images import QwenImages
 from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork
 from rfm.vlm.language_folder import LanguageFolder, reward_model_of
 

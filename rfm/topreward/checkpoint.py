@@ -14,10 +14,10 @@ from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, re
 from rfm.checkpoint.hub import find
 from rfm.checkpoint.provenance import Decision
 from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.pixels import Normalisation
 from rfm.family import Description, Options
 from rfm.topreward.predictor import TopRewardPredictor
 from rfm.topreward.prompts import PROMPT_PREFIX, PROMPT_SUFFIX, TopRewardCollator, TopRewardConfig, TopRewardImages
-from rfm.vlm.images import Normalisation
 from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork, processor_name
 from rfm.vlm.language_folder import LanguageFolder, reward_model_of
 from rfm.vlm.preprocessor import (

@@ -15,7 +15,8 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
-from rfm.triton_model.placement import Placement, use_threads
+from rfm.engine.threads import use_threads
+from rfm.triton_model.placement import Placement
 from rfm.triton_model.request import Request
 from rfm.triton_model.watchdog import end
 

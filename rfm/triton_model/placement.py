@@ -12,6 +12,7 @@ import torch
 
 from rfm.engine.device import use
 from rfm.engine.layers import keep_float32
+from rfm.engine.threads import num_preparing, use_threads
 from rfm.parameters import THREADS_PARAMETER
 
 
@@ -24,8 +25,8 @@ class Placement:
 
     @property
     def num_preparing(self) -> int:
-        """Number of threads that prepare samples during scoring: all with a GPU, else 1."""
-        return self.num_threads if self.device.type == "cuda" else 1
+        """Number of requests that are prepared at the same time."""
+        return num_preparing(self.device, self.num_threads)
 
     @classmethod
     def of(cls, args: Mapping[str, str], config: Mapping[str, Any], settings: Mapping[str, str]) -> Placement:
@@ -47,12 +48,6 @@ class Placement:
         with ThreadPoolExecutor(1, "rfm-load") as thread:
             thread.submit(self.apply).result()
             thread.submit(work).result()
-
-
-def use_threads(number: int) -> None:
-    """Set the number of PyTorch's threads for the calling thread."""
-    torch.get_num_threads()  # else the first use takes the number of another thread
-    torch.set_num_threads(number)
 
 
 def num_instances(config: Mapping[str, Any]) -> int:

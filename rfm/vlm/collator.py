@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, TypeAlias
 
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import check_type
+from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.vlm.batch import FramesOfOneSize, QwenPixels, Shots, SmolPixels, VlmBatch
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages, SmolImages
 from rfm.vlm.network import VlmConfig
@@ -111,17 +113,26 @@ class VlmCollator:
             return [replace(row, picked=picked) for picked in videos[0].conversations]
         return [row]
 
-    def to_size(self, video: VlmVideo, cache: FeatureCache[Any] | None = None) -> SizedFrames:
-        """Resize a video's frames for the backbone.
+    def to_size(
+        self, video: VlmVideo, cache: FeatureCache[Any] | None = None, threads: FrameThreads = IN_TURN
+    ) -> SizedFrames:
+        """Resize the frames of a video's shots for the backbone.
 
         cache: frames of shots in it need no resizing; None: no cache
+        threads: prepare the frames
         """
-        frames = np.arange(len(video.frames))
         keys = {shot: (id(video), shot) for shot in video.shots(are_images=self.config.multi_image)}
-        return SizedFrames(self._to_size(video, frames.tolist()), frames, keys)
+        needed = sorted({frame for shot in keys for frame in shot})
+        places = np.full(len(video.frames), -1)
+        places[needed] = np.arange(len(needed))
+        return SizedFrames(self._all_to_size(video, needed, threads), places, keys)
+
+    def _all_to_size(self, video: VlmVideo, needed: Sequence[int], threads: FrameThreads) -> Tensor:
+        parts = threads.parts(partial(self._to_size, video), needed)
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
 
     def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
-        """Resize some of a video's frames to uint8 [N, H', W', 3]."""
+        """Resize some of a video's frames to uint8 [N, H', W', 3], each independent of the others. Thread-safe."""
         raise NotImplementedError
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
@@ -220,10 +231,13 @@ class QwenCollator(VlmCollator):
 
     images: QwenImages
 
-    def to_size(self, video: VlmVideo, cache: FeatureCache[Any] | None = None) -> SizedFrames:
+    def to_size(
+        self, video: VlmVideo, cache: FeatureCache[Any] | None = None, threads: FrameThreads = IN_TURN
+    ) -> SizedFrames:
         """Resize the frames of the shots that are not in the cache."""
         if cache is None:
-            return super().to_size(video)
+            return super().to_size(video, threads=threads)
+        video.compute_digests(threads)
         keys = self.shot_keys(video)
         found = cache.found(keys.values())
         kept = {key: found[key] for shot, key in keys.items() if key in found and not video.is_blank(shot)}
@@ -231,7 +245,7 @@ class QwenCollator(VlmCollator):
         needed = sorted({int(alike[frame]) for shot, key in keys.items() if key not in kept for frame in shot})
         places = np.full(len(video.frames), -1)
         places[needed] = np.arange(len(needed))
-        return SizedFrames(self._to_size(video, needed), places[alike], keys, kept)
+        return SizedFrames(self._all_to_size(video, needed, threads), places[alike], keys, kept)
 
     def shot_keys(self, video: VlmVideo) -> dict[Shot, Hashable]:
         """Return each shot's key: its size and its frames' digests, on which alone the shot's features depend."""

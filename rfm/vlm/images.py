@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rfm.checkpoint.content import MAX_UINT8, PIL_BICUBIC
+from rfm.engine.pixels import Normalisation
 from rfm_client.contract.samples import UInt8Array
 
 MERGE = 2
@@ -31,29 +31,6 @@ VIDEO_TOKENS = (128.0, 768.0)  # of a frame of a video
 VIDEO_TOTAL_TOKENS = 128_000 * 0.9  # of a whole video
 MAX_QWEN_ASPECT_RATIO = 200
 MAX_VIDEO_SIDE_PX = 480  # larger frames of videos are scaled down first
-
-
-@dataclass(frozen=True)
-class Normalisation:
-    """Normalisation of each channel's pixels: (value - 255 mean) / (255 std)."""
-
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-
-    def to_config(self) -> dict[str, Any]:
-        """Return the corresponding fields of preprocessor_config.json."""
-        return {"image_mean": self.mean, "image_std": self.std, "rescale_factor": 1 / MAX_UINT8}
-
-    def __call__(self, frames: Tensor) -> Tensor:
-        """Normalise pixels: uint8 [..., H, W, C] -> float32 [..., C, H, W]."""
-        mean, std = (_channels(values, frames.device) for values in (self.mean, self.std))
-        return (frames.movedim(-1, -3).float() - mean) / std
-
-
-@lru_cache
-def _channels(values: tuple[float, ...], device: torch.device) -> Tensor:
-    """Return values from 0 to 1 as grey levels, float32 [C, 1, 1], cached on the device."""
-    return (torch.tensor(values).view(-1, 1, 1) * MAX_UINT8).to(device)
 
 
 @dataclass(frozen=True)

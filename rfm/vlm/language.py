@@ -22,6 +22,7 @@ from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS, CheckpointError, exp
 from rfm.checkpoint.provenance import Decision, source_name
 from rfm.checkpoint.weights import check_shapes
 from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.pixels import Normalisation
 from rfm.engine.predictor import check_type
 from rfm.family import NETWORK, config_fields
 from rfm.vlm.batch import VlmBatch
@@ -35,7 +36,7 @@ from rfm.vlm.collator import (
     timed_groups,
     video_of,
 )
-from rfm.vlm.images import MERGE, Normalisation, QwenImages
+from rfm.vlm.images import MERGE, QwenImages
 from rfm.vlm.network import BackboneConfig, build_backbone, qwen_states
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.preprocessor import SIZED_BY_PROCESSOR, normalisation_of, patch_px

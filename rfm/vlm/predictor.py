@@ -16,6 +16,7 @@ from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.layers import progress_from_logits, speed_up
 from rfm.engine.predictor import RowScores, no_success, of_rows, part_of
+from rfm.engine.threads import FrameThreads
 from rfm.vlm.batch import Layout, VlmBatch
 from rfm.vlm.collator import VlmCollator, VlmRow
 from rfm.vlm.images import FRAMES_PER_GROUP
@@ -28,6 +29,7 @@ class VlmPredictor:
     """A vision-language reward model on a device.
 
     cache: holds frames, for frame references, and features of temporal patches; None: no cache
+    threads: prepare the frames of all samples
     """
 
     works_ahead = True
@@ -40,6 +42,7 @@ class VlmPredictor:
         self.collator = collator
         self.device = device
         self.cache = cache
+        self.threads = FrameThreads.of(device)
         self._copies = Copies(device)
         self._dtype = next(network.parameters()).dtype
         self._max_tokens = int(network.model.config.get_text_config().max_position_embeddings)
@@ -67,7 +70,7 @@ class VlmPredictor:
         """Resize the frames whose features are not cached, and start their copy to the device."""
         for video in (video for row in rows for video in row.videos):
             if video.sized is None:
-                sized = self.collator.to_size(video, self.cache)
+                sized = self.collator.to_size(video, self.cache, self.threads)
                 video.sized = replace(sized, pixels=self._copies.send(sized.pixels))
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:

@@ -22,7 +22,8 @@ from rfm.checkpoint.content import (
     shown,
 )
 from rfm.checkpoint.hub import local_copy
-from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Normalisation
+from rfm.engine.pixels import Normalisation
+from rfm.vlm.images import FRAMES_PER_GROUP, MERGE
 
 PROCESSOR_CONFIG = "processor_config.json"
 VIDEO_PREPROCESSOR_CONFIG = "video_preprocessor_config.json"

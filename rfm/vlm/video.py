@@ -15,10 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
+from rfm.engine.feature_cache import digests_of
 from rfm.engine.predictor import prefix_indices
+from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm_client.contract import InvalidSampleError, wire
-from rfm_client.contract.frame_refs import TrajectoryRefs, frame_digest
+from rfm_client.contract.frame_refs import TrajectoryRefs
 from rfm_client.contract.samples import UInt8Array
 
 Indices: TypeAlias = npt.NDArray[np.int64]
@@ -82,7 +84,12 @@ class VlmVideo:
     @cached_property
     def digests(self) -> Sequence[bytes]:
         """The digest of each frame."""
-        return self.named or tuple(map(frame_digest, self.frames))
+        return self.named or digests_of(list(self.frames), IN_TURN)
+
+    def compute_digests(self, threads: FrameThreads) -> None:
+        """Compute ``digests`` in these threads."""
+        if self.named is None:
+            self.digests = digests_of(list(self.frames), threads)
 
     @property
     def alike(self) -> Indices:
@@ -98,9 +105,9 @@ class VlmVideo:
         return self.named is None and not any(self.frames[frame].any() for frame in shot)
 
     def stack(self, needed: Sequence[int]) -> UInt8Array:
-        """Return the frames at ``needed``, uint8 [N, H, W, 3]; all frames of an array are not copied."""
-        if isinstance(self.frames, np.ndarray) and len(needed) == len(self.frames):
-            return self.frames
+        """Return the frames at ``needed`` (ascending), uint8 [N, H, W, 3]; neighbours in an array are not copied."""
+        if isinstance(self.frames, np.ndarray) and needed and needed[-1] - needed[0] == len(needed) - 1:
+            return self.frames[needed[0] : needed[-1] + 1]
         height, width = self.size
         return np.stack([self.frames[i] for i in needed]) if needed else np.empty((0, height, width, 3), np.uint8)
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
+from rfm.engine.pixels import Normalisation
 from rfm.rewind.encoders import ImagePreprocessor
-from rfm.vlm.images import Normalisation, QwenImages, SmolImages, fitted_size
+from rfm.vlm.images import QwenImages, SmolImages, fitted_size
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.resize import resize_frames

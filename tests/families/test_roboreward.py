@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from reward_models import Reference, references
 from rfm import families
@@ -20,7 +22,7 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.roboreward.predictor import RoboRewardPredictor, WrittenAnswer
-from rfm.roboreward.prompts import is_unclear, parsed
+from rfm.roboreward.prompts import as_jpeg, is_unclear, parsed
 from rfm.vlm.collator import VlmRow
 from rfm.vlm.qwen import ROOM
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Trajectory
@@ -73,6 +75,13 @@ def test_the_expected_value_is_that_of_the_digits_behind_answer(case: Reference)
         assert result.progress_logits is not None
         np.testing.assert_allclose(result.progress_logits[0], told["fp32_forced_digit_logits"], rtol=0, atol=EXACT)
         assert result.progress[-1] * 4 + 1 == pytest.approx(told["expected_score_fp32"], abs=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(48, 64, 3), (33, 57, 3)])
+def test_jpeg_has_the_pixels_of_the_original_which_optimises_its_tables(shape: tuple[int, ...]) -> None:
+    frame, file = np.random.default_rng(0).integers(0, 256, shape, np.uint8), io.BytesIO()
+    Image.fromarray(frame).save(file, format="JPEG", quality=85, optimize=True)
+    np.testing.assert_array_equal(as_jpeg(frame), np.asarray(Image.open(file)))
 
 
 @pytest.mark.reference

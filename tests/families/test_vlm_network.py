@@ -21,9 +21,10 @@ import goldens
 from engines import TRANSFORMERS, load_engine
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
+from rfm.engine.pixels import Normalisation
 from rfm.vlm.backbone import QWEN_2_5
 from rfm.vlm.collator import QwenCollator
-from rfm.vlm.images import Normalisation, QwenImages, fitted_size
+from rfm.vlm.images import QwenImages, fitted_size
 from rfm.vlm.qwen import embedded
 from rfm_client import PreferenceSample, ProgressSample, Sample
 from vlm import BFLOAT16, PLAIN, assert_close, predictor_of, upstream_inputs, video

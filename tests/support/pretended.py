@@ -19,7 +19,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-from rfm.engine import scoring
+from rfm.engine import scoring, threads
 
 CUDA = torch.device("cuda", 0)
 _ASKS = {"_local_scalar_dense", "item", "is_nonzero", "equal", "nonzero", "masked_select", "_unique2", "unique_dim"}
@@ -190,6 +190,7 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
     monkeypatch.setattr(torch.Tensor, "pin_memory", pin)
     monkeypatch.setattr(torch.Tensor, "record_stream", recorded("record_stream"))
     monkeypatch.setattr(torch, "autocast", lambda **_: contextlib.nullcontext())  # asks the device
-    monkeypatch.setattr(scoring, "ThreadPoolExecutor", Threads)
+    for module in (scoring, threads):
+        monkeypatch.setattr(module, "ThreadPoolExecutor", Threads)
     with Pretending(seen):
         yield seen

@@ -16,10 +16,11 @@ import torch
 
 from batch_models import BREAKS, CONFIG, FAILS, LOGGED, METRICS, REFUSED, WIDTHS, Model, Request, backend, request  # noqa: F401  a fixture
 from rfm.engine.execution import Execution
+from rfm.engine.threads import use_threads
 from rfm.probe_request import probe_request
 from rfm.triton_model import batch_model
 from rfm.triton_model.batch_model import GIVEN_UP_S
-from rfm.triton_model.placement import Placement, use_threads
+from rfm.triton_model.placement import Placement
 from rfm.triton_model.watchdog import FAILED_BATCHES, Watchdog
 from rfm_client import (
     FrameScores,

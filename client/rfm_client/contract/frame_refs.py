@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,10 +40,13 @@ class TrajectoryRefs:
         return len(self.digests)
 
     @classmethod
-    def of(cls, frames: UInt8Array, task: str) -> TrajectoryRefs:
-        """Return the trajectory of frames, uint8 [T, H, W, 3], with all pixels."""
-        digests = tuple(map(frame_digest, frames))
-        return cls(digests, dict(zip(digests, frames, strict=True)), task)
+    def of(cls, frames: UInt8Array, task: str, digests: Iterable[bytes] | None = None) -> TrajectoryRefs:
+        """Return the trajectory of frames, uint8 [T, H, W, 3], with all pixels.
+
+        digests: of the frames; None: they are computed here
+        """
+        known = tuple(map(frame_digest, frames) if digests is None else digests)
+        return cls(known, dict(zip(known, frames, strict=True)), task)
 
 
 @dataclass(frozen=True, eq=False)
