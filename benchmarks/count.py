@@ -4,12 +4,12 @@
     python benchmarks/count.py
 
 Prints a Markdown table. The networks and samples are those of real_size.py. They run on PyTorch's meta device, whose
-tensors have shapes but no values, so the counts do not depend on this machine. All engine code runs as on a GPU; what it
-reads from the device is 0, so a written answer has its full length.
+tensors have shapes but no values, so the counts do not depend on this machine. All code of the engine runs as on a GPU.
+What it reads from the device is 0, so a written answer has its full length.
 
-passes: of the network, and of each written token
+passes: of the language model, also for each written token
 padding: share of the tokens
-kernels: operators that compute; attention counts as one, as with a fused kernel
+kernels: operators that compute; attention and RMSNorm count as one each, as GPUs have kernels for them
 TFLOP: of matrix products and attention; half of the products of causal attention
 element-wise GB: tensors read and written by all other operators
 """
@@ -34,8 +34,18 @@ from rfm.engine.execution import Execution
 
 META = torch.device("meta")
 ATTENTION = torch.ops.aten.scaled_dot_product_attention.default
+RMS_NORM = torch.ops.aten.rms_norm.default
+ASKS = torch.ops.aten._local_scalar_dense.default
 READS = torch.ops.aten._to_copy.default
-ALLOCATIONS = {"empty", "empty_like", "empty_strided", "new_empty", "lift_fresh", "detach", "alias"}
+NO_KERNEL = {
+    "_unsafe_view",
+    "detach",
+    "empty",
+    "empty_like",
+    "empty_strided",
+    "lift_fresh",
+    "new_empty",
+}  # besides views
 COLUMNS = (
     "reward model", "samples", "frames", "size", "tokens", "padding", "passes", "kernels", "TFLOP", "element-wise GB",
 )  # fmt: skip
@@ -52,6 +62,8 @@ class Count(TorchDispatchMode):
         kwargs = kwargs or {}
         if func is ATTENTION:
             return self._attention(*args, **kwargs)
+        if func is RMS_NORM:
+            return self._rms_norm(args[0])
         with self:
             parts = func.decompose(*args, **kwargs)
         if parts is not NotImplemented:
@@ -59,10 +71,12 @@ class Count(TorchDispatchMode):
         read = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
         if func is READS and read[0].device == META and torch.device(kwargs.get("device") or META) != META:
             return torch.zeros(read[0].shape, dtype=kwargs.get("dtype") or read[0].dtype)
+        if func is ASKS:
+            return 0
         made = func(*args, **kwargs)
         written = [each for each in tree_leaves(made) if isinstance(each, Tensor)]
         name = func._schema.name.removeprefix("aten::")
-        if any(each.device == META for each in written) and not func.is_view and name not in ALLOCATIONS:
+        if any(each.device == META for each in written) and not func.is_view and name not in NO_KERNEL:
             self._add(func, args, kwargs, made, read + written)
         return made
 
@@ -84,6 +98,11 @@ class Count(TorchDispatchMode):
         shape = (*query.shape[:-1], value.shape[-1])
         return query.new_empty(shape[0], shape[2], shape[1], shape[3]).transpose(1, 2)
 
+    def _rms_norm(self, x: Tensor) -> Tensor:
+        self.num_kernels += 1
+        self.num_bytes += 2 * _num_bytes(x)
+        return torch.empty_like(x)
+
 
 def _num_bytes(tensor: Tensor) -> int:
     """Return the bytes of a tensor; repeated values count once."""
@@ -101,18 +120,15 @@ def counted(
     what: str, engine: Engine, device: torch.device, num_samples: int, num_frames: int, size_px: tuple[int, int]
 ) -> dict[str, Any]:
     """Return the row of a batch of noise videos."""
-    passes = 0
-
-    def on_forward() -> None:
-        nonlocal passes
-        passes += 1
-
-    execution = Execution(on_forward=on_forward)
+    execution, passes = Execution(), []
+    last: Any = engine.predictor.network.model.language_model.norm  # type: ignore[attr-defined]  # of these families
+    hook = last.register_forward_hook(lambda *_: passes.append(1))
     with without_autocast(), Count() as count:
         engine.evaluate(noise(num_samples, num_frames, size_px), execution)
+    hook.remove()
     row = (
         what, num_samples, num_frames, "x".join(map(str, size_px)), execution.num_tokens,
-        f"{execution.padding_ratio:.1%}", passes, count.num_kernels, f"{count.num_flop / 1e12:.2f}",
+        f"{execution.padding_ratio:.1%}", len(passes), count.num_kernels, f"{count.num_flop / 1e12:.2f}",
         f"{count.num_bytes / 1e9:.1f}",
     )  # fmt: skip
     typer.echo(f"| {' | '.join(map(str, row))} |")

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: MIT
+"""A pass of a model of a published size launches no more kernels than it did."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from paths import ROOT
+
+# Of a Robometer with 4 billion parameters, for a sample of 8 frames of 224x224; each layer more is 28 to 31.
+MOST_KERNELS = 1_570
+TOKENS, LEAST_TFLOP = 583, 5.3
+
+
+def test_a_pass_of_robometer_4b_launches_few_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    import count
+
+    def first(*what: Any) -> dict[str, Any]:
+        return count.counted(*what) if what[3:] == (1, 8, (224, 224)) else {}
+
+    rows = [row for row in count.robometer(torch.device("meta"), first) if row]
+    assert [(row["tokens"], row["passes"]) for row in rows] == [(TOKENS, 1)]
+    assert rows[0]["kernels"] <= MOST_KERNELS
+    assert float(rows[0]["TFLOP"]) > LEAST_TFLOP  # the whole network was counted
