@@ -13,10 +13,10 @@ from __future__ import annotations
 import json
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -39,9 +39,6 @@ SMALL_PX, USUAL_PX = (224, 224), (480, 640)
 ROUNDS = 3
 TASK = "put the red block in the bowl"
 
-# What to do with an engine: its name, the engine, its device, numbers of samples and frames, and the frames' size.
-Measure: TypeAlias = Callable[[str, Engine, torch.device, int, int, tuple[int, int]], dict[str, Any]]
-
 
 def of_real_size(config: Any, num_tokens: int) -> Any:
     """Return a small checkpoint's configuration with the sizes above."""
@@ -54,32 +51,27 @@ def random_network(network_class: Any, config: Any, device: torch.device) -> Any
     """Return a network with normally distributed weights on ``device``."""
     with device:
         network = network_class(config, build_backbone(config, torch.bfloat16))
-    torch.manual_seed(0)
+    generator = torch.Generator(device).manual_seed(0)
     for name, parameter in network.named_parameters():
         parameter.requires_grad_(False)
         parameter.data = parameter.data.bfloat16()
         if parameter.ndim > 1:
-            parameter.normal_(0, 0.02)
+            parameter.normal_(0, 0.02, generator=generator)
         else:
             parameter.fill_(0.0 if name.endswith("bias") else 1.0)
     return network
-
-
-def noise(num_samples: int, num_frames: int, size_px: tuple[int, int]) -> list[ProgressSample]:
-    """Return samples of noise videos."""
-    random = np.random.default_rng(0)
-    shape = (num_frames, *size_px, 3)
-    return [
-        ProgressSample(Trajectory(frames=random.integers(0, 256, shape, np.uint8), task=TASK))
-        for _ in range(num_samples)
-    ]
 
 
 def measured(
     what: str, engine: Engine, device: torch.device, num_samples: int, num_frames: int, size_px: tuple[int, int]
 ) -> dict[str, Any]:
     """Return the time and memory of a batch of noise videos: median of ROUNDS, after one to warm up."""
-    samples = noise(num_samples, num_frames, size_px)
+    random = np.random.default_rng(0)
+    shape = (num_frames, *size_px, 3)
+    samples = [
+        ProgressSample(Trajectory(frames=random.integers(0, 256, shape, np.uint8), task=TASK))
+        for _ in range(num_samples)
+    ]
     engine.evaluate(samples)
     torch.cuda.reset_peak_memory_stats(device)
     times_s = []
@@ -102,7 +94,7 @@ def measured(
     return row
 
 
-def robometer(device: torch.device, measure: Measure = measured) -> list[dict[str, Any]]:
+def robometer(device: torch.device) -> list[dict[str, Any]]:
     """Measure Robometer."""
     folder = GOLDEN / "vlm" / "q3_tok_disc10_bf16" / "checkpoint"
     small = families.load(folder, base_model=str(GOLDEN / "vlm" / "bases" / "q3"))
@@ -110,10 +102,10 @@ def robometer(device: torch.device, measure: Measure = measured) -> list[dict[st
     collator = type(small.collator)(config, small.collator.tokenizer, small.collator.images)  # type: ignore[attr-defined]  # of this family
     engine = Engine(VlmPredictor(random_network(VlmRewardModel, config, device), collator, device))
     sizes = [(size_px, count) for size_px in (SMALL_PX, USUAL_PX) for count in (1, 8, 32)]
-    return [measure("Robometer", engine, device, count, 8, size_px) for size_px, count in sizes]
+    return [measured("Robometer", engine, device, count, 8, size_px) for size_px, count in sizes]
 
 
-def asked_in_words(device: torch.device, measure: Measure = measured) -> list[dict[str, Any]]:
+def asked_in_words(device: torch.device) -> list[dict[str, Any]]:
     """Measure RoboReward and TOPReward, which share a network."""
     robo, top = "roboreward/rr_tied_bf16/checkpoint", "topreward/checkpoints/vlm_fp32_untied"
     network, rows = None, []
@@ -134,7 +126,7 @@ def asked_in_words(device: torch.device, measure: Measure = measured) -> list[di
         images = small.collator.images
         collator = scaled.make_collator(small.collator.tokenizer, VISION["patch_size"], images.normalisation)
         engine = Engine(predictor_class(network, collator, device), max_sample_tokens=10**6)
-        rows += [measure(reward_model, engine, device, *size) for size in sizes]
+        rows += [measured(reward_model, engine, device, *size) for size in sizes]
     return rows
 
 

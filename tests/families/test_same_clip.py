@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def progress(engine: Engine, samples: list[Sample]) -> Float32Array:
 @pytest.fixture(scope="module")
 def cold() -> dict[str, list[float]]:
     """Scores of the first pass of another process, by dtype."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [os.path.dirname(__file__), *sys.path]))}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(Path(__file__).parent), *sys.path]))}
     done = subprocess.run([sys.executable, "-c", COLD], env=environment, check=True, capture_output=True, text=True)
     return dict(json.loads(done.stdout))
 
