@@ -96,7 +96,9 @@ def test_bfloat16_on_a_gpu_is_near_float32_on_the_cpu() -> None:
     config = goldens.config(BFLOAT16)
     samples = [sample for case in config.cases() for sample in case.samples()]
     engine = Engine.from_checkpoint(config.checkpoint, **config.sources, device="cuda")
-    for left, right in zip(load_engine(BFLOAT16).evaluate(samples), engine.evaluate(samples), strict=True):
+    expected, together = load_engine(BFLOAT16).evaluate(samples), engine.evaluate(samples)
+    alone = [engine.evaluate([sample])[0] for sample in samples]
+    for left, right in [*zip(expected, together, strict=True), *zip(alone, together, strict=True)]:
         assert not isinstance(left, Exception), left
         assert not isinstance(right, Exception), right
         for a, b in zip(goldens.frame_scores(left), goldens.frame_scores(right), strict=True):
