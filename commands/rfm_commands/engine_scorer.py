@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +19,7 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.provenance import settings_digest, weights_digest
 from rfm.checkpoint.run_config import PROGRESS, SUCCESS
 from rfm.engine import Engine
+from rfm.engine.computation import computation
 from rfm.engine.execution import Execution
 from rfm.family import Checkpoint, FrameEncoders, config_fields
 from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
@@ -47,7 +49,8 @@ class EngineScorer:
         told |= {} if dtype is None else {"dtype": str(dtype)}
         told |= {"marks_unclear": True} if self._checkpoint.description.marks_unclear else {}
         folders = _folders(source, options)
-        self._facts = _facts(source, self._checkpoint, self._encoders, folders, told)
+        computed = computation(self._checkpoint, dtype, on_gpu=on.type != "cpu")
+        self._facts = replace(_facts(source, self._checkpoint, self._encoders, folders, told), computation=computed)
         self.notes = families.notes(folders[0], self._checkpoint, (PROGRESS, SUCCESS))
         self._device, self._dtype = on, dtype
         self._lock = threading.Lock()

@@ -20,6 +20,7 @@ from rfm.checkpoint.run_config import find_run_config
 from rfm.family import NETWORK, Checkpoint, EncodersDescription, config_fields
 from rfm.parameters import DTYPE_PARAMETER
 from rfm_client.contract.model_info import (
+    COMPUTATION_PARAMETER,
     DIGEST_PARAMETER,
     LICENSE_PARAMETER,
     NETWORK_PARAMETER,
@@ -29,7 +30,7 @@ from rfm_client.contract.model_info import (
     SOURCE_PARAMETER,
 )
 
-_OF_ORIGIN = (SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER, LICENSE_PARAMETER)
+_OF_ORIGIN = (SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER, LICENSE_PARAMETER, COMPUTATION_PARAMETER)
 _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for example hub_token, wandb_api_key
 
 

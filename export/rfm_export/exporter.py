@@ -20,9 +20,11 @@ from rfm.checkpoint.provenance import Decision, write
 from rfm.checkpoint.run_config import find_run_config
 from rfm.config import ExportConfig
 from rfm.engine import Engine
+from rfm.engine.computation import computation
 from rfm.family import Checkpoint, Description, Family, FrameEncoders, Options
 from rfm.parameters import CHECKPOINT_FOLDER, FAMILY_PARAMETER
 from rfm_client.contract import wire
+from rfm_client.contract.model_info import COMPUTATION_PARAMETER
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import about, origin_in, origin_of, record_digests
 from rfm_export.errors import ExportError
@@ -114,7 +116,10 @@ def _load(source: str | Path, settings: ExportConfig, family: str | None, say: S
     for note in families.notes(folder, checkpoint):
         say(note)
     told = [] if settings.dtype is None else [Decision("served_dtype", settings.dtype, "--dtype")]
-    return _Source(kind, checkpoint, encoders, origin_of(source, folder), [*checkpoint.decisions(), *told])
+    computed = computation(checkpoint, settings.torch_dtype, on_gpu=_num_gpus(settings) > 0)
+    told.append(Decision(COMPUTATION_PARAMETER, computed, "installed PyTorch"))
+    origin = {**origin_of(source, folder), COMPUTATION_PARAMETER: computed}
+    return _Source(kind, checkpoint, encoders, origin, [*checkpoint.decisions(), *told])
 
 
 def _check_gpus(num_gpus: int | None) -> None:
@@ -212,8 +217,11 @@ def _generated(models: Sequence[GeneratedModel], repository: Path) -> dict[str, 
 
 
 def _version(source: _Source, settings: ExportConfig, number: int) -> Version:
-    num_gpus = torch.cuda.device_count() if settings.num_gpus is None else settings.num_gpus
-    return Version(number, settings, num_gpus, source.family.name, about(source.checkpoint, source.origin))
+    return Version(number, settings, _num_gpus(settings), source.family.name, about(source.checkpoint, source.origin))
+
+
+def _num_gpus(settings: ExportConfig) -> int:
+    return torch.cuda.device_count() if settings.num_gpus is None else settings.num_gpus
 
 
 def _read_config(repository: Path, name: str) -> Any:

@@ -15,6 +15,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 import torch
 
+from rfm.engine.computation import is_by_this_torch
 from rfm.engine.execution import Execution
 from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, OLD_QUEUE_PARAMETERS
 from rfm.probe_request import probe_request
@@ -27,7 +28,13 @@ from rfm.triton_model.watchdog import Watchdog
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
 from rfm_client.contract.frame_refs import EncoderSampleRefs
-from rfm_client.contract.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, REVISION_PARAMETER, SOURCE_PARAMETER
+from rfm_client.contract.model_info import (
+    COMPUTATION_PARAMETER,
+    DIGEST_PARAMETER,
+    NETWORK_PARAMETER,
+    REVISION_PARAMETER,
+    SOURCE_PARAMETER,
+)
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import Tensors
 
@@ -70,6 +77,10 @@ class BatchModel(Generic[Question, Answer]):
         self._num_warmups = sum(warmup.get("count") or 1 for warmup in config.get("model_warmup", []))
         if any(settings.get(name) for name in OLD_QUEUE_PARAMETERS):
             self._log.note(f"{', '.join(OLD_QUEUE_PARAMETERS)} of an older export have no effect: export again")
+        told = settings.get(COMPUTATION_PARAMETER)
+        if told and not is_by_this_torch(told):
+            here = f"torch {torch.__version__}"
+            self._log.note(f"labels will name the export's computation, {told}, but this is {here}: export with {here}")
         if self.works_ahead:
             max_tokens = int(settings.get(BUDGET_PARAMETER) or sys.maxsize)
             self._pipeline = Pipeline(

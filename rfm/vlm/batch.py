@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from rfm.engine.device import pinned
+from rfm.engine.layers import concatenated
 from rfm.vlm.images import QwenImages, SmolImages
 from rfm.vlm.qwen import VisionPlan
 from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo, shots_of
@@ -115,7 +116,7 @@ class FramesOfOneSize:
 
     def frames(self, device: torch.device) -> Tensor:
         """Return the frames of all videos on ``device``, uint8 [sum of T, H', W', 3]."""
-        return torch.cat([video.to(device, non_blocking=True) for video in self.videos])
+        return concatenated([video.to(device, non_blocking=True) for video in self.videos])
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ class QwenPixels:
     def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
         """Return the backbone's input: the patches of all shots on ``device``."""
         patches = [self.images.patches(size.frames(device), size.shots, dtype) for size in self.sizes]
-        return {"pixel_values": torch.cat(patches) if len(patches) > 1 else patches[0]}
+        return {"pixel_values": concatenated(patches)}
 
 
 @dataclass(frozen=True)

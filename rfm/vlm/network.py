@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias
 import torch
 from torch import Tensor, nn
 
-from rfm.engine.layers import PredictionHead
+from rfm.engine.layers import PredictionHead, concatenated
 from rfm.family import VideoPrompt
 from rfm.vlm.backbone import BACKBONES, SMOL
 from rfm.vlm.batch import VlmBatch
@@ -172,8 +172,7 @@ def qwen_states(backbone: Any, batch: VlmBatch, key_values: KeyValues | None = N
         made = features(backbone.visual, batch.inputs["pixel_values"], batch.plan)
     assert batch.layout is not None
     shots = [*([] if made is None else [made]), *batch.layout.kept.values()]
-    merged = torch.cat(shots) if len(shots) > 1 else shots[0]
-    return last_hidden_state(backbone.language_model, batch.inputs, merged, key_values), made
+    return last_hidden_state(backbone.language_model, batch.inputs, concatenated(shots), key_values), made
 
 
 def _of_each(reduction: str, values: Tensor, lengths: Tensor) -> Tensor:

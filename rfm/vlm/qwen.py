@@ -29,6 +29,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rfm.checkpoint.content import CheckpointError
+from rfm.engine.layers import concatenated
 from rfm.vlm.images import MERGE, Grid
 
 
@@ -163,16 +164,16 @@ def embedded(projection: Any, patches: Tensor) -> Tensor:
 
 def _attention(attention: Any, hidden: Tensor, turned: Turn, plan: VisionPlan, *, is_full: bool) -> Tensor:
     """Attend within each shot (``is_full``) or window, equal sizes in one call: [N, D] -> [N, D]."""
-    heads = attention.qkv(hidden).reshape(len(hidden), 3, attention.num_heads, -1)
-    query, key, value = heads.unbind(1)
-    query, key = turned(query), turned(key)
+    heads = attention.qkv(hidden).unflatten(1, (3, attention.num_heads, -1))
+    query, key = turned(heads[:, :2]).unbind(1)
+    value = heads[:, 2]
     is_moved = is_full and plan.order is not None
     if is_moved:
         query, key, value = (_moved(each, plan.back) for each in (query, key, value))
     runs = plan.shots if is_full or plan.windows is None else plan.windows
     counts = [count * length for count, length in runs]
     parts = zip(runs, query.split(counts), key.split(counts), value.split(counts), strict=True)
-    mixed = torch.cat([_within(*part, scale=attention.scaling) for part in parts])
+    mixed = concatenated([_within(*part, scale=attention.scaling) for part in parts])
     return attention.proj(_moved(mixed, plan.order) if is_moved else mixed)
 
 
@@ -184,25 +185,29 @@ def _within(run: tuple[int, int], query: Tensor, key: Tensor, value: Tensor, *, 
 
 @dataclass(frozen=True)
 class Turn:
-    """The rotary embedding: cosines and sines of positions, float32 [N, 1, D / heads]."""
+    """The rotary embedding: float32 [N, 1, 1, D / heads].
+
+    cosine, sine: of positions; the first half of the sines is negated, so that no other values have to be
+    """
 
     cosine: Tensor
     sine: Tensor
 
     def __call__(self, heads: Tensor) -> Tensor:
-        """Rotate queries or keys, [N, heads, D / heads], in float32; the result has their dtype."""
-        values = heads.float()
-        first, second = values.chunk(2, dim=-1)
-        turned = values * self.cosine + torch.cat((-second, first), dim=-1) * self.sine
-        return turned.to(heads.dtype)
+        """Rotate queries and keys, [N, 2, heads, D / heads], in float32; the result has their dtype."""
+        first, second = heads.chunk(2, dim=-1)
+        return (heads * self.cosine + torch.cat((second, first), dim=-1) * self.sine).to(heads.dtype)
 
 
 def _turned(frequencies: Tensor, plan: VisionPlan) -> Turn:
     angles = (plan.positions[..., None].to(frequencies.dtype) * frequencies).flatten(1)
-    angles = _repeated(torch.cat((angles, angles), dim=-1), plan.shots)
+    cosine, sine = angles.cos().float(), angles.sin().float()
+    of_sizes = torch.stack((torch.cat((cosine, cosine), dim=-1), torch.cat((-sine, sine), dim=-1)), dim=1)
+    of_patches = _repeated(of_sizes, plan.shots)
     if plan.order is not None:
-        angles = _moved(angles, plan.order)
-    return Turn(angles.cos().float()[:, None], angles.sin().float()[:, None])
+        of_patches = _moved(of_patches, plan.order)
+    cosine, sine = of_patches[:, :, None, None].unbind(1)
+    return Turn(cosine, sine)
 
 
 def _learned_positions(embedding: Any, plan: VisionPlan) -> Tensor:
@@ -215,8 +220,8 @@ def _learned_positions(embedding: Any, plan: VisionPlan) -> Tensor:
 
 def _repeated(of_sizes: Tensor, shots: Runs) -> Tensor:
     """Repeat the values of a shot of each size for all its shots: [sum of S, ...] -> [N, ...]."""
-    parts = of_sizes.split([length for _, length in shots])
-    return torch.cat([part.repeat(count, 1) for part, (count, _) in zip(parts, shots, strict=True)])
+    parts = zip(of_sizes.split([length for _, length in shots]), shots, strict=True)
+    return concatenated([part.repeat(count, *(1,) * (part.ndim - 1)) for part, (count, _) in parts])
 
 
 def _moved(patches: Tensor, order: Tensor | None) -> Tensor:

@@ -338,6 +338,14 @@ def test_the_digest_of_settings_is_of_the_dtype_too(exported: Path, tmp_path: Pa
     assert len({parameter(repository, "video", "settings_digest") for repository in repositories}) == 2
 
 
+def test_clients_learn_number_type_pytorch_and_attention(exported: Path, tmp_path: Path) -> None:
+    export(FRAMES, tmp_path, name="video", dtype="bfloat16")
+    for repository, dtype in ((exported, "float32"), (tmp_path, "bfloat16")):
+        expected = f"{dtype}, torch {torch.__version__}, scaled_dot_product_attention"
+        assert parameter(repository, "video", "computation") == parameter(repository, "video_frames", "computation")
+        assert parameter(repository, "video", "computation") == expected
+
+
 def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:
     snapshot = tmp_path / "models--org--name" / "snapshots" / "0123abcd"
     assert origin_of("org/name@best", snapshot) == {"source": "org/name@best", "revision": "0123abcd"}

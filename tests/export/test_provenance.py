@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 from transformers import AutoTokenizer
 from typer.testing import CliRunner
@@ -63,10 +64,11 @@ def vlm(tmp_path: Path) -> Callable[[str], tuple[Path, Path]]:
 
 
 def explained(folder: Path, base: Path | None = None) -> tuple[dict[str, Decision], list[str]]:
-    """The decisions by name, and what was said of assumptions and contradictions."""
+    """The decisions on the checkpoint by name, and what was said of assumptions and contradictions."""
     said: list[str] = []
     settings = ExportConfig(num_gpus=0, base_model=None if base is None else str(base))
     decisions = {each.name: each for each in rfm_export.explain(folder, settings, say=said.append)}
+    assert decisions.pop("computation").source == "installed PyTorch"
     return decisions, [line for line in said if "read as the settings" not in line and "did not train" not in line]
 
 
@@ -203,7 +205,9 @@ def test_an_export_keeps_the_table_beside_the_checkpoint_and_nothing_reads_it(tm
     rfm_export.export(source.checkpoint, repository, settings)
     checkpoint = repository / "rfm" / "1" / "checkpoint"
     kept = [Decision(**row) for row in json.loads((checkpoint / PROVENANCE).read_text())]
-    assert kept == [*explained(source.checkpoint)[0].values(), Decision("served_dtype", "float32", "--dtype")]
+    computed = f"float32, torch {torch.__version__}, scaled_dot_product_attention"
+    told = [Decision("served_dtype", "float32", "--dtype"), Decision("computation", computed, "installed PyTorch")]
+    assert kept == [*explained(source.checkpoint)[0].values(), *told]
 
     assert rfm_export.check(repository, settings) == []
     (checkpoint / PROVENANCE).write_text("no JSON")
@@ -290,5 +294,5 @@ def test_explain_prints_the_table_and_writes_nothing(tmp_path: Path) -> None:
     command = ["export", "--checkpoint", str(folder), "--repository", str(repository), "--num-gpus", "0"]
     result = CliRunner().invoke(app, [*command, "--explain"])
     assert result.exit_code == 0, result.output
-    assert [line.split()[0] for line in result.stdout.splitlines()] == list(explained(folder)[0])
+    assert [line.split()[0] for line in result.stdout.splitlines()] == [*explained(folder)[0], "computation"]
     assert not repository.exists()

@@ -88,17 +88,23 @@ def test_patches_are_embedded_without_a_convolution(name: str, monkeypatch: pyte
     predictor.score(predictor.rows(ProgressSample(video(0, 2, 84, 112))), batch, Execution())
 
 
+# The original's own scores in bfloat16 differ from those in float32 by up to 0.018 (``goldens``), rounded up here.
+BFLOAT16_BOUND = 0.02
+
+
 @pytest.mark.gpu
 def test_bfloat16_on_a_gpu_is_near_float32_on_the_cpu() -> None:
     config = goldens.config(BFLOAT16)
     samples = [sample for case in config.cases() for sample in case.samples()]
     engine = Engine.from_checkpoint(config.checkpoint, **config.sources, device="cuda")
-    for left, right in zip(load_engine(BFLOAT16).evaluate(samples), engine.evaluate(samples), strict=True):
+    expected, together = load_engine(BFLOAT16).evaluate(samples), engine.evaluate(samples)
+    alone = [engine.evaluate([sample])[0] for sample in samples]
+    for left, right in [*zip(expected, together, strict=True), *zip(alone, together, strict=True)]:
         assert not isinstance(left, Exception), left
         assert not isinstance(right, Exception), right
         for a, b in zip(goldens.frame_scores(left), goldens.frame_scores(right), strict=True):
-            np.testing.assert_allclose(a.progress, b.progress, rtol=0, atol=5e-3)
-            np.testing.assert_allclose(a.success, b.success, rtol=0, atol=1.5e-2)
+            np.testing.assert_allclose(a.progress, b.progress, rtol=0, atol=BFLOAT16_BOUND)
+            np.testing.assert_allclose(a.success, b.success, rtol=0, atol=BFLOAT16_BOUND)
 
 
 @pytest.mark.gpu

@@ -60,7 +60,9 @@ def test_a_run_stops_when_another_checkpoint_is_served(
 @pytest.mark.parametrize("has_encoder", [True, False], ids=["embeddings", "frames"])
 def test_servers_that_are_replaced_one_after_the_other_mix_no_curve(output: Path, has_encoder: bool) -> None:
     shelves = [Shelf(has_encoder=has_encoder), Shelf(has_encoder=has_encoder, after=3, url="grpc://other:1")]
-    with pytest.raises(InvalidSampleError, match="the same weights_digest, settings_digest at every server"):
+    with pytest.raises(
+        InvalidSampleError, match="the same weights_digest, settings_digest and computation at every server"
+    ):
         labelled(output, *shelves, limit=4)
     assert_of_one_checkpoint(output)
 

@@ -89,6 +89,11 @@ OTHERS: dict[str, tuple[BrightnessScorer, dict[str, Any], str]] = {
     "what tells files": (BrightnessScorer(), {"verify": True}, "verify: False there, True now"),
     "decoder": (BrightnessScorer(), {}, f"decoders.{FRONT}: {{decoder}} there, PyAV 1.0 now"),  # they differ in colours
     "weights": (BrightnessScorer(digest="new"), {}, "checkpoint.weights_digest: brightness there, new now"),
+    "PyTorch": (
+        BrightnessScorer(computation="float32, torch 2.14.0, sdpa"),
+        {},
+        "checkpoint.computation: float32, torch 2.13.0, sdpa there, float32, torch 2.14.0, sdpa now",
+    ),
     "settings": (BrightnessScorer(settings="new"), {}, "checkpoint.settings_digest: settings there, new now"),
 }
 

@@ -213,6 +213,7 @@ def test_the_files_have_the_documented_form(output: Path) -> None:
         "revision": None,
         "weights_digest": "brightness",
         "settings_digest": "settings",
+        "computation": "float32, torch 2.13.0, sdpa",
     }
     assert provenance["sampling"] == {"rule": "rint_pad", "frames": 16}
     assert provenance["cameras"] == [FRONT, WRIST]

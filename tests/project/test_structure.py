@@ -60,6 +60,7 @@ EXCEPTIONS = {
     "benchmarks/bench.py": {"rfm", "rfm_export"},  # the engine without a server, and what is served
     "benchmarks/client.py": {"rfm", "rfm_export"},
     "benchmarks/contestants.py": {"rfm", "rfm_commands", "rfm_export"},
+    "benchmarks/count.py": {"rfm"},
     "benchmarks/engine.py": {"rfm", "rfm_export"},
     "benchmarks/perf_analyzer.py": {"rfm"},
     "benchmarks/real_size.py": {"rfm"},

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,18 +32,25 @@ class BrightnessScorer:
     """Progress is how bright the slot's frame is, success how red: what is read can be recomputed by hand."""
 
     def __init__(
-        self, seconds: float = 0.0, digest: str = "brightness", max_frames: int | None = 16, settings: str = "settings"
+        self,
+        seconds: float = 0.0,
+        digest: str = "brightness",
+        max_frames: int | None = 16,
+        settings: str = "settings",
+        computation: str = "float32, torch 2.13.0, sdpa",
     ) -> None:
         self.seconds = seconds
         self.digest = digest
         self.settings = settings
+        self.computation = computation
         self.max_frames = max_frames
         self.num_samples = 0
         self.tasks: set[str] = set()
         self._lock = threading.Lock()
 
     def checkpoint(self) -> CheckpointFacts:
-        return CheckpointFacts("toy/brightness", None, self.digest, self.settings, self.max_frames, None, False, False)
+        facts = CheckpointFacts("toy/brightness", None, self.digest, self.settings, self.max_frames, None, False, False)
+        return replace(facts, computation=self.computation)
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
         raise AssertionError("it does not encode")

@@ -288,6 +288,15 @@ def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_watchdog_k
     assert threads == [threading.current_thread()] * 2
 
 
+@pytest.mark.parametrize("told", ["", f"float32, torch {torch.__version__}, sdpa", "float32, torch 1.0, sdpa"])
+def test_an_instance_notes_that_labels_name_another_pytorch(tmp_path: Path, told: str) -> None:
+    """Clients read the PyTorch of the export, and write it into label files."""
+    Model(tmp_path, settings={"computation": told})
+    noted = [entry["note"] for entry in LOGGED if "labels will name" in entry.get("note", "")]
+    assert len(noted) == ("torch 1.0" in told)
+    assert all(f"export with torch {torch.__version__}" in note for note in noted)
+
+
 def test_an_older_export_s_bound_of_the_queue_is_ignored_with_a_note(tmp_path: Path) -> None:
     model = Model(tmp_path, settings={"queue_timeout_ms": "1"})
     assert "of an older export have no effect: export again" in LOGGED[0]["note"]

@@ -20,6 +20,7 @@ SOURCE_PARAMETER = "source"
 REVISION_PARAMETER = "revision"
 DIGEST_PARAMETER = "weights_digest"
 SETTINGS_DIGEST_PARAMETER = "settings_digest"
+COMPUTATION_PARAMETER = "computation"
 NETWORK_PARAMETER = "network"
 RUN_CONFIG_PARAMETER = "run_config"
 KIND_PARAMETER = "kind"
@@ -47,6 +48,7 @@ class ModelInfo:
     weights_digest: 16 hex digits, digest of the exported weights; None: unknown
     settings_digest: 16 hex digits, digest of all else that decides scores: files beside the weights (configuration,
         tokenizer, image processor), dtype, kind of device; None: unknown
+    computation: number type of the network, version of PyTorch and kernel of attention, as of its export; None: unknown
     network: ``class``, ``config``, and the number of weights of each part (``parameters``)
     run_config: config.yaml of the training run, without secrets; empty: the checkpoint has none
     kind: name of the reward model, such as TOPReward; None: unknown
@@ -73,6 +75,7 @@ class ModelInfo:
     revision: str | None = None
     weights_digest: str | None = None
     settings_digest: str | None = None
+    computation: str | None = None
     network: Mapping[str, Any] = field(default_factory=dict)
     run_config: Mapping[str, Any] = field(default_factory=dict)
     kind: str | None = None
@@ -123,6 +126,7 @@ class ModelInfo:
             revision=parameters.get(REVISION_PARAMETER) or None,
             weights_digest=parameters.get(DIGEST_PARAMETER) or None,
             settings_digest=parameters.get(SETTINGS_DIGEST_PARAMETER) or None,
+            computation=parameters.get(COMPUTATION_PARAMETER) or None,
             network=json.loads(parameters.get(NETWORK_PARAMETER) or "{}"),
             run_config=json.loads(parameters.get(RUN_CONFIG_PARAMETER) or "{}"),
             kind=parameters.get(KIND_PARAMETER) or None,

@@ -134,7 +134,7 @@ class Run:
         """Stop the run and raise _StoppedError if another checkpoint is served now."""
         try:
             planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
-            for name in ("weights_digest", "settings_digest"):
+            for name in ("weights_digest", "settings_digest", "computation"):
                 if getattr(now, name) != getattr(planned, name):
                     raise InvalidSampleError.at(name, getattr(planned, name), getattr(now, name))
         except InvalidSampleError as error:

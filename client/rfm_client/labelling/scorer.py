@@ -23,6 +23,7 @@ class CheckpointFacts:
     source, revision: origin; None: unknown
     weights_digest: of the weights
     settings_digest: of all else that decides the scores: configuration, encoders, dtype, device
+    computation: number type of the network, version of PyTorch and kernel of attention; None: unknown
     max_frames: most frames of a trajectory, in training or for the network, the smaller number; None: both unknown
     frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
     encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
@@ -43,10 +44,11 @@ class CheckpointFacts:
     trained_padding: bool = True
     has_log_prob: bool = False
     needs_whole_episode: bool = False
+    computation: str | None = None
 
     def document(self) -> dict[str, Any]:
         """Return the facts for the provenance."""
-        told = ("source", "revision", "weights_digest", "settings_digest")
+        told = ("source", "revision", "weights_digest", "settings_digest", "computation")
         return {name: value for name, value in asdict(self).items() if name in told}
 
 
@@ -95,6 +97,7 @@ class ClientScorer:
             trained_padding=info.trained_padding,
             has_log_prob=info.has_log_prob,
             needs_whole_episode=info.needs_whole_episode,
+            computation=info.computation,
         )
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
@@ -107,11 +110,10 @@ class ClientScorer:
 
 
 def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:
-    """A model's name and digests. Raises InvalidSampleError if the digests differ between servers."""
-    digests = {(info.name, info.weights_digest, info.settings_digest) for info in infos}
+    """A model's name and digests. Raises InvalidSampleError if servers differ in them, or in the computation."""
+    digests = {(info.name, info.weights_digest, info.settings_digest, info.computation) for info in infos}
     if len(digests) > 1:
-        told = " and ".join(sorted(f"{weights}, {settings}" for _, weights, settings in digests))
-        raise InvalidSampleError.at(
-            f"model {infos[0].name}", "the same weights_digest, settings_digest at every server", told
-        )
-    return digests.pop()
+        told = " and ".join(sorted(", ".join(map(str, values)) for _, *values in digests))
+        expected = "the same weights_digest, settings_digest and computation at every server"
+        raise InvalidSampleError.at(f"model {infos[0].name}", expected, told)
+    return digests.pop()[:3]

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: MIT
+"""What decides the last digits of a score, besides checkpoint and device: number type, PyTorch, kernel of attention.
+
+PyTorch chooses the kernel of ``scaled_dot_product_attention`` by its version, the GPU, the dtype and the shapes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+ATTENTION = "scaled_dot_product_attention"
+
+
+def computation(checkpoint: Any, dtype: torch.dtype | None, *, on_gpu: bool) -> str:
+    """Return how this PyTorch scores the checkpoint, as one line.
+
+    dtype: of the network; None: float32 on the CPU, else the checkpoint's own
+    """
+    if dtype is None:
+        dtype = getattr(checkpoint.config, "torch_dtype", torch.float32) if on_gpu else torch.float32
+    return f"{str(dtype).removeprefix('torch.')}, {_torch()}, {ATTENTION}"
+
+
+def is_by_this_torch(told: str) -> bool:
+    """True if ``told``, a result of ``computation``, names the version of this process's PyTorch."""
+    return _torch() in told.split(", ")
+
+
+def _torch() -> str:
+    return f"torch {torch.__version__}"
