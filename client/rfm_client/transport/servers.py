@@ -2,7 +2,8 @@
 """Servers of one checkpoint, and the loop that retries a request until its deadline.
 
 The least busy server gets a request, unless the caller names the first to ask. A server that fails is left out until it
-reports ready; after more failures, it is asked later. A score depends on the request alone, so a request may be sent twice:
+reports ready; after more failures, it is asked later. A score depends on the request alone, so a request may be sent
+twice:
 
 - the server is down, restarting or full: retry at once at another server, else after growing pauses
 - a process or the connection ended, perhaps because of this request: retry once, when a server can be back. So a
