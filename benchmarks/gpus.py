@@ -89,7 +89,7 @@ def batches(arguments: argparse.Namespace, folder: Path) -> None:
                 print(f"{num_gpus} GPUs, up to {limit}, {callers} callers: {share:.0%} of {evenly:.0f}/s", flush=True)
     about = (
         "Samples/s of several GPUs\n"
-        f"A forward pass sleeps for {arguments.lone_ms:g} ms, or {arguments.sample_ms:g} ms a sample if that is longer. "
+        f"A forward pass sleeps for {arguments.lone_ms:g} ms, or {arguments.sample_ms:g} ms a sample if longer.\n"
         "evenly: the rate if each GPU always had its part of the callers. share: of that rate."
     )
     by = ("GPUs", "callers", "batch")
@@ -124,8 +124,8 @@ def episodes(arguments: argparse.Namespace, folder: Path) -> None:
                 print(rows[-1], flush=True)
     about = (
         f"A step on {num_gpus} GPUs, each with a feature cache\n"
-        f"Episodes with a window of {STEP_FRAMES} frames of {STEP_PX} x {STEP_PX}, {arguments.steps} steps. Of a step and "
-        "episode: samples sent, KB sent, frames encoded; refused: share of samples that were refused, and then sent whole."
+        f"Windows of {STEP_FRAMES} frames of {STEP_PX} x {STEP_PX}, {arguments.steps} steps.\n"
+        "For each step of an episode: samples and KB sent, frames encoded, samples that were refused and sent whole."
     )
     report.write("gpus_episodes", about, rows, ("episodes", "way"), folder=arguments.output)
 
