@@ -76,7 +76,7 @@ def batches(arguments: argparse.Namespace, folder: Path) -> None:
         peers = str(Path(__file__).parent / "peers")
         told = {"peers": peers, "file": str(place / "ledger"), "row_s": row_s, "lone_s": lone_s}
         model.write_text(model.read_text() + SIMULATED.format(**told))
-        with served(place) as url, Contestant("gRPC", url, (0, 0)) as contestant:
+        with Contestant("gRPC", served(place), (0, 0)) as contestant:
             for number, callers in product(range(arguments.rounds), arguments.callers):
                 load = Load(callers, arguments.seconds, (FRAMES, FRAMES), frame_px=FRAME_PX)
                 measured = contestant.measure(load)
