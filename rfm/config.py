@@ -55,7 +55,9 @@ class ExportConfig(Settings):
     torch_threads: int = setting(
         0, "CPU threads of each instance. 0: the instances of a model share the cores.", least=0, **_OF_A_MACHINE
     )
-    max_batch_size: int = setting(64, "Most samples of one batch, over all callers.", **_COUNT)
+    max_batch_size: int | None = setting(
+        None, "Most samples of one batch, over all callers. Default: enough to saturate a GPU, at most 64.", **_COUNT
+    )
     token_budget: int = setting(
         DEFAULT_TOKEN_BUDGET, "Most tokens, with padding, of one forward pass of several samples.", **_COUNT
     )

@@ -12,7 +12,7 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.provenance import Decision
 from rfm.config import ExportConfig
 from rfm.config import VideoPrompt as VideoPrompt
-from rfm_client.contract import FrameSize, RewardError
+from rfm_client.contract import FrameSize, RewardError, Sample
 from rfm_client.contract.frame_refs import EncoderSampleRefs
 from rfm_client.contract.samples import EncoderSample, Float32Array
 
@@ -220,6 +220,12 @@ class Checkpoint(Protocol):
 
     def decisions(self) -> Sequence[Decision]:
         """Return the source of each setting that scores depend on. Raises CheckpointError for missing files."""
+
+    def flop(self, sample: Sample) -> float:
+        """Return the floating-point operations to score a sample: about two for each parameter that a token passes.
+
+        Raises CheckpointError, and InvalidSampleError if this checkpoint cannot score the sample.
+        """
 
     def encoders(self) -> FrameEncoders | None:
         """Return the checkpoint's encoders, or None. Raises CheckpointError if they are missing or do not fit."""

@@ -105,12 +105,15 @@ class Ledger:
         fcntl.flock(self._file, fcntl.LOCK_UN)
 
 
-def simulate(engine: Engine, file: Path, batch_s: float, row_s: float) -> Engine:
-    """Make the engine's forward passes sleep for ``batch_s``, plus ``row_s`` for each row. Scores are 0.5."""
+def simulate(engine: Engine, file: Path, batch_s: float, row_s: float, least_s: float = 0.0) -> Engine:
+    """Make the engine's forward passes sleep for ``batch_s``, plus ``row_s`` for each row. Scores are 0.5.
+
+    least_s: shortest time of a forward pass, for the launch of its kernels
+    """
     ledger, num_bins = Ledger(file), engine.predictor.network.config.progress_bins
 
     def score(rows: Sequence[Any], batch: Any, execution: Any) -> list[RowScores]:
-        ledger.run(batch_s + row_s * len(rows))
+        ledger.run(max(batch_s + row_s * len(rows), least_s))
         return [_half(row, num_bins) for row in rows]
 
     engine.predictor.score = score  # type: ignore[method-assign]  # only the forward pass is replaced

@@ -40,7 +40,8 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     The arrays of a sample must not change while its call is awaited: they are read when it is the request's turn.
 
     urls: one or several ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``. The server
-        with the fewest open requests gets the next. A server that fails is left out until it is ready again
+        with the fewest open requests gets the next; an episode stays on its server, which keeps features of its frames.
+        A server that fails is left out until it is ready again
     model: name of the exported checkpoint; raw frames go to ``<model>_frames``
     timeout_s: longest time of a call, retries included; at most 1e9
     retry: True: until the time is up, retry requests that fail because a server is down, restarting or full
@@ -75,7 +76,7 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         self._timeout_s = timeout_s
         self._servers = Servers(transports, retry=retry)
         self._scorer = SampleScorer(model, self._servers, ConcurrencyLimiter(max_in_flight))
-        self._windows = WindowScorer(model, self._scorer)
+        self._windows = WindowScorer(model, self._scorer, len(self._servers))
         self._is_closed = False
         self._loop: asyncio.AbstractEventLoop | None = None  # of the first call
 

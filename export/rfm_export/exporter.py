@@ -27,6 +27,7 @@ from rfm_client.contract import wire
 from rfm_client.contract.model_info import COMPUTATION_PARAMETER
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import about, origin_in, origin_of, record_digests
+from rfm_export.batches import with_batch_size
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_name
 from rfm_export.publish import alone, next_version, publish, read_config, staging
@@ -67,7 +68,8 @@ def export(
     other_machine: True: another machine serves it, so ``num_gpus`` may exceed the GPUs of this machine
     family: package of the checkpoint's family, which the server must also be able to import; None: a built-in family
     device: for the comparison of scores; None: the CPU, for a large network a GPU with room for it
-    say: takes a line for the user: the run's config.yaml, ``rfm.families.notes``, the device of a large network
+    say: takes a line for the user: the run's config.yaml, ``rfm.families.notes``, a derived ``max_batch_size``, the
+        device of a large network
 
     Raises CheckpointError, ExportError.
     """
@@ -75,6 +77,7 @@ def export(
         _check_gpus(settings.num_gpus)
     named = None if device is None else device_named(device)
     loaded = _load(source, settings, family, say)
+    settings = with_batch_size(settings, loaded.checkpoint, say)
     described = loaded.encoders.description if loaded.encoders is not None else None
     names = [settings.name, encoder_name(settings.name), frames_name(settings.name)]
     with alone(repository), staging(repository, names) as staged:
@@ -196,6 +199,7 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     folder = repository / scorer / str(number) / CHECKPOINT_FOLDER
     family = families.choose(folder, config.parameters[FAMILY_PARAMETER].string_value or None)
     checkpoint = family.load(folder, Options())
+    settings = with_batch_size(settings, checkpoint, _nobody)
     encoders = repository / encoder_name(settings.name) / str(number)
     described = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
     version = _version(_Source(family, checkpoint, None, origin_in(config)), settings, number)

@@ -100,23 +100,25 @@ def generated_models(
     # Two small networks keep a GPU busy: one scores while the other reads.
     several = widths is not None and version.num_gpus > 0
     settings = replace(version.settings, instances=version.settings.instances or (2 if several else 1))
-    # With several instances, each cache would have to see all frames.
+    # With several instances on a device, each cache would have to see all frames.
     keeps = description.keeps_features and cache_mib > 0 and settings.instances == 1
+    # A frame reference names a frame that one cache holds, and Triton chooses the instance: so there may be one alone.
+    has_one_cache = cache_mib > 0 and version.num_gpus <= 1
     bins = description.progress_bins if description.progress_bins > 1 else None
     outputs = wire.score_outputs(bins, has_log_prob=description.has_log_prob, marks_unclear=description.marks_unclear)
-    inputs = wire.frame_inputs(by_digest=keeps) if widths is None else wire.embedding_inputs(*widths)
+    inputs = wire.frame_inputs(by_digest=keeps and has_one_cache) if widths is None else wire.embedding_inputs(*widths)
     about = {**_limits(description, description.frame_size), **version.about}
     scorer = Interface(scorer_name(description, name), inputs, outputs, about)
     version = replace(version, settings=settings)
     models = [_python_model(scorer, "rfm", version, _warmups(description), keeps=keeps)]
     if encoders is None or widths is None:
         return models
-    inputs, about = wire.encoder_inputs(by_digest=cache_mib > 0), about_encoders(encoders, version.about)
+    inputs, about = wire.encoder_inputs(by_digest=has_one_cache), about_encoders(encoders, version.about)
     encoder = Interface(encoder_name(name), inputs, wire.encoder_outputs(*widths), about)
     of_encoder = replace(version, settings=replace(settings, instances=1)) if cache_mib else version
     models.append(_python_model(encoder, "rfm_encoder", of_encoder, [_encoder_warmup()], keeps=True))
     about = {**_limits(description, encoders.frame_size), **version.about}
-    frames = Interface(frames_name(name), wire.frame_inputs(by_digest=cache_mib > 0), outputs, about)
+    frames = Interface(frames_name(name), wire.frame_inputs(by_digest=has_one_cache), outputs, about)
     return [*models, GeneratedModel(ensemble_config(frames, settings, version.number, encoder, scorer), version.number)]
 
 

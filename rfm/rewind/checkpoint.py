@@ -45,6 +45,7 @@ from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
 from rfm.rewind.pretrained import IMAGE_ENCODER, TEXT_ENCODER, differences, image_facts, text_facts
+from rfm_client.contract import Sample
 
 MODEL_TYPE = "rewind_transformer"
 IMAGE_ENCODER_PREFIX = "image_encoder."
@@ -154,6 +155,12 @@ class RewindCheckpoint:
         image_source, text_source = self._sources
         with self._having_encoders():
             return image_facts(image_source), text_facts(text_source)
+
+    def flop(self, sample: Sample) -> float:
+        """Return the operations of a sample's products: two for each parameter and token."""
+        counts = [trajectory.num_frames for trajectory in sample.trajectories]
+        num_tokens = self.config.num_tokens(counts[0], sum(counts[1:]))
+        return 2.0 * num_tokens * sum(tensor.numel() for tensor in self.network.values())
 
     def encoders(self) -> Encoders | None:
         """Return the encoders if the checkpoint has their weights or the user names them; else None.

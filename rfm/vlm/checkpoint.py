@@ -79,6 +79,8 @@ from rfm.vlm.processor import (
 from rfm.vlm.prompts import OF_AN_OLD_RUN
 from rfm.vlm.run_config import RunConfig, decisions_of
 from rfm.vlm.video_prompt import decided
+from rfm.vlm.work import flop
+from rfm_client.contract import Sample
 
 LORA = "lora"  # key in VlmCheckpoint.parts: the factors that change the network's weights
 SETTINGS = "rfm"  # key in an exported config.json: this project's fields
@@ -168,6 +170,10 @@ class VlmCheckpoint:
         if self.base_model is not None and is_published(self.config.base_model_id, self.config.family):
             check_published(collator, self.base_model)
         return collator
+
+    def flop(self, sample: Sample) -> float:
+        """Return the operations of a sample's products. Raises CheckpointError, InvalidSampleError."""
+        return flop(self.config, self.collator, sample)
 
     def encoders(self) -> None:
         """Return None: the network reads raw frames and needs no encoders."""

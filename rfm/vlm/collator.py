@@ -135,6 +135,10 @@ class VlmCollator:
         """Resize some of a video's frames to uint8 [N, H', W', 3], each independent of the others. Thread-safe."""
         raise NotImplementedError
 
+    def num_patches(self, video: VlmVideo) -> int:
+        """Return the number of patches that the vision tower reads of a video's frames."""
+        raise NotImplementedError
+
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
         """Return the batch of conversations of any kinds and lengths, whose frames have been resized."""
         length = max(row.num_tokens for row in rows)
@@ -269,6 +273,11 @@ class QwenCollator(VlmCollator):
             return replace(self.images.image_grid(*video.size), groups=video.num_shown)
         return self.images.video_grid(*video.size, video.num_shown)
 
+    def num_patches(self, video: VlmVideo) -> int:
+        """Return the number of patches of the longest conversation's frames."""
+        grid = self.grid(video)
+        return grid.groups * grid.rows * grid.columns
+
     def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
         grids = [self.grid(video) for video in videos]
         of_shots = [grid.tokens_per_group for grid in grids for _ in range(grid.groups)]
@@ -341,6 +350,10 @@ class SmolCollator(VlmCollator):
 
     def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
         return self.images.images_to_size(video.stack(needed))
+
+    def num_patches(self, video: VlmVideo) -> int:
+        """Return the number of patches of all frames."""
+        return video.num_shown * self.images.tokens * int(self.config.backbone["scale_factor"]) ** 2
 
     def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
         text = text.replace(SMOL_IMAGE, FAKE + GLOBAL_IMAGE + SMOL_IMAGE + FAKE)

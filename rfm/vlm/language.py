@@ -43,6 +43,7 @@ from rfm.vlm.preprocessor import SIZED_BY_PROCESSOR, normalisation_of, patch_px
 from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, read_processor, save_processor
 from rfm.vlm.qwen import Box, KeyValues, positions
 from rfm.vlm.video import Indices, VlmVideo
+from rfm.vlm.work import flop
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample
 from rfm_client.contract.frame_refs import ProgressSampleRefs
 
@@ -192,6 +193,10 @@ class LanguageCheckpoint:
         read = [Decision(fact, value, name) for fact, value in images.items() if fact != "patch_size"]
         patch = Decision("patch_size", images["patch_size"], f"{NETWORK_CONFIG}: vision_config")
         return [*self.settings, Decision("prompt", self.collator.example(), name), patch, *read]
+
+    def flop(self, sample: Sample) -> float:
+        """Return the operations of a sample's products. Raises CheckpointError, InvalidSampleError."""
+        return flop(self.config, self.collator, sample)
 
     def encoders(self) -> None:
         """Return None: the network reads raw frames and needs no encoders."""

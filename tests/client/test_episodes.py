@@ -82,6 +82,11 @@ class Recording(GrpcTransport):
         return await super().infer(model, inputs, outputs, timeout_s, **more)
 
     @property
+    def digests(self) -> set[bytes]:
+        """Of all frames that it was asked about."""
+        return {row.tobytes() for inputs in self.requests for row in inputs[wire.FRAME_DIGESTS].reshape(-1, 32)}
+
+    @property
     def most_bytes(self) -> int:
         return max(sum(array.nbytes for array in inputs.values()) for inputs in self.requests)
 
@@ -162,6 +167,57 @@ def test_episodes_side_by_side_are_one_request_and_score_alike(transport: Record
         scores = [float(step.progress[index]) for step in added], [float(step.success[index]) for step in added]
         assert_same(scores, offline(client, videos[:, index], task=task))
     assert added[-1].step.tolist() == [6, 6, 6]
+
+
+class Failing(Recording):
+    """To the real server, until it is down."""
+
+    is_down = False
+
+    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **more: str) -> Answer:
+        if self.is_down:
+            raise ServerUnavailableError("Connection refused")
+        return await super().infer(model, inputs, outputs, timeout_s, **more)
+
+    async def is_ready(self, model: str, timeout_s: float) -> bool:
+        return not self.is_down and await super().is_ready(model, timeout_s)
+
+
+def test_episodes_are_shared_out_among_servers_and_stay(served: Served) -> None:
+    transports = [Recording(served.url("grpc")) for _ in range(3)]
+    videos = np.stack([video(seed, 6) for seed in range(210, 216)], axis=1)  # [T, N, H, W, 3]
+    with RewardClient([], transports=transports, model=MODEL) as client:
+        episodes = client.episodes(6, TASK, frames=4)
+        added = [episodes.add(frames) for frames in videos]
+        for transport in transports:
+            assert [len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests] == [2] * len(videos)
+            assert transport.most_bytes < 2 * (videos[0, 0].nbytes + 512)
+        first, second, third = (transport.digests for transport in transports)
+        assert len(first | second | third) == len(first) + len(second) + len(third) == videos[:, :, 0, 0, 0].size
+        for index in range(6):
+            scores = [float(step.progress[index]) for step in added], [float(step.success[index]) for step in added]
+            assert_same(scores, offline(client, videos[:, index]))
+        for transport in transports:
+            transport.requests.clear()
+        episodes.reset([True, True, True, False, False, False])
+        episodes.add(videos[0])
+        asked = [sum(len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests) for transport in transports]
+        assert asked == [2, 2, 2]  # the new ones went to the servers with the fewest
+
+
+def test_episodes_of_a_server_that_is_down_go_on_at_the_next(served: Served) -> None:
+    transports = [Failing(served.url("grpc")) for _ in range(2)]
+    videos = np.stack([video(seed, 6) for seed in (220, 221)], axis=1)
+    with RewardClient([], transports=transports, model=MODEL, timeout_s=30) as client:
+        episodes = client.episodes(2, TASK, frames=4)
+        added = [episodes.add(frames) for frames in videos[:3]]
+        transports[0].is_down = True
+        added += [episodes.add(frames) for frames in videos[3:]]
+        assert len(transports[0].requests) == 3
+        assert transports[1].most_bytes < videos[0, 0].nbytes + 512  # it knew the frames, since both are one server
+        for index in range(2):
+            scores = [float(step.progress[index]) for step in added], [float(step.success[index]) for step in added]
+            assert_same(scores, offline(client, videos[:, index]))
 
 
 def test_a_mask_leaves_episodes_out_and_a_reset_begins_some_anew(client: RewardClient) -> None:

@@ -63,7 +63,7 @@ def test_the_fastapi_servers_file_is_accepted(tmp_path: Path) -> None:
         "model_path: org/name\nnum_gpus: null\nmax_workers: 4\nbatch_size: 16\nserver_url: http://localhost\nserver_port: 8010\n",
     )
     assert (config.export.checkpoint, config.export.num_gpus, config.serve.http_threads) == ("org/name", None, 4)
-    assert (config.export.batch_size, config.export.max_batch_size) == (16, 64)  # the original never reads it
+    assert (config.export.batch_size, config.export.max_batch_size) == (16, None)  # the original never reads it
     assert (config.serve.host, config.serve.http_port) == ("127.0.0.1", 8010)
 
 

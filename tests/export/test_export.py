@@ -22,7 +22,6 @@ from engines import serve_config
 from paths import ROOT
 from repositories import forget_input
 from rfm.checkpoint.content import CheckpointError, read_run_config
-from rfm.config import ExportConfig
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm_client.contract import wire
 from rfm_commands.cli import app
@@ -297,7 +296,7 @@ def test_upstream_s_file_exports_whatever_its_batch_size_unless_it_names_gpus_th
     assert exported.exit_code == 0, exported.output
     config = read(repository, "rfm")
     assert list(config.instance_group[0].gpus) == list(range(there + 1))
-    assert config.max_batch_size == ExportConfig().max_batch_size
+    assert config.max_batch_size == 64
 
 
 def parameter(repository: Path, model: str, name: str) -> str:

@@ -33,6 +33,7 @@ from paths import ROOT
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import Endpoints
 from rfm_commands.config import Config
+from rfm_export.batches import MOST_SAMPLES
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -169,7 +170,7 @@ def composed(profile: str, **variables: str) -> dict[str, Any]:
 def test_the_example_configuration_lets_more_wait_than_a_batch() -> None:
     export = Config.from_yaml(DOCKER / "serve.yaml").export
     assert export.max_queue_size is not None
-    assert export.max_queue_size > 2 * export.max_batch_size
+    assert export.max_queue_size > 2 * MOST_SAMPLES
 
 
 def test_the_dockerfile_is_clean() -> None:

@@ -167,6 +167,9 @@ class ToyCheckpoint:
     def decisions(self) -> list[Decision]:
         return [Decision("num_colours", self.config.num_colours, NETWORK_CONFIG)]
 
+    def flop(self, sample: Sample) -> float:
+        return 2.0 * sum(trajectory.num_frames for trajectory in sample.trajectories) * self.config.num_colours
+
     def encoders(self) -> Palette:
         return Palette(torch.full((self.config.num_colours,), 1 / 255))
 

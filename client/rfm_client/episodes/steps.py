@@ -245,7 +245,7 @@ class EpisodeFrames:
     def windows(self, prefix: Prefix) -> list[Window]:
         """Return each camera's window: its sampled frames, and the task. Raises InvalidSampleError for a wrong task."""
         shown = [self._frames[index] for index in prefix.indices]
-        return [Window(of_camera, self.task) for of_camera in zip(*shown, strict=True)]
+        return [Window(of_camera, self.task, self) for of_camera in zip(*shown, strict=True)]
 
     def score(self, step: int, prefix: Prefix, outcomes: Sequence[Result | RewardError], ms: float) -> StepScore:
         """Return the score of a step from the outcomes of its ``windows``.

@@ -8,11 +8,13 @@ all pixels are sent. In both cases the answer equals that for a ``ProgressSample
 from __future__ import annotations
 
 import asyncio
-from collections import OrderedDict
+import random
+from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import groupby
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -45,10 +47,14 @@ class EpisodeFrame:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Frames of one size with their task, to be scored for progress. Raises InvalidSampleError for an invalid task."""
+    """Frames of one size with their task, to be scored for progress. Raises InvalidSampleError for an invalid task.
+
+    episode: stands for the frames' episode, whose windows all go to one server
+    """
 
     frames: tuple[EpisodeFrame, ...]
     task: str
+    episode: object
 
     def __post_init__(self) -> None:
         check_task(self.task)
@@ -71,16 +77,39 @@ class Window:
         return TrajectoryRefs(tuple(frame.digest for frame in self.frames), {}, self.task)
 
 
+class _Server:
+    """The digests of frames that a server was sent. number: among the client's servers"""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self._sent: OrderedDict[bytes, None] = OrderedDict()
+
+    def __contains__(self, digest: bytes) -> bool:
+        return digest in self._sent
+
+    def remember(self, digests: Iterable[bytes]) -> None:
+        for digest in digests:
+            self._sent[digest] = None
+            self._sent.move_to_end(digest)
+        while len(self._sent) > MAX_REMEMBERED:
+            self._sent.popitem(last=False)
+
+    def forget(self, digests: Iterable[bytes]) -> None:
+        for digest in digests:
+            self._sent.pop(digest, None)
+
+
 class WindowScorer:
-    """Scores windows for one client, in its event loop.
+    """Scores windows for one client, in its event loop. A new episode goes to the server with the fewest.
 
     model: name of the exported model
     """
 
-    def __init__(self, model: str, scorer: SampleScorer) -> None:
+    def __init__(self, model: str, scorer: SampleScorer, num_servers: int) -> None:
         self._model = frames_name(model)
         self._scorer = scorer
-        self._remembered: OrderedDict[bytes, None] = OrderedDict()  # digests of frames sent to the servers
+        self._servers = [_Server(number) for number in range(num_servers)]
+        self._server_of: WeakKeyDictionary[object, _Server] = WeakKeyDictionary()  # of each episode that goes on
 
     async def outcomes(self, windows: Sequence[Window], call: Call) -> list[Result | RewardError]:
         """Return the result or error of each window."""
@@ -105,19 +134,20 @@ class WindowScorer:
     def _parts(self, windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
         """Indices of the windows of each request.
 
-        A request has frames of one size, at most ``limit`` windows, and at most MAX_NEW_BYTES unless a window alone
-        has more.
+        A request has frames of one size, for one server, at most ``limit`` windows, and at most MAX_NEW_BYTES unless a
+        window alone has more.
         """
+        servers = [self._server(window) for window in windows]
 
-        def size(index: int) -> tuple[int, ...]:
-            return windows[index].frames[0].pixels.shape
+        def alike(index: int) -> tuple[int, tuple[int, ...]]:
+            return servers[index].number, windows[index].frames[0].pixels.shape
 
-        for _, of_size in groupby(sorted(range(len(windows)), key=size), key=size):
+        for _, together in groupby(sorted(range(len(windows)), key=alike), key=alike):
             part: list[int] = []
             sent: set[bytes] = set()
-            for index in of_size:
+            for index in together:
                 frames = windows[index].frames
-                own = {frame.digest for frame in frames if frame.digest not in self._remembered}
+                own = {frame.digest for frame in frames if frame.digest not in servers[index]}
                 num_bytes = _padded_bytes(len(part) + 1, len(sent | own), frames[0].pixels.nbytes)
                 if part and (len(part) == limit or num_bytes > MAX_NEW_BYTES):
                     yield part
@@ -130,29 +160,32 @@ class WindowScorer:
         self, windows: Sequence[Window], outputs: Sequence[str], call: Call
     ) -> Sequence[Result | RewardError]:
         """Send a request; if it fails, perhaps because the server lacks frames, send all pixels."""
+        server = self._server(windows[0])
+        call = call.at(server.number)
         new = {frame.digest: frame.pixels for window in windows for frame in window.frames}
         digests = list(new)
-        sent = [pixels for digest, pixels in new.items() if digest not in self._remembered]
+        sent = [pixels for digest, pixels in new.items() if digest not in server]
         try:
             results = await self._request(windows, sent, outputs, call)
         except (InvalidSampleError, InferenceFailedError):  # the server may lack frames
-            for digest in digests:
-                self._remembered.pop(digest, None)
+            server.forget(digests)
             outcomes = await self._whole(windows, call)
             if not any(isinstance(outcome, RewardError) for outcome in outcomes):
-                self._remember(digests)
+                server.remember(digests)
             return outcomes
         except RewardError as error:
             return for_each(error, len(windows))
-        self._remember(digests)
+        server.remember(digests)
         return results
 
-    def _remember(self, digests: Iterable[bytes]) -> None:
-        for digest in digests:
-            self._remembered[digest] = None
-            self._remembered.move_to_end(digest)
-        while len(self._remembered) > MAX_REMEMBERED:
-            self._remembered.popitem(last=False)
+    def _server(self, window: Window) -> _Server:
+        """Return the server of a window's episode; of a new episode, one with the fewest episodes."""
+        if window.episode not in self._server_of:
+            counts = Counter(self._server_of.values())
+            fewest = min(counts[server] for server in self._servers)
+            # at random, since each of many clients may have a single episode
+            self._server_of[window.episode] = random.choice([each for each in self._servers if counts[each] == fewest])
+        return self._server_of[window.episode]
 
     async def _request(
         self, windows: Sequence[Window], sent: Sequence[UInt8Array], outputs: Sequence[str], call: Call
@@ -161,7 +194,7 @@ class WindowScorer:
         num_bytes = _padded_bytes(len(windows), len(sent), sent[0].nbytes if sent else 0)
         tensors = partial(wire.encode_refs, [window.named for window in windows], sent)
         try:
-            answer = await self._scorer.infer(self._model, num_bytes, tensors, outputs, call.deadline, request_id)
+            answer = await self._scorer.infer(self._model, num_bytes, tensors, outputs, call, request_id)
         except RewardError as error:
             error.request_id = request_id
             raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import secrets
+from copy import copy
 from typing import TypedDict
 
 from rfm_client.contract import wire
@@ -41,7 +42,10 @@ class Call:
 
     outputs: outputs beside the scores of the samples
     request_ids: an id for each request
+    server: number of the server to ask first; None: the least busy
     """
+
+    server: int | None = None
 
     def __init__(
         self,
@@ -65,3 +69,9 @@ class Call:
             *[wire.TIMING_MS] * timing,
         )
         self.subsample, self.resize = subsample, resize
+
+    def at(self, server: int) -> Call:
+        """Return the same call with a server that is asked first."""
+        call = copy(self)
+        call.server = server
+        return call

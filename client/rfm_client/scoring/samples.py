@@ -81,7 +81,7 @@ class SampleScorer:
             raise InvalidSampleError.at("trajectory", "frames", "video_embeddings")
         tensors, model = partial(wire.encode_frames, trajectory), encoder_name(self._model)
         size, request_id = trajectory.frames.nbytes, next(call.request_ids)
-        answer = await self.infer(model, size, tensors, _EMBEDDINGS, call.deadline, request_id)
+        answer = await self.infer(model, size, tensors, _EMBEDDINGS, call, request_id)
         return wire.decode_embeddings(answer.tensors, trajectory)
 
     async def model_info(self, model: str, deadline: Deadline, *, refresh: bool = False) -> ModelInfo:
@@ -156,12 +156,12 @@ class SampleScorer:
         asks_marks: True: ask for the marks of unclear answers, if the model has them
         """
         request_id = next(call.request_ids)
-        size, deadline, tensors = padded_bytes(samples), call.deadline, partial(wire.encode_samples, samples)
+        size, tensors = padded_bytes(samples), partial(wire.encode_samples, samples)
         marks = asks_marks and samples[0].trajectories[0].frames is not None
         try:
-            marks = marks and await self._marks_unclear(model, deadline)
+            marks = marks and await self._marks_unclear(model, call.deadline)
             outputs = (*wire.outputs_for(samples), *call.outputs, *[wire.UNCLEAR] * marks)
-            answer = await self.infer(model, size, tensors, outputs, deadline, request_id)
+            answer = await self.infer(model, size, tensors, outputs, call, request_id)
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
             error.request_id = request_id
@@ -188,16 +188,20 @@ class SampleScorer:
         num_bytes: int,
         tensors: Callable[[], wire.Tensors],
         outputs: Collection[str],
-        deadline: Deadline,
+        call: Call,
         request_id: str,
     ) -> Answer:
         """Return the model's ``outputs``. Raises RewardError.
 
         tensors: makes the inputs of ``num_bytes`` when it is the request's turn
         """
-        async with self._concurrency.room(num_bytes, deadline):  # tensors are made in turn, so that they do not pile up
+        async with self._concurrency.room(
+            num_bytes, call.deadline
+        ):  # tensors are made in turn, so that they do not pile up
             inputs = await off_loop(num_bytes, tensors)
-            answer = await self._servers.infer(model, inputs, outputs, deadline, request_id=request_id)
+            answer = await self._servers.infer(
+                model, inputs, outputs, call.deadline, request_id=request_id, first=call.server
+            )
         known = self._infos.get(model)
         if known is not None and known.versions and answer.model_version not in known.versions:
             del self._infos[model]

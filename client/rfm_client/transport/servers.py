@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Servers of one checkpoint, and the loop that retries a request until its deadline.
 
-The least busy server gets a request. A server that fails is left out until it reports ready; after more failures, it is
-asked later. A score depends on the request alone, so a request may be sent twice:
+The least busy server gets a request, unless the caller names the first to ask. A server that fails is left out until it
+reports ready; after more failures, it is asked later. A score depends on the request alone, so a request may be sent
+twice:
 
 - the server is down, restarting or full: retry at once at another server, else after growing pauses
 - a process or the connection ended, perhaps because of this request: retry once, when a server can be back. So a
@@ -119,19 +120,32 @@ class Servers:
         self._retry = retry
         self._moments = itertools.count(1)
 
+    def __len__(self) -> int:
+        return len(self._servers)
+
     def __str__(self) -> str:
         return ", ".join(server.transport.url for server in self._servers)
 
     async def infer(
-        self, model: str, inputs: Tensors, outputs: Collection[str], deadline: Deadline, *, request_id: str
+        self,
+        model: str,
+        inputs: Tensors,
+        outputs: Collection[str],
+        deadline: Deadline,
+        *,
+        request_id: str,
+        first: int | None = None,
     ) -> Answer:
-        """Return the named ``outputs`` of ``model`` for ``inputs``. Raises RewardError with the request's id."""
+        """Return the named ``outputs`` of ``model`` for ``inputs``. Raises RewardError with the request's id.
+
+        first: number of the server to ask, if it fails the next in the list; None: the least busy
+        """
 
         def request(server: Transport, left_s: float) -> Awaitable[Answer]:
             return server.infer(model, inputs, outputs, left_s, request_id=request_id)
 
         try:
-            return await self._request(model, request, deadline)
+            return await self._request(model, request, deadline, first)
         except RewardError as error:
             error.request_id = request_id
             raise
@@ -188,22 +202,26 @@ class Servers:
         self.stop_retrying()
         await asyncio.gather(*(server.close() for server in self._servers))
 
-    async def _request(self, model: str, request: Request[Answered], deadline: Deadline) -> Answered:
+    async def _request(
+        self, model: str, request: Request[Answered], deadline: Deadline, first: int | None = None
+    ) -> Answered:
         try:
-            return await self._until_answered(model, request, deadline)
+            return await self._until_answered(model, request, deadline, first)
         except OF_A_PORT as error:
             if not any(server.has_answered for server in self._servers):
                 for named in filter(None, await self._wrong_ports()):
                     raise ServerUnavailableError(named) from error
             raise
 
-    async def _until_answered(self, model: str, request: Request[Answered], deadline: Deadline) -> Answered:
+    async def _until_answered(
+        self, model: str, request: Request[Answered], deadline: Deadline, first: int | None
+    ) -> Answered:
         """Run the loop that the module describes."""
         refusals: dict[KnownServer, RewardError] = {}
         failures: dict[KnownServer, ServerUnavailableError] = {}
         has_ended = False  # True: a process or the connection, during this request
         for attempt in itertools.count():
-            server = self._least_busy(refusals)
+            server = self._best(refusals, first)
             left_s = deadline.remaining_s()
             try:
                 answer = await server.answer(request, next(self._moments), left_s)
@@ -249,11 +267,15 @@ class Servers:
                 return answer
         raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # says least
 
-    def _least_busy(self, avoided: Collection[KnownServer]) -> KnownServer:
-        def rank(server: KnownServer) -> tuple[bool, bool, int, int]:
-            return server in avoided, server.is_left_out, server.outstanding, server.last_request
+    def _best(self, avoided: Collection[KnownServer], first: int | None) -> KnownServer:
+        """Return the server to ask next: ``first``, or the next in the list that answers; None: the least busy."""
 
-        return min(self._servers, key=rank)
+        def rank(number: int) -> tuple[bool, bool, int, int, int]:
+            server = self._servers[number]
+            behind = 0 if first is None else (number - first) % len(self)
+            return server in avoided, server.is_left_out, behind, server.outstanding, server.last_request
+
+        return self._servers[min(range(len(self)), key=rank)]
 
     def _leave_out(self, server: KnownServer, model: str, error: RewardError) -> None:
         """Leave the server out until it is ready. A single server still gets requests."""
