@@ -42,7 +42,10 @@ class Size:
     vocabulary: int = 0
 
 
-TINY = Size()
+TINY = Size(
+    {"hidden_size": 64, "intermediate_size": 128, "num_attention_heads": 4, "num_key_value_heads": 2},
+    {"depth": 2, "out_hidden_size": 64, "deepstack_visual_indexes": [0]},
+)
 QWEN3_VL_4B = Size(
     {
         "hidden_size": 2560, "intermediate_size": 9728, "num_attention_heads": 32, "num_key_value_heads": 8,
