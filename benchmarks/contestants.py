@@ -185,7 +185,8 @@ def serving(
     assert process.stdout is not None
     try:
         while not (line := process.stdout.readline()).startswith("{"):
-            assert line, "expected a server, got its end"
+            if not line:
+                raise RuntimeError(f"{python}: expected a server, got its end with exit status {process.wait()}")
         yield json.loads(line)
     finally:
         process.communicate()
