@@ -90,6 +90,7 @@ gpu-packages: $(INSTALLED)
 	  nvidia_pytriton.libs/libpython3* $$(find pytriton/tritonserver/python_backend_stubs -mindepth 1 -type d ! -name 3.12)
 	$(if $(BEFORE),mkdir build/gpu/before && git archive $(BEFORE) rfm client/rfm_client export/rfm_export commands | \
 	  tar -x -C build/gpu/before && git rev-parse $(BEFORE) > build/gpu/before/COMMIT)
+	git rev-parse HEAD > build/gpu/COMMIT
 	tar -c -C build/gpu . | xz --x86 --lzma2=preset=9 > build/gpu.tar.xz
 	ls -l build/gpu.tar.xz
 

@@ -170,17 +170,14 @@ class BareEngine:
 
 
 @contextmanager
-def serving(
-    checkpoint: Path, folder: Path, settings: Mapping[str, Any], python: str = sys.executable, path: str | None = None
-) -> Iterator[dict[str, str]]:
-    """Serve a checkpoint with another Python, or with the packages of another checkout; yield the addresses.
+def serving(checkpoint: Path, folder: Path, settings: Mapping[str, Any], python: str) -> Iterator[dict[str, str]]:
+    """Serve a checkpoint with the packages of another Python, without those of PYTHONPATH; yield the addresses.
 
     folder: for the repository and the log
     settings: section ``export`` of a configuration
-    path: PYTHONPATH; None: as here
     """
     words = [python, str(HERE / "serving.py"), str(checkpoint), str(folder), json.dumps(settings)]
-    environment = dict(os.environ) if path is None else {**os.environ, "PYTHONPATH": path}
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
     assert process.stdout is not None
     try:

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 import traceback
+import venv
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -62,10 +63,18 @@ class Run:
     folder: Path
 
     @property
-    def python_path(self) -> str:
-        """PYTHONPATH with the packages of the checkout first."""
-        folders = [str(self.checkout / source) for source in SOURCES]
-        return os.pathsep.join([*folders, *filter(None, [os.environ.get("PYTHONPATH")])])
+    def python(self) -> str:
+        """Return a Python with the packages of the checkout before those of this Python, made at first use.
+
+        Triton's Python backend does not read PYTHONPATH, but takes the packages of the first python3 in PATH.
+        """
+        place = self.folder / "venv"
+        if not place.exists():
+            venv.create(place, symlinks=True)
+            (packages,) = place.glob("lib/python3*/site-packages")
+            folders = [*(str(self.checkout / source) for source in SOURCES), *filter(os.path.isdir, sys.path[1:])]
+            (packages / "benchmark.pth").write_text("\n".join(folders) + "\n")
+        return str(place / "bin" / "python3")
 
     @property
     def num_gpus(self) -> int:
@@ -97,9 +106,9 @@ def engine(run: Run) -> Iterator[Row]:
     """Measure the bare engine in a process of its own."""
     for kind in (ROBOMETER, QWEN):
         run.checkpoint(kind)
-    words = [sys.executable, str(Path(__file__).with_name("real_size.py")), str(run.folder)]
+    words = [run.python, str(Path(__file__).with_name("real_size.py")), str(run.folder)]
     words += ["--tiny"] if run.scale is SMALLEST else []
-    environment = {**os.environ, "PYTHONPATH": run.python_path}
+    environment = {**os.environ, "PYTHONPATH": ""}
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None
         try:
@@ -177,7 +186,7 @@ def _warmed(load: Load, scale: Scale) -> Load:
 @contextmanager
 def _grpc_of(run: Run, checkpoint: Path, place: Path, settings: Mapping[str, Any]) -> Iterator[str]:
     began_s = time.perf_counter()
-    with serving(checkpoint, place, settings, path=run.python_path) as addresses:
+    with serving(checkpoint, place, settings, run.python) as addresses:
         print(f"exported and ready in {time.perf_counter() - began_s:.0f} s", flush=True)
         yield addresses["grpc"]
 
@@ -317,8 +326,9 @@ def _cell(value: Any) -> str:
 def about(checkout: Path, device: str) -> dict[str, Any]:
     """Return the device, packages, commit and date of a run."""
     told = report.machine()
-    marked = checkout / "COMMIT"
-    commit = marked.read_text().strip() if marked.exists() else told["commit"]
+    marked = checkout / "COMMIT" if checkout != report.ROOT else report.ROOT / "build" / "gpu" / "COMMIT"
+    commit = told["commit"] if checkout == report.ROOT else ""
+    commit = commit or (marked.read_text().strip() if marked.exists() else "unknown")
     name = torch.cuda.get_device_name() if device == "cuda" else told["cpu"]
     return {"device": name, "torch": torch.__version__, "cores": told["cores"], "commit": commit, "date": told["date"]}
 
