@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -176,9 +177,13 @@ def serving(checkpoint: Path, folder: Path, settings: Mapping[str, Any], python:
     folder: for the repository and the log
     settings: section ``export`` of a configuration
     """
-    words = [python, str(HERE / "serving.py"), str(checkpoint), str(folder), json.dumps(settings)]
+    program = str(Path(shutil.which(python) or python).absolute())
+    words = [program, str(HERE / "serving.py"), str(checkpoint.absolute()), str(folder), json.dumps(settings)]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+    # In another folder: Triton's Python backend imports from the working folder first.
+    process = subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, cwd=folder
+    )
     assert process.stdout is not None
     try:
         while not (line := process.stdout.readline()).startswith("{"):
