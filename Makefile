@@ -6,7 +6,7 @@ WORKERS := --numprocesses 2 --dist loadgroup
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
-.PHONY: help demo test test-all nightly test-newest check parity bench bench-full perf chaos soak format model_repository \
+.PHONY: help demo test test-all nightly test-newest check parity bench bench-full gpu gpu-packages perf chaos soak format model_repository \
   clean ops-check ops-tools audit lock mutate docs prose version
 
 # What can be made: this list.
@@ -64,6 +64,35 @@ bench-full: $(INSTALLED)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
 	$(BIN)/python benchmarks/engine.py forward
 	$(BIN)/python benchmarks/bench.py --full
+
+# The packages from build/gpu.tar.xz if it exists, else those of $(VENV).
+GPU_PYTHON = $(if $(wildcard build/gpu.tar.xz),$(PYTHON),$(BIN)/python)
+EMPTY :=
+SPACE := $(EMPTY) $(EMPTY)
+GPU_PATH = $(subst $(SPACE),:,$(addprefix $(CURDIR)/,. client gateway export commands build/gpu/site))
+
+# Measure on a GPU: GPU tests, the bare engine, served checkpoints. Nine minutes.
+# Makes benchmarks/results/gpu.md. ARGUMENTS="--checkout build/gpu/before" measures the commit of make gpu-packages.
+gpu:
+	test ! -f build/gpu.tar.xz || $(PYTHON) -c "import tarfile; tarfile.open('build/gpu.tar.xz').extractall('build/gpu')"
+	PYTHONPATH=$(GPU_PATH) $(GPU_PYTHON) benchmarks/gpu.py $(ARGUMENTS)
+
+PLATFORMS := manylinux_2_35_x86_64 manylinux_2_28_x86_64 manylinux_2_17_x86_64 manylinux2014_x86_64
+
+# Pack what a machine with Python 3.12, PyTorch and transformers lacks for make gpu into build/gpu.tar.xz, 35 MB.
+# Needs the network. BEFORE=COMMIT also packs the packages of that commit. Of the wheels, only what is needed is packed.
+gpu-packages: $(INSTALLED)
+	rm -rf build/gpu build/gpu.tar.xz
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-compile --target build/gpu/site \
+	  --python-version 3.12 --implementation cp --only-binary :all: $(addprefix --platform ,$(PLATFORMS)) \
+	  --constraint constraints.txt nvidia-pytriton numpy tritonclient python-rapidjson
+	cd build/gpu/site && find . -type d -name tests -prune -exec rm -r {} + && rm -r bin pytriton/tritonserver/caches \
+	  nvidia_pytriton.libs/libpython3* $$(find pytriton/tritonserver/python_backend_stubs -mindepth 1 -type d ! -name 3.12)
+	$(if $(BEFORE),mkdir build/gpu/before && git archive $(BEFORE) rfm client/rfm_client export/rfm_export commands | \
+	  tar -x -C build/gpu/before && git rev-parse $(BEFORE) > build/gpu/before/COMMIT)
+	git rev-parse HEAD > build/gpu/COMMIT
+	tar -c -C build/gpu . | xz --x86 --lzma2=preset=9 > build/gpu.tar.xz
+	ls -l build/gpu.tar.xz
 
 # Measure with Triton's own perf_analyzer, checkpoints of both sizes.
 perf: $(INSTALLED)

@@ -16,17 +16,28 @@ import argparse
 import itertools
 import json
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory, gettempdir
+from tempfile import TemporaryDirectory
 
 import report
 import torch
-from contestants import DEMO, PEERS, VLM_BASE, VLM_CHECKPOINT, BareEngine, Contestant, checkpoint, peer, running
+from contestants import (
+    DEMO,
+    PEERS,
+    VLM_BASE,
+    VLM_CHECKPOINT,
+    BareEngine,
+    Checkpoint,
+    Contestant,
+    checkpoint,
+    peer,
+    running,
+    serving,
+)
 from load import SHARED_MEMORY, Load
 from report import Row
 
@@ -53,23 +64,9 @@ FULL = {
     "8 callers": (replace(MANY, callers=8), OURS, True),
     "128 callers": (replace(MANY, callers=128), OURS, True),
     "2 callers, 32 samples each": (Load(2, 0, UNIFORM, together=32), ("gRPC", "gateway"), True),
-    "8 callers, 8 raw frames of 256 x 256": (Load(8, 0, (8, 8), frame_px=256), OURS[:3], False),
+    "8 callers, 8 raw frames of 256 x 256": (Load(8, 0, (8, 8), frame_px=(256, 256)), OURS[:3], False),
     "Poisson, half of the bare engine's rate": (Load(0, 0, UNIFORM, rate_per_s=0.5), ("gRPC",), True),
 }
-COMMIT = """
-import sys
-from pathlib import Path
-from rfm.config import ExportConfig
-from rfm.launch.temporary import temporary_server
-import rfm_export
-
-checkpoint, base, threads, folder = sys.argv[1:]
-config = ExportConfig(num_gpus=0, torch_threads=int(threads), base_model=base or None)
-rfm_export.export(checkpoint, Path(folder) / "repository", config)
-with temporary_server(Path(folder) / "repository", Path(folder) / "log") as endpoints:
-    print(endpoints.grpc_url, flush=True)
-    sys.stdin.readline()
-"""
 BATCH_S, ROW_S, VLM_ROW_S = 4e-3, 0.5e-3, 30e-3  # sleep for a batch, a sample, a sample of frames
 SIMULATED = """
 
@@ -137,12 +134,11 @@ def commits(arguments: argparse.Namespace, folder: Path) -> None:
         made = {}
         for name, python in (word.split("=", 1) for word in arguments.server):
             (place := folder / f"{size}_{name}").mkdir()
-            words = [python, "-c", COMMIT, str(measured.folder), base, str(measured.threads), str(place)]
-            made[name] = Contestant("gRPC", _commit(words), measured.widths)
+            made[name] = Contestant("gRPC", _commit(python, measured, base, place), measured.widths)
         if not base:
             options = {"checkpoint": measured.folder, "threads": measured.threads}
             made["mosec"] = Contestant("mosec", peer("mosec", options, folder / "mosec.log"), measured.widths)
-        load = Load(1, arguments.seconds, (8, 8) if base else UNIFORM, frame_px=256 if base else 0)
+        load = Load(1, arguments.seconds, (8, 8) if base else UNIFORM, frame_px=(256, 256) if base else None)
         with ExitStack() as stack:
             for contestant in made.values():
                 stack.enter_context(contestant)
@@ -181,7 +177,7 @@ def accelerator(arguments: argparse.Namespace, folder: Path) -> None:
         made[name] = Contestant(name, peer(name, {"checkpoint": copied}, folder / f"{name}.log"), (64, 32))
     loads = [("embeddings", Load(callers, arguments.seconds, UNIFORM)) for callers in arguments.callers]
     for callers, px in ((16, 256), (4, 256), (16, 480)):
-        loads.append((f"frames of {px} x {px}", Load(callers, 2 * arguments.seconds, (8, 8), frame_px=px)))
+        loads.append((f"frames of {px} x {px}", Load(callers, 2 * arguments.seconds, (8, 8), frame_px=(px, px))))
     rows: list[Row] = []
     with ExitStack() as stack:
         for name, contestant in made.items():
@@ -221,16 +217,10 @@ def _ours(place: Path) -> Iterator[str]:
 
 
 @contextmanager
-def _commit(words: list[str]) -> Iterator[str]:
-    # In another folder: from this folder, Python would import this commit's packages.
-    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=gettempdir())
-    assert process.stdout is not None
-    try:
-        while not (line := process.stdout.readline()).startswith("grpc"):
-            assert line, "expected a server, got its end"
-        yield line.strip()
-    finally:
-        process.communicate("\n")
+def _commit(python: str, measured: Checkpoint, base_model: str, place: Path) -> Iterator[str]:
+    settings = {"num_gpus": 0, "torch_threads": measured.threads, "base_model": base_model or None}
+    with serving(measured.folder, place, settings, python) as addresses:
+        yield addresses["grpc"]
 
 
 def main() -> None:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Measure the cost of a client, and the rate of a served checkpoint. All parts but ``episodes`` need a running server.
+"""Measure the cost of a client.
 
-    client.py cost        CPU of the client's process a call: asyncio tasks or threads, gRPC or HTTP
+    client.py cost        CPU of the client's process a call, by tasks or threads, gRPC or HTTP; needs a server
     client.py episodes    a step of an RL loop: whole windows, episodes, resized episodes; starts its own servers
-    client.py throughput  samples/s of frames, with 1, 8 and 32 samples a call; GPU utilisation
 
 Each round measures every way once, so that drift of the machine affects all alike.
 """
@@ -89,20 +88,6 @@ def episodes(arguments: argparse.Namespace) -> None:
     report.write("episodes", f"{about} Ratio: of ms.", rows, ("way",), "ms", arguments.output)
 
 
-def throughput(arguments: argparse.Namespace) -> None:
-    """One caller. gpu_busy: GPU utilisation after the last call, from Triton's metrics."""
-    rows = []
-    with Contestant("gRPC", nullcontext(arguments.grpc), (0, 0)) as caller:
-        for number in range(arguments.rounds):
-            for count in (1, 8, 32):
-                told = caller.measure(Load(1, arguments.seconds, (8, 8), together=count, frame_px=256))
-                figures = {name: told[name] for name in ("samples_per_s", "failed", "p50_ms")}
-                figures["gpu_busy"] = max(_metric(arguments.metrics, "nv_gpu_utilization"), default=float("nan"))
-                rows.append({"way": f"{count} together", "round": number, **figures})
-    about = f"Frames of 256 x 256, 8 a sample\n{throughput.__doc__}"
-    report.write("throughput", about, rows, ("way",), folder=arguments.output)
-
-
 def _loopback_bytes() -> int:
     return int(psutil.net_io_counters(pernic=True)["lo"].bytes_sent)
 
@@ -120,19 +105,18 @@ def _metric(url: str, name: str) -> list[float]:
 def main() -> None:
     """Run the chosen benchmark, then write and print its results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    programs = {each.__name__: each for each in (cost, episodes, throughput)}
+    programs = {each.__name__: each for each in (cost, episodes)}
     parser.add_argument("what", choices=programs)
     parser.add_argument("--grpc", default="grpc://localhost:8001", help="gRPC address of the server")
     parser.add_argument("--http", default="http://localhost:8000", help="its HTTP address")
-    parser.add_argument("--metrics", default="http://localhost:8002/metrics", help="of its metrics")
-    parser.add_argument("--rounds", type=int, help="9 of cost, 48 steps of episodes, 5 of throughput")
-    parser.add_argument("--seconds", type=float, default=1.0, help="of each measurement of cost and throughput")
+    parser.add_argument("--rounds", type=int, help="9 of cost, 48 steps of episodes")
+    parser.add_argument("--seconds", type=float, default=1.0, help="of each measurement of cost")
     parser.add_argument("--frames", type=int, default=16, help="of a window")
     parser.add_argument("--size", type=int, nargs=2, default=(400, 600), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--envs", type=int, default=8)
     parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
     arguments = parser.parse_args()
-    arguments.rounds = arguments.rounds or {"cost": 9, "episodes": 48, "throughput": 5}[arguments.what]
+    arguments.rounds = arguments.rounds or {"cost": 9, "episodes": 48}[arguments.what]
     programs[arguments.what](arguments)
 
 

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""The measured servers, each with a separate process of callers, and the bare engine."""
+"""The measured servers, each with separate processes of callers, and the bare engine."""
 
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 import time
@@ -12,11 +14,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import psutil
 import torch
-from load import Load, Measured, samples
+from load import Calls, Load, Measured, samples
 
 import rfm_export
 from rfm.config import ExportConfig
@@ -33,6 +35,7 @@ VLM = HERE.parent / "tests" / "golden" / "vlm"
 VLM_CHECKPOINT, VLM_BASE = VLM / "q3_tok_disc10" / "checkpoint", VLM / "bases" / "q3"
 PEERS = {"FastAPI": "fastapi_server.py", "LitServe": "litserve_server.py", "mosec": "mosec_server.py"}
 START_S = 120
+CORES_OF_A_PROCESS = 4  # a Python process of callers has one core's worth of work, the rest is the server's
 US_PER_S = 1e6
 DEFAULT_SIZE = RewindConfig(  # upstream's defaults
     video_feature_dim=768,
@@ -84,7 +87,7 @@ def checkpoint(size: str, folder: Path) -> Checkpoint:
 
 
 class Contestant:
-    """A context with a running server and a separate process of its callers.
+    """A context with a running server and separate processes of its callers, one for every four cores.
 
     way: how callers reach the server, see load.py
     server: context that yields the server's address
@@ -99,27 +102,46 @@ class Contestant:
         url = self._server.__enter__()
         self._processes = set(psutil.Process().children(recursive=True)) - before
         words = [sys.executable, str(HERE / "load.py"), self._way, url, *map(str, self._widths)]
-        self._callers = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._callers = [
+            subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+            for _ in range(max(len(os.sched_getaffinity(0)) // CORES_OF_A_PROCESS, 1))
+        ]
         return self
 
     def __exit__(self, *raised: object) -> None:
-        self._callers.communicate()
+        for process in self._callers:
+            process.communicate()
         self._server.__exit__(None, None, None)
 
     def measure(self, load: Load) -> dict[str, float]:
-        """Return rates, latencies, and CPU microseconds a sample. Raises RuntimeError if the callers' process ends."""
-        assert self._callers.stdin is not None and self._callers.stdout is not None
-        before_s = _cpu_s(self._processes), _cpu_s([psutil.Process(self._callers.pid)])
-        self._callers.stdin.write(json.dumps(asdict(load)) + "\n")
-        self._callers.stdin.flush()
-        line = self._callers.stdout.readline()
-        if not line:
-            raise RuntimeError(f"callers: expected an answer, got exit status {self._callers.wait()}")
-        after_s = _cpu_s(self._processes), _cpu_s([psutil.Process(self._callers.pid)])
-        measured = Measured(**json.loads(line))
+        """Return rates, latencies, and CPU microseconds a sample. Raises RuntimeError if a process of callers ends."""
+        callers = self._callers[: load.callers or 1]
+        asking = [psutil.Process(process.pid) for process in callers]
+        before_s = _cpu_s(self._processes), _cpu_s(asking)
+        for process, share in zip(callers, shares(load, len(callers)), strict=True):
+            assert process.stdin is not None
+            process.stdin.write(json.dumps(asdict(share)) + "\n")
+            process.stdin.flush()
+        measured = Measured.of([_calls(process) for process in callers], load.together)
+        after_s = _cpu_s(self._processes), _cpu_s(asking)
         count = max(measured.samples_per_s * measured.took_s, 1)
         server_us, client_us = ((after - b) / count * US_PER_S for after, b in zip(after_s, before_s, strict=True))
         return {**asdict(measured), "server_us": server_us, "client_us": client_us}
+
+
+def shares(load: Load, count: int) -> list[Load]:
+    """Return the parts of a load for ``count`` processes, at most one for each caller."""
+    each, more = divmod(load.callers, count)
+    rate_per_s = load.rate_per_s / count
+    return [replace(load, callers=each + (number < more), rate_per_s=rate_per_s) for number in range(count)]
+
+
+def _calls(process: subprocess.Popen[str]) -> Calls:
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    if not line:
+        raise RuntimeError(f"callers: expected an answer, got exit status {process.wait()}")
+    return Calls(**json.loads(line))
 
 
 def _cpu_s(processes: Sequence[psutil.Process] | set[psutil.Process]) -> float:
@@ -141,12 +163,35 @@ class BareEngine:
             if started_s and time.perf_counter() - started_s > load.seconds:
                 break
             before_s = time.perf_counter()
-            self._engine.evaluate([asked[(number * batch_size + i) % len(asked)] for i in range(batch_size)])
+            self._engine.evaluate([asked(number * batch_size + i) for i in range(batch_size)])
             latencies_s.append(time.perf_counter() - before_s)
         took_s = time.perf_counter() - started_s
-        p50_ms, p99_ms = np.percentile(latencies_s, [50, 99]) * 1e3
-        measured = Measured(len(latencies_s) * batch_size / took_s, 0, float(p50_ms), float(p99_ms), took_s)
+        measured = Measured.of([Calls(latencies_s, 0, took_s)], batch_size)
         return {**asdict(measured), "server_us": 0.0, "client_us": 0.0}
+
+
+@contextmanager
+def serving(checkpoint: Path, folder: Path, settings: Mapping[str, Any], python: str) -> Iterator[dict[str, str]]:
+    """Serve a checkpoint with the packages of another Python, without those of PYTHONPATH; yield the addresses.
+
+    folder: for the repository and the log
+    settings: section ``export`` of a configuration
+    """
+    program = str(Path(shutil.which(python) or python).absolute())
+    words = [program, str(HERE / "serving.py"), str(checkpoint.absolute()), str(folder), json.dumps(settings)]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    # In another folder: Triton's Python backend imports from the working folder first.
+    process = subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, cwd=folder
+    )
+    assert process.stdout is not None
+    try:
+        while not (line := process.stdout.readline()).startswith("{"):
+            if not line:
+                raise RuntimeError(f"{python}: expected a server, got its end with exit status {process.wait()}")
+        yield json.loads(line)
+    finally:
+        process.communicate()
 
 
 @contextmanager

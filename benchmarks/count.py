@@ -4,8 +4,9 @@
     python benchmarks/count.py
 
 Prints a Markdown table. The networks run on PyTorch's meta device, whose tensors have shapes but no values, so the
-counts do not depend on this machine. All code of the engine runs as on a GPU. What it reads from the device is 0, so a
-written answer has its full length. Tokenizers are the tests' small ones, which make more tokens of text than Qwen's.
+counts do not depend on this machine. All code of the engine runs as on a GPU. What it reads from the device is 0: a
+draft of zeros is right, and a written answer has its full length. Tokenizers are the tests' small ones, which make
+more tokens of text than Qwen's.
 
 passes: of the language model, also for each written token
 padding: share of the tokens
@@ -26,7 +27,7 @@ from unittest import mock
 import numpy as np
 import torch
 import typer
-from engine import ALL_LAYERS, TEXT, VISION
+from random_checkpoints import QWEN3_VL_4B
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -41,7 +42,6 @@ from rfm.vlm.predictor import VlmPredictor
 from rfm_client import ProgressSample, Trajectory
 
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
-VOCABULARY = 151_936
 WRITTEN_TOKENS = 6  # of "ANSWER: 4" and its end
 SMALL_PX, USUAL_PX = (224, 224), (480, 640)
 ROBOMETER, ROBOREWARD, TOPREWARD = "Robometer", "roboreward", "topreward"
@@ -146,12 +146,16 @@ def engine_of(reward_model: str) -> Engine:
         "roboreward/rr_tied_bf16/checkpoint" if ROBOREWARD in reward_model else "topreward/checkpoints/vlm_fp32_untied"
     )
     small: Any = families.load(GOLDEN / "reward_models" / folder, reward_model=reward_model)
-    config = _of_real_size(small.config, VOCABULARY)
+    config = _of_real_size(small.config, QWEN3_VL_4B.vocabulary)
     if hasattr(config, "max_new_tokens"):
         config = replace(config, max_new_tokens=WRITTEN_TOKENS)
     of_real_size = replace(small, config=config)
     images = small.collator.images
-    collator = of_real_size.make_collator(small.collator.tokenizer, VISION["patch_size"], images.normalisation)
+    collator = of_real_size.make_collator(
+        small.collator.tokenizer, QWEN3_VL_4B.vision["patch_size"], images.normalisation
+    )
+    if len(getattr(collator, "draft", ())):
+        collator.draft = np.zeros_like(collator.draft)
     vars(of_real_size)["collator"] = collator
     predictor = of_real_size.make_predictor(_network(LanguageNetwork, config), META, None)
     return Engine(predictor, max_sample_tokens=10**6)
@@ -166,8 +170,8 @@ def _robometer() -> Engine:
 
 
 def _of_real_size(config: Any, num_tokens: int) -> Any:
-    text = {**config.backbone["text_config"], **TEXT, "num_hidden_layers": ALL_LAYERS, "vocab_size": num_tokens}
-    vision = {**config.backbone["vision_config"], **VISION}
+    text = {**config.backbone["text_config"], **QWEN3_VL_4B.text, "vocab_size": num_tokens}
+    vision = {**config.backbone["vision_config"], **QWEN3_VL_4B.vision}
     return replace(config, backbone={**config.backbone, "text_config": text, "vision_config": vision}, dtype="bfloat16")
 
 

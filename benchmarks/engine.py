@@ -4,8 +4,6 @@
     engine.py forward      forward passes, ours and upstream's; options; dense mode; more frames; wider networks
     engine.py preparation  CPU time to prepare frames for a vision-language checkpoint, ours and transformers'
     engine.py loading      host memory to load a vision-language checkpoint of 0.6B parameters (takes 9 GB)
-    engine.py checkpoint FOLDER --base-model DIR_OR_ID
-                           writes a Qwen3-VL reward checkpoint of 4B parameters with random weights
 
 Weights are random. Each round measures all ways in turn.
 """
@@ -14,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import re
 import shutil
 import subprocess
@@ -28,10 +25,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import random_checkpoints
 import report
 import torch
 from contestants import DEFAULT_SIZE, VLM_BASE, VLM_CHECKPOINT
 from peers.upstream_forward import UpstreamRewind, progress_of
+from random_checkpoints import QWEN3_VL_4B, ROBOMETER
 
 from rfm import families
 from rfm.config import ExportConfig
@@ -42,30 +41,7 @@ from rfm.rewind.predictor import RewindPredictor
 from rfm_client import ProgressSample, Trajectory
 
 FRAMES = 16
-THREE_LAYERS, ALL_LAYERS = 3, 36  # of the language model: 0.6B and 4B parameters
-SPECIAL_TOKENS = ("<|split_token|>", "<|reward_token|>", "<|pref_token|>", "<|sim_token|>", "<|prog_token|>")
-TEXT: dict[str, Any] = {  # Qwen3-VL-4B-Instruct
-    "hidden_size": 2560, "intermediate_size": 9728, "num_attention_heads": 32, "num_key_value_heads": 8,
-    "head_dim": 128, "max_position_embeddings": 262144, "rope_theta": 5000000,
-    "rope_scaling": {"rope_type": "default", "mrope_interleaved": True, "mrope_section": [24, 20, 20]},
-}  # fmt: skip
-VISION = {
-    "hidden_size": 1024, "intermediate_size": 4096, "depth": 24, "num_heads": 16, "patch_size": 16,
-    "out_hidden_size": 2560, "deepstack_visual_indexes": [5, 11, 17], "num_position_embeddings": 2304,
-}  # fmt: skip
-RUN = {  # Robometer-4B's defaults
-    "model": {
-        "model_type": "default", "torch_dtype": "bfloat16", "use_multi_image": True,
-        "use_per_frame_progress_token": True,
-    },
-    "training": {"predict_pref_progress": True},
-}  # fmt: skip
-TOKEN_IDS = {
-    "image_token_id": "<|image_pad|>",
-    "video_token_id": "<|video_pad|>",
-    "vision_start_token_id": "<|vision_start|>",
-    "vision_end_token_id": "<|vision_end|>",
-}
+THREE_LAYERS = 3  # of the language model: 0.6B parameters
 
 Row = dict[str, Any]
 
@@ -192,9 +168,9 @@ def loading(arguments: argparse.Namespace) -> None:
         print(_peak_bytes(arguments.one, arguments.folder))
         return
     with TemporaryDirectory() as name:
-        folder, rows = Path(name) / "checkpoint", []
-        write_checkpoint(folder, str(VLM_BASE), THREE_LAYERS)
-        size = (folder / "model.safetensors").stat().st_size
+        small = replace(QWEN3_VL_4B, text={**QWEN3_VL_4B.text, "num_hidden_layers": THREE_LAYERS})
+        folder, rows = random_checkpoints.write(Path(name), ROBOMETER, small), []
+        size = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
         for what in ("bfloat16", "float32", "export"):
             words = [[sys.executable, __file__, "loading", str(of), "--one", what] for of in (folder, VLM_CHECKPOINT)]
             peaks = [int(subprocess.check_output(line, text=True).splitlines()[-1]) for line in words]
@@ -222,56 +198,16 @@ def _peak_bytes(what: str, checkpoint: Path) -> int:
     return int(peak_kib) * 1024
 
 
-def checkpoint(arguments: argparse.Namespace) -> None:
-    """Write a checkpoint of 4B parameters."""
-    write_checkpoint(arguments.folder, arguments.base_model)
-
-
-def write_checkpoint(folder: Path, base_model: str, layers: int = ALL_LAYERS) -> None:
-    """Write model.safetensors, config.json and config.yaml.
-
-    base_model: folder or Hub id of the model with the tokenizer
-    layers: number of layers of the language model
-    """
-    from safetensors.torch import save_file
-    from transformers import AutoTokenizer, Qwen3VLConfig, Qwen3VLModel
-
-    folder.mkdir(parents=True)
-    tokenizer = AutoTokenizer.from_pretrained(base_model)
-    tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
-    ids = {name: tokenizer.convert_tokens_to_ids(token) for name, token in TOKEN_IDS.items()}
-    text = {**TEXT, "num_hidden_layers": layers, "vocab_size": len(tokenizer)}
-    config = Qwen3VLConfig(text_config=text, vision_config=VISION, **ids)
-    torch.manual_seed(0)
-    backbone = Qwen3VLModel._from_config(config, dtype=torch.bfloat16)
-    width = TEXT["hidden_size"]
-    weights = {f"model.{name}": tensor for name, tensor in backbone.state_dict().items()}
-    weights["frame_pool_attn.weight"] = torch.randn(1, width)
-    for head, outputs in (("progress", 10), ("success", 1), ("preference", 1)):
-        modules = {0: (width, width // 2), 4: (width // 2, outputs)}
-        layers_of = {i: torch.nn.Linear(*sizes) for i, sizes in modules.items()} | {1: torch.nn.LayerNorm(width // 2)}
-        for index, layer in layers_of.items():
-            weights |= {f"{head}_head.{index}.{key}": tensor for key, tensor in layer.state_dict().items()}
-    tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in weights.items()}
-    save_file(tensors, folder / "model.safetensors", metadata={"format": "pt"})
-    (folder / "config.json").write_text(json.dumps(config.to_dict(), indent=2))
-    run = {**RUN, "model": {**RUN["model"], "base_model_id": base_model}}
-    (folder / "config.yaml").write_text(json.dumps(run))  # JSON is YAML
-
-
 def main() -> None:
     """Run the chosen benchmark, then write and print its results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    programs = {each.__name__: each for each in (forward, preparation, loading, checkpoint)}
+    programs = {each.__name__: each for each in (forward, preparation, loading)}
     parser.add_argument("what", choices=programs)
-    parser.add_argument("folder", type=Path, nargs="?", help="checkpoint: where it is written")
-    parser.add_argument("--base-model", help="checkpoint: folder or id whose tokenizer is used")
+    parser.add_argument("folder", type=Path, nargs="?", help=argparse.SUPPRESS)  # of --one
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
     parser.add_argument("--one", help=argparse.SUPPRESS)  # loading starts itself with this option, to print one peak
     arguments = parser.parse_args()
-    if arguments.what == "checkpoint" and None in (arguments.folder, arguments.base_model):
-        parser.error("checkpoint: expected FOLDER and --base-model")
     programs[arguments.what](arguments)
 
 

@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""Callers of one server, as a program. Reads a Load as a line of JSON from standard input, writes a line of JSON.
+"""Callers of one server, as a program. Reads a Load as a line of JSON from standard input, writes Calls as a line.
 
 Closed loop: each caller makes a call and waits for the answer. Open loop: calls begin at random times (Poisson), even
 while earlier answers are late, so that a slow answer does not hide the calls behind it. A latency counts from the time
 when the call was due. Each caller stands for a separate client, so calls are not joined.
+
+Raw frames are distinct by default: no frame comes twice, so no feature of a frame is in the server's cache.
 """
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import sys
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
@@ -36,7 +39,7 @@ from rfm_client import (
 )
 
 NUM_SAMPLES = 256
-NUM_FILMED = 16
+NUM_FILMED = 16  # distinct samples of raw frames of a load that repeats them
 IN_FLIGHT = 4096  # more than any load needs, so that no client holds calls back
 KEEP_ALIVE_S = 3.0  # peers close a connection after 5 idle seconds, perhaps just as a call reuses it
 MS_PER_S = 1e3
@@ -59,7 +62,9 @@ class Load:
     mixed: True: all three sample types in turn; False: only progress
     rate_per_s: calls a second of the open loop
     together: samples of a call
-    frame_px: height and width of raw frames; 0: embeddings
+    frame_px: height and width of raw frames; None: embeddings
+    repeated: True: NUM_FILMED samples of raw frames in turn; False: each frame is new
+    warm_up_s: time before the calls that count
     """
 
     callers: int
@@ -68,7 +73,23 @@ class Load:
     mixed: bool = False
     rate_per_s: float = 0.0
     together: int = 1
-    frame_px: int = 0
+    frame_px: tuple[int, int] | None = None
+    repeated: bool = False
+    warm_up_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Calls:
+    """What the calls of one process gave, after the warm-up.
+
+    latencies_s: of answered calls
+    failed: number of samples without scores
+    took_s: duration, up to the last answer
+    """
+
+    latencies_s: Sequence[float]
+    failed: int
+    took_s: float
 
 
 @dataclass(frozen=True)
@@ -87,30 +108,66 @@ class Measured:
     p99_ms: float
     took_s: float
 
+    @classmethod
+    def of(cls, calls: Sequence[Calls], together: int = 1) -> Measured:
+        """Return what processes that called at the same time measured. together: samples of a call"""
+        latencies_s = [latency_s for each in calls for latency_s in each.latencies_s]
+        rate = sum(len(each.latencies_s) * together / each.took_s for each in calls)
+        p50, p99 = np.percentile(latencies_s, [50, 99]) * MS_PER_S if latencies_s else (float("nan"),) * 2
+        failed, took_s = sum(each.failed for each in calls), max(each.took_s for each in calls)
+        return cls(rate, failed, float(p50), float(p99), took_s)
 
-def samples(load: Load, video_dim: int, text_dim: int) -> list[Sample]:
-    """Return the samples of a load, equal for every server. A pair has as many frames as a single trajectory."""
+
+def samples(load: Load, video_dim: int, text_dim: int) -> Callable[[int], Sample]:
+    """Return a function that gives the sample of a number.
+
+    Embeddings are equal for every server. A pair has as many frames as a single trajectory.
+    """
     random = np.random.default_rng(0)
+    lengths = random.integers(load.frames[0], load.frames[1] + 1, NUM_SAMPLES).tolist()
+    trajectory = _filmed(load) if load.frame_px else _embedded(random, video_dim, text_dim)
 
-    def trajectory(num_frames: int) -> Trajectory:
-        if load.frame_px:
-            frames = random.integers(0, 256, (num_frames, load.frame_px, load.frame_px, 3), np.uint8)
-            return Trajectory(frames=frames, task="put the block in the bowl")
+    def made(index: int) -> Sample:
+        num_frames = lengths[index % NUM_SAMPLES]
+        kind = index % 3 if load.mixed and num_frames > 1 else 0
+        if kind == 0:
+            return ProgressSample(trajectory(index, 0, num_frames))
+        half = num_frames // 2
+        pair = trajectory(index, 0, half), trajectory(index, half, num_frames - half)
+        return PreferenceSample(*pair) if kind == 1 else SimilaritySample(*pair)
+
+    if load.frame_px:
+        return made
+    kept = [made(index) for index in range(NUM_SAMPLES)]
+    return lambda index: kept[index % NUM_SAMPLES]
+
+
+def _embedded(random: np.random.Generator, video_dim: int, text_dim: int) -> Callable[[int, int, int], Trajectory]:
+    def trajectory(_index: int, _first: int, num_frames: int) -> Trajectory:
         return Trajectory(
             video_embeddings=random.standard_normal((num_frames, video_dim), np.float32),
             text_embedding=random.standard_normal(text_dim, np.float32),
         )
 
-    made: list[Sample] = []
-    for index in range(NUM_FILMED if load.frame_px else NUM_SAMPLES):
-        num_frames = int(random.integers(load.frames[0], load.frames[1] + 1))
-        kind = index % 3 if load.mixed and num_frames > 1 else 0
-        if kind == 0:
-            made.append(ProgressSample(trajectory(num_frames)))
-        else:
-            pair = trajectory(num_frames // 2), trajectory(num_frames - num_frames // 2)
-            made.append(PreferenceSample(*pair) if kind == 1 else SimilaritySample(*pair))
-    return made
+    return trajectory
+
+
+def _filmed(load: Load) -> Callable[[int, int, int], Trajectory]:
+    """Return a function of a sample's number, its first frame and the number of frames.
+
+    Frames are views into random bytes, each video one byte further than the video before, so a frame costs nothing.
+    """
+    assert load.frame_px is not None
+    size = 3 * load.frame_px[0] * load.frame_px[1]
+    pool = np.random.default_rng().integers(0, 256, (load.frames[1] + 1) * size, np.uint8)
+    shifts = itertools.count()
+
+    def trajectory(index: int, first: int, num_frames: int) -> Trajectory:
+        begin = first * size + (index % NUM_FILMED if load.repeated else next(shifts) % size)
+        frames = pool[begin : begin + num_frames * size].reshape(num_frames, *load.frame_px, 3)
+        return Trajectory(frames=frames, task="put the block in the bowl")
+
+    return trajectory
 
 
 @asynccontextmanager
@@ -145,19 +202,23 @@ def _score(result: Result) -> float:
     return result.preference if isinstance(result, PreferenceResult) else result.similarity
 
 
-async def measure(ask: Ask, load: Load, asked: Sequence[Sample], *, threads: bool = False) -> Measured:
+async def measure(ask: Ask, load: Load, sample: Callable[[int], Sample], *, threads: bool = False) -> Calls:
     """Apply a load to a server, with each caller in its own task or thread, and measure it."""
     latencies_s: list[float] = []
     failed = 0
-    started_s = time.perf_counter()
+    started_s = time.perf_counter() + load.warm_up_s
     end_s = started_s + load.seconds
 
     async def answered(index: int, due_s: float) -> None:
         nonlocal failed
         try:
-            await ask([asked[(index * load.together + i) % len(asked)] for i in range(load.together)])
-            latencies_s.append(time.perf_counter() - due_s)
-        except Exception:  # noqa: BLE001  every error counts as failed samples
+            await ask([sample(index * load.together + i) for i in range(load.together)])
+            now_s = time.perf_counter()
+            if now_s > started_s:
+                latencies_s.append(now_s - due_s)
+        except Exception as error:  # noqa: BLE001  every error counts as failed samples
+            if not failed:
+                print(f"first error: {error!r:.500}", file=sys.stderr)
             failed += load.together
 
     async def call(index: int) -> None:
@@ -167,7 +228,8 @@ async def measure(ask: Ask, load: Load, asked: Sequence[Sample], *, threads: boo
 
     if load.rate_per_s:
         random = np.random.default_rng(1)
-        due_s = started_s + np.cumsum(random.exponential(1 / load.rate_per_s, int(load.rate_per_s * load.seconds)))
+        num_calls = int(load.rate_per_s * (load.warm_up_s + load.seconds))
+        due_s = started_s - load.warm_up_s + np.cumsum(random.exponential(1 / load.rate_per_s, num_calls))
         calls = []
         for index, moment_s in enumerate(due_s.tolist()):
             await asyncio.sleep(max(moment_s - time.perf_counter(), 0))
@@ -178,9 +240,7 @@ async def measure(ask: Ask, load: Load, asked: Sequence[Sample], *, threads: boo
             list(pool.map(lambda index: asyncio.run(call(index)), range(load.callers)))
     else:
         await asyncio.gather(*map(call, range(load.callers)))
-    took_s = time.perf_counter() - started_s
-    p50, p99 = np.percentile(latencies_s, [50, 99]) * MS_PER_S if latencies_s else (float("nan"),) * 2
-    return Measured(len(latencies_s) * load.together / took_s, failed, float(p50), float(p99), took_s)
+    return Calls(latencies_s, failed, time.perf_counter() - started_s)
 
 
 async def main(way: str, url: str, video_dim: int, text_dim: int) -> None:
@@ -188,10 +248,10 @@ async def main(way: str, url: str, video_dim: int, text_dim: int) -> None:
     async with connected(way, url) as ask:
         while line := await asyncio.to_thread(sys.stdin.readline):
             load = Load(**json.loads(line))
-            asked = samples(load, video_dim, text_dim)
-            for sample in asked[:3]:  # opens connections, and warms up each sample type
-                await ask([sample])
-            print(json.dumps(asdict(await measure(ask, load, asked, threads=way == THREADS))), flush=True)
+            sample = samples(load, video_dim, text_dim)
+            for index in range(3):  # opens connections, and warms up each sample type
+                await ask([sample(index)])
+            print(json.dumps(asdict(await measure(ask, load, sample, threads=way == THREADS))), flush=True)
 
 
 if __name__ == "__main__":

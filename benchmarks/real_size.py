@@ -1,145 +1,113 @@
 # SPDX-License-Identifier: MIT
-"""Measure networks of a published size with random weights on a GPU, without a server.
+"""Measure networks of a published size without a server: prints a line of JSON for each measurement.
 
-    python benchmarks/real_size.py FILE.json
+    real_size.py FOLDER [--tiny]
 
-A Qwen3-VL of 4 billion parameters in bfloat16, as Robometer (8 frames, progress tokens), TOPReward and RoboReward ask
-it. Random weights cost the same time and memory as trained ones. Tokenizers are the tests' small ones, which make more
-tokens of text than Qwen's. RoboReward writes 6 tokens, as a trained model does ("ANSWER: 4" and its end).
+FOLDER has the checkpoints of random_checkpoints.py. Imports only what exists at older commits, too. Each batch has new
+frames; a measurement lasts a few seconds after the calls that warm up.
 """
 
 from __future__ import annotations
 
+import inspect
 import json
-import statistics
+import sys
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import numpy as np
 import torch
-import typer
-from engine import ALL_LAYERS, TEXT, VISION
+from load import Calls, Load, Measured, samples
+from random_checkpoints import BASE_MODEL, QWEN, QWEN3_VL_4B, ROBOMETER, TINY, Size
 
-from rfm import families
 from rfm.engine import Engine
-from rfm.engine.layers import keep_float32
-from rfm.roboreward.predictor import RoboRewardPredictor
-from rfm.topreward.predictor import TopRewardPredictor
-from rfm.vlm.language import LanguageNetwork
-from rfm.vlm.network import VlmRewardModel, build_backbone
-from rfm.vlm.predictor import VlmPredictor
-from rfm_client import ProgressSample, Trajectory
 
-GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
-VOCABULARY = 151_936
-SMALL_PX, USUAL_PX = (224, 224), (480, 640)
-ROUNDS = 3
-TASK = "put the red block in the bowl"
+FRAMES = 8
+WARM_UP_CALLS = 3  # a CUDA graph is captured at the third
+LEAST_ROUNDS = 3
+MAX_TOKENS = 10**6
 
 
-def of_real_size(config: Any, num_tokens: int) -> Any:
-    """Return a small checkpoint's configuration with the sizes above."""
-    text = {**config.backbone["text_config"], **TEXT, "num_hidden_layers": ALL_LAYERS, "vocab_size": num_tokens}
-    vision = {**config.backbone["vision_config"], **VISION}
-    return replace(config, backbone={**config.backbone, "text_config": text, "vision_config": vision}, dtype="bfloat16")
+@dataclass(frozen=True)
+class Scale:
+    """What is measured, and how long.
+
+    small_px, usual_px: heights and widths of frames
+    many_frames: of TOPReward's episode
+    callers: numbers of callers, and of samples in a batch
+    seconds: of a measurement, after warm_up_s
+    """
+
+    size: Size
+    device: str
+    small_px: tuple[int, int]
+    usual_px: tuple[int, int]
+    many_frames: int
+    callers: tuple[int, int, int]
+    seconds: float
+    warm_up_s: float
 
 
-def random_network(network_class: Any, config: Any, device: torch.device) -> Any:
-    """Return a network with normally distributed weights on ``device``."""
-    with device:
-        network = network_class(config, build_backbone(config, torch.bfloat16))
-    generator = torch.Generator(device).manual_seed(0)
-    for name, parameter in network.named_parameters():
-        parameter.requires_grad_(False)
-        parameter.data = parameter.data.bfloat16()
-        if parameter.ndim > 1:
-            parameter.normal_(0, 0.02, generator=generator)
-        else:
-            parameter.fill_(0.0 if name.endswith("bias") else 1.0)
-    return network
+FULL = Scale(QWEN3_VL_4B, "cuda", (224, 224), (480, 640), 64, (1, 8, 32), 5.0, 1.5)
+SMALLEST = Scale(TINY, "cpu", (64, 64), (64, 96), 6, (1, 2, 4), 0.3, 0.1)
 
 
-def measured(
-    what: str, engine: Engine, device: torch.device, num_samples: int, num_frames: int, size_px: tuple[int, int]
-) -> dict[str, Any]:
-    """Return the time and memory of a batch of noise videos: median of ROUNDS, after one to warm up."""
-    random = np.random.default_rng(0)
-    shape = (num_frames, *size_px, 3)
-    samples = [
-        ProgressSample(Trajectory(frames=random.integers(0, 256, shape, np.uint8), task=TASK))
-        for _ in range(num_samples)
-    ]
-    engine.evaluate(samples)
-    torch.cuda.reset_peak_memory_stats(device)
-    times_s = []
-    for _ in range(ROUNDS):
-        torch.cuda.synchronize(device)
-        began_s = time.perf_counter()
-        engine.evaluate(samples)
-        torch.cuda.synchronize(device)
-        times_s.append(time.perf_counter() - began_s)
-    row = {
-        "what": what,
-        "samples": num_samples,
-        "frames": num_frames,
-        "size_px": size_px,
-        "tokens": sum(row.num_tokens for row in engine.predictor.rows(samples[0])),
-        "ms_per_sample": statistics.median(times_s) / num_samples * 1e3,
-        "peak_gib": torch.cuda.max_memory_allocated(device) / 2**30,
-    }
-    typer.echo(row)
-    return row
+def described(px: tuple[int, int], frames: int, callers: int, **more: Any) -> dict[str, Any]:
+    """Return the columns that identify a measurement."""
+    return {"frames": frames, "size": f"{px[0]}x{px[1]}", "callers": callers, "repeated": False, **more}
 
 
-def robometer(device: torch.device) -> list[dict[str, Any]]:
-    """Measure Robometer."""
-    folder = GOLDEN / "vlm" / "q3_tok_disc10_bf16" / "checkpoint"
-    small = families.load(folder, base_model=str(GOLDEN / "vlm" / "bases" / "q3"))
-    config = of_real_size(small.config, len(small.collator.tokenizer))  # type: ignore[attr-defined]  # of this family
-    collator = type(small.collator)(config, small.collator.tokenizer, small.collator.images)  # type: ignore[attr-defined]  # of this family
-    engine = Engine(VlmPredictor(random_network(VlmRewardModel, config, device), collator, device))
-    sizes = [(size_px, count) for size_px in (SMALL_PX, USUAL_PX) for count in (1, 8, 32)]
-    return [measured("Robometer", engine, device, count, 8, size_px) for size_px, count in sizes]
+def measured(engine: Engine, scale: Scale, count: int, frames: int, px: tuple[int, int]) -> dict[str, Any]:
+    """Return rate, latencies and memory of batches of ``count`` samples."""
+    sample = samples(Load(1, 0, (frames, frames), frame_px=px), 0, 0)
+    on_gpu = scale.device != "cpu"
+    latencies_s: list[float] = []
+    began_s = time.perf_counter()
+    for number in range(WARM_UP_CALLS, -(10**6), -1):
+        if number == 0:
+            began_s = time.perf_counter()
+            if on_gpu:
+                torch.cuda.reset_peak_memory_stats()
+        if len(latencies_s) >= LEAST_ROUNDS and time.perf_counter() - began_s > scale.seconds / 2:
+            break
+        batch = [sample(0) for _ in range(count)]
+        before_s = time.perf_counter()
+        for result in engine.evaluate(batch):
+            if isinstance(result, Exception):
+                raise result
+        if number <= 0:
+            latencies_s.append(time.perf_counter() - before_s)
+    told = Measured.of([Calls(latencies_s, 0, sum(latencies_s))], count)
+    row = described(px, frames, count, tokens=engine.prepare(sample(0)).num_tokens)
+    figures = {"samples_per_s": told.samples_per_s, "failed": 0, "p50_ms": told.p50_ms, "p99_ms": told.p99_ms}
+    return {**row, **figures, "peak_gib": torch.cuda.max_memory_allocated() / 2**30 if on_gpu else None}
 
 
-def asked_in_words(device: torch.device) -> list[dict[str, Any]]:
-    """Measure RoboReward and TOPReward, which share a network."""
-    robo, top = "roboreward/rr_tied_bf16/checkpoint", "topreward/checkpoints/vlm_fp32_untied"
-    network, rows = None, []
-    plans: Sequence[tuple[str, str, Any, dict[str, Any], Sequence[tuple[int, int, tuple[int, int]]]]] = (
-        (robo, "roboreward", RoboRewardPredictor, {"max_new_tokens": 6}, [(n, 8, USUAL_PX) for n in (1, 8, 32)]),
-        (robo, "roboreward-expected", RoboRewardPredictor, {}, [(n, 8, USUAL_PX) for n in (1, 8, 32)]),
-        (top, "topreward", TopRewardPredictor, {}, [(1, 16, SMALL_PX), (1, 64, SMALL_PX), (1, 16, USUAL_PX)]),
-        (top, "topreward,num_prefixes=15", TopRewardPredictor, {}, [(1, 64, SMALL_PX)]),
+def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
+    """Measure all networks in turn. Graphs are measured where the engine knows them."""
+    small, usual, (one, some, many) = scale.small_px, scale.usual_px, scale.callers
+    plans: Sequence[tuple[str, str, Sequence[tuple[int, int, tuple[int, int]]]]] = (
+        ("Robometer", ROBOMETER, [(n, FRAMES, px) for px in (small, usual) for n in (one, some, many)]),
+        ("topreward", QWEN, [(one, scale.many_frames // 4, small), (one, scale.many_frames, small)]),
+        ("roboreward", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
+        ("roboreward-expected", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
     )
-    for folder, reward_model, predictor_class, settings, sizes in plans:
-        small: Any = families.load(GOLDEN / "reward_models" / folder, reward_model=reward_model)
-        config = replace(of_real_size(small.config, VOCABULARY), **settings)
-        if network is None:
-            network = random_network(LanguageNetwork, config, device)
-            network.lm_head.weight = network.model.language_model.embed_tokens.weight
-        network.config = config
-        scaled = replace(small, config=config)
-        images = small.collator.images
-        collator = scaled.make_collator(small.collator.tokenizer, VISION["patch_size"], images.normalisation)
-        engine = Engine(predictor_class(network, collator, device), max_sample_tokens=10**6)
-        rows += [measured(reward_model, engine, device, *size) for size in sizes]
-    return rows
-
-
-def main(file: Annotated[Path, typer.Argument(help="Where the results go.")], device: str = "cuda") -> None:
-    """Measure all, and write FILE."""
-    keep_float32()
-    on = torch.device(device)
-    rows = robometer(on)
-    torch.cuda.empty_cache()
-    rows += asked_in_words(on)
-    told = {"device": torch.cuda.get_device_name(on), "torch": torch.__version__, "rows": rows}
-    file.write_text(json.dumps(told, indent=1) + "\n")
+    knows_graphs = "cuda_graphs" in inspect.signature(Engine.from_checkpoint).parameters
+    for what, kind, sizes in plans:
+        for graphs in (False, True) if knows_graphs and kind == ROBOMETER else (False,):
+            sources: dict[str, Any] = {"base_model": str(BASE_MODEL)} if kind == ROBOMETER else {"reward_model": what}
+            if graphs:
+                sources["cuda_graphs"] = True
+            engine = Engine.from_checkpoint(folder / kind, device=scale.device, max_sample_tokens=MAX_TOKENS, **sources)
+            for size in sizes[:2] if graphs else sizes:
+                yield {"what": what, "way": "engine", "graphs": graphs, **measured(engine, scale, *size)}
+            del engine
+            if scale.device != "cpu":
+                torch.cuda.empty_cache()
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    for row in rows(Path(sys.argv[1]), SMALLEST if "--tiny" in sys.argv else FULL):
+        print(json.dumps(row), flush=True)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shutil
 import statistics
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,8 @@ Row = Mapping[str, Any]
 def machine() -> dict[str, object]:
     """Return the CPU, packages, commit and date of the results."""
     cpu = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")), "")
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False).stdout
+    git = shutil.which("git") or "false"  # a bare machine may have none
+    commit = subprocess.run([git, "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False).stdout
     return {
         "cpu": cpu.partition(": ")[2],
         "cores": len(os.sched_getaffinity(0)),

@@ -67,14 +67,6 @@ def test_a_tensor_that_does_not_fit_is_refused_as_an_array_is() -> None:
         Trajectory(video_embeddings=torch.tensor([[0.0], [torch.nan]]))  # type: ignore[arg-type]
 
 
-@pytest.mark.gpu
-def test_tensors_are_fetched_from_the_gpu() -> None:
-    frames = Trajectory(frames=torch.from_numpy(FRAMES).cuda()).frames  # type: ignore[arg-type]
-    np.testing.assert_array_equal(frames, FRAMES)
-    filmed = as_trajectory({TOP: channels_first(FRAMES).cuda().requires_grad_()})
-    np.testing.assert_array_equal(filmed.positions, FRAMES)
-
-
 def items(**more: Any) -> list[dict[str, Any]]:
     """One dict a step, as indexing a LeRobot dataset gives them."""
     return [

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ from typer.testing import CliRunner
 
 import goldens
 import rfm_export
-from engines import serve_config
 from labelling import LEROBOT
 from rfm import families
 from rfm.family import NETWORK
@@ -91,11 +89,3 @@ def test_label_refuses_a_device_that_is_not_there(free_bytes: list[float]) -> No
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 1
     assert "rfm: device: expected one of cpu, got 0: PyTorch " in done.stderr
-
-
-@pytest.mark.gpu
-def test_a_gpu_compares(tmp_path: Path) -> None:
-    said: list[str] = []
-    settings = replace(serve_config(LARGE), num_gpus=1, dtype="float32")
-    assert rfm_export.export(LARGE.checkpoint, tmp_path, settings, say=said.append) == 1
-    assert "on cuda:0" in said[-1]

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""A pass of a model of a published size launches no more kernels than it did."""
+"""Models of a published size launch no more kernels, and need no more passes and tokens, than they did."""
 
 from __future__ import annotations
+
+import importlib
+from typing import Any
 
 import pytest
 
@@ -12,11 +15,18 @@ MOST_KERNELS = 1_570
 TOKENS, LEAST_TFLOP = 583, 5.3
 
 
-def test_a_pass_of_robometer_4b_launches_few_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def count(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    import count
+    return importlib.import_module("count")
 
+
+def test_a_pass_of_robometer_4b_launches_few_kernels(count: Any) -> None:
     row = count.counted(count.ROBOMETER, 1, 8, count.SMALL_PX)
     assert (row["tokens"], row["passes"]) == (TOKENS, 1)
     assert row["kernels"] <= MOST_KERNELS
     assert float(row["TFLOP"]) > LEAST_TFLOP  # the whole network was counted
+
+
+def test_a_usual_answer_of_roboreward_takes_two_passes(count: Any) -> None:
+    assert count.counted(count.ROBOREWARD, 1, 8, count.SMALL_PX)["passes"] == 2

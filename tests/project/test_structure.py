@@ -62,9 +62,11 @@ EXCEPTIONS = {
     "benchmarks/contestants.py": {"rfm", "rfm_commands", "rfm_export"},
     "benchmarks/count.py": {"rfm"},
     "benchmarks/engine.py": {"rfm", "rfm_export"},
+    "benchmarks/gpu.py": {"rfm"},
     "benchmarks/gpus.py": {"rfm", "rfm_export"},  # what is served
     "benchmarks/perf_analyzer.py": {"rfm"},
     "benchmarks/real_size.py": {"rfm"},
+    "benchmarks/serving.py": {"rfm", "rfm_export"},
     "benchmarks/peers/engines.py": {"rfm"},  # the peers score with our engine, or weights
     "benchmarks/peers/litserve_server.py": {"rfm"},
     "benchmarks/peers/upstream_forward.py": {"rfm"},

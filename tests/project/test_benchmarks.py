@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from paths import ROOT
+from rfm.engine import Engine
+from rfm_client import ProgressResult, ProgressSample, Sample
+
+sys.path.append(str(ROOT / "benchmarks"))
+
+import contestants
+import gpu
+import random_checkpoints
+from load import NUM_FILMED, Calls, Load, Measured, samples
+from real_size import FULL
+
+FILMED = Load(4, 0, (2, 2), frame_px=(8, 6))
+
+
+def frames(sample: Callable[[int], Sample], index: int) -> list[bytes]:
+    made = sample(index)
+    assert isinstance(made, ProgressSample)
+    assert made.trajectory.frames is not None
+    assert made.trajectory.frames.shape == (2, 8, 6, 3)
+    return [frame.tobytes() for frame in made.trajectory.frames]
+
+
+def test_no_frame_of_a_load_comes_twice() -> None:
+    sample = samples(FILMED, 0, 0)
+    made = [frame for _ in range(2) for index in range(50) for frame in frames(sample, index)]
+    assert len(set(made)) == len(made) == 200
+
+
+def test_a_load_that_repeats_frames_has_few_videos() -> None:
+    sample = samples(replace(FILMED, repeated=True), 0, 0)
+    made = [frame for index in range(100) for frame in frames(sample, index)]
+    assert len(set(made)) == 2 * NUM_FILMED
+
+
+def test_processes_share_the_callers_of_a_load() -> None:
+    parts = contestants.shares(replace(FILMED, callers=10), 4)
+    assert [part.callers for part in parts] == [3, 3, 2, 2]
+    assert [part.rate_per_s for part in contestants.shares(Load(0, 1, (1, 1), rate_per_s=8.0), 2)] == [4.0, 4.0]
+
+
+def test_percentiles_are_those_of_all_processes() -> None:
+    measured = Measured.of([Calls([0.1] * 3, 0, 1.0), Calls([0.5], 2, 2.0)], together=2)
+    assert measured == Measured(samples_per_s=7.0, failed=2, p50_ms=100.0, p99_ms=pytest.approx(488.0), took_s=2.0)
+
+
+def test_a_server_of_another_commit_is_started_with_a_relative_python(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    program = tmp_path / "bin" / "python"
+    program.parent.mkdir()
+    program.write_text('#!/bin/sh\necho \'{"grpc": "grpc://here:1"}\'\nread line\n')
+    program.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    with contestants.serving(tmp_path, tmp_path, {}, os.path.join("bin", "python")) as addresses:  # noqa: PTH118
+        assert addresses == {"grpc": "grpc://here:1"}
+
+
+def test_a_random_checkpoint_writes_the_answer_of_a_trained_one(tmp_path: Path) -> None:
+    folder = random_checkpoints.write(tmp_path, random_checkpoints.QWEN, random_checkpoints.TINY)
+    engine = Engine.from_checkpoint(folder, reward_model="roboreward")
+    (result,) = engine.evaluate([samples(replace(FILMED, frame_px=(64, 64)), 0, 0)(0)])
+    assert isinstance(result, ProgressResult), result
+    assert result.last_progress == 0.75
+
+
+def test_results_of_parts_and_of_another_checkout_stay_and_are_judged(tmp_path: Path) -> None:
+    row = {"what": "Robometer", "way": "served", "graphs": False, "frames": 8, "size": "224x224", "repeated": False}
+    slow, quick = ({**row, "callers": 32, "samples_per_s": rate} for rate in (60.0, 120.0))
+    bare = {**row, "callers": 32, "way": "engine", "samples_per_s": 130.0}
+    gpu.Results(tmp_path, gpu.BEFORE, FULL).add(slow)
+    gpu.Results(tmp_path, gpu.NOW, FULL).add(slow)
+    for measured in (quick, bare):
+        gpu.Results(tmp_path, gpu.NOW, FULL).add(measured)
+    told = (tmp_path / "gpu.md").read_text()
+    assert "| figure | aim | before | now |" in told
+    assert "| Robometer, 224x224, 32 callers, samples/s | >= 100 | 60, missed | 120, met |" in told
+    assert "| Robometer, 224x224, 32 callers, beside the engine | >= 0.95 | not measured | 0.923, missed |" in told
+
+
+@pytest.mark.nightly
+@pytest.mark.triton
+def test_make_gpu_s_program_runs_to_the_end_on_the_cpu_with_tiny_networks(tmp_path: Path) -> None:
+    words = [sys.executable, str(ROOT / "benchmarks" / "gpu.py"), "--tiny", "--output", str(tmp_path)]
+    subprocess.run(words, check=True)
+    assert "not measured" not in (tmp_path / "gpu.md").read_text()
