@@ -29,7 +29,7 @@ Batch = TypeVar("Batch")
 
 
 class Predictor(Protocol[Row, Batch]):
-    """A network on a device, with the collation of its batches. A row is one token sequence of a forward pass."""
+    """A network on a device, with the collation of its batches. A row is one token sequence, or several that begin alike."""
 
     @property
     def has_success(self) -> bool:
@@ -47,7 +47,10 @@ class Predictor(Protocol[Row, Batch]):
         """
 
     def num_tokens(self, row: Row) -> int:
-        """Return the number of tokens in the row. Rows with similar numbers share a batch."""
+        """Return the number of tokens that the network computes. Rows with similar numbers share a batch."""
+
+    def longest(self, row: Row) -> int:
+        """Return the number of tokens in the longest of the row's sequences, which often is its only one."""
 
     def work_ahead(self, rows: Sequence[Row]) -> None:
         """Do the slow, independent work on these rows; thread-safe. ``collate`` does the rest."""
