@@ -30,7 +30,7 @@ class TopRewardPredictor(VlmPredictor):
         self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         output = self._output(batch)
         prefixes = [ids for row in rows for ids in (*(leaf.input_ids for leaf in row.leaves), row.input_ids)]
-        answers = torch.tensor([int(ids[-1]) for ids in prefixes], device=output.logits.device)
+        answers = torch.tensor([int(ids[-1]) for ids in prefixes]).to(output.logits.device)
         logits = output.logits.float() if self._config.variant == "lerobot" else output.logits
         log_probs = logits.log_softmax(-1).gather(1, answers[:, None])[:, 0].float().cpu().numpy()
         if np.isfinite(log_probs).all():

@@ -98,6 +98,11 @@ class VlmPredictor:
         scores, preference, similarity, may_keep = _read(output)
         of_rows, read, num_queries = [], 0, 0
         for row in rows:
+            if row.packs:
+                prefixes = slice(read, read + len(row.leaves) + 1)
+                of_rows.append(RowScores([part_of(scores, prefixes)], is_of_prefixes=True))
+                read = prefixes.stop
+                continue
             frames = []
             for spans, video in zip(row.spans, row.videos, strict=True):
                 frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), video.num_shown))

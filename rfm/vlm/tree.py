@@ -80,7 +80,7 @@ def trees(rows: Sequence[VlmRow], pad: int, *, are_images: bool) -> list[VlmRow]
     found: list[VlmRow] = []
     for _, group in groupby(rows, key=lambda row: id(row.videos[0])):
         of_video = list(group)
-        if len(of_video) == 1 or of_video[0].query is None:
+        if len(of_video) == 1:
             found += of_video
         else:
             found += _trees([Conversation.of(row, pad, are_images=are_images) for row in of_video])
@@ -91,7 +91,8 @@ def _trees(conversations: Sequence[Conversation]) -> list[VlmRow]:
     """Return one tree, or those of each half if it would be too large."""
     rows = [each.row for each in conversations]
     packs = _packs(conversations[:-1], conversations[-1])
-    tree = replace(rows[-1], packs=packs)
+    ends: tuple[list[tuple[int, int]]] = ([] if rows[-1].query is not None else [conversations[-1].reads],)
+    tree = replace(rows[-1], packs=packs, spans=ends)
     trunk = tree.num_tokens
     is_bounded = all(fits(sum(leaf.num_tokens for leaf in pack), trunk) for pack in packs)
     if not is_bounded or tree.cost - trunk > MOST_LEAF_TOKENS:
