@@ -86,7 +86,7 @@ def measured(
         "samples": num_samples,
         "frames": num_frames,
         "size_px": size_px,
-        "tokens": sum(row.num_tokens for row in engine.predictor.rows(samples[0])),
+        "tokens": engine.prepare(samples[0]).num_tokens,
         "ms_per_sample": statistics.median(times_s) / num_samples * 1e3,
         "peak_gib": torch.cuda.max_memory_allocated(device) / 2**30,
     }

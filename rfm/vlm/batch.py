@@ -238,7 +238,7 @@ class VlmBatch:
 
     @property
     def num_slots(self) -> int:
-        """Tokens with padding."""
+        """Number of tokens, with padding."""
         return sum(ids.numel() for ids in (self.inputs["input_ids"], *(packs.input_ids for packs in self.packs)))
 
     def pinned(self) -> VlmBatch:

@@ -156,24 +156,10 @@ def padded(packs: Sequence[PlacedPack], pad: int, visual_pad: int, features: Cal
             num_visual = int((leaf.input_ids == visual_pad).sum())
             shown = features(leaf)
             of_features.append(shown[len(shown) - num_visual :])
-    return Packs(
-        trunks=torch.tensor([pack.trunk for pack in packs]),
-        num_keys=max(pack.num_keys for pack in packs),
-        visual_tokens=torch.from_numpy(np.flatnonzero(ids == visual_pad)),
-        visual_features=torch.from_numpy(np.concatenate(of_features)),
-        **{
-            name: torch.from_numpy(array)
-            for name, array in {
-                "input_ids": ids,
-                "position_ids": positions,
-                "from_trunk": from_trunk,
-                "leaves": leaves,
-                "places": places,
-                "seen": seen,
-                "upto": upto,
-            }.items()
-        },
-    )
+    at_features = np.flatnonzero(ids == visual_pad)
+    arrays = ids, positions, at_features, np.concatenate(of_features), from_trunk, leaves, places, seen, upto
+    trunks = torch.tensor([pack.trunk for pack in packs])
+    return Packs(trunks, max(pack.num_keys for pack in packs), *map(torch.from_numpy, arrays))
 
 
 def starts(packs: Sequence[PlacedPack]) -> dict[Leaf, int]:
