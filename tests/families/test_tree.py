@@ -99,6 +99,14 @@ def test_a_batch_of_trees_gives_the_scores_of_separate_prefixes(settings: str, m
     assert_as_separate(topreward(settings), [*MIXED, sample(40)], monkeypatch)
 
 
+@pytest.mark.parametrize("frame_steps", [0, 4], ids=["TOPReward", "dense mode"])
+def test_a_tree_does_not_depend_on_its_batch(frame_steps: int) -> None:
+    engine = robometer() if frame_steps else topreward()
+    samples = [replace(each, frame_steps=frame_steps) for each in MIXED]
+    for each, together in zip(samples, values(engine.evaluate(samples)), strict=True):
+        np.testing.assert_allclose(together, values(engine.evaluate([each]))[0], rtol=0, atol=TOLERANCE)
+
+
 def test_a_tree_in_bfloat16_is_as_near_as_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     assert_as_separate(topreward(dtype=torch.bfloat16), MIXED, monkeypatch, ROUNDED)
 
@@ -188,3 +196,15 @@ def test_a_device_gives_the_scores_of_a_tree_and_rarely_makes_the_host_wait(seen
     assert (seen.asked.total() - asked, seen.awaited - awaited) == (1, 1)  # the scores are read, the answers sent
     for each, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(each, wanted, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("frame_steps", [0, 4], ids=["TOPReward", "dense mode"])
+def test_a_gpu_gives_the_cpu_s_scores_of_a_tree(frame_steps: int) -> None:
+    engine_of = robometer if frame_steps else topreward
+    samples = [replace(each, frame_steps=frame_steps) for each in MIXED]
+    expected, found = (
+        values(engine_of(device=device, dtype=torch.float32).evaluate(samples)) for device in ("cpu", "cuda")
+    )
+    for each, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(each, wanted, rtol=0, atol=1e-4)
