@@ -62,7 +62,7 @@ class ExportConfig(Settings):
         DEFAULT_TOKEN_BUDGET, "Most tokens, with padding, of one forward pass of several samples.", **_COUNT
     )
     max_sample_tokens: int = setting(
-        DEFAULT_SAMPLE_TOKENS, "Most tokens of one sample, in dense mode of one frame's; it bounds memory.", **_COUNT
+        DEFAULT_SAMPLE_TOKENS, "Most tokens of one sample, or of its longest prefix; it bounds memory.", **_COUNT
     )
     dtype: Dtype | None = setting(None, "Number type of the network; else as checkpoint and device decide.")
     image_encoder: str | None = setting(None, "Folder or id of ReWiND's image encoder.")

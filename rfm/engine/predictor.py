@@ -29,7 +29,10 @@ Batch = TypeVar("Batch")
 
 
 class Predictor(Protocol[Row, Batch]):
-    """A network on a device, with the collation of its batches. A row is one token sequence of a forward pass."""
+    """A network on a device, with the collation of its batches.
+
+    A row is one token sequence, or several that begin alike.
+    """
 
     @property
     def has_success(self) -> bool:
@@ -47,7 +50,10 @@ class Predictor(Protocol[Row, Batch]):
         """
 
     def num_tokens(self, row: Row) -> int:
-        """Return the number of tokens in the row. Rows with similar numbers share a batch."""
+        """Return the number of tokens that the network computes. Rows with similar numbers share a batch."""
+
+    def longest(self, row: Row) -> int:
+        """Return the number of tokens in the longest of the row's sequences, which often is its only one."""
 
     def work_ahead(self, rows: Sequence[Row]) -> None:
         """Do the slow, independent work on these rows; thread-safe. ``collate`` does the rest."""
@@ -74,10 +80,12 @@ class RowScores:
 
     frames: of each trajectory
     query: the preference or similarity of two trajectories; None: the row asks for neither
+    is_of_prefixes: in dense mode, the row has several prefixes, and one value for the last frame of each
     """
 
     frames: list[FrameScores]
     query: float | None = None
+    is_of_prefixes: bool = False
 
 
 def check_type(sample: Sample | ProgressSampleRefs, config: Any) -> None:
@@ -109,12 +117,14 @@ def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> Fram
 
 
 def of_rows(sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
-    """Return a progress sample's scores: of its one row, in dense mode the last score of each prefix's row."""
+    """Return a progress sample's scores: of its one row, in dense mode those of each prefix's last frame."""
     if not getattr(sample, "frame_steps", 0):
         return rows[0].frames[0]
-    frames = [vars(row.frames[0]) for row in rows]
+    frames = [
+        vars(row.frames[0]) if row.is_of_prefixes else vars(part_of(row.frames[0], slice(-1, None))) for row in rows
+    ]
     there = [name for name, scores in frames[0].items() if scores is not None]
-    return FrameScores(**{name: np.stack([scores[name][-1] for scores in frames]) for name in there})
+    return FrameScores(**{name: np.concatenate([scores[name] for scores in frames]) for name in there})
 
 
 def part_of(scores: FrameScores, index: slice | npt.NDArray[np.intp]) -> FrameScores:

@@ -59,7 +59,7 @@ class Engine:
     predictor: the network, with the collation of its batches
     encoders: on the same device, for samples of raw frames if the network scores embeddings
     token_budget: maximum tokens, with padding, of a forward pass of several rows; a larger row runs alone
-    max_sample_tokens: maximum tokens of one row; a sample with a larger row is refused
+    max_sample_tokens: maximum tokens of one sequence; a sample with a longer one is refused
     """
 
     def __init__(
@@ -198,11 +198,11 @@ class Engine:
             rows = self.predictor.rows(embedded_sample)
         except RewardError as error:
             return Prepared(sample, error)
-        num_tokens = [self.predictor.num_tokens(row) for row in rows]
-        if max(num_tokens) > self.max_sample_tokens:
+        longest = max(map(self.predictor.longest, rows))
+        if longest > self.max_sample_tokens:
             expected = f"at most {self.max_sample_tokens} tokens (max_sample_tokens of this server)"
-            return Prepared(sample, InvalidSampleError.at("num_frames", expected, f"{max(num_tokens)} tokens"))
-        return Prepared(sample, rows, sum(num_tokens))
+            return Prepared(sample, InvalidSampleError.at("num_frames", expected, f"{longest} tokens"))
+        return Prepared(sample, rows, sum(map(self.predictor.num_tokens, rows)))
 
     def _results(self, prepared: Sequence[Prepared], execution: Execution, before: Execution) -> list[Outcome]:
         """Return each sample's result or error. ``before``: ``execution`` at the start of this batch."""

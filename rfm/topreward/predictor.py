@@ -26,19 +26,17 @@ class TopRewardPredictor(VlmPredictor):
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
-        """Run one forward pass; return the log-probability of each row's answer, or its error."""
+        """Run one forward pass; return the log-probabilities of the answers of each row's prefixes, or its error."""
         self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         output = self._output(batch)
-        answers = torch.tensor([int(row.input_ids[-1]) for row in rows], device=output.logits.device)
+        prefixes = [ids for row in rows for ids in (*(leaf.input_ids for leaf in row.leaves), row.input_ids)]
+        answers = torch.tensor([int(ids[-1]) for ids in prefixes]).to(output.logits.device)
         logits = output.logits.float() if self._config.variant == "lerobot" else output.logits
         log_probs = logits.log_softmax(-1).gather(1, answers[:, None])[:, 0].float().cpu().numpy()
         if np.isfinite(log_probs).all():
             self._keep(rows, batch.layout, output.made)
-        unknown = np.full(1, np.nan, np.float32)  # progress is known once all rows are
-        return [
-            RowScores([FrameScores(progress=unknown, success=unknown, log_prob=log_probs[index : index + 1])])
-            for index in range(len(rows))
-        ]
+        ends = np.cumsum([len(row.leaves) + 1 for row in rows])
+        return [RowScores([_unjoined(of_row)]) for of_row in np.split(log_probs, ends[:-1])]
 
     def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
         """Return the scores of an episode's frames: progress is 0 at the least likely prefix, 1 at the likeliest."""
@@ -64,6 +62,11 @@ class TopRewardPredictor(VlmPredictor):
     def _config(self) -> TopRewardConfig:
         config: TopRewardConfig = self.network.config
         return config
+
+
+def _unjoined(log_probs: Float32Array) -> FrameScores:
+    unknown = np.full_like(log_probs, np.nan)  # progress is known once all rows are
+    return FrameScores(progress=unknown, success=unknown, log_prob=log_probs)
 
 
 def _log_prob(row: RowScores) -> Float32Array:

@@ -49,7 +49,7 @@ class TopRewardConfig(LanguageConfig):
     prompt_prefix, prompt_suffix: text behind the video; the suffix has ``{instruction}`` and ends with the answer
     fps: frames a second, from which LeRobot's variant writes times; Robometer's ignores it
     num_prefixes: most prefixes that are scored, evenly spaced, the frames between are interpolated; None: all
-    max_frames: most frames of an episode; each scored prefix is a row
+    max_frames: most frames of an episode
     least_px, most_px: of a video, over all its frames, in LeRobot's variant
     """
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from rfm.engine.device import pinned
 from rfm.engine.layers import concatenated
 from rfm.vlm.images import QwenImages, SmolImages
+from rfm.vlm.leaves import Packs
 from rfm.vlm.qwen import VisionPlan
 from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo, shots_of
 
@@ -221,6 +222,8 @@ class VlmBatch:
     pixels: source of the arguments for pixels; None: these are in ``inputs``, or all shots are cached
     plan: of a Qwen backbone's vision tower; None: all shots are cached, or the backbone is SmolVLM
     layout: of a Qwen backbone's shots; None: the backbone is SmolVLM
+    packs: of conversations that begin like others (``rfm.vlm.tree``). If there are any, spans and queries have row 0,
+        and are indices among all B * L tokens and those of the packs
     """
 
     inputs: dict[str, Tensor]
@@ -232,6 +235,12 @@ class VlmBatch:
     pixels: QwenPixels | SmolPixels | None = None
     plan: VisionPlan | None = None
     layout: Layout | None = None
+    packs: tuple[Packs, ...] = ()
+
+    @property
+    def num_slots(self) -> int:
+        """Number of tokens, with padding."""
+        return sum(ids.numel() for ids in (self.inputs["input_ids"], *(packs.input_ids for packs in self.packs)))
 
     def pinned(self) -> VlmBatch:
         """Return the batch with its tensors, except the frames, in pinned memory."""
@@ -252,4 +261,5 @@ class VlmBatch:
             query_tokens=change(self.query_tokens),
             pixels=None if self.pixels is None else self.pixels.changed(change),
             plan=None if self.plan is None else self.plan.changed(change),
+            packs=tuple(packs.changed(change) for packs in self.packs),
         )

@@ -8,7 +8,7 @@ Making a row is cheap. Resizing its frames is not, and may be done before its ba
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -23,6 +23,7 @@ from rfm.engine.predictor import check_type
 from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.vlm.batch import FramesOfOneSize, QwenPixels, Shots, SmolPixels, VlmBatch
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages, SmolImages
+from rfm.vlm.leaves import Leaf, PlacedPack, calls, padded, starts
 from rfm.vlm.network import VlmConfig
 from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, Chat, TrajectoryPart, Visual, question
 from rfm.vlm.qwen import Box, plan, positions
@@ -53,6 +54,7 @@ class VlmRow:
     query: index of the token whose state gives preference or similarity; None: a single trajectory
     picked: in dense mode int64 [frame_steps], the frames in the conversation; None: all
     position_ids: int64 [3, L] for a Qwen backbone; None: for SmolVLM
+    packs: conversations about the same video that begin like this one, the trunk, and precede it (``rfm.vlm.tree``)
     """
 
     input_ids: Indices
@@ -62,6 +64,17 @@ class VlmRow:
     is_similarity: bool
     picked: Indices | None = None
     position_ids: Indices | None = None
+    packs: tuple[tuple[Leaf, ...], ...] = ()
+
+    @property
+    def leaves(self) -> list[Leaf]:
+        """The conversations that begin like this one, in order."""
+        return [leaf for pack in self.packs for leaf in pack]
+
+    @property
+    def cost(self) -> int:
+        """Number of tokens that the language model computes: the conversation's, and those that its leaves add."""
+        return self.num_tokens + sum(leaf.num_tokens for leaf in self.leaves)
 
     @property
     def frames(self) -> tuple[Sequence[UInt8Array] | UInt8Array, ...]:
@@ -162,7 +175,7 @@ class VlmCollator:
             spans=torch.tensor(spans, dtype=torch.int64),
             query_rows=query_rows,
             query_tokens=query_tokens,
-            num_tokens=sum(row.num_tokens for row in rows),
+            num_tokens=sum(row.cost for row in rows),
             num_span_tokens=sum(stop - start for _, start, stop in spans),
         )
         return self._with_pixels(batch, rows)
@@ -267,6 +280,11 @@ class QwenCollator(VlmCollator):
     def _pad(self) -> str:
         return IMAGE_PAD if self.config.multi_image else VIDEO_PAD
 
+    @property
+    def visual_pad(self) -> int:
+        """The token whose embedding a feature of vision replaces."""
+        return int(self.tokenizer.convert_tokens_to_ids(self._pad))
+
     def grid(self, video: VlmVideo) -> Grid:
         """Return the grid of a conversation's frames of a video, as images or as a video."""
         if self.config.multi_image:
@@ -323,6 +341,7 @@ class QwenCollator(VlmCollator):
     def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
         shots = Shots(are_images=self.config.multi_image)
         read = [shots.add(video, shown) for row in rows for video, shown in row.shown]
+        read_by = {leaf: shots.add(row.videos[0], leaf.shown) for row in rows for leaf in row.leaves}
         grids = [self.images.grid(len(each.shots), *each.videos[0].shape[1:3]) for each in shots.sizes]
         layout = shots.layout([grid.tokens_per_group for grid in grids])
         ids = batch.inputs["input_ids"]
@@ -333,14 +352,44 @@ class QwenCollator(VlmCollator):
         inputs = {
             "input_ids": ids,
             "position_ids": position_ids,
-            "visual_tokens": (ids.flatten() == self.tokenizer.convert_tokens_to_ids(self._pad)).nonzero()[:, 0],
+            "visual_tokens": (ids.flatten() == self.visual_pad).nonzero()[:, 0],
             "visual_features": torch.from_numpy(np.concatenate([layout.tokens(keys) for keys in read])),
         }
         batch = replace(batch, inputs=inputs, layout=layout)
+        if read_by:
+            batch = self._with_leaves(batch, rows, lambda leaf: layout.tokens(read_by[leaf]))
         if not grids:
             return batch
         pixels = QwenPixels(self.images, [each.frames() for each in shots.sizes])
         return replace(batch, pixels=pixels, plan=plan(grids, self.config.backbone["vision_config"]))
+
+    def _with_leaves(self, batch: VlmBatch, rows: Sequence[VlmRow], features: Callable[[Leaf], Indices]) -> VlmBatch:
+        """Return the batch with all leaves, and with its spans and queries as indices among all tokens.
+
+        features: returns the indices of the features that a leaf's whole conversation shows
+        """
+        packs = [PlacedPack(index, row.num_tokens, pack) for index, row in enumerate(rows) for pack in row.packs]
+        made, first = [], dict[Leaf, int]()
+        num_slots = batch.inputs["input_ids"].numel()
+        for call in calls(packs):
+            made.append(padded(call, self.tokenizer.pad_token_id, self.visual_pad, features))
+            first |= {leaf: num_slots + start for leaf, start in starts(call).items()}
+            num_slots += made[-1].input_ids.numel()
+        length = batch.inputs["input_ids"].shape[1]
+        spans, queries = [], []
+        for index, row in enumerate(rows):
+            reads = [(first[leaf] + leaf.reads[0], first[leaf] + leaf.reads[1]) for leaf in row.leaves]
+            own = [(index * length + start, index * length + stop) for each in row.spans for start, stop in each]
+            spans += own if row.query is not None else [*reads, *own]
+            queries += [] if row.query is None else [*(start for start, _ in reads), index * length + row.query]
+        return replace(
+            batch,
+            packs=tuple(made),
+            spans=torch.tensor([(0, *span) for span in spans], dtype=torch.int64).reshape(-1, 3),
+            num_span_tokens=sum(stop - start for start, stop in spans),
+            query_rows=torch.zeros(len(queries), dtype=torch.int64),
+            query_tokens=torch.tensor(queries, dtype=torch.int64),
+        )
 
 
 class SmolCollator(VlmCollator):

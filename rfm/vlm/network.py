@@ -20,6 +20,7 @@ from rfm.family import VideoPrompt
 from rfm.vlm.backbone import BACKBONES, SMOL
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.qwen import KeyValues, check_attention, features, last_hidden_state
+from rfm.vlm.tree_states import tree_hidden_states
 
 Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
 Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
@@ -163,7 +164,9 @@ class VlmRewardModel(nn.Module):
 
 
 def qwen_states(backbone: Any, batch: VlmBatch, key_values: KeyValues | None = None) -> tuple[Tensor, Tensor | None]:
-    """Return a Qwen backbone's last hidden states, [B, L, D], and the features that its vision tower computed.
+    """Return a Qwen backbone's last hidden states, and the features that its vision tower computed.
+
+    The states have the shape [B, L, D], or [1, all tokens, D] for a batch with packs.
 
     key_values: receives the keys and values of all tokens, for ``next_hidden_state``
     """
@@ -172,7 +175,10 @@ def qwen_states(backbone: Any, batch: VlmBatch, key_values: KeyValues | None = N
         made = features(backbone.visual, batch.inputs["pixel_values"], batch.plan)
     assert batch.layout is not None
     shots = [*([] if made is None else [made]), *batch.layout.kept.values()]
-    return last_hidden_state(backbone.language_model, batch.inputs, concatenated(shots), key_values), made
+    merged = concatenated(shots)
+    if batch.packs:
+        return tree_hidden_states(backbone.language_model, batch.inputs, batch.packs, merged), made
+    return last_hidden_state(backbone.language_model, batch.inputs, merged, key_values), made
 
 
 def _of_each(reduction: str, values: Tensor, lengths: Tensor) -> Tensor:

@@ -18,9 +18,10 @@ from rfm.engine.layers import progress_from_logits, speed_up
 from rfm.engine.predictor import RowScores, no_success, of_rows, part_of
 from rfm.engine.threads import FrameThreads
 from rfm.vlm.batch import Layout, VlmBatch
-from rfm.vlm.collator import VlmCollator, VlmRow
+from rfm.vlm.collator import QwenCollator, VlmCollator, VlmRow
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.network import VlmOutput
+from rfm.vlm.tree import trees
 from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
 from rfm_client.contract.frame_refs import ProgressSampleRefs
 
@@ -60,10 +61,16 @@ class VlmPredictor:
         if longest > self._max_tokens:
             expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"
             raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
-        return rows
+        if not isinstance(self.collator, QwenCollator):
+            return rows
+        return trees(rows, self.collator.visual_pad, are_images=self.collator.config.multi_image)
 
     def num_tokens(self, row: VlmRow) -> int:
-        """Return the number of tokens in the row."""
+        """Return the number of tokens that the language model computes."""
+        return row.cost
+
+    def longest(self, row: VlmRow) -> int:
+        """Return the number of tokens in the row's longest conversation."""
         return row.num_tokens
 
     def work_ahead(self, rows: Sequence[VlmRow]) -> None:
@@ -81,7 +88,7 @@ class VlmPredictor:
 
     def count(self, batch: VlmBatch, execution: Execution) -> None:
         """Count tokens, without and with padding, the encoded frames, and the frames with cached features."""
-        execution.add_tokens(batch.num_tokens, batch.inputs["input_ids"].numel())
+        execution.add_tokens(batch.num_tokens, batch.num_slots)
         execution.num_encoded += 0 if batch.pixels is None else batch.pixels.num_shown
         execution.num_found += 0 if batch.layout is None else len(batch.layout.kept) * self.collator.frames_per_shot
         execution.cache_bytes = None if self.cache is None else self.cache.num_bytes
@@ -94,6 +101,11 @@ class VlmPredictor:
         scores, preference, similarity, may_keep = _read(output)
         of_rows, read, num_queries = [], 0, 0
         for row in rows:
+            if row.packs:
+                prefixes = slice(read, read + len(row.leaves) + 1)
+                of_rows.append(RowScores([part_of(scores, prefixes)], is_of_prefixes=True))
+                read = prefixes.stop
+                continue
             frames = []
             for spans, video in zip(row.spans, row.videos, strict=True):
                 frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), video.num_shown))

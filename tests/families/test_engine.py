@@ -49,6 +49,8 @@ class Pipelined:
     def num_tokens(self, row: int) -> int:
         return 1
 
+    longest = num_tokens
+
     def collate(self, rows: Sequence[int]) -> Any:
         self.collated[rows[0]].set()
 
@@ -88,6 +90,8 @@ class Fixed:
 
     def num_tokens(self, row: RowScores) -> int:
         return 1
+
+    longest = num_tokens
 
     def collate(self, rows: Sequence[RowScores]) -> None:
         pass

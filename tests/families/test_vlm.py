@@ -53,7 +53,7 @@ def test_token_ids_and_pixels_are_those_of_the_original(case: goldens.Case) -> N
     for kind, samples in groupby(sorted(case.samples(), key=goldens.sample_type), goldens.sample_type):
         if f"{kind}.collated.input_ids" not in arrays:  # evaluated one by one
             continue
-        inputs = upstream_inputs(predictor, [row for sample in samples for row in predictor.rows(sample)])
+        inputs = upstream_inputs(predictor, [row for sample in samples for row in predictor.collator.rows(sample)])
         for name in ("input_ids", "attention_mask", "image_grid_thw", "video_grid_thw"):
             if f"{kind}.collated.{name}" in arrays:
                 np.testing.assert_array_equal(inputs[name].numpy(), arrays[f"{kind}.collated.{name}"])

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: MIT
+"""Prefixes of an episode as one tree: the scores of separate passes, fewer tokens, bounded masks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pretended import CUDA, Seen, pretended
+from reward_models import ROOT
+from rfm import families
+from rfm.engine import Engine
+from rfm.engine.execution import Execution
+from rfm.vlm import leaves, tree
+from rfm.vlm.collator import VlmRow
+from rfm.vlm.tree import trees
+from rfm_client import ProgressResult, ProgressSample, Trajectory
+from rfm_client.contract import InvalidSampleError
+from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs, frame_digest
+from vlm import load
+
+CHECKPOINT = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
+TASK = "put the red block in the bowl"
+TOLERANCE, ROUNDED = 1e-5, 0.3  # the second of log-probabilities in bfloat16
+
+
+def sample(num_frames: int, height: int = 64, width: int = 64, frame_steps: int = 0) -> ProgressSample:
+    frames = np.random.default_rng(num_frames).integers(0, 256, (num_frames, height, width, 3), np.uint8)
+    return ProgressSample(Trajectory(frames=frames, task=TASK), frame_steps=frame_steps)
+
+
+def topreward(settings: str = "", **options: Any) -> Engine:
+    return Engine.from_checkpoint(str(CHECKPOINT), reward_model=f"topreward{settings}", **options)
+
+
+def robometer(name: str = "q3_tok_disc10", **options: Any) -> Engine:
+    return Engine.of(load(name), **options)
+
+
+def values(outcomes: Any) -> list[Any]:
+    """What a network says of each sample."""
+    assert all(isinstance(outcome, ProgressResult) for outcome in outcomes), outcomes
+    return [outcome.progress if outcome.log_prob is None else outcome.log_prob for outcome in outcomes]
+
+
+def assert_as_separate(
+    engine: Engine, samples: list[ProgressSample], monkeypatch: pytest.MonkeyPatch, tolerance: float = TOLERANCE
+) -> None:
+    """The scores of trees are those of prefixes that have a row of their own, and fewer tokens give them."""
+    of_trees, separate = Execution(), Execution()
+    found = values(engine.evaluate(samples, of_trees))
+    with monkeypatch.context() as changed:
+        changed.setattr(tree, "WORTH", np.inf)
+        expected = values(engine.evaluate(samples, separate))
+    assert of_trees.num_tokens < separate.num_tokens
+    for each, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(each, wanted, rtol=0, atol=tolerance)
+
+
+def planned(rows: list[VlmRow], collator: Any) -> list[VlmRow]:
+    return trees(rows, collator.visual_pad, are_images=collator.config.multi_image)
+
+
+COUNTED = {
+    "16 frames": ("topreward", 16, (224, 224), 4984, 1800),
+    "64 frames": ("topreward", 64, (224, 224), 64218, 7500),
+    "15 prefixes of 64 frames": ("topreward,num_prefixes=15", 64, (224, 224), 14967, 3000),
+}
+
+
+@pytest.mark.parametrize("name, num_frames, size_px, separate, most", COUNTED.values(), ids=COUNTED)
+def test_a_tree_has_few_tokens(name: str, num_frames: int, size_px: tuple[int, int], separate: int, most: int) -> None:
+    collator: Any = families.load(CHECKPOINT, reward_model=name).collator  # type: ignore[attr-defined]
+    rows = collator.rows(sample(num_frames, *size_px))
+    assert sum(row.num_tokens for row in rows) == separate
+    assert sum(row.cost for row in planned(rows, collator)) <= most
+
+
+def test_the_budget_and_the_metrics_know_a_tree_s_tokens() -> None:
+    engine, execution = topreward(), Execution()
+    asked = sample(64, 224, 224)
+    prepared = engine.prepare(asked)
+    engine.score([prepared], execution)
+    assert execution.num_tokens == prepared.num_tokens <= 7500
+    assert execution.num_slots == execution.num_tokens
+    assert execution.num_encoded == 128  # 32 pairs, and 32 frames that fill up their pair themselves
+
+
+MIXED = [sample(1), sample(16), sample(20, 48, 80), sample(24, 96, 64)]
+
+
+@pytest.mark.parametrize("settings", ["", ",chat_template=true", ",num_prefixes=5"])
+def test_a_batch_of_trees_gives_the_scores_of_separate_prefixes(settings: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_as_separate(topreward(settings), [*MIXED, sample(40)], monkeypatch)
+
+
+@pytest.mark.parametrize("frame_steps", [0, 4], ids=["TOPReward", "dense mode"])
+def test_a_tree_does_not_depend_on_its_batch(frame_steps: int) -> None:
+    engine = robometer() if frame_steps else topreward()
+    samples = [replace(each, frame_steps=frame_steps) for each in MIXED]
+    for each, together in zip(samples, values(engine.evaluate(samples)), strict=True):
+        np.testing.assert_allclose(together, values(engine.evaluate([each]))[0], rtol=0, atol=TOLERANCE)
+
+
+def test_a_tree_in_bfloat16_is_as_near_as_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_as_separate(topreward(dtype=torch.bfloat16), MIXED, monkeypatch, ROUNDED)
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        {"leaves.MOST_PACK_TOKENS": 200},
+        {"leaves.MOST_MASK_BYTES": 60_000},
+        {"tree.MOST_LEAF_TOKENS": 300},
+    ],
+    ids=lambda bounds: next(iter(bounds)),
+)
+def test_bounds_of_memory_change_no_score(bounds: dict[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    masks: list[int] = []
+    mask = leaves.Packs.mask
+    monkeypatch.setattr(leaves.Packs, "mask", lambda packs: masks.append(mask(packs).numel()) or mask(packs))
+    samples = [sample(24), *MIXED]
+    engine = topreward()
+    of_all = max(1, sum(len(row.packs) for each in samples for row in engine.predictor.rows(each)))
+    for name, value in bounds.items():
+        monkeypatch.setattr(f"rfm.vlm.{name}", value)
+    assert_as_separate(engine, samples, monkeypatch)
+    assert sum(len(row.packs) for each in samples for row in engine.predictor.rows(each)) > of_all
+    assert max(masks) <= leaves.MOST_MASK_BYTES
+
+
+def test_the_longest_prefix_and_not_the_tree_is_what_a_server_may_refuse() -> None:
+    engine = topreward()
+    asked = sample(16)
+    (row,) = engine.predictor.rows(asked)
+    engine.max_sample_tokens = row.num_tokens
+    assert row.cost > 2 * row.num_tokens
+    (served,) = engine.evaluate([asked])
+    assert isinstance(served, ProgressResult)
+    engine.max_sample_tokens -= 1
+    (refused,) = engine.evaluate([asked])
+    assert isinstance(refused, InvalidSampleError)
+    assert f"expected at most {row.num_tokens - 1} tokens (max_sample_tokens of this server)" in str(refused)
+
+
+@pytest.mark.parametrize("frame_steps", [0, 4], ids=["TOPReward", "dense mode"])
+def test_cached_features_and_frame_references_change_no_score(
+    frame_steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cached = (robometer if frame_steps else topreward)(feature_cache_mib=16)
+    asked = sample(16, frame_steps=frame_steps)
+    assert_as_separate(cached, [asked], monkeypatch)
+    expected, again = values(cached.evaluate([asked])), Execution()
+    frames = asked.trajectory.frames
+    assert frames is not None
+    longer = ProgressSampleRefs(TrajectoryRefs(tuple(map(frame_digest, frames)), {}, TASK), frame_steps)
+    found = values(cached.score([cached.prepare(longer)], again))
+    np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=TOLERANCE)
+    assert (again.num_encoded, again.num_found > 0) == (0, True)
+
+
+DENSE = ["q3_tok_disc10", "q25_peft_adapter_disc10", "q25_boundary_disc10"]
+
+
+@pytest.mark.parametrize("name", DENSE)
+def test_dense_mode_in_trees_gives_the_scores_of_separate_prefixes(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = [sample(9, 56, 84, 4), sample(16, 84, 56, 8), sample(3), sample(2, frame_steps=2)]
+    assert_as_separate(robometer(name), samples, monkeypatch)
+
+
+def test_dense_mode_has_half_of_the_tokens() -> None:
+    collator: Any = load("q3_tok_disc10").collator
+    for num_steps, times in ((4, 2.7), (8, 2.1)):
+        rows = collator.rows(replace(sample(16, 224, 224), frame_steps=num_steps))
+        assert sum(row.num_tokens for row in rows) >= times * sum(row.cost for row in planned(rows, collator))
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
+    with pretended(monkeypatch) as seen:
+        yield seen
+
+
+def test_a_device_gives_the_scores_of_a_tree_and_rarely_makes_the_host_wait(seen: Seen) -> None:
+    expected = values(topreward().evaluate(MIXED))
+    with torch.inference_mode():
+        there = topreward(device=CUDA, dtype=torch.float32)
+    for _ in range(2):
+        asked, awaited = seen.asked.total(), seen.awaited
+        found = values(there.evaluate(MIXED))
+    assert (seen.asked.total() - asked, seen.awaited - awaited) == (1, 1)  # the scores are read, the answers sent
+    for each, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(each, wanted, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("frame_steps", [0, 4], ids=["TOPReward", "dense mode"])
+def test_a_gpu_gives_the_cpu_s_scores_of_a_tree(frame_steps: int) -> None:
+    engine_of = robometer if frame_steps else topreward
+    samples = [replace(each, frame_steps=frame_steps) for each in MIXED]
+    expected, found = (
+        values(engine_of(device=device, dtype=torch.float32).evaluate(samples)) for device in ("cpu", "cuda")
+    )
+    for each, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(each, wanted, rtol=0, atol=1e-4)
