@@ -274,12 +274,8 @@ def _exported(folder: Path, content: Mapping[str, Any], base_model: str | None) 
     config = _saved_config(backbone)
     weights, factors = _used(renamed(read_weights(folder), _NAMES_OF.get(config.family, QWEN_NAMES)))
     told = decisions_of(config, None, base_model)
-    return (
-        config,
-        weights,
-        factors,
-        told if config.weights is None else (*told, decision(config.weights, NETWORK_CONFIG)),
-    )
+    rounded = () if config.weights is None else (decision(config.weights, NETWORK_CONFIG),)
+    return config, weights, factors, (*told, *rounded)
 
 
 def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Parts:

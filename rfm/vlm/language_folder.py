@@ -72,14 +72,12 @@ class LanguageFolder:
         processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
         base = Decision("base_model", source_name(processor), _BASE_MODEL if options.base_model else "the checkpoint")
         dtype, form = _dtype(backbone, file), _video_prompt(backbone, options)
-        kind, by = (
-            (settings or {}).get("weights") or kind_of(weights),
-            OF_WEIGHTS if settings is None else NETWORK_CONFIG,
-        )
-        if options.weights is not None and kind is None:
+        kind = kind_of(weights) if settings is None else settings.get("weights")
+        rounded = None if kind is None else (kind, OF_WEIGHTS if settings is None else NETWORK_CONFIG)
+        if rounded is None and options.weights is not None:
             weights, _ = round_layers(weights, {}, options.weights, getattr(torch, dtype.value))
-            kind, by = options.weights, FLAG
-        return cls(folder, backbone, settings, weights, processor, dtype, base, form, kind and (kind, by))
+            rounded = options.weights, FLAG
+        return cls(folder, backbone, settings, weights, processor, dtype, base, form, rounded)
 
     @property
     def made_of(self) -> dict[str, Any]:

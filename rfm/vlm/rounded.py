@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from rfm.checkpoint.content import CheckpointError
-from rfm.config import Weights
 from rfm.engine.layers import linear
+from rfm.family import Weights
 from rfm.vlm import nf4
 from rfm.vlm.nf4 import DECODED, SCALE
 
@@ -33,6 +33,11 @@ INSTALL = 'pip install "rfm-triton[quantized]"'
 
 class RoundedLinear(nn.Module):
     """An ``nn.Linear`` with a rounded weight, and perhaps with LoRA factors beside it, as in PEFT."""
+
+    weight: Tensor
+    scale: Tensor
+    lora_A: nn.Linear | None  # noqa: N815  PEFT's name
+    lora_B: nn.Linear | None  # noqa: N815
 
     def __init__(self, layer: nn.Linear, rank: int | None) -> None:
         super().__init__()
@@ -69,6 +74,8 @@ class Int8Linear(RoundedLinear):
 
 class Nf4Linear(RoundedLinear):
     """A linear layer in NF4, which bitsandbytes decodes. ``decoded``: empty, in the dtype of the decoded values"""
+
+    decoded: Tensor
 
     def __init__(self, layer: nn.Linear, scale: Tensor, decoded: Tensor, rank: int | None) -> None:
         super().__init__(layer, rank)

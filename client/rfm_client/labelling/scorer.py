@@ -30,6 +30,7 @@ class CheckpointFacts:
     trained_padding: True if training padded shorter trajectories, or if unknown
     has_log_prob: True if results have log-probabilities
     needs_whole_episode: True if scores are relative to the whole episode
+    weights: how the weights are rounded, so that scores are not the full checkpoint's; None: they are not
     """
 
     source: str | None
@@ -43,10 +44,11 @@ class CheckpointFacts:
     trained_padding: bool = True
     has_log_prob: bool = False
     needs_whole_episode: bool = False
+    weights: str | None = None
 
     def document(self) -> dict[str, Any]:
         """Return the facts for the provenance."""
-        told = ("source", "revision", "weights_digest", "settings_digest")
+        told = ("source", "revision", "weights_digest", "settings_digest", *(("weights",) if self.weights else ()))
         return {name: value for name, value in asdict(self).items() if name in told}
 
 
@@ -95,6 +97,7 @@ class ClientScorer:
             trained_padding=info.trained_padding,
             has_log_prob=info.has_log_prob,
             needs_whole_episode=info.needs_whole_episode,
+            weights=info.weights,
         )
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
