@@ -17,9 +17,9 @@ from rfm.checkpoint.content import read_run_config
 from rfm.checkpoint.hub import commit_of
 from rfm.checkpoint.provenance import is_folder, license_of, settings_digest, source_name, weights_digest
 from rfm.checkpoint.run_config import find_run_config
+from rfm.checkpoint.weights import num_values
 from rfm.family import NETWORK, Checkpoint, EncodersDescription, config_fields
 from rfm.parameters import DTYPE_PARAMETER
-from rfm.vlm.rounded import num_values
 from rfm_client.contract.model_info import (
     DIGEST_PARAMETER,
     LICENSE_PARAMETER,

@@ -43,12 +43,14 @@ def device_for(checkpoint: Checkpoint, dtype: torch.dtype | None, *, may_use_gpu
     if not (checkpoint.description.is_large and may_use_gpu and torch.cuda.is_available()):
         return torch.device("cpu")
     free_bytes = [_free_bytes(index) for index in range(torch.cuda.device_count())]
-    weights = checkpoint.parts[NETWORK].values()
-    needed = WORKING_ROOM * sum(
-        each.numel() * (dtype if dtype and each.is_floating_point() else each.dtype).itemsize for each in weights
-    )
+    needed = WORKING_ROOM * sum(_bytes(each, dtype) for each in checkpoint.parts[NETWORK].values())
     roomiest = max(range(len(free_bytes)), key=free_bytes.__getitem__)
     return torch.device("cuda", roomiest) if free_bytes[roomiest] >= needed else torch.device("cpu")
+
+
+def _bytes(weight: torch.Tensor, dtype: torch.dtype | None) -> int:
+    """Return the bytes of a weight in a network of ``dtype``; rounded weights stay as they are."""
+    return weight.numel() * (dtype if dtype and weight.is_floating_point() else weight.dtype).itemsize
 
 
 def _free_bytes(index: int) -> int:

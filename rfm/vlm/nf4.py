@@ -21,14 +21,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from rfm.checkpoint.content import CheckpointError, shown
+from rfm.checkpoint.weights import DECODED, SCALE, VALUES_OF_BYTE
 
 _STATE = ".quant_state.bitsandbytes__nf4"  # behind a weight's name: JSON in bytes
 _MAX_STATE_BYTES = 2**16
 _DTYPES = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": torch.float32}
 _BLOCK_SIZES = [2**power for power in range(5, 13)]  # of bitsandbytes, for weights and scales
 _BITS = 4  # of a value
-VALUES_OF_BYTE = 2
-SCALE, DECODED = ".scale", ".decoded"  # in place of ``.weight`` in the names of a layer's other tensors
 _BLOCK_SIZE = 64  # of ``quantize``, bitsandbytes' default
 _VALUES_AT_ONCE = 2**22  # more would take more memory and save no time
 _CODES = (

@@ -19,10 +19,10 @@ import torch
 from torch import Tensor, nn
 
 from rfm.checkpoint.content import CheckpointError
+from rfm.checkpoint.weights import DECODED, SCALE, VALUES_OF_BYTE
 from rfm.engine.layers import linear
 from rfm.family import Weights
 from rfm.vlm import nf4
-from rfm.vlm.nf4 import DECODED, SCALE
 
 # The layers that may be rounded: linear ones of the language model and the vision tower. Their weights are nine tenths
 # of a network's bytes; the embedding, the heads and what stands between the parts keep their numbers.
@@ -88,7 +88,7 @@ class Nf4Linear(RoundedLinear):
         count = self.out_features * self.in_features
         self._block_size = nf4.block_size(count, len(scale))
         num_blocks = math.ceil(count / self._block_size)
-        packed = self.out_features, self.in_features // nf4.VALUES_OF_BYTE
+        packed = self.out_features, self.in_features // VALUES_OF_BYTE
         self.register_buffer("weight", torch.empty(packed, dtype=torch.uint8, device="meta"))
         self.register_buffer("scale", torch.empty(num_blocks, dtype=torch.float32, device="meta"))
         self.register_buffer("decoded", torch.empty(0, dtype=decoded.dtype, device="meta"))
@@ -120,13 +120,7 @@ def is_rounded(name: str, tensor: Tensor) -> bool:
 def shape_of(weight: Tensor) -> list[int]:
     """Return the shape of a weight's values, [N, K]."""
     rows, *columns = weight.shape
-    return [rows, columns[0] * nf4.VALUES_OF_BYTE] if weight.dtype is torch.uint8 else [rows, *columns]
-
-
-def num_values(weights: Mapping[str, Tensor]) -> dict[str, int]:
-    """Return the number of values of each weight; scales do not count."""
-    counted = {name: tensor for name, tensor in weights.items() if not name.endswith((SCALE, DECODED))}
-    return {name: tensor.numel() * (2 if tensor.dtype is torch.uint8 else 1) for name, tensor in counted.items()}
+    return [rows, columns[0] * VALUES_OF_BYTE] if weight.dtype is torch.uint8 else [rows, *columns]
 
 
 def fit(network: nn.Module, weights: Mapping[str, Tensor], factors: Mapping[str, Tensor] | None = None) -> None:

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, shown
 from rfm.checkpoint.provenance import Decision
-from rfm.checkpoint.weights import read_weights
+from rfm.checkpoint.weights import DECODED, read_weights
 from rfm.family import Weights
 from rfm.vlm.backbone import NF4, QUANTIZED, UNQUANTIZED, check_not_quantized, quantization
 from rfm.vlm.lora import changed_by, merged
-from rfm.vlm.nf4 import DECODED, dequantize
+from rfm.vlm.nf4 import dequantize
 from rfm.vlm.rounded import may_be_rounded, rounded
 
 FLAG = "--weights"
