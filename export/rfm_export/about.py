@@ -106,5 +106,5 @@ def _network(checkpoint: Checkpoint) -> dict[str, Any]:
     return {
         "class": checkpoint.description.network_class,
         "config": config_fields(checkpoint.config),
-        "parameters": dict(parameters),
+        "parameters": dict(sorted(parameters.items())),  # as in the exported file, whose tensors are in another order
     }
