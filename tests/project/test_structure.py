@@ -62,6 +62,7 @@ EXCEPTIONS = {
     "benchmarks/contestants.py": {"rfm", "rfm_commands", "rfm_export"},
     "benchmarks/engine.py": {"rfm", "rfm_export"},
     "benchmarks/perf_analyzer.py": {"rfm"},
+    "benchmarks/memory.py": {"rfm"},
     "benchmarks/real_size.py": {"rfm"},
     "benchmarks/peers/engines.py": {"rfm"},  # the peers score with our engine, or weights
     "benchmarks/peers/litserve_server.py": {"rfm"},
