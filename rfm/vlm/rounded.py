@@ -28,7 +28,7 @@ from rfm.vlm import nf4
 # of a network's bytes; the embedding, the heads and what stands between the parts keep their numbers.
 _LAYER = re.compile(r"\.(layers|blocks)\.\d+\..*\.weight")
 _MOST = 127  # of int8, so that zero is in the middle
-INSTALL = 'pip install "rfm-triton[quantized]"'
+INSTALL = 'pip install ".[quantized]"'
 
 
 class RoundedLinear(nn.Module):

@@ -241,7 +241,7 @@ def test_weights_that_are_rounded_are_not_rounded_in_another_way(tmp_path: Path)
 
 def test_a_missing_bitsandbytes_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "bitsandbytes", None)
-    expected = r'^weights: expected bitsandbytes, which decodes .* got none; pip install "rfm-triton\[quantized\]"$'
+    expected = r'^weights: expected bitsandbytes, which decodes .* got none; pip install "\.\[quantized\]"$'
     with pytest.raises(CheckpointError, match=expected):
         families.load(**sources(PLAIN), weights="nf4")
     Engine.from_checkpoint(**sources(PLAIN), weights="int8")  # which PyTorch decodes
@@ -297,3 +297,16 @@ def test_a_gpu_needs_room_for_the_rounded_bytes(monkeypatch: pytest.MonkeyPatch)
         rooms.append(high)
     assert rooms == sorted(rooms, reverse=True)
     assert len(set(rooms)) == 3
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_gpu_decodes_as_the_cpu(kind: str) -> None:
+    engines = [
+        Engine.from_checkpoint(**sources(PLAIN), weights=kind, device=on, dtype=torch.float32) for on in ("cpu", "cuda")
+    ]
+    layers = [layers_of(engine) for engine in engines]
+    for name, layer in layers[0].items():
+        assert torch.equal(layer.values(torch.bfloat16), layers[1][name].values(torch.bfloat16).cpu())
+    for result, expected in zip(*(engine.evaluate(SAMPLES) for engine in engines), strict=True):
+        assert_close(result, expected, 1e-4)
