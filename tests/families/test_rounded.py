@@ -65,8 +65,10 @@ def layers_of(engine: Engine) -> dict[str, RoundedLinear]:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", [PLAIN, "q25_mean_l2", "smol_mean_disc10", "roboreward-expected", "topreward"])
 def test_a_rounded_network_scores_a_sample_alone_as_in_a_batch(name: str, kind: str, dtype: torch.dtype) -> None:
-    if name.startswith("smol") and (TRANSFORMERS >= 5 or dtype is torch.bfloat16):  # whose bfloat16 depends on padding
+    if name.startswith("smol") and TRANSFORMERS >= 5:
         pytest.skip("SmolVLM is refused with transformers 5")
+    if name.startswith("smol") and dtype is torch.bfloat16:
+        pytest.skip("in bfloat16 padding changes SmolVLM's scores, with full weights, too")
     engine = Engine.from_checkpoint(**sources(name), weights=kind, dtype=dtype)
     assert {type(layer) for layer in layers_of(engine).values()} == {KINDS[kind]}
     together = engine.evaluate(SAMPLES)
