@@ -170,7 +170,7 @@ lock:
 	  echo '# Not here: torch, whose build and so whose hash depends on TORCH_INDEX, and what only torch needs.'; \
 	  printf 'torch\nrfm-client\nrfm-gateway\n' | $(VENV)/lock/bin/uv pip compile --quiet --no-python-downloads --no-header \
 	  --no-annotate --universal --python-version 3.10 --generate-hashes --constraints constraints.txt --excludes - \
-	  --extra encoders --extra vlm client/pyproject.toml gateway/pyproject.toml pyproject.toml; } > $(VENV)/lock/requirements.txt
+	  --extra encoders --extra vlm --extra quantized client/pyproject.toml gateway/pyproject.toml pyproject.toml; } > $(VENV)/lock/requirements.txt
 	mv $(VENV)/lock/requirements.txt docker/requirements.txt
 
 VERSIONED := pyproject.toml client/pyproject.toml gateway/pyproject.toml CITATION.cff docker/.env.example docker/compose.yaml \
@@ -199,7 +199,7 @@ $(INSTALLED): pyproject.toml client/pyproject.toml gateway/pyproject.toml constr
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	  --editable "client[gym,hdf5,label,ray,rerun]" --editable gateway --editable ".[encoders,vlm,triton,demo,dev]"
+	  --editable "client[gym,hdf5,label,ray,rerun]" --editable gateway --editable ".[encoders,vlm,quantized,triton,demo,dev]"
 	touch $@
 
 # Remove what make has made.

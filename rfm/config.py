@@ -29,6 +29,7 @@ MAX_INT32 = 2**31 - 1
 MAX_NAME = 100  # characters; the name of a model becomes that of a folder
 Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
 VideoPrompt: TypeAlias = Literal["bare", "wrapped"]
+Weights: TypeAlias = Literal["int8", "nf4"]
 
 _COUNT = {"least": 1, "most": MAX_INT32}
 _PORT = {"least": 1, "most": MAX_PORT}
@@ -65,6 +66,11 @@ class ExportConfig(Settings):
         DEFAULT_SAMPLE_TOKENS, "Most tokens of one sample, or of its longest prefix; it bounds memory.", **_COUNT
     )
     dtype: Dtype | None = setting(None, "Number type of the network; else as checkpoint and device decide.")
+    weights: Weights | None = setting(
+        None,
+        "Round a vision-language model's weights to 8 bits (int8) or 4 bits (nf4), for GPUs of 8 or 12 GB; scores are "
+        "then not the full checkpoint's. Default: as in the checkpoint.",
+    )
     image_encoder: str | None = setting(None, "Folder or id of ReWiND's image encoder.")
     text_encoder: str | None = setting(None, "Folder or id of ReWiND's text encoder.")
     base_model: str | None = setting(

@@ -12,7 +12,7 @@ from rfm.checkpoint.hub import find as find
 from rfm.checkpoint.provenance import assumed
 from rfm.checkpoint.run_config import HEADS, SIMILARITY, constant_heads, training_notes
 from rfm.checkpoint.weights import check_values
-from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, VideoPrompt
+from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, VideoPrompt, Weights
 
 # Packages in the order in which they are tried. ReWiND comes last: its first checkpoints do not name their network.
 FAMILIES = ("rfm.topreward", "rfm.roboreward", "rfm.vlm", "rfm.rewind")
@@ -69,6 +69,7 @@ def load(
     reward_model: str | None = None,
     video_prompt: VideoPrompt | None = None,
     strict_answers: bool = False,
+    weights: Weights | None = None,
 ) -> Checkpoint:
     """Load the checkpoint of a local folder or Hugging Face id. Raises CheckpointError.
 
@@ -76,7 +77,7 @@ def load(
     others: as in ``rfm.family.Options``
     """
     folder = find(source)
-    options = Options(base_model, image_encoder, text_encoder, reward_model, video_prompt, strict_answers)
+    options = Options(base_model, image_encoder, text_encoder, reward_model, video_prompt, strict_answers, weights)
     return load_from(folder, choose(folder, family, options), options)
 
 

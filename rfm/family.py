@@ -12,6 +12,7 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.provenance import Decision
 from rfm.config import ExportConfig
 from rfm.config import VideoPrompt as VideoPrompt
+from rfm.config import Weights as Weights
 from rfm_client.contract import FrameSize, RewardError, Sample
 from rfm_client.contract.frame_refs import EncoderSampleRefs
 from rfm_client.contract.samples import EncoderSample, Float32Array
@@ -26,11 +27,12 @@ if TYPE_CHECKING:
 
 NETWORK = "network"  # key in Checkpoint.parts: the weights of the network that scores
 # Fields of networks' configurations that are newer than some exports, with the value of those exports.
-_USUAL = {"has_preference": True, "has_success": True, "video_prompt": "bare", "strict_answers": False}
+_USUAL = {"has_preference": True, "has_success": True, "video_prompt": "bare", "strict_answers": False, "weights": None}
 # Options, with the checkpoints that support them.
 _FOLLOWED_BY = {
     "video_prompt": "a checkpoint that shows videos to a Qwen3-VL",
     "strict_answers": "a RoboReward that writes its answers",
+    "weights": "a vision-language checkpoint whose weights are not rounded (other networks are small)",
 }
 
 
@@ -45,6 +47,7 @@ class Options:
         checkpoint is a reward model
     video_prompt: form of a Qwen3-VL's video prompt; None: as the checkpoint's ``transformers_version`` tells
     strict_answers: refuse an unclear written answer; False: mark it
+    weights: round the weights of a vision-language network's layers; None: as in the checkpoint
     """
 
     base_model: str | None = None
@@ -53,6 +56,7 @@ class Options:
     reward_model: str | None = None
     video_prompt: VideoPrompt | None = None
     strict_answers: bool = False
+    weights: Weights | None = None
 
     @classmethod
     def of(cls, settings: ExportConfig) -> Options:

@@ -28,7 +28,7 @@ PARTS = {
     "rfm/engine/layers.py": "families/test_linear.py families/test_precision.py families/test_rewind.py",
     "rfm/rewind/*.py": "families/test_rewind.py families/test_*encoders.py families/test_checkpoint.py"
     " families/test_missing_heads.py families/test_forms.py export/test_provenance.py",
-    "rfm/vlm/*.py": "families/test_vlm*.py families/test_nf4.py families/test_forms.py families/test_shot_cache.py"
+    "rfm/vlm/*.py": "families/test_vlm*.py families/test_nf4.py families/test_rounded.py families/test_forms.py families/test_shot_cache.py"
     " export/test_provenance.py",
     "rfm/triton_model/batch_model.py": "triton/test_batch_model.py triton/test_pipeline.py",
 }

@@ -118,7 +118,8 @@ def export(
     version = rfm_export.export(
         settings.checkpoint, repository, settings, other_machine=other_machine, device=device, say=say
     )
-    typer.echo(f"{repository}: {settings.name} version {version}, scores equal to the checkpoint's")
+    whose = "the checkpoint's" if settings.weights is None else f"those of the checkpoint in {settings.weights}"
+    typer.echo(f"{repository}: {settings.name} version {version}, scores equal to {whose}")
 
 
 @app.command(cls=RfmCommand, epilog=SERVE_EXAMPLE)

@@ -18,7 +18,7 @@ from rfm_client.contract.settings import ConfigError
 from rfm_export.errors import ExportError
 
 OF_A_CHECKPOINT = ("checkpoint", "image_encoder", "text_encoder", "base_model", "reward_model")  # settings that name it
-ASKED_BY = ("video_prompt", "strict_answers")  # settings that change how it is asked
+ASKED_BY = ("video_prompt", "strict_answers", "weights")  # settings that change how it is asked, or its weights
 CHECKPOINT_TITLE = "Checkpoint"  # heading of their options in commands without --config
 
 AdminKeyFile = Annotated[

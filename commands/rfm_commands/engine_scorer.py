@@ -102,6 +102,7 @@ def _facts(
         trained_padding=description.trained_padding is not False,
         has_log_prob=description.has_log_prob,
         needs_whole_episode=description.needs_whole_episode,
+        weights=getattr(checkpoint.config, "weights", None),
     )
 
 

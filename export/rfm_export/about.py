@@ -17,6 +17,7 @@ from rfm.checkpoint.content import read_run_config
 from rfm.checkpoint.hub import commit_of
 from rfm.checkpoint.provenance import is_folder, license_of, settings_digest, source_name, weights_digest
 from rfm.checkpoint.run_config import find_run_config
+from rfm.checkpoint.weights import num_values
 from rfm.family import NETWORK, Checkpoint, EncodersDescription, config_fields
 from rfm.parameters import DTYPE_PARAMETER
 from rfm_client.contract.model_info import (
@@ -28,9 +29,14 @@ from rfm_client.contract.model_info import (
     RUN_CONFIG_PARAMETER,
     SETTINGS_DIGEST_PARAMETER,
     SOURCE_PARAMETER,
+    WEIGHTS_DIFFERENCE_PARAMETER,
 )
 
-_OF_ORIGIN = (SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER, LICENSE_PARAMETER, COMPUTATION_PARAMETER)
+# What the source and the export's own measurement say, which the exported files do not.
+_OF_ORIGIN = (
+    *(SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER, LICENSE_PARAMETER),
+    *(COMPUTATION_PARAMETER, WEIGHTS_DIFFERENCE_PARAMETER),
+)
 _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for example hub_token, wandb_api_key
 
 
@@ -96,10 +102,10 @@ def _is_secret(key: str, value: Any) -> bool:
 
 def _network(checkpoint: Checkpoint) -> dict[str, Any]:
     parameters: Counter[str] = Counter()
-    for name, tensor in checkpoint.parts[NETWORK].items():
-        parameters[name.partition(".")[0]] += tensor.numel()
+    for name, count in num_values(checkpoint.parts[NETWORK]).items():
+        parameters[name.partition(".")[0]] += count
     return {
         "class": checkpoint.description.network_class,
         "config": config_fields(checkpoint.config),
-        "parameters": dict(parameters),
+        "parameters": dict(sorted(parameters.items())),  # as in the exported file, whose tensors are in another order
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -24,14 +24,14 @@ from rfm.engine.computation import computation
 from rfm.family import Checkpoint, Description, Family, FrameEncoders, Options
 from rfm.parameters import CHECKPOINT_FOLDER, FAMILY_PARAMETER
 from rfm_client.contract import wire
-from rfm_client.contract.model_info import COMPUTATION_PARAMETER
+from rfm_client.contract.model_info import COMPUTATION_PARAMETER, WEIGHTS_DIFFERENCE_PARAMETER
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import about, origin_in, origin_of, record_digests
 from rfm_export.batches import with_batch_size
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_name
 from rfm_export.publish import alone, next_version, publish, read_config, staging
-from rfm_export.verify import device_for, device_named, needing_room, probes, verify
+from rfm_export.verify import device_for, device_named, largest_difference, needing_room, probes, verify
 
 Say: TypeAlias = Callable[[str], object]  # takes a line for the user
 
@@ -42,13 +42,18 @@ def _nobody(line: str) -> None:
 
 @dataclass(frozen=True)
 class _Source:
-    """The checked input of an export. decisions: settings that the scores depend on"""
+    """The checked input of an export.
+
+    decisions: settings that the scores depend on
+    full: loads the checkpoint before ``weights`` of the settings rounds it; None: it stays as it is
+    """
 
     family: Family
     checkpoint: Checkpoint
     encoders: FrameEncoders | None
     origin: Mapping[str, str]
     decisions: Sequence[Decision] = ()
+    full: Callable[[], Checkpoint] | None = None
 
 
 def export(
@@ -84,6 +89,9 @@ def export(
         version = _version(loaded, settings, next_version(repository, names))
         models = generated_models(loaded.checkpoint.description, described, version)
         _check_replaceable(repository, models, settings)
+        if (differs := _difference(loaded, version, named, say)) is not None:
+            version = replace(version, about={**version.about, WEIGHTS_DIFFERENCE_PARAMETER: differs})
+            models = generated_models(loaded.checkpoint.description, described, version)
         with _needing_disk(repository):
             _stage(loaded, models, version, staged)
         _verify(loaded, version, staged, named, say)
@@ -122,7 +130,10 @@ def _load(source: str | Path, settings: ExportConfig, family: str | None, say: S
     computed = computation(checkpoint, settings.torch_dtype, on_gpu=_num_gpus(settings) > 0)
     told.append(Decision(COMPUTATION_PARAMETER, computed, "installed PyTorch"))
     origin = {**origin_of(source, folder), COMPUTATION_PARAMETER: computed}
-    return _Source(kind, checkpoint, encoders, origin, [*checkpoint.decisions(), *told])
+    full = (
+        None if options.weights is None else partial(families.load_from, folder, kind, replace(options, weights=None))
+    )
+    return _Source(kind, checkpoint, encoders, origin, [*checkpoint.decisions(), *told], full)
 
 
 def _check_gpus(num_gpus: int | None) -> None:
@@ -154,6 +165,21 @@ def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, 
     for path, content in _generated(models, staged).items():
         (staged / path).parent.mkdir(parents=True, exist_ok=True)
         (staged / path).write_bytes(content)
+
+
+def _difference(source: _Source, version: Version, named: torch.device | None, say: Say) -> str | None:
+    """Return the largest difference of progress that rounded weights make; None: they are as in the checkpoint."""
+    full = None if source.full is None else source.full()
+    if full is None or full.config.weights is not None:
+        return None
+    settings, kind = version.settings, source.checkpoint.config.weights
+    device = named or device_for(full, settings.torch_dtype, may_use_gpu=settings.num_gpus != 0)
+    engine = partial(Engine.of, device=device, dtype=settings.torch_dtype)
+    samples = probes(full.description, with_encoders=False)
+    with needing_room(device):
+        largest = largest_difference(partial(engine, full), partial(engine, source.checkpoint), samples)
+    say(f"--weights {kind}: progress differs by at most {largest:.2g} from the full checkpoint's, on noise")
+    return f"{largest:.2g}"
 
 
 def _verify(source: _Source, version: Version, staged: Path, named: torch.device | None, say: Say) -> None:

@@ -21,6 +21,7 @@ from rfm_client.contract import (
     ProgressSample,
     RewardError,
     Sample,
+    SimilarityResult,
     SimilaritySample,
     Trajectory,
 )
@@ -42,10 +43,14 @@ def device_for(checkpoint: Checkpoint, dtype: torch.dtype | None, *, may_use_gpu
     if not (checkpoint.description.is_large and may_use_gpu and torch.cuda.is_available()):
         return torch.device("cpu")
     free_bytes = [_free_bytes(index) for index in range(torch.cuda.device_count())]
-    weights = checkpoint.parts[NETWORK].values()
-    needed = WORKING_ROOM * sum(each.numel() * (dtype or each.dtype).itemsize for each in weights)
+    needed = WORKING_ROOM * sum(_bytes(each, dtype) for each in checkpoint.parts[NETWORK].values())
     roomiest = max(range(len(free_bytes)), key=free_bytes.__getitem__)
     return torch.device("cuda", roomiest) if free_bytes[roomiest] >= needed else torch.device("cpu")
+
+
+def _bytes(weight: torch.Tensor, dtype: torch.dtype | None) -> int:
+    """Return the bytes of a weight in a network of ``dtype``; rounded weights stay as they are."""
+    return weight.numel() * (dtype if dtype and weight.is_floating_point() else weight.dtype).itemsize
 
 
 def _free_bytes(index: int) -> int:
@@ -124,15 +129,37 @@ def verify(
             )
 
 
+def largest_difference(full: Callable[[], Engine], rounded: Callable[[], Engine], samples: Sequence[Sample]) -> float:
+    """Return the largest difference of progress between both engines. Only one engine exists at a time.
+
+    Samples that either refuses do not count.
+    """
+    scores = [make().evaluate(samples) for make in (full, rounded)]
+    pairs = [pair for pair in zip(*scores, strict=True) if not any(isinstance(each, RewardError) for each in pair)]
+    frames = [frame for pair in pairs for frame in zip(*map(_trajectories, pair), strict=True)]
+    return max((float(np.abs(after.progress - before.progress).max()) for before, after in frames), default=0.0)
+
+
 def _numbers(index: int, whose: str, outcome: Outcome) -> npt.NDArray[np.float64]:
     """All scores of a probe, concatenated."""
     if isinstance(outcome, RewardError):
         raise ExportDiffersError(f"probe {index}: expected scores of {whose}, got: {outcome}") from outcome
-    if isinstance(outcome, ProgressResult):
-        return _of_frames(outcome)
+    of_pair: list[float] = []
     if isinstance(outcome, PreferenceResult):
-        return np.concatenate([[outcome.preference], _of_frames(outcome.first), _of_frames(outcome.second)])
-    return np.concatenate([[outcome.similarity], _of_frames(outcome.reference), _of_frames(outcome.other)])
+        of_pair = [outcome.preference]
+    elif isinstance(outcome, SimilarityResult):
+        of_pair = [outcome.similarity]
+    return np.concatenate([of_pair, *map(_of_frames, _trajectories(outcome))])
+
+
+def _trajectories(outcome: Outcome) -> Sequence[FrameScores]:
+    """Return the scores of each trajectory of a result."""
+    if isinstance(outcome, ProgressResult):
+        return [outcome]
+    if isinstance(outcome, PreferenceResult):
+        return [outcome.first, outcome.second]
+    assert isinstance(outcome, SimilarityResult)  # no error, by the callers
+    return [outcome.reference, outcome.other]
 
 
 def _of_frames(scores: FrameScores) -> npt.NDArray[np.float64]:

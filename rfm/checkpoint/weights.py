@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 PICKLE_STEM = "pytorch_model"  # of the names of transformers' pickled weights
+# Of a rounded weight: in place of ``.weight`` in the names of its other tensors; values of a byte in NF4.
+SCALE, DECODED, VALUES_OF_BYTE = ".scale", ".decoded", 2
 _SHARDS = "model-*.safetensors"
 _ENCODERS = ("image_encoder", "text_encoder")  # subfolders of an exported checkpoint
 _LEVELS = ("*", "*/*", "*/*/*")  # depth of checkpoints in the folder of a training run or in a model repository
@@ -182,6 +184,14 @@ def take_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 def has_head(weights: Iterable[str], head: str) -> bool:
     """True if the weights contain any of this head's; ``check_shapes`` finds an incomplete head."""
     return any(name.startswith(f"{head}_head.") for name in weights)
+
+
+def num_values(weights: Mapping[str, Tensor]) -> dict[str, int]:
+    """Return the number of values of each weight. A byte of NF4 holds two; scales do not count."""
+    import torch  # imported here: it takes seconds
+
+    counted = {name: tensor for name, tensor in weights.items() if not name.endswith((SCALE, DECODED))}
+    return {name: each.numel() * (VALUES_OF_BYTE if each.dtype is torch.uint8 else 1) for name, each in counted.items()}
 
 
 def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:

@@ -21,7 +21,7 @@ from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.engine.finite import finite
 from rfm.engine.layers import keep_float32
 from rfm.engine.predictor import Predictor, RowScores
-from rfm.family import Checkpoint, FrameEncoders, VideoPrompt
+from rfm.family import Checkpoint, FrameEncoders, VideoPrompt, Weights
 from rfm_client.contract import (
     BatchTiming,
     InvalidSampleError,
@@ -86,6 +86,7 @@ class Engine:
         reward_model: str | None = None,
         video_prompt: VideoPrompt | None = None,
         strict_answers: bool = False,
+        weights: Weights | None = None,
         device: str | torch.device = "cpu",
         dtype: torch.dtype | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
@@ -94,7 +95,7 @@ class Engine:
     ) -> Engine:
         """Return the engine for a checkpoint's folder or Hugging Face id.
 
-        source, family, base_model to strict_answers: as in ``rfm.families.load``; others: as in ``of`` and the class
+        source, family, base_model to weights: as in ``rfm.families.load``; others: as in ``of`` and the class
         Raises CheckpointError.
         """
         return cls.of(
@@ -105,6 +106,7 @@ class Engine:
                 reward_model=reward_model,
                 video_prompt=video_prompt,
                 strict_answers=strict_answers,
+                weights=weights,
             ),
             encoders=encoders,
             device=device,

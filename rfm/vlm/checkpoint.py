@@ -36,8 +36,6 @@ from rfm.family import NETWORK, Description, Options, config_fields
 from rfm.vlm.backbone import (
     BACKBONES,
     LORA_INSIDE,
-    NF4,
-    QUANTIZED,
     QWEN_2_5,
     QWEN_NAMES,
     SMOL,
@@ -47,7 +45,6 @@ from rfm.vlm.backbone import (
     backbone_config,
     check_not_quantized,
     is_at_least,
-    quantization,
     renamed,
 )
 from rfm.vlm.collator import QWEN3, VlmCollator
@@ -64,7 +61,6 @@ from rfm.vlm.lora import (
     split,
 )
 from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
-from rfm.vlm.nf4 import dequantize
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import (
     PROCESSOR_FOLDER,
@@ -77,6 +73,8 @@ from rfm.vlm.processor import (
     save_processor,
 )
 from rfm.vlm.prompts import OF_AN_OLD_RUN
+from rfm.vlm.rounded import fit
+from rfm.vlm.rounding import FLAG, decision, kind_of, read_published, read_unrounded_config, round_layers
 from rfm.vlm.run_config import RunConfig, decisions_of
 from rfm.vlm.video_prompt import decided
 from rfm.vlm.work import flop
@@ -214,6 +212,7 @@ class VlmCheckpoint:
             version = importlib.metadata.version("transformers")
             raise CheckpointError(f"transformers: expected {expected}, got {version}")
         network = self._network(wanted)
+        fit(network, self.weights, self.factors)
         # Parameters only: rotary frequencies stay float32, as upstream.
         network.load_state_dict(merged(self.weights, self.factors, wanted), strict=True, assign=True)
         return network.eval().requires_grad_(False)
@@ -223,6 +222,7 @@ class VlmCheckpoint:
         _check_layers(self.config.backbone)
         with expecting("a backbone that transformers can make", NETWORK_CONFIG), torch.device("meta"):
             network = self._network(self.config.torch_dtype)
+        fit(network, self.weights)
         check_shapes(network.state_dict(), self.weights)
 
     def _network(self, dtype: torch.dtype) -> VlmRewardModel:
@@ -249,6 +249,9 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
         if config.family == QWEN3 and not config.multi_image:
             config, form = _with_video_prompt(config, content, options)
             settings = (*settings, form)
+        if options.weights is not None and config.weights is None:
+            weights, factors = round_layers(weights, factors, options.weights, config.torch_dtype)
+            config, settings = replace(config, weights=options.weights), (*settings, decision(options.weights, FLAG))
     checkpoint = VlmCheckpoint(config, weights, factors, processor, options.base_model, settings)
     checkpoint.check()
     return checkpoint
@@ -276,7 +279,9 @@ def _exported(folder: Path, content: Mapping[str, Any], base_model: str | None) 
     check_not_quantized(backbone, file, UNQUANTIZED)
     config = _saved_config(backbone)
     weights, factors = _used(renamed(read_weights(folder), _NAMES_OF.get(config.family, QWEN_NAMES)))
-    return config, weights, factors, decisions_of(config, None, base_model)
+    told = decisions_of(config, None, base_model)
+    rounded = () if config.weights is None else (decision(config.weights, NETWORK_CONFIG),)
+    return config, weights, factors, (*told, *rounded)
 
 
 def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Parts:
@@ -295,16 +300,13 @@ def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -
     """Read the checkpoint of a training run, with the run's config.yaml. content: {} for an adapter."""
     file = folder / NETWORK_CONFIG
     backbone = backbone_config(content, file) if content else {}
-    is_nf4, num_nf4 = quantization(backbone) == NF4, 0
-    if is_nf4:
-        del backbone["quantization_config"]
-    check_not_quantized(backbone, file, UNQUANTIZED)
+    is_nf4, num_nf4 = read_unrounded_config(backbone, file), 0
     run = RunConfig.of(folder)
     run.check_model_type()
     check_progress(run.sections, run.file)
     scaling: Scaling | None
     if content:
-        tensors, num_nf4 = _in_full_precision(folder, is_nf4)
+        tensors, num_nf4 = read_published(folder, is_nf4)
         tensors, scaling = _whole(tensors, folder, backbone, run)
     else:
         backbone, tensors, scaling = adapted(folder, base_model or base_of_adapter(folder, run))
@@ -340,25 +342,13 @@ def _config(
         size_px=run.size_px(family, network["multi_image"]),
         has_preference=has_head(weights, "preference"),
         has_success=has_head(weights, "success"),
+        weights=kind_of(weights),
         **network,
     )
     if (family == SMOL or config.per_frame_progress_token) and not config.multi_image:
         why = "SmolVLM" if family == SMOL else "per-frame progress tokens"
         raise CheckpointError(f"{run.file}: use_multi_image with {why}: expected true, got false")
     return config
-
-
-def _in_full_precision(folder: Path, is_nf4: bool) -> tuple[dict[str, Tensor], int]:
-    """Return the folder's tensors, dequantized, and how many were in NF4; is_nf4: config.json says that some are."""
-    tensors = read_weights(folder)
-    num_nf4 = dequantize(tensors)
-    quantized = next((name for name in tensors if QUANTIZED.search(name)), None)
-    if quantized is not None:
-        raise CheckpointError(f"{folder}: expected weights in full precision, got {shown(quantized)}; {UNQUANTIZED}")
-    if is_nf4 and not num_nf4:
-        got = "none; if they are meant in full precision, remove it"
-        raise CheckpointError(f"{folder / NETWORK_CONFIG}: quantization_config: expected weights in NF4, got {got}")
-    return tensors, num_nf4
 
 
 def _whole(

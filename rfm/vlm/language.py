@@ -37,11 +37,13 @@ from rfm.vlm.collator import (
     video_of,
 )
 from rfm.vlm.images import MERGE, QwenImages
+from rfm.vlm.lora import merged
 from rfm.vlm.network import BackboneConfig, build_backbone, qwen_states
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.preprocessor import SIZED_BY_PROCESSOR, normalisation_of, patch_px
 from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, read_processor, save_processor
 from rfm.vlm.qwen import Box, KeyValues, positions
+from rfm.vlm.rounded import fit
 from rfm.vlm.video import Indices, VlmVideo
 from rfm.vlm.work import flop
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample
@@ -253,7 +255,8 @@ class LanguageCheckpoint:
     def build(self, dtype: torch.dtype) -> LanguageNetwork:
         """Return the network with these weights, on the CPU, in ``dtype``."""
         network = LanguageNetwork(self.config, build_backbone(self.config, dtype))
-        weights = {name: tensor.to(dtype) for name, tensor in self.weights.items()}
+        fit(network, self.weights)
+        weights = merged(self.weights, {}, dtype)
         network.load_state_dict(_with_head(weights), strict=True, assign=True)
         if HEAD not in weights:
             network.lm_head.weight = network.model.language_model.embed_tokens.weight
@@ -263,6 +266,7 @@ class LanguageCheckpoint:
         """Raise CheckpointError unless the weights fit the network, before memory is allocated for it."""
         with expecting("a backbone that transformers can make", NETWORK_CONFIG), torch.device("meta"):
             network = LanguageNetwork(self.config, build_backbone(self.config, torch.float32))
+        fit(network, self.weights)
         check_shapes(network.state_dict(), _with_head(self.weights))
 
 

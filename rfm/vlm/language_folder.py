@@ -8,16 +8,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import torch
 from torch import Tensor
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
 from rfm.checkpoint.provenance import OF_WEIGHTS, Decision, source_name
 from rfm.checkpoint.weights import read_weights
-from rfm.family import Options
-from rfm.vlm.backbone import QWEN_NAMES, UNQUANTIZED, Renames, backbone_config, check_not_quantized, renamed
+from rfm.family import Options, Weights
+from rfm.vlm.backbone import QWEN_NAMES, Renames, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
 from rfm.vlm.language import EMBEDDING, HEAD, REWARD_MODEL, SETTINGS, LanguageConfig
 from rfm.vlm.processor import PROCESSOR_FOLDER
+from rfm.vlm.rounding import FLAG, decision, kind_of, read_published, read_unrounded_config, round_layers
 from rfm.vlm.run_config import DTYPES
 from rfm.vlm.video_prompt import WRAPPED, decided
 
@@ -37,6 +39,7 @@ class LanguageFolder:
     dtype: stated by config.json, with its source
     base_model: source of the tokenizer and processor, with the reason
     video_prompt: form of the prompt, of a folder that is no export
+    rounded: how weights of layers are rounded, with its source; None: they are not
     """
 
     folder: Path
@@ -47,6 +50,7 @@ class LanguageFolder:
     dtype: Decision
     base_model: Decision
     video_prompt: Decision
+    rounded: tuple[Weights, str] | None = None
 
     @classmethod
     def read(cls, folder: Path, options: Options) -> LanguageFolder:
@@ -58,10 +62,9 @@ class LanguageFolder:
             raise CheckpointError(f"{file}: model_type: expected {QWEN3}, of an ordinary Qwen3-VL, got {got}")
         settings = content.pop(SETTINGS, None)
         backbone = backbone_config(content, file)
-        check_not_quantized(backbone, file, UNQUANTIZED)
-        weights = {
-            name: tensor for name, tensor in renamed(read_weights(folder), _NAMES).items() if "inv_freq" not in name
-        }
+        is_nf4 = read_unrounded_config(backbone, file)
+        tensors = read_weights(folder) if settings is not None else read_published(folder, is_nf4)[0]
+        weights = {name: tensor for name, tensor in renamed(tensors, _NAMES).items() if "inv_freq" not in name}
         if any(name.startswith("progress_head") for name in weights):
             raise CheckpointError(f"{folder}: expected an ordinary Qwen3-VL, got reward heads: leave out --as")
         _tie(weights, backbone, file)
@@ -69,7 +72,12 @@ class LanguageFolder:
         processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
         base = Decision("base_model", source_name(processor), _BASE_MODEL if options.base_model else "the checkpoint")
         dtype, form = _dtype(backbone, file), _video_prompt(backbone, options)
-        return cls(folder, backbone, settings, weights, processor, dtype, base, form)
+        kind = kind_of(weights) if settings is None else settings.get("weights")
+        rounded = None if kind is None else (kind, OF_WEIGHTS if settings is None else NETWORK_CONFIG)
+        if rounded is None and options.weights is not None:
+            weights, _ = round_layers(weights, {}, options.weights, getattr(torch, dtype.value))
+            rounded = options.weights, FLAG
+        return cls(folder, backbone, settings, weights, processor, dtype, base, form, rounded)
 
     @property
     def made_of(self) -> dict[str, Any]:
@@ -79,6 +87,7 @@ class LanguageFolder:
             "dtype": self.dtype.value,
             "base_model_id": self.base_model.value,
             "video_prompt": self.video_prompt.value,
+            "weights": self.rounded and self.rounded[0],
         }
 
     def saved(self, config: type[Config]) -> Config | None:
@@ -97,7 +106,7 @@ class LanguageFolder:
             if name != REWARD_MODEL
         }
         made: Any = config
-        return cast(Config, made(backbone=self.backbone, **fields))
+        return cast(Config, made(**{"backbone": self.backbone, **fields, "weights": self.rounded and self.rounded[0]}))
 
     def decisions(self, config: LanguageConfig) -> tuple[Decision, ...]:
         """Return the source of the settings that all reward models of a Qwen3-VL share."""
@@ -112,6 +121,7 @@ class LanguageFolder:
             *shared,
             Decision("language_head", head, f"{why}: {HEAD if why == OF_WEIGHTS else _TIED}"),
             Decision("rows_of_the_language_head", self.backbone["text_config"]["vocab_size"], OF_WEIGHTS),
+            *([] if self.rounded is None else [decision(*self.rounded)]),
         )
 
 

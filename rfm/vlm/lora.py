@@ -43,6 +43,7 @@ from rfm.vlm.backbone import (
     renamed,
 )
 from rfm.vlm.lora_targets import TEXT, WHOLE, check_factors, check_none_lost, check_replaced
+from rfm.vlm.rounded import is_rounded, shape_of
 from rfm.vlm.run_config import RunConfig, model_name
 
 LORA_NAME = re.compile(r"(?P<module>.+)\.lora_(?P<side>[AB])(\.default)?\.weight")
@@ -162,10 +163,14 @@ def check_inside(tensors: Mapping[str, Tensor], file: Path) -> bool:
 
 
 def merged(weights: Mapping[str, Tensor], factors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
-    """Return the weights in ``dtype``, with B A of the factors added in float32."""
+    """Return the weights in ``dtype``, with B A of the factors added in float32; factors of rounded weights stay."""
     whole = {}
     for name, weight in weights.items():
         module = name.removesuffix(".weight")
+        if is_rounded(name, weight):
+            whole[name] = weight
+            whole |= {each: factors[each].to(dtype) for side in "AB" if (each := _name(module, side)) in factors}
+            continue
         if _name(module, "A") in factors:
             weight = weight.float() + factors[_name(module, "B")].float() @ factors[_name(module, "A")].float()
         whole[name] = weight.to(dtype)
@@ -180,9 +185,9 @@ def _check(module: str, weight: Tensor | None, pair: Mapping[str, Tensor]) -> No
     if weight is None or pair.keys() != {"A", "B"}:
         raise CheckpointError(f"{module}: expected a weight and LoRA factors A and B, got {sorted(pair)}")
     shapes = [list(pair[side].shape) for side in ("B", "A")]
-    if [len(shape) for shape in shapes] != [2, 2] or [shapes[0][0], shapes[1][1]] != list(weight.shape):
+    if [len(shape) for shape in shapes] != [2, 2] or [shapes[0][0], shapes[1][1]] != shape_of(weight):
         got = f"{shapes[0]} and {shapes[1]}"
-        raise CheckpointError(f"{module}: expected LoRA factors of {list(weight.shape)}, got {got}; {MERGE}")
+        raise CheckpointError(f"{module}: expected LoRA factors of {shape_of(weight)}, got {got}; {MERGE}")
     if shapes[0][1] != shapes[1][0]:
         raise CheckpointError(f"{module}: expected LoRA factors of one rank, got {shapes[0]} and {shapes[1]}")
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from rfm.engine.layers import PredictionHead, concatenated
-from rfm.family import VideoPrompt
+from rfm.family import VideoPrompt, Weights
 from rfm.vlm.backbone import BACKBONES, SMOL
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.qwen import KeyValues, check_attention, features, last_hidden_state
@@ -32,11 +32,13 @@ class BackboneConfig:
 
     backbone: transformers' configuration (config.json)
     video_prompt: form of a Qwen3-VL's prompt with a video (``rfm.vlm.video_prompt``)
+    weights: how weights of layers are rounded (``rfm.vlm.rounded``); None: they are not
     """
 
     backbone: dict[str, Any]
     dtype: Dtype
     video_prompt: VideoPrompt = field(default="bare", kw_only=True)
+    weights: Weights | None = field(default=None, kw_only=True)
 
     @property
     def family(self) -> str:

@@ -195,7 +195,7 @@ def test_the_lock_has_the_versions_of_the_constraints(python: str) -> None:
 def test_the_lock_names_what_the_packages_ask_for_with_hashes_and_without_addresses() -> None:
     """What those need in turn, ``pip check`` finds as the image is built."""
     asked = [Requirement(text) for name in DISTRIBUTIONS for text in importlib.metadata.requires(name) or []]
-    extras = ("", "encoders", "vlm")
+    extras = ("", "encoders", "vlm", "quantized")
     needed = {
         canonicalize_name(need.name)
         for need in asked

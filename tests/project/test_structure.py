@@ -65,6 +65,7 @@ EXCEPTIONS = {
     "benchmarks/gpu.py": {"rfm"},
     "benchmarks/gpus.py": {"rfm", "rfm_export"},  # what is served
     "benchmarks/perf_analyzer.py": {"rfm"},
+    "benchmarks/memory.py": {"rfm"},
     "benchmarks/real_size.py": {"rfm"},
     "benchmarks/serving.py": {"rfm", "rfm_export"},
     "benchmarks/peers/engines.py": {"rfm"},  # the peers score with our engine, or weights

@@ -26,6 +26,7 @@ RUN_CONFIG_PARAMETER = "run_config"
 KIND_PARAMETER = "kind"
 LICENSE_PARAMETER = "license"
 LACKS_PARAMETER = "lacks"  # names of scores that the checkpoint does not give, with commas between
+WEIGHTS_DIFFERENCE_PARAMETER = "weights_difference"  # largest, of progress; empty: the weights are not rounded
 WHOLE_EPISODE_PARAMETER = "needs_whole_episode"  # "true"; any other value: false
 
 
@@ -57,6 +58,8 @@ class ModelInfo:
     has_log_prob: True if it gives log-probabilities (``log_prob=True`` of a call)
     marks_unclear: True if its results mark unclear written answers (``unclear``)
     needs_whole_episode: True if its scores are relative to the whole episode, so it cannot score while one runs
+    weights_difference: largest difference of progress from the full checkpoint's, which the export measured on noise
+        when it rounded weights; None: not measured
     """
 
     name: str
@@ -84,6 +87,13 @@ class ModelInfo:
     has_log_prob: bool = False
     marks_unclear: bool = False
     needs_whole_episode: bool = False
+    weights_difference: float | None = None
+
+    @property
+    def weights(self) -> str | None:
+        """How weights are rounded (int8, nf4), so that scores are not the full checkpoint's; None: they are not."""
+        found = self.network.get("config", {}).get("weights")
+        return found if isinstance(found, str) else None
 
     @property
     def widths(self) -> tuple[int, int] | None:
@@ -108,6 +118,7 @@ class ModelInfo:
         max_frames = parameters.get(MAX_FRAMES_PARAMETER)
         frame_size = parameters.get(FRAME_SIZE_PARAMETER)
         lacks = parameters.get(LACKS_PARAMETER)
+        difference = parameters.get(WEIGHTS_DIFFERENCE_PARAMETER)
         versions = config.get("version_policy", {}).get("specific", {}).get("versions", [])
         return cls(
             name=config["name"],
@@ -135,6 +146,7 @@ class ModelInfo:
             has_log_prob=wire.LOG_PROB in last_dims,
             marks_unclear=wire.UNCLEAR in last_dims,
             needs_whole_episode=parameters.get(WHOLE_EPISODE_PARAMETER) == "true",
+            weights_difference=float(difference) if difference else None,
         )
 
 

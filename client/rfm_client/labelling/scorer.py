@@ -31,6 +31,7 @@ class CheckpointFacts:
     trained_padding: True if training padded shorter trajectories, or if unknown
     has_log_prob: True if results have log-probabilities
     needs_whole_episode: True if scores are relative to the whole episode
+    weights: how the weights are rounded, so that scores are not the full checkpoint's; None: they are not
     """
 
     source: str | None
@@ -45,10 +46,13 @@ class CheckpointFacts:
     has_log_prob: bool = False
     needs_whole_episode: bool = False
     computation: str | None = None
+    weights: str | None = None
 
     def document(self) -> dict[str, Any]:
         """Return the facts for the provenance."""
-        told = ("source", "revision", "weights_digest", "settings_digest", "computation")
+        told = ["source", "revision", "weights_digest", "settings_digest", "computation"]
+        if self.weights is not None:
+            told.append("weights")
         return {name: value for name, value in asdict(self).items() if name in told}
 
 
@@ -98,6 +102,7 @@ class ClientScorer:
             has_log_prob=info.has_log_prob,
             needs_whole_episode=info.needs_whole_episode,
             computation=info.computation,
+            weights=info.weights,
         )
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:

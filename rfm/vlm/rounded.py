@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""Linear layers whose weights have 8 or 4 bits. Each forward pass decodes them; inputs and products are not rounded.
+
+So a row's scores do not depend on the other rows of its batch, as they would with rounded inputs. N outputs and K
+inputs of a layer.
+
+int8: weight int8 [N, K] and scale [N, 1]; a value is weight * scale.
+nf4: weight uint8 [N, K / 2], two codes a byte, and scale float32 [blocks], as ``rfm.vlm.nf4`` describes them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from rfm.checkpoint.content import CheckpointError
+from rfm.checkpoint.weights import DECODED, SCALE, VALUES_OF_BYTE
+from rfm.engine.layers import linear
+from rfm.family import Weights
+from rfm.vlm import nf4
+
+# The layers that may be rounded: linear ones of the language model and the vision tower. Their weights are nine tenths
+# of a network's bytes; the embedding, the heads and what stands between the parts keep their numbers.
+_LAYER = re.compile(r"\.(layers|blocks)\.\d+\..*\.weight")
+_MOST = 127  # of int8, so that zero is in the middle
+INSTALL = 'pip install ".[quantized]"'
+
+
+class RoundedLinear(nn.Module):
+    """An ``nn.Linear`` with a rounded weight, and perhaps with LoRA factors beside it, as in PEFT."""
+
+    weight: Tensor
+    scale: Tensor
+    lora_A: nn.Linear | None  # noqa: N815  PEFT's name
+    lora_B: nn.Linear | None  # noqa: N815
+
+    def __init__(self, layer: nn.Linear, rank: int | None) -> None:
+        super().__init__()
+        self.in_features, self.out_features = layer.in_features, layer.out_features
+        self.bias = layer.bias
+        self.lora_A = self.lora_B = None
+        if rank is not None:
+            self.lora_A = nn.Linear(self.in_features, rank, bias=False, device="meta")
+            self.lora_B = nn.Linear(rank, self.out_features, bias=False, device="meta")
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Float [..., K] -> [..., N]."""
+        plus = None if self.lora_A is None or self.lora_B is None else self.lora_B(self.lora_A(input))
+        return linear(input, self.values(input.dtype), self.bias, plus=plus)
+
+    def values(self, dtype: torch.dtype) -> Tensor:
+        """Return the decoded weight, [N, K]."""
+        raise NotImplementedError
+
+
+class Int8Linear(RoundedLinear):
+    """A linear layer with 8 bits for each value, and a scale for each output."""
+
+    def __init__(self, layer: nn.Linear, scale: Tensor, rank: int | None) -> None:
+        super().__init__(layer, rank)
+        shape = self.out_features, self.in_features
+        self.register_buffer("weight", torch.empty(shape, dtype=torch.int8, device="meta"))
+        self.register_buffer("scale", torch.empty(self.out_features, 1, dtype=scale.dtype, device="meta"))
+
+    def values(self, dtype: torch.dtype) -> Tensor:
+        """Return the decoded weight, [N, K]."""
+        return (self.weight * self.scale).to(dtype)
+
+
+class Nf4Linear(RoundedLinear):
+    """A linear layer in NF4, which bitsandbytes decodes. ``decoded``: empty, in the dtype of the decoded values"""
+
+    decoded: Tensor
+
+    def __init__(self, layer: nn.Linear, scale: Tensor, decoded: Tensor, rank: int | None) -> None:
+        super().__init__(layer, rank)
+        try:
+            from bitsandbytes import functional
+        except ImportError as error:
+            expected = "expected bitsandbytes, which decodes weights in NF4, got none"
+            raise CheckpointError(f"weights: {expected}; {INSTALL}") from error
+        self._bitsandbytes: Any = functional
+        count = self.out_features * self.in_features
+        self._block_size = nf4.block_size(count, len(scale))
+        num_blocks = math.ceil(count / self._block_size)
+        packed = self.out_features, self.in_features // VALUES_OF_BYTE
+        self.register_buffer("weight", torch.empty(packed, dtype=torch.uint8, device="meta"))
+        self.register_buffer("scale", torch.empty(num_blocks, dtype=torch.float32, device="meta"))
+        self.register_buffer("decoded", torch.empty(0, dtype=decoded.dtype, device="meta"))
+
+    def values(self, dtype: torch.dtype) -> Tensor:
+        """Return the decoded weight, [N, K]."""
+        state = self._bitsandbytes.QuantState(
+            absmax=self.scale,
+            # One row: on the CPU, bitsandbytes takes wrong scales for rows that are not whole blocks.
+            shape=torch.Size([1, self.out_features * self.in_features]),
+            dtype=self.decoded.dtype,
+            blocksize=self._block_size,
+            quant_type="nf4",
+        )
+        flat = self._bitsandbytes.dequantize_4bit(self.weight.view(-1, 1), state)
+        return flat.view(self.out_features, self.in_features).to(dtype)
+
+
+def may_be_rounded(name: str) -> bool:
+    """True for the name of a weight, or of its LoRA-wrapped form, that belongs to a layer that may be rounded."""
+    return _LAYER.search(name) is not None
+
+
+def is_rounded(name: str, tensor: Tensor) -> bool:
+    """True if the tensor belongs to a rounded weight, and so keeps its dtype in a network of any other."""
+    return not tensor.is_floating_point() or name.endswith((SCALE, DECODED))
+
+
+def shape_of(weight: Tensor) -> list[int]:
+    """Return the shape of a weight's values, [N, K]."""
+    rows, *columns = weight.shape
+    return [rows, columns[0] * VALUES_OF_BYTE] if weight.dtype is torch.uint8 else [rows, *columns]
+
+
+def fit(network: nn.Module, weights: Mapping[str, Tensor], factors: Mapping[str, Tensor] | None = None) -> None:
+    """Replace the network's layers whose weights are rounded by layers that take these weights.
+
+    factors: of LoRA; those of rounded weights get a place beside them
+    Raises CheckpointError if bitsandbytes is missing.
+    """
+    modules = dict(network.named_modules())
+    for path in (name.removesuffix(SCALE) for name in weights if name.endswith(SCALE)):
+        layer = modules.get(path)
+        if type(layer) is not nn.Linear:
+            continue  # ``check_shapes`` names what does not fit
+        down = (factors or {}).get(f"{path}.lora_A.weight")
+        rank = None if down is None else len(down)
+        scale, decoded = weights[path + SCALE], weights.get(path + DECODED)
+        rounded = Int8Linear(layer, scale, rank) if decoded is None else Nf4Linear(layer, scale, decoded, rank)
+        parent, _, child = path.rpartition(".")
+        setattr(modules[parent], child, rounded)
+
+
+def rounded(name: str, weight: Tensor, kind: Weights, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Return the tensors of a rounded weight by name.
+
+    name: of the weight, with its end ``.weight``
+    weight: float32 [N, K]
+    dtype: of the decoded values
+    """
+    if kind == "nf4":
+        return nf4.of_layer(name, *nf4.quantize(weight), dtype)
+    scale = (weight.abs().amax(1, keepdim=True) / _MOST).to(dtype)
+    steps = weight / torch.where(scale == 0, 1, scale).float()
+    return {name: steps.round().clamp(-_MOST, _MOST).to(torch.int8), name.removesuffix(".weight") + SCALE: scale}

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: MIT
+"""Checkpoints with rounded weights: rounded here (``rfm export --weights``), or published in NF4."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, shown
+from rfm.checkpoint.provenance import Decision
+from rfm.checkpoint.weights import DECODED, read_weights
+from rfm.family import Weights
+from rfm.vlm.backbone import NF4, QUANTIZED, UNQUANTIZED, check_not_quantized, quantization
+from rfm.vlm.lora import changed_by, merged
+from rfm.vlm.nf4 import dequantize
+from rfm.vlm.rounded import may_be_rounded, rounded
+
+FLAG = "--weights"
+_NF4: Weights = "nf4"
+
+
+def read_unrounded_config(backbone: dict[str, Any], file: Path) -> bool:
+    """Return True if the configuration says that weights are in NF4, and remove that from it.
+
+    Raises CheckpointError for weights that are rounded in another way.
+    """
+    is_nf4 = quantization(backbone) == NF4
+    if is_nf4:
+        del backbone["quantization_config"]
+    check_not_quantized(backbone, file, UNQUANTIZED)
+    return is_nf4
+
+
+def read_published(folder: Path, is_nf4: bool) -> tuple[dict[str, Tensor], int]:
+    """Return a folder's tensors, and the number of weights in NF4. Those of layers stay in NF4, others are decoded.
+
+    is_nf4: config.json says that some are in NF4
+    Raises CheckpointError.
+    """
+    tensors = read_weights(folder)
+    num_nf4 = dequantize(tensors, may_be_rounded)
+    quantized = next((name for name in tensors if QUANTIZED.search(name)), None)
+    if quantized is not None:
+        raise CheckpointError(f"{folder}: expected weights in full precision, got {shown(quantized)}; {UNQUANTIZED}")
+    if is_nf4 and not num_nf4:
+        got = "none; if they are meant in full precision, remove it"
+        raise CheckpointError(f"{folder / NETWORK_CONFIG}: quantization_config: expected weights in NF4, got {got}")
+    return tensors, num_nf4
+
+
+def kind_of(weights: Mapping[str, Tensor]) -> Weights | None:
+    """Return the form of weights as they were published: NF4, or None."""
+    return _NF4 if any(name.endswith(DECODED) for name in weights) else None
+
+
+def round_layers(
+    weights: Mapping[str, Tensor], factors: Mapping[str, Tensor], kind: Weights, dtype: torch.dtype
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return the weights with those of layers rounded, and the LoRA factors of the others.
+
+    factors: of LoRA, which are added before rounding
+    dtype: of the decoded values
+    """
+    whole: dict[str, Tensor] = {}
+    rest = dict(factors)
+    for name, weight in weights.items():
+        if not (may_be_rounded(name) and weight.ndim == 2 and weight.shape[1] % 2 == 0):
+            whole[name] = weight
+            continue
+        own = {factor: rest.pop(factor) for factor in factors if changed_by(factor) == name}
+        whole |= rounded(name, merged({name: weight}, own, torch.float32)[name], kind, dtype)
+    return whole, rest
+
+
+def decision(kind: Weights, source: str) -> Decision:
+    """Return the form of rounded weights as a setting that scores depend on."""
+    return Decision("weights", f"{kind}: rounded, so the scores are not the full checkpoint's", source)

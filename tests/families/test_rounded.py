@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: MIT
+"""Weights of 8 and 4 bits: what they stand for, and that scores depend on nothing else."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from bitsandbytes import functional as bitsandbytes
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+import goldens
+import rfm_export
+from engines import TRANSFORMERS, load_engine, serve_config
+from few_bits import LORA_INSIDE, TOLERANCES, in_both_forms
+from few_bits import rounded as in_nf4
+from pretended import CUDA, pretended
+from reward_models import ROOT
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm.config import ExportConfig
+from rfm.engine import Engine
+from rfm.vlm import nf4
+from rfm.vlm.rounded import Int8Linear, Nf4Linear, RoundedLinear, fit, rounded
+from rfm_client import ProgressSample
+from rfm_client.contract.model_info import ModelInfo
+from rfm_commands.engine_scorer import EngineScorer
+from rfm_export.pbtxt import parse
+from rfm_export.verify import device_for
+from vlm import PLAIN, assert_close, video
+
+KINDS = {"int8": Int8Linear, "nf4": Nf4Linear}
+SAMPLES = [
+    ProgressSample(video(0, 3, 60, 84)),
+    ProgressSample(video(1, 4, 84, 60)),
+    ProgressSample(video(2, 2, 64, 64)),
+]
+ROBOREWARD = ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint"
+TOPREWARD = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
+
+
+def sources(name: str) -> dict[str, Any]:
+    if name in ("roboreward-expected", "topreward"):
+        return {"source": ROBOREWARD if name.startswith("robo") else TOPREWARD, "reward_model": name}
+    config = goldens.config(name)
+    return {"source": config.checkpoint, **config.sources}
+
+
+def network_of(engine: Engine) -> nn.Module:
+    network: nn.Module = engine.predictor.network  # type: ignore[attr-defined]
+    return network
+
+
+def layers_of(engine: Engine) -> dict[str, RoundedLinear]:
+    return {name: each for name, each in network_of(engine).named_modules() if isinstance(each, RoundedLinear)}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", [PLAIN, "q25_mean_l2", "smol_mean_disc10", "roboreward-expected", "topreward"])
+def test_a_rounded_network_scores_a_sample_alone_as_in_a_batch(name: str, kind: str, dtype: torch.dtype) -> None:
+    if name.startswith("smol") and TRANSFORMERS >= 5:
+        pytest.skip("SmolVLM is refused with transformers 5")
+    if name.startswith("smol") and dtype is torch.bfloat16:
+        pytest.skip("in bfloat16 padding changes SmolVLM's scores, with full weights, too")
+    engine = Engine.from_checkpoint(**sources(name), weights=kind, dtype=dtype)
+    assert {type(layer) for layer in layers_of(engine).values()} == {KINDS[kind]}
+    together = engine.evaluate(SAMPLES)
+    for sample, expected in zip(SAMPLES, together, strict=True):
+        (alone,) = engine.evaluate([sample])
+        assert_close(alone, expected, 1e-5 if dtype is torch.float32 else 5e-3)
+    full = Engine.from_checkpoint(**sources(name), dtype=dtype).evaluate(SAMPLES)
+    with pytest.raises(AssertionError):
+        assert_close(full[0], together[0], 1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_layers_of_the_language_model_and_the_vision_tower_are_rounded_and_nothing_else(kind: str) -> None:
+    engine, full = Engine.from_checkpoint(**sources(PLAIN), weights=kind), load_engine(PLAIN)
+    linear = {name for name, each in network_of(full).named_modules() if isinstance(each, nn.Linear)}
+    inside = {name for name in linear if ".layers." in name or ".blocks." in name}
+    assert layers_of(engine).keys() == inside
+    assert any("visual" in name for name in inside)
+    assert {name.split(".")[0] for name in linear - inside} == {
+        "frame_pool_attn", "model", "preference_head", "progress_head", "success_head",
+    }  # fmt: skip
+    for name, parameter in network_of(engine).named_parameters():
+        assert torch.equal(parameter, network_of(full).get_parameter(name))
+
+
+def layer_with(weight: torch.Tensor, kind: Any, dtype: torch.dtype = torch.float32) -> RoundedLinear:
+    network = nn.ModuleDict({"layer": nn.Linear(weight.shape[1], weight.shape[0], bias=False)})
+    tensors = rounded("layer.weight", weight, kind, dtype)
+    fit(network, tensors)
+    network.load_state_dict(tensors, assign=True)
+    layer = network["layer"]
+    assert isinstance(layer, RoundedLinear)
+    return layer
+
+
+def test_int8_takes_the_nearest_of_255_steps_of_each_row() -> None:
+    weight = torch.randn(5, 40, generator=torch.Generator().manual_seed(0)) * torch.logspace(-3, 1, 5)[:, None]
+    weight[2] = 0
+    layer = layer_with(weight, "int8")
+    steps = weight.abs().amax(1, keepdim=True) / 127
+    assert ((layer.values(torch.float32) - weight).abs() <= steps * 0.5001).all()
+    assert torch.equal(layer.values(torch.float32)[2], weight[2])
+    assert layer.values(torch.bfloat16).dtype is torch.bfloat16
+    for_bfloat16 = layer_with(weight, "int8", torch.bfloat16).values(torch.float32)
+    assert ((for_bfloat16 - weight).abs() <= steps * 1.01).all()  # the scale and the products are rounded, too
+
+
+@pytest.mark.parametrize("shape", [(6, 128), (5, 100), (3, 34), (1, 2)])
+def test_nf4_rounds_and_decodes_as_bitsandbytes(shape: tuple[int, int]) -> None:
+    weight = torch.randn(shape, generator=torch.Generator().manual_seed(1)) * 0.02
+    codes, scales = nf4.quantize(weight)
+    theirs, state = bitsandbytes.quantize_4bit(weight, blocksize=64, quant_type="nf4")
+    assert torch.equal(codes.flatten(), theirs.flatten())
+    assert torch.equal(scales, state.absmax)
+    parts, values = in_nf4("layer.weight", weight)
+    assert torch.equal(layer_with(weight, "nf4", torch.bfloat16).values(torch.bfloat16), values)
+    assert nf4.dequantize(parts) == 1
+    assert torch.equal(parts["layer.weight"], values)
+    assert not nf4.quantize(torch.zeros(2, 32))[1].any()
+
+
+@pytest.mark.parametrize("name", [PLAIN, LORA_INSIDE, "q25_peft_adapter_disc10"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_export_holds_the_rounded_weights_and_says_how_far_scores_are(tmp_path: Path, kind: Any, name: str) -> None:
+    config, said = goldens.config(name), list[str]()
+    settings = ExportConfig(**{**vars(serve_config(config)), "weights": kind})
+    rfm_export.export(config.checkpoint, tmp_path, settings, say=said.append)
+    folder = tmp_path / "rfm_frames"
+    exported, memory = Engine.from_checkpoint(folder / "1" / "checkpoint"), families.load(**sources(name), weights=kind)
+    in_memory = Engine.of(memory).evaluate(SAMPLES)
+    for result, expected in zip(exported.evaluate(SAMPLES), in_memory, strict=True):
+        assert_close(result, expected, 1e-6)
+
+    info = info_of(folder)
+    assert info.weights == kind
+    assert info.weights_difference is not None and 1e-5 < info.weights_difference < 0.5
+    (line,) = [each for each in said if each.startswith(f"--weights {kind}: ")]
+    told = f"progress differs by at most {info.weights_difference:.2g} from the full checkpoint's, on noise"
+    assert line.endswith(told)
+    assert info.network["parameters"] == numbers_of(load_engine(name))
+    assert rfm_export.check(tmp_path, settings) == []
+    table = json.loads((folder / "1" / "checkpoint" / "provenance.json").read_text())
+    (row,) = [each for each in table if each["name"] == "weights"]
+    assert row["value"] == f"{kind}: rounded, so the scores are not the full checkpoint's"
+    assert row["source"] == "--weights"
+    stored = load_file(folder / "1" / "checkpoint" / "model.safetensors")
+    assert not any("lora" in key for key in stored)
+    again = families.load(folder / "1" / "checkpoint", weights=kind)  # the same may be asked for again
+    assert {each.source for each in again.decisions() if each.name == "weights"} == {"config.json"}
+
+
+def info_of(model: Path) -> ModelInfo:
+    from google.protobuf.json_format import MessageToDict
+
+    config = parse((model / "config.pbtxt").read_text())
+    return ModelInfo.from_config(MessageToDict(config, preserving_proto_field_name=True))
+
+
+def numbers_of(engine: Engine) -> Mapping[str, int]:
+    numbers: dict[str, int] = {}
+    for key, parameter in network_of(engine).named_parameters():
+        part = key.partition(".")[0]
+        numbers[part] = numbers.get(part, 0) + parameter.numel()
+    return numbers
+
+
+@pytest.mark.parametrize("name", TOLERANCES)
+def test_a_checkpoint_in_nf4_keeps_its_codes_and_is_labelled(tmp_path: Path, name: str) -> None:
+    few_bits, full = in_both_forms(name, tmp_path)
+    options = goldens.config(name).sources
+    checkpoint = families.load(few_bits, **options)
+    engine = Engine.of(checkpoint)
+    assert {type(layer) for layer in layers_of(engine).values()} == {Nf4Linear}
+    assert checkpoint.config.weights == "nf4"
+    weights = load_file(few_bits / "model.safetensors")
+    for path, layer in layers_of(engine).items():
+        kept = [key for key in weights if key.endswith(".weight") and _is_of(key, path)]
+        assert torch.equal(layer.weight.flatten(), weights[kept[0]].flatten())
+    dense = Engine.from_checkpoint(full, **options)
+    for result, expected in zip(engine.evaluate(SAMPLES), dense.evaluate(SAMPLES), strict=True):
+        assert_close(result, expected, TOLERANCES[name])
+
+    rfm_export.export(few_bits, tmp_path / "models", serve_config(goldens.config(name)))
+    info = info_of(tmp_path / "models" / "rfm_frames")
+    assert (info.weights, info.weights_difference) == ("nf4", None)  # nobody has the weights before rounding
+
+
+def _is_of(key: str, path: str) -> bool:
+    return (
+        key.replace("base_model.model.", "")
+        .replace(".base_layer", "")
+        .endswith(f"{path.partition('model.')[2]}.weight")
+    )
+
+
+def test_an_ordinary_qwen_in_nf4_is_read(tmp_path: Path) -> None:
+    folder = tmp_path / "Qwen3-VL-bnb-4bit"
+    folder.mkdir()
+    for file in ROBOREWARD.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    few_bits = {}
+    for key, tensor in load_file(folder / "model.safetensors").items():
+        is_linear = key.endswith(".weight") and (".layers." in key or ".blocks." in key) and tensor.ndim == 2
+        few_bits |= in_nf4(key, tensor)[0] if is_linear else {key: tensor}
+    save_file(few_bits, folder / "model.safetensors", {"format": "pt"})
+    content = json.loads((folder / "config.json").read_text())
+    content["quantization_config"] = {
+        "quant_method": "bitsandbytes",
+        "load_in_4bit": True,
+        "bnb_4bit_quant_type": "nf4",
+    }
+    (folder / "config.json").write_text(json.dumps(content))
+    published = families.load(folder, reward_model="roboreward-expected")
+    rounded_here = families.load(ROBOREWARD, reward_model="roboreward-expected", weights="nf4")
+    assert {each.source for each in published.decisions() if each.name == "weights"} == {"weights"}
+    scores = [Engine.of(each).evaluate(SAMPLES) for each in (published, rounded_here)]
+    for result, expected in zip(*scores, strict=True):
+        assert_close(result, expected, 1e-6)
+
+
+def test_weights_that_are_rounded_are_not_rounded_in_another_way(tmp_path: Path) -> None:
+    few_bits, _ = in_both_forms(PLAIN, tmp_path)
+    options = goldens.config(PLAIN).sources
+    expected = "^--weights: expected a vision-language checkpoint whose weights are not rounded .*; leave it out"
+    with pytest.raises(CheckpointError, match=expected):
+        families.load(few_bits, weights="int8", **options)
+    assert families.load(few_bits, weights="nf4", **options).config.weights == "nf4"
+    rewind = goldens.config("c1_t1_disc10")
+    with pytest.raises(CheckpointError, match=expected):
+        families.load(rewind.checkpoint, weights="int8", **rewind.sources)
+
+
+def test_a_missing_bitsandbytes_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "bitsandbytes", None)
+    expected = r'^weights: expected bitsandbytes, which decodes .* got none; pip install "\.\[quantized\]"$'
+    with pytest.raises(CheckpointError, match=expected):
+        families.load(**sources(PLAIN), weights="nf4")
+    Engine.from_checkpoint(**sources(PLAIN), weights="int8")  # which PyTorch decodes
+
+
+@pytest.mark.parametrize("part", ["weight", "scale"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_tensors_of_other_shapes_are_refused(tmp_path: Path, kind: Any, part: str) -> None:
+    families.load(**sources(PLAIN), weights=kind).save(tmp_path / "saved")
+    tensors = load_file(tmp_path / "saved" / "model.safetensors")
+    name = f"model.language_model.layers.0.mlp.up_proj.{part}"
+    tensors[name] = tensors[name][:-1].clone()
+    save_file(tensors, tmp_path / "saved" / "model.safetensors", {"format": "pt"})
+    with pytest.raises(CheckpointError, match=r"layers\.0\.mlp\.up_proj\.(weight|scale): expected \[.*\], got \["):
+        families.load(tmp_path / "saved")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_labels_tell_rounded_weights(kind: str) -> None:
+    source, *options = sources(PLAIN).items()
+    full, few_bits = (EngineScorer(str(source[1]), **dict(options), **given) for given in ({}, {"weights": kind}))
+    assert "weights" not in full.checkpoint().document()
+    assert few_bits.checkpoint().document()["weights"] == kind
+    assert few_bits.checkpoint().settings_digest != full.checkpoint().settings_digest
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_device_decodes_without_a_wait(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    expected = Engine.from_checkpoint(**sources(PLAIN), weights=kind).evaluate(SAMPLES)
+    with pretended(monkeypatch) as seen, torch.inference_mode():
+        engine = Engine.from_checkpoint(**sources(PLAIN), weights=kind, device=CUDA, dtype=torch.float32)
+        results = engine.evaluate(SAMPLES)
+        asked = seen.asked.total()
+        engine.evaluate(SAMPLES)
+        assert seen.asked.total() - asked <= 1  # for the scores
+    for result, other in zip(results, expected, strict=True):
+        assert_close(result, other, 1e-5)
+
+
+def test_a_gpu_needs_room_for_the_rounded_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exports are compared on a GPU with room for them."""
+    checkpoints = [families.load(**sources(PLAIN), weights=kind) for kind in (None, "int8", "nf4")]
+    rooms = []
+    for checkpoint in checkpoints:
+        low, high = 0, 2**30
+        while high - low > 1:
+            free = (low + high) // 2
+            monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+            monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+            monkeypatch.setattr(torch.cuda, "mem_get_info", lambda index, free=free: (free, free))
+            fits = device_for(checkpoint, torch.bfloat16, may_use_gpu=True).type == "cuda"
+            low, high = (low, free) if fits else (free, high)
+        rooms.append(high)
+    assert rooms == sorted(rooms, reverse=True)
+    assert len(set(rooms)) == 3
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_gpu_decodes_as_the_cpu(kind: str) -> None:
+    engines = [
+        Engine.from_checkpoint(**sources(PLAIN), weights=kind, device=on, dtype=torch.float32) for on in ("cpu", "cuda")
+    ]
+    layers = [layers_of(engine) for engine in engines]
+    for name, layer in layers[0].items():
+        assert torch.equal(layer.values(torch.bfloat16), layers[1][name].values(torch.bfloat16).cpu())
+    for result, expected in zip(*(engine.evaluate(SAMPLES) for engine in engines), strict=True):
+        assert_close(result, expected, 1e-4)
