@@ -14,6 +14,7 @@ import torch
 from rfm.engine.device import Copies, memory_errors
 from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.graphs import Graphs
 from rfm.engine.layers import progress_from_logits, speed_up
 from rfm.engine.predictor import RowScores, no_success, of_rows, part_of
 from rfm.vlm.batch import Layout, VlmBatch
@@ -49,6 +50,10 @@ class VlmPredictor:
         """True if the network predicts success."""
         return bool(self.network.config.has_success)
 
+    def use_graphs(self, graphs: Graphs) -> None:
+        """Score small batches with CUDA graphs from now on."""
+        self.network.graphs = graphs
+
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
         """Return the conversations of a sample. Raises InvalidSampleError, also for unknown frame references."""
         rows = self.collator.rows(self._completed(sample) if isinstance(sample, ProgressSampleRefs) else sample)
@@ -73,7 +78,8 @@ class VlmPredictor:
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
         """Return one batch of conversations of any kind."""
         self.work_ahead(rows)
-        batch = self.collator.collate(rows)
+        length, graphs = max(row.num_tokens for row in rows), self.network.graphs
+        batch = self.collator.collate(rows, length if graphs is None else graphs.padded(len(rows), length))
         return batch.pinned() if self._copies.pins else batch
 
     def count(self, batch: VlmBatch, execution: Execution) -> None:
@@ -109,13 +115,15 @@ class VlmPredictor:
         return of_rows(sample, rows)
 
     def _output(self, batch: VlmBatch, *arguments: Any) -> Any:
-        """Return the network's output. Out of memory, clear the cache, since the engine tries again with fewer rows."""
+        """Return the network's output. Out of memory, free what is kept: the engine tries again with fewer rows."""
         try:
             with memory_errors():
                 return self.network(batch.to(self.device, self._dtype), *arguments)
         except torch.OutOfMemoryError:
             if self.cache is not None:
                 self.cache.clear()
+            if self.network.graphs is not None:
+                self.network.graphs.clear()
             raise
 
     def _completed(self, sample: ProgressSampleRefs) -> ProgressSampleRefs:
