@@ -98,7 +98,7 @@ def doubled(tensor: Tensor) -> Tensor:
 
 
 def call(graphs: Graphs, length: int, value: float = 1.0) -> float:
-    return float(graphs(doubled, [torch.full((length,), value)], "doubled", length).max())
+    return float(graphs(doubled, [torch.full((length,), float(value))], "doubled", length).max())
 
 
 def test_a_graph_that_rests_makes_room() -> None:
