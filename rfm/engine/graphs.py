@@ -56,7 +56,7 @@ class Captured:
 
 
 class Capture(Protocol):
-    """Captures a call."""
+    """The form of ``CudaCapture`` and of what tests use in its place."""
 
     def __call__(self, function: Function, tensors: Sequence[Tensor], beside: Captured | None) -> Captured:
         """Return the captured call ``function(*tensors)``. Raises RuntimeError if it cannot be captured.
@@ -74,7 +74,7 @@ class CudaCapture:
 
     def __call__(self, function: Function, tensors: Sequence[Tensor], beside: Captured | None) -> Captured:
         """Return the captured call ``function(*tensors)``; see ``Capture``."""
-        self._stream = self._stream or torch.cuda.Stream(self._device)  # type: ignore[no-untyped-call]
+        self._stream = self._stream or torch.cuda.Stream(self._device)  # type: ignore[no-untyped-call]  # as PyTorch declares it
         pool = torch.cuda.graph_pool_handle() if beside is None else beside.pool
         inputs = [tensor.clone() for tensor in tensors]
         graph = torch.cuda.CUDAGraph()
