@@ -103,6 +103,11 @@ class ExportConfig(Settings):
         least=0,
         most=MAX_INT32,
     )
+    cuda_graphs: bool = setting(
+        False,
+        "Launch the passes of single samples and small batches as CUDA graphs. For RFM, Robometer and RoboReward's "
+        "expected score on a Qwen backbone, on GPUs.",
+    )
     batch_size: int | None = setting(
         None, "Of no effect, as in the FastAPI server; max_batch_size bounds a batch.", least=1, has_option=False
     )

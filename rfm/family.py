@@ -120,6 +120,7 @@ class Description:
         load a model whose warm-up fails
     kind: the reward model's name for people
     asks_in_words: an ordinary language model, which has no heads, so that none is missing
+    uses_graphs: its predictor can score small batches with CUDA graphs (``use_graphs``)
     is_large: exports are verified in the dtype that serves, on a GPU if it has room, since float32 on the CPU is slow
     """
 
@@ -133,6 +134,7 @@ class Description:
     frame_size: FrameSize | None = None
     frames_per_value: int = 1
     keeps_features: bool = False
+    uses_graphs: bool = False
     is_large: bool = False
     has_preference: bool = True
     has_success: bool = True

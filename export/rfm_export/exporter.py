@@ -31,7 +31,15 @@ from rfm_export.batches import with_batch_size
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_name
 from rfm_export.publish import alone, next_version, publish, read_config, staging
-from rfm_export.verify import device_for, device_named, largest_difference, needing_room, probes, verify
+from rfm_export.verify import (
+    device_for,
+    device_named,
+    largest_difference,
+    needing_room,
+    probes,
+    verify,
+    verify_graphs,
+)
 
 Say: TypeAlias = Callable[[str], object]  # takes a line for the user
 
@@ -82,6 +90,7 @@ def export(
         _check_gpus(settings.num_gpus)
     named = None if device is None else device_named(device)
     loaded = _load(source, settings, family, say)
+    _check_graphs(settings, loaded.checkpoint.description)
     settings = with_batch_size(settings, loaded.checkpoint, say)
     described = loaded.encoders.description if loaded.encoders is not None else None
     names = [settings.name, encoder_name(settings.name), frames_name(settings.name)]
@@ -146,6 +155,18 @@ def _check_gpus(num_gpus: int | None) -> None:
         )
 
 
+def _check_graphs(settings: ExportConfig, description: Description) -> None:
+    """Raise ExportError for CUDA graphs that nothing would use."""
+    if settings.cuda_graphs and not description.uses_graphs:
+        expected = "an RFM, Robometer or RoboReward checkpoint (its expected score) on a Qwen backbone"
+        raise ExportError(f"cuda_graphs: expected {expected}, got another; leave out --cuda-graphs")
+    if settings.cuda_graphs and not _num_gpus(settings):
+        raise ExportError(
+            "cuda_graphs: expected an export for GPUs, got one for the CPU; leave out --cuda-graphs, or name "
+            "--num-gpus with --other-machine"
+        )
+
+
 @contextmanager
 def _needing_disk(repository: Path) -> Iterator[None]:
     """Raise ExportError if the repository's disk is full."""
@@ -191,12 +212,12 @@ def _verify(source: _Source, version: Version, staged: Path, named: torch.device
     if description.is_large:
         say(f"the export's scores are compared with the checkpoint's on {device} (--device names another one)")
 
-    def exported() -> Engine:
+    def exported(*, cuda_graphs: bool = False) -> Engine:
         checkpoint = families.named(source.family.name).load(
             _checkpoint_folder(description, version, staged), Options()
         )
         if source.encoders is None:
-            return engine(checkpoint)
+            return engine(checkpoint, cuda_graphs=cuda_graphs)
         served_by = families.encoders_of(source.family.name)
         return engine(checkpoint, encoders=served_by.load(_encoders_folder(version, staged)))
 
@@ -204,6 +225,8 @@ def _verify(source: _Source, version: Version, staged: Path, named: torch.device
     with needing_room(device):
         original = partial(engine, source.checkpoint, encoders=source.encoders)
         verify(original, exported, samples, may_not_answer=description.may_not_answer)
+        if settings.cuda_graphs and device.type == "cuda":
+            verify_graphs(partial(exported, cuda_graphs=True), description, say)
 
 
 def _checkpoint_folder(description: Description, version: Version, repository: Path) -> Path:
@@ -247,7 +270,8 @@ def _generated(models: Sequence[GeneratedModel], repository: Path) -> dict[str, 
 
 
 def _version(source: _Source, settings: ExportConfig, number: int) -> Version:
-    return Version(number, settings, _num_gpus(settings), source.family.name, about(source.checkpoint, source.origin))
+    about_checkpoint = about(source.checkpoint, source.origin)
+    return Version(number, settings, _num_gpus(settings), source.family.name, about_checkpoint)
 
 
 def _num_gpus(settings: ExportConfig) -> int:

@@ -17,7 +17,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 from rfm.config import ExportConfig
 from rfm.family import Description, EncodersDescription
 from rfm.launch.repository_folder import CONFIG_FILE
-from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER
+from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER, GRAPHS_PARAMETER
 from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
 from rfm_client.contract.model_info import (
     FRAME_SIZE_PARAMETER,
@@ -111,6 +111,8 @@ def generated_models(
     scorer = Interface(scorer_name(description, name), inputs, outputs, about)
     version = replace(version, settings=settings)
     models = [_python_model(scorer, "rfm", version, _warmups(description), keeps=keeps)]
+    if settings.cuda_graphs:
+        models[0].config.parameters[GRAPHS_PARAMETER].string_value = "true"
     if encoders is None or widths is None:
         return models
     inputs, about = wire.encoder_inputs(by_digest=has_one_cache), about_encoders(encoders, version.about)

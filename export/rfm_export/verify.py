@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 
 from rfm.engine import Engine, Outcome
+from rfm.engine.graphs import PLAIN_CALLS
 from rfm.family import NETWORK, Checkpoint, Description
 from rfm_client.contract import (
     FrameScores,
@@ -29,6 +30,7 @@ from rfm_client.contract.synthetic import Widths, random_trajectory
 from rfm_export.errors import ExportDiffersError, ExportError
 
 TOLERANCE = 1e-6  # same weights, machine and code: only rounding may differ
+GRAPHS_TOLERANCE = 1e-5  # the same kernels on the same shapes
 PROBE_FRAMES = (1, 3, 8)
 PROBE_SIZE_PX = (48, 80)
 PROBE_FRAME_STEPS = 2
@@ -81,12 +83,12 @@ def needing_room(device: torch.device) -> Iterator[None]:
         raise ExportError(f"device: expected {expected}, got: {reason}; --device names another one") from error
 
 
-def probes(description: Description, *, with_encoders: bool) -> list[Sample]:
+def probes(description: Description, *, with_encoders: bool, seed: int = 0) -> list[Sample]:
     """Return random samples of each type that the checkpoint can score, in several lengths.
 
     with_encoders: True: for a checkpoint that scores embeddings, raw frames too
     """
-    random = np.random.default_rng(0)
+    random = np.random.default_rng(seed)
 
     def make(num_frames: int, widths: Widths) -> Trajectory:
         task = f"pick up {num_frames} red cups"
@@ -138,6 +140,34 @@ def largest_difference(full: Callable[[], Engine], rounded: Callable[[], Engine]
     pairs = [pair for pair in zip(*scores, strict=True) if not any(isinstance(each, RewardError) for each in pair)]
     frames = [frame for pair in pairs for frame in zip(*map(_trajectories, pair), strict=True)]
     return max((float(np.abs(after.progress - before.progress).max()) for before, after in frames), default=0.0)
+
+
+def verify_graphs(make: Callable[[], Engine], description: Description, say: Callable[[str], object]) -> None:
+    """Raise ExportDiffersError unless CUDA graphs give the scores of plain passes.
+
+    Each sample, and another of its shapes, is scored alone: first by plain passes, then by graphs.
+
+    make: returns an engine with CUDA graphs, which has not scored yet
+    say: takes a line for the user
+    """
+    engine = make()
+    if engine.graphs is None:
+        return
+    rounds = [probes(description, with_encoders=False, seed=seed) for seed in range(PLAIN_CALLS)]
+    for index, samples in enumerate(zip(*rounds, strict=True)):
+        engine.graphs.clear()
+        plain, graphed = (
+            np.concatenate([_numbers(index, whose, *engine.evaluate([sample])) for sample in samples])
+            for whose in ("a plain pass", "a CUDA graph")
+        )
+        if not np.allclose(graphed, plain, rtol=0, atol=GRAPHS_TOLERANCE, equal_nan=True):
+            difference = np.nanmax(np.abs(graphed - plain))
+            raise ExportDiffersError(
+                f"probe {index}: cuda_graphs: expected the scores of a plain pass, got a difference of "
+                f"{difference:g}; leave out --cuda-graphs"
+            )
+    if engine.graphs.has_failed:
+        say("cuda_graphs: this device cannot capture the network's passes, so the setting gains nothing here")
 
 
 def _numbers(index: int, whose: str, outcome: Outcome) -> npt.NDArray[np.float64]:

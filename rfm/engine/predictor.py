@@ -12,6 +12,7 @@ import numpy.typing as npt
 from torch import Tensor
 
 from rfm.engine.execution import Execution
+from rfm.engine.graphs import Graphs
 from rfm.engine.layers import progress_from_logits
 from rfm_client.contract import (
     FrameScores,
@@ -72,6 +73,13 @@ class Predictor(Protocol[Row, Batch]):
 
     def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
         """Return the scores of a progress sample's frames, from those of all its rows."""
+
+
+class GraphedPredictor(Predictor[Row, Batch], Protocol):
+    """A predictor that can score small batches with CUDA graphs: ``Description.uses_graphs``."""
+
+    def use_graphs(self, graphs: Graphs) -> None:
+        """Score small batches with these graphs from now on."""
 
 
 @dataclass(frozen=True, eq=False)

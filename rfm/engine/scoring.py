@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import torch
 
@@ -19,8 +19,9 @@ from rfm.engine.device import memory_errors
 from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.engine.finite import finite
+from rfm.engine.graphs import CudaCapture, Graphs
 from rfm.engine.layers import keep_float32
-from rfm.engine.predictor import Predictor, RowScores
+from rfm.engine.predictor import GraphedPredictor, Predictor, RowScores
 from rfm.family import Checkpoint, FrameEncoders, VideoPrompt, Weights
 from rfm_client.contract import (
     BatchTiming,
@@ -60,6 +61,7 @@ class Engine:
     encoders: on the same device, for samples of raw frames if the network scores embeddings
     token_budget: maximum tokens, with padding, of a forward pass of several rows; a larger row runs alone
     max_sample_tokens: maximum tokens of one sequence; a sample with a longer one is refused
+    graphs: CUDA graphs for small batches, if the predictor can use them; None: all passes are plain
     """
 
     def __init__(
@@ -69,11 +71,15 @@ class Engine:
         encoders: FrameEncoders | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
+        graphs: Graphs | None = None,
     ) -> None:
         self.predictor = predictor
         self.encoders = encoders
         self.token_budget = token_budget
         self.max_sample_tokens = max_sample_tokens
+        self.graphs = graphs
+        if graphs is not None:
+            cast("GraphedPredictor[Any, Any]", predictor).use_graphs(graphs)
 
     @classmethod
     def from_checkpoint(
@@ -92,6 +98,7 @@ class Engine:
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
         feature_cache_mib: int = 0,
+        cuda_graphs: bool = False,
     ) -> Engine:
         """Return the engine for a checkpoint's folder or Hugging Face id.
 
@@ -114,6 +121,7 @@ class Engine:
             token_budget=token_budget,
             max_sample_tokens=max_sample_tokens,
             feature_cache_mib=feature_cache_mib,
+            cuda_graphs=cuda_graphs,
         )
 
     @classmethod
@@ -127,11 +135,13 @@ class Engine:
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
         feature_cache_mib: int = 0,
+        cuda_graphs: bool = False,
     ) -> Engine:
         """Return the engine for a checkpoint in memory.
 
         dtype: of the network; None: a vision-language checkpoint's own on a GPU, else float32
         feature_cache_mib: MiB for features of raw frames; 0: no cache
+        cuda_graphs: small batches are CUDA graphs; without effect on the CPU and if not ``Description.uses_graphs``
         others: as in the class
         Raises CheckpointError.
         """
@@ -140,7 +150,14 @@ class Engine:
         cache = FeatureCache[Any](feature_cache_mib * BYTES_PER_MIB) if feature_cache_mib else None
         predictor = checkpoint.predictor(on, dtype, cache)
         encoders = None if encoders is None else encoders.to(on)
-        return cls(predictor, encoders=encoders, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
+        is_graphed = cuda_graphs and on.type == "cuda" and checkpoint.description.uses_graphs
+        return cls(
+            predictor,
+            encoders=encoders,
+            token_budget=token_budget,
+            max_sample_tokens=max_sample_tokens,
+            graphs=Graphs(CudaCapture(on)) if is_graphed else None,
+        )
 
     def evaluate(self, samples: Sequence[Sample], execution: Execution | None = None) -> list[Outcome]:
         """Return each sample's result or error, independent of the other samples.

@@ -46,6 +46,7 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
             progress_bins=len(SCORES),
             has_similarity=False,
             keeps_features=True,
+            uses_graphs=self.config.is_expected,  # a written answer keeps keys and values, whose number grows
             is_large=True,
             asks_in_words=True,
             has_preference=False,

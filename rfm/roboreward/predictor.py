@@ -51,6 +51,7 @@ class RoboRewardPredictor(VlmPredictor):
     """A Qwen3-VL on a device, which writes a score."""
 
     collator: RoboRewardCollator
+    makes_trees = False  # an answer is written behind each conversation
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
@@ -75,6 +76,10 @@ class RoboRewardPredictor(VlmPredictor):
     def num_tokens(self, row: VlmRow) -> int:
         """Return the number of tokens in the row's first pass, which include the draft."""
         return row.num_tokens + len(self.collator.draft)
+
+    def longest(self, row: VlmRow) -> int:
+        """Return the number of tokens in the row's first pass."""
+        return self.num_tokens(row)
 
     @torch.inference_mode()
     def write(

@@ -87,12 +87,13 @@ class RoboRewardCollator(LanguageCollator):
         times_s = group_times(self.grid(video).groups)
         return [self.row(video, text, shown, times_s, more) for shown in video.conversations]
 
-    def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
+    def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> VlmBatch:
         """Return the batch of conversations with the draft behind each.
 
+        length: as in ``VlmCollator.collate``
         Its queries: each conversation's last token, and the tokens of the draft.
         """
-        batch = super().collate([self._drafted(row) for row in rows])
+        batch = super().collate([self._drafted(row) for row in rows], length)
         back = torch.arange(-len(self.draft), 1)
         return replace(
             batch,

@@ -118,6 +118,7 @@ class VlmCheckpoint:
             frame_size=frame_size(self.config),
             frames_per_value=1 if self.config.multi_image else FRAMES_PER_GROUP,
             keeps_features=self.config.family != SMOL,
+            uses_graphs=self.config.family != SMOL,
             is_large=True,
             has_preference=self.config.has_preference,
             has_success=self.config.has_success,

@@ -152,9 +152,12 @@ class VlmCollator:
         """Return the number of patches that the vision tower reads of a video's frames."""
         raise NotImplementedError
 
-    def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Return the batch of conversations of any kinds and lengths, whose frames have been resized."""
-        length = max(row.num_tokens for row in rows)
+    def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> VlmBatch:
+        """Return the batch of conversations of any kinds and lengths, whose frames have been resized.
+
+        length: L, to which they are padded; None: the longest conversation's
+        """
+        length = length or max(row.num_tokens for row in rows)
         pad = self.tokenizer.pad_token_id
         ids = torch.full((len(rows), length), pad, dtype=torch.int64)
         mask = torch.zeros_like(ids)

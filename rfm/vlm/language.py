@@ -22,6 +22,7 @@ from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS, CheckpointError, exp
 from rfm.checkpoint.provenance import Decision, source_name
 from rfm.checkpoint.weights import check_shapes
 from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.graphs import Graphs
 from rfm.engine.pixels import Normalisation
 from rfm.engine.predictor import check_type
 from rfm.family import NETWORK, config_fields
@@ -82,6 +83,8 @@ class LanguageOutput:
 class LanguageNetwork(nn.Module):
     """The backbone and its language head."""
 
+    graphs: Graphs | None = None
+
     def __init__(self, config: LanguageConfig, backbone: nn.Module) -> None:
         super().__init__()
         self.config = config
@@ -93,7 +96,7 @@ class LanguageNetwork(nn.Module):
 
         key_values: receives the keys and values of all tokens
         """
-        hidden, made = qwen_states(self.model, batch, key_values)
+        hidden, made = qwen_states(self.model, batch, key_values, self.graphs)
         return LanguageOutput(self.lm_head(hidden[batch.query_rows, batch.query_tokens]), made)
 
 

@@ -15,10 +15,12 @@ from typing import Any, Literal, TypeAlias
 import torch
 from torch import Tensor, nn
 
+from rfm.engine.graphs import Graphs
 from rfm.engine.layers import PredictionHead, concatenated
 from rfm.family import VideoPrompt, Weights
 from rfm.vlm.backbone import BACKBONES, SMOL
 from rfm.vlm.batch import VlmBatch
+from rfm.vlm.graphed import graphed_features, graphed_hidden_state
 from rfm.vlm.qwen import KeyValues, check_attention, features, last_hidden_state
 from rfm.vlm.tree_states import tree_hidden_states
 
@@ -118,6 +120,8 @@ class VlmOutput:
 class VlmRewardModel(nn.Module):
     """Backbone and heads, with upstream's names of the heads."""
 
+    graphs: Graphs | None = None
+
     def __init__(self, config: VlmConfig, backbone: nn.Module) -> None:
         super().__init__()
         self.config = config
@@ -137,7 +141,7 @@ class VlmRewardModel(nn.Module):
         if self.config.family == SMOL:
             hidden, made = self.model(**batch.inputs, use_cache=False).last_hidden_state, None
         else:
-            hidden, made = qwen_states(self.model, batch)
+            hidden, made = qwen_states(self.model, batch, graphs=self.graphs)
         frames = self._frame_states(hidden, batch.spans, batch.num_span_tokens)
         queries = hidden[batch.query_rows, batch.query_tokens]
         return VlmOutput(
@@ -165,21 +169,27 @@ class VlmRewardModel(nn.Module):
         return (_of_each("sum", states.float(), lengths) / lengths[:, None]).to(hidden.dtype)
 
 
-def qwen_states(backbone: Any, batch: VlmBatch, key_values: KeyValues | None = None) -> tuple[Tensor, Tensor | None]:
+def qwen_states(
+    backbone: Any, batch: VlmBatch, key_values: KeyValues | None = None, graphs: Graphs | None = None
+) -> tuple[Tensor, Tensor | None]:
     """Return a Qwen backbone's last hidden states, and the features that its vision tower computed.
 
     The states have the shape [B, L, D], or [1, all tokens, D] for a batch with packs.
 
     key_values: receives the keys and values of all tokens, for ``next_hidden_state``
+    graphs: of small batches; without effect on a language model whose keys and values are wanted
     """
     made = None
     if batch.plan is not None:
-        made = features(backbone.visual, batch.inputs["pixel_values"], batch.plan)
+        of_tower = backbone.visual, batch.inputs["pixel_values"], batch.plan
+        made = features(*of_tower) if graphs is None else graphed_features(graphs, *of_tower)
     assert batch.layout is not None
     shots = [*([] if made is None else [made]), *batch.layout.kept.values()]
     merged = concatenated(shots)
     if batch.packs:
         return tree_hidden_states(backbone.language_model, batch.inputs, batch.packs, merged), made
+    if graphs is not None and key_values is None:
+        return graphed_hidden_state(graphs, backbone.language_model, batch.inputs, merged), made
     return last_hidden_state(backbone.language_model, batch.inputs, merged, key_values), made
 
 

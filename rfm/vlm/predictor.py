@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ import torch
 from rfm.engine.device import Copies, memory_errors
 from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.graphs import Graphs
 from rfm.engine.layers import progress_from_logits, speed_up
 from rfm.engine.predictor import RowScores, no_success, of_rows, part_of
 from rfm.engine.threads import FrameThreads
@@ -34,6 +35,7 @@ class VlmPredictor:
     """
 
     works_ahead = True
+    makes_trees: ClassVar[bool] = True  # of prefixes, whose common beginnings are computed once
 
     def __init__(
         self, network: Any, collator: VlmCollator, device: torch.device, cache: FeatureCache[Any] | None = None
@@ -53,6 +55,10 @@ class VlmPredictor:
         """True if the network predicts success."""
         return bool(self.network.config.has_success)
 
+    def use_graphs(self, graphs: Graphs) -> None:
+        """Score small batches with CUDA graphs from now on."""
+        self.network.graphs = graphs
+
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
         """Return the conversations of a sample. Raises InvalidSampleError, also for unknown frame references."""
         rows = self.collator.rows(self._completed(sample) if isinstance(sample, ProgressSampleRefs) else sample)
@@ -61,7 +67,7 @@ class VlmPredictor:
         if longest > self._max_tokens:
             expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"
             raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
-        if not isinstance(self.collator, QwenCollator):
+        if not (self.makes_trees and isinstance(self.collator, QwenCollator)):
             return rows
         return trees(rows, self.collator.visual_pad, are_images=self.collator.config.multi_image)
 
@@ -83,7 +89,9 @@ class VlmPredictor:
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
         """Return one batch of conversations of any kind."""
         self.work_ahead(rows)
-        batch = self.collator.collate(rows)
+        graphs = self.network.graphs
+        length = None if graphs is None else graphs.padded(len(rows), max(map(self.longest, rows)))
+        batch = self.collator.collate(rows, length)
         return batch.pinned() if self._copies.pins else batch
 
     def count(self, batch: VlmBatch, execution: Execution) -> None:
@@ -124,13 +132,15 @@ class VlmPredictor:
         return of_rows(sample, rows)
 
     def _output(self, batch: VlmBatch, *arguments: Any) -> Any:
-        """Return the network's output. Out of memory, clear the cache, since the engine tries again with fewer rows."""
+        """Return the network's output. Out of memory, free what is kept: the engine tries again with fewer rows."""
         try:
             with memory_errors():
                 return self.network(batch.to(self.device, self._dtype), *arguments)
         except torch.OutOfMemoryError:
             if self.cache is not None:
                 self.cache.clear()
+            if self.network.graphs is not None:
+                self.network.graphs.clear()
             raise
 
     def _completed(self, sample: ProgressSampleRefs) -> ProgressSampleRefs:

@@ -4,22 +4,31 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 from typer.testing import CliRunner
 
 import goldens
 import rfm_export
+from captures import CalledAgain
+from engines import serve_config
 from labelling import LEROBOT
 from rfm import families
+from rfm.engine import Engine
+from rfm.engine.graphs import Captured, Function, Graphs
 from rfm.family import NETWORK
 from rfm_commands.cli import app
-from rfm_export.verify import WORKING_ROOM, device_for, device_named, needing_room
+from rfm_export.errors import ExportDiffersError
+from rfm_export.verify import WORKING_ROOM, device_for, device_named, needing_room, verify_graphs
 
 SMALL = goldens.config("c1_t1_disc10")
 LARGE = next(iter(goldens.VLM))
+PLAIN = goldens.config("q3_tok_disc10")
 
 
 @pytest.fixture
@@ -81,6 +90,54 @@ def test_the_command_says_where_it_compares(tmp_path: Path) -> None:
     assert "the export's scores are compared with the checkpoint's on cpu (--device names another one)" in done.output
     refused = CliRunner().invoke(app, [*words, "--device", "tpu"])
     assert (refused.exit_code, "device: expected one of cpu" in refused.output) == (1, True)
+
+
+class Stale(CalledAgain):
+    """Replays the inputs of the capture for ever."""
+
+    def __call__(self, function: Function, tensors: Sequence[Tensor], beside: Captured | None) -> Captured:
+        captured = super().__call__(function, tensors, beside)
+        return replace(captured, inputs=[tensor.clone() for tensor in captured.inputs])
+
+
+class Failing(CalledAgain):
+    """Cannot capture."""
+
+    def __call__(self, function: Function, tensors: Sequence[Tensor], beside: Captured | None) -> Captured:
+        raise RuntimeError("made up")
+
+
+def compare(capture: CalledAgain) -> tuple[Graphs, list[str]]:
+    """Compare the graphs of a reference checkpoint with its plain passes; also return what is said."""
+    checkpoint, graphs, said = families.load(PLAIN.checkpoint, **PLAIN.sources), Graphs(capture), list[str]()
+    engine = Engine(checkpoint.predictor(torch.device("cpu")), graphs=graphs)
+    verify_graphs(lambda: engine, checkpoint.description, said.append)
+    return graphs, said
+
+
+def test_an_export_compares_graphs_with_plain_passes() -> None:
+    graphs, said = compare(CalledAgain())
+    assert graphs.num_replayed >= 2 * graphs.num_captured > 0
+    assert said == []
+    with pytest.raises(ExportDiffersError, match=r"cuda_graphs: expected the scores of a plain pass, got a difference"):
+        compare(Stale())
+    _, said = compare(Failing())
+    assert said == ["cuda_graphs: this device cannot capture the network's passes, so the setting gains nothing here"]
+
+
+def test_graphs_are_refused_where_nothing_uses_them(tmp_path: Path) -> None:
+    settings = replace(serve_config(PLAIN), cuda_graphs=True)
+    with pytest.raises(rfm_export.ExportError, match="cuda_graphs: expected an export for GPUs, got one for the CPU"):
+        rfm_export.export(PLAIN.checkpoint, tmp_path, settings)
+    with pytest.raises(rfm_export.ExportError, match=r"cuda_graphs: expected an RFM, .*leave out --cuda-graphs$"):
+        rfm_export.export(SMALL.checkpoint, tmp_path, replace(serve_config(SMALL), cuda_graphs=True, num_gpus=0))
+
+
+@pytest.mark.parametrize("cuda_graphs", [False, True])
+def test_a_configuration_names_graphs_only_if_they_are_on(tmp_path: Path, cuda_graphs: bool) -> None:
+    settings = replace(serve_config(PLAIN), cuda_graphs=cuda_graphs, num_gpus=1)
+    rfm_export.export(PLAIN.checkpoint, tmp_path, settings, other_machine=True, device="cpu")
+    assert ("cuda_graphs" in (tmp_path / "rfm_frames" / "config.pbtxt").read_text()) == cuda_graphs
 
 
 def test_label_refuses_a_device_that_is_not_there(free_bytes: list[float]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Both families and the encoders on a GPU that PyTorch pretends to have: the CPU's numbers, and few waits of the host."""
+"""Both families and the encoders on GPUs that PyTorch pretends to have: the CPU's numbers, and few waits of the host."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import torch
 
 import goldens
 from engines import TRANSFORMERS, load_engine
-from pretended import CUDA, Seen, pretended
-from reward_models import references
+from pretended import CUDA, SECOND, Seen, pretended
+from reward_models import ROOT, references
 from rfm import families
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
@@ -28,11 +28,11 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
         yield seen
 
 
-def engine_there(name: str, feature_cache_mib: int = 0) -> Engine:
-    """The engine of a reference checkpoint on the device."""
+def engine_there(name: str, feature_cache_mib: int = 0, device: torch.device = CUDA) -> Engine:
+    """The engine of a reference checkpoint on a device."""
     config = goldens.config(name)
     checkpoint = families.load(config.checkpoint, **config.sources)
-    options = {"device": CUDA, "dtype": torch.float32, "feature_cache_mib": feature_cache_mib}
+    options = {"device": device, "dtype": torch.float32, "feature_cache_mib": feature_cache_mib}
     with torch.inference_mode():  # what is made in it needs no views that count versions
         return Engine.of(checkpoint, encoders=checkpoint.encoders(), **options)
 
@@ -53,14 +53,16 @@ WAITS = {
 def test_a_device_gives_the_reference_answers_and_waits_no_more_often_than_it_must(
     seen: Seen, config: goldens.Config
 ) -> None:
+    """The device is the second, which is not the current one: no tensor may lie elsewhere."""
     if config.name.startswith("smol") and TRANSFORMERS >= 5:
         pytest.skip("SmolVLM is refused with transformers 5")
-    engine = engine_there(config.name)
+    engine = engine_there(config.name, device=SECOND)
     cases = [case for case in config.cases() if not case.is_refused]
     for case in [*cases[:1], *(case for case in cases if "mixed" in case.file.stem)]:
         for result, expected in zip(engine.evaluate(case.samples()), case.expected(), strict=True):
             goldens.check(result, expected, case.tolerances)
     assert seen.num_operators > 100
+    assert {*seen.made_on} == {SECOND}
     for _ in range(2):
         asked, awaited = seen.asked.total(), seen.awaited
         engine.evaluate(cases[0].samples())
@@ -80,6 +82,48 @@ def test_a_device_writes_the_answers_of_the_original(seen: Seen) -> None:
     for result, case in zip(results, cases, strict=True):
         assert isinstance(result, ProgressResult), result
         assert result.last_progress == case.content["generations"][0]["parsed_score"] / 4 - 0.25
+
+
+@pytest.mark.parametrize("name", ["topreward", "topreward-robometer", "roboreward", "roboreward-expected"])
+def test_reward_models_that_are_asked_in_words_stay_on_their_device(seen: Seen, name: str) -> None:
+    of_topreward = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
+    folder = of_topreward if name.startswith("topreward") else references("roboreward")[0].config / "checkpoint"
+    checkpoint = families.load(folder, reward_model=name)
+    sample = ProgressSample(video(0, 4, 64, 64))
+    with torch.inference_mode():
+        engine = Engine.of(checkpoint, device=SECOND, dtype=torch.float32, feature_cache_mib=1)
+    for _ in range(2):
+        (result,) = engine.evaluate([sample])
+        (expected,) = Engine.of(checkpoint).evaluate([sample])
+        assert type(result) is type(expected)
+    assert {*seen.made_on} == {SECOND}
+
+
+def test_tensors_of_two_places_do_not_meet(seen: Seen) -> None:
+    first, second = (torch.ones(2, device=device) for device in (CUDA, SECOND))
+    index = torch.tensor([1], device=SECOND)
+    for mix in (
+        lambda: first + second,
+        lambda: torch.cat([first, second]),
+        lambda: first[index],
+        lambda: first + second.sum(),  # not even a single number
+        lambda: torch.ones(2) + second,
+    ):
+        with pytest.raises(RuntimeError, match="expected all tensors to be on the same device"):
+            mix()
+    with pytest.raises(RuntimeError, match="invalid device ordinal 2"):
+        torch.ones(2, device="cuda:2")
+    assert (second + torch.ones(2, device=SECOND)).device == SECOND
+    assert (first + second.to(CUDA)).device == CUDA
+
+
+def test_a_device_without_an_index_is_the_thread_s_current_one(seen: Seen) -> None:
+    assert torch.ones(1, device="cuda").device == CUDA
+    Placement(SECOND, torch.get_num_threads()).apply()
+    assert torch.ones(1, device="cuda").device == SECOND
+    with torch.cuda.stream(torch.cuda.Stream(CUDA)):
+        assert torch.ones(1, device="cuda").device == CUDA
+    assert torch.cuda.current_device() == SECOND.index
 
 
 MIXED: list[Sample] = [

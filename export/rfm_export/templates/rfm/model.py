@@ -16,6 +16,7 @@ from rfm.parameters import (
     DTYPE_PARAMETER,
     FAMILY_PARAMETER,
     FEATURE_CACHE_PARAMETER,
+    GRAPHS_PARAMETER,
     SAMPLE_TOKENS_PARAMETER,
 )
 from rfm.triton_model.batch_model import BatchModel
@@ -35,6 +36,7 @@ class TritonPythonModel(BatchModel[Sample | ProgressSampleRefs, Result]):
             token_budget=int(settings[BUDGET_PARAMETER]),
             max_sample_tokens=int(settings[SAMPLE_TOKENS_PARAMETER]),
             feature_cache_mib=int(settings.get(FEATURE_CACHE_PARAMETER) or 0),
+            cuda_graphs=settings.get(GRAPHS_PARAMETER) == "true",
         )
 
     def decode(self, tensors: wire.Tensors) -> list[Sample | ProgressSampleRefs]:
