@@ -72,7 +72,7 @@ SPACE := $(EMPTY) $(EMPTY)
 GPU_PATH = $(subst $(SPACE),:,$(addprefix $(CURDIR)/,. client gateway export commands build/gpu/site))
 
 # Measure on a GPU: GPU tests, the bare engine, served checkpoints. Nine minutes.
-# Makes benchmarks/results/gpu.md. ARGUMENTS="--checkout build/gpu/before" measures the commit of make gpu-packages.
+# Writes benchmarks/results/gpu.md. ARGUMENTS="--checkout build/gpu/before" measures the commit of make gpu-packages.
 gpu:
 	test ! -f build/gpu.tar.xz || $(PYTHON) -c "import tarfile; tarfile.open('build/gpu.tar.xz').extractall('build/gpu')"
 	PYTHONPATH=$(GPU_PATH) $(GPU_PYTHON) benchmarks/gpu.py $(ARGUMENTS)
@@ -80,7 +80,7 @@ gpu:
 PLATFORMS := manylinux_2_35_x86_64 manylinux_2_28_x86_64 manylinux_2_17_x86_64 manylinux2014_x86_64
 
 # Pack what a machine with Python 3.12, PyTorch and transformers lacks for make gpu into build/gpu.tar.xz, 35 MB.
-# Needs the network. BEFORE=COMMIT also packs the packages of that commit. Of the wheels, only what is needed is packed.
+# Needs the network. BEFORE=COMMIT also packs the packages of that commit. Unneeded files of the wheels are left out.
 gpu-packages: $(INSTALLED)
 	rm -rf build/gpu build/gpu.tar.xz
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-compile --target build/gpu/site \

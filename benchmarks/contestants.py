@@ -35,7 +35,7 @@ VLM = HERE.parent / "tests" / "golden" / "vlm"
 VLM_CHECKPOINT, VLM_BASE = VLM / "q3_tok_disc10" / "checkpoint", VLM / "bases" / "q3"
 PEERS = {"FastAPI": "fastapi_server.py", "LitServe": "litserve_server.py", "mosec": "mosec_server.py"}
 START_S = 120
-CORES_OF_A_PROCESS = 4  # a Python process of callers has one core's worth of work, the rest is the server's
+CORES_OF_A_PROCESS = 4  # one for a Python process of callers, the others for the server
 US_PER_S = 1e6
 DEFAULT_SIZE = RewindConfig(  # upstream's defaults
     video_feature_dim=768,
@@ -130,7 +130,7 @@ class Contestant:
 
 
 def shares(load: Load, count: int) -> list[Load]:
-    """Return the parts of a load for ``count`` processes, at most one for each caller."""
+    """Split a load among ``count`` processes, at most one for each caller."""
     each, more = divmod(load.callers, count)
     rate_per_s = load.rate_per_s / count
     return [replace(load, callers=each + (number < more), rate_per_s=rate_per_s) for number in range(count)]
@@ -172,7 +172,7 @@ class BareEngine:
 
 @contextmanager
 def serving(checkpoint: Path, folder: Path, settings: Mapping[str, Any], python: str) -> Iterator[dict[str, str]]:
-    """Serve a checkpoint with the packages of another Python, without those of PYTHONPATH; yield the addresses.
+    """Serve a checkpoint with the packages of another Python, ignoring PYTHONPATH; yield the addresses by name.
 
     folder: for the repository and the log
     settings: section ``export`` of a configuration
@@ -188,7 +188,7 @@ def serving(checkpoint: Path, folder: Path, settings: Mapping[str, Any], python:
     try:
         while not (line := process.stdout.readline()).startswith("{"):
             if not line:
-                raise RuntimeError(f"{python}: expected a server, got its end with exit status {process.wait()}")
+                raise RuntimeError(f"{python}: expected the addresses of a server, got exit status {process.wait()}")
         yield json.loads(line)
     finally:
         process.communicate()

@@ -4,9 +4,9 @@
     python benchmarks/count.py
 
 Prints a Markdown table. The networks run on PyTorch's meta device, whose tensors have shapes but no values, so the
-counts do not depend on this machine. All code of the engine runs as on a GPU. What it reads from the device is 0: a
-draft of zeros is right, and a written answer has its full length. Tokenizers are the tests' small ones, which make
-more tokens of text than Qwen's.
+counts do not depend on this machine. All code of the engine runs as on a GPU. Values that it reads from the device are
+0, so a draft of zeros is accepted, and a written answer has the full length. Tokenizers are the tests' small ones,
+which make more tokens of text than Qwen's.
 
 passes: of the language model, also for each written token
 padding: share of the tokens
@@ -184,7 +184,7 @@ def _network(network_class: Any, config: Any) -> Any:
 
 
 def counted(reward_model: str, num_samples: int, num_frames: int, size_px: tuple[int, int]) -> dict[str, Any]:
-    """Return the row of a batch of noise videos."""
+    """Return the table row of a batch of noise videos."""
     engine, random = engine_of(reward_model), np.random.default_rng(0)
     videos = random.integers(0, 256, (num_samples, num_frames, *size_px, 3), np.uint8)
     samples = [ProgressSample(Trajectory(frames=video, task="put the red block in the bowl")) for video in videos]

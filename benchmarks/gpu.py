@@ -52,7 +52,7 @@ class TimeIsUpError(Exception):
 
 @dataclass(frozen=True)
 class Run:
-    """What all parts need.
+    """Settings that all parts need.
 
     checkout: folder with the packages that are measured
     folder: for checkpoints and repositories
@@ -64,7 +64,7 @@ class Run:
 
     @property
     def python(self) -> str:
-        """Return a Python with the packages of the checkout before those of this Python, made at first use.
+        """Return a Python that prefers the packages of the checkout to its own, made at first use.
 
         Triton's Python backend does not read PYTHONPATH, but takes the packages of the first python3 in PATH.
         """
@@ -103,7 +103,7 @@ def tests(run: Run) -> Iterator[Row]:
 
 
 def engine(run: Run) -> Iterator[Row]:
-    """Measure the bare engine in a process of its own."""
+    """Measure the bare engine in a separate process."""
     for kind in (ROBOMETER, QWEN):
         run.checkpoint(kind)
     words = [run.python, str(Path(__file__).with_name("real_size.py")), str(run.folder)]
@@ -200,8 +200,8 @@ PARTS: dict[str, Callable[[Run], Iterator[Row]]] = {
 class Aim:
     """A figure that should be at least, or at most, ``limit``.
 
-    of: columns of the row
-    beside: columns of the row that the figure is divided by; None: it is not
+    of: columns that identify the row
+    beside: columns that identify the row to divide by; None: no division
     """
 
     title: str
@@ -213,7 +213,7 @@ class Aim:
 
 
 def aims(scale: Scale) -> list[Aim]:
-    """Return what the server should reach on an H100 or H200."""
+    """Return the aims for an H100 or H200."""
     one, some, many = scale.callers
     small, usual = (f"{px[0]}x{px[1]}" for px in (scale.small_px, scale.usual_px))
     lone = {"what": "Robometer", "way": "served", "size": small, "callers": one, "repeated": False}
@@ -233,7 +233,7 @@ def aims(scale: Scale) -> list[Aim]:
 
 
 def figure(aim: Aim, rows: Sequence[Row], graphs: bool) -> float | None:
-    """Return the figure of an aim; None: not measured. An engine or row that knows no graphs stands for both."""
+    """Return the figure of an aim; None: not measured. Lacking a divisor with graphs, divide by the plain one."""
     found = _row(rows, {**aim.of, "graphs": graphs})
     if found is None:
         return None

@@ -2,7 +2,7 @@
 """Measure how well several GPUs share the requests, without a GPU.
 
     gpus.py batches     samples/s of 1, 2 and 4 GPUs, with batches of several sizes
-    gpus.py episodes    the cost of a step with one server of all GPUs, and with one server for each GPU
+    gpus.py episodes    the cost of a step with one server for all GPUs, and with one for each GPU
 
 A real Triton serves a tiny vision-language checkpoint on the CPU. Each instance stands for a GPU.
 """
@@ -39,7 +39,7 @@ from rfm_export.pbtxt import parse, render
 
 FRAMES, FRAME_PX = 2, 32  # of a sample: the CPU has little to prepare
 STEP_FRAMES, STEP_PX = 8, 64  # of a window
-METRICS_S = 1.5  # until instances have told Triton of all frames
+METRICS_S = 1.5  # until instances have reported all frames to Triton
 TASK = "lift the block"
 SETTINGS = ExportConfig(num_gpus=0, torch_threads=1, base_model=str(VLM_BASE))
 SIMULATED = """
@@ -201,7 +201,7 @@ def main() -> None:
     """Read the command line, and measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("batches", "episodes"))
-    parser.add_argument("--gpus", type=int, nargs="+", default=[1, 2, 4], help="episodes: the last of them counts")
+    parser.add_argument("--gpus", type=int, nargs="+", default=[1, 2, 4], help="episodes: only the largest counts")
     parser.add_argument("--callers", type=int, nargs="+", default=[16, 32, 64])
     parser.add_argument("--max-batch", type=int, nargs="+", default=[64, 4], help="sizes of batches to compare")
     parser.add_argument("--lone-ms", type=float, default=50.0, help="shortest forward pass")
@@ -210,7 +210,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--seconds", type=float, default=8.0, help="of each load")
     parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder of the results")
+    parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
     arguments = parser.parse_args()
     with TemporaryDirectory(prefix="rfm-bench-") as name:
         {"batches": batches, "episodes": episodes}[arguments.what](arguments, Path(name))

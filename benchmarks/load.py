@@ -80,7 +80,7 @@ class Load:
 
 @dataclass(frozen=True)
 class Calls:
-    """What the calls of one process gave, after the warm-up.
+    """Results of the calls of one process after the warm-up.
 
     latencies_s: of answered calls
     failed: number of samples without scores
@@ -110,7 +110,7 @@ class Measured:
 
     @classmethod
     def of(cls, calls: Sequence[Calls], together: int = 1) -> Measured:
-        """Return what processes that called at the same time measured. together: samples of a call"""
+        """Combine the results of processes that called at the same time. together: samples in a call"""
         latencies_s = [latency_s for each in calls for latency_s in each.latencies_s]
         rate = sum(len(each.latencies_s) * together / each.took_s for each in calls)
         p50, p99 = np.percentile(latencies_s, [50, 99]) * MS_PER_S if latencies_s else (float("nan"),) * 2
@@ -119,7 +119,7 @@ class Measured:
 
 
 def samples(load: Load, video_dim: int, text_dim: int) -> Callable[[int], Sample]:
-    """Return a function that gives the sample of a number.
+    """Return a function that makes a sample from its number.
 
     Embeddings are equal for every server. A pair has as many frames as a single trajectory.
     """
@@ -153,7 +153,7 @@ def _embedded(random: np.random.Generator, video_dim: int, text_dim: int) -> Cal
 
 
 def _filmed(load: Load) -> Callable[[int, int, int], Trajectory]:
-    """Return a function of a sample's number, its first frame and the number of frames.
+    """Return a function that makes a trajectory from a sample's number, its first frame and the number of frames.
 
     Frames are views into random bytes, each video one byte further than the video before, so a frame costs nothing.
     """

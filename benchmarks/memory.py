@@ -5,7 +5,7 @@
 
 At rest: the weights. At most: the weights, and the tensors that live at the same time in a forward pass of the default
 token budget, in bfloat16, with 8 frames of 480x640 in a sample. Not counted: CUDA itself (about 0.5 GiB), the feature
-cache (256 MiB), what PyTorch reserves, and of written answers the keys and values.
+cache (256 MiB), memory that PyTorch reserves, and the keys and values of written answers.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def network_of(size: str) -> tuple[Any, VlmRewardModel]:
 
 
 def at_rest(network: VlmRewardModel, kind: Any) -> int:
-    """Return the bytes of the weights. kind: of ``weights``; None: bfloat16"""
+    """Return the bytes of the weights. kind: int8 or nf4; None: bfloat16"""
     weights = dict(network.named_parameters())
     with META, torch.no_grad():
         rounded = weights if kind is None else round_layers(weights, {}, kind, torch.bfloat16)[0]
@@ -111,7 +111,7 @@ def of_a_pass(small: Any, network: VlmRewardModel) -> int:
     predictor = VlmPredictor(network, collator, META)
     frames = np.zeros((NUM_FRAMES, *USUAL_PX, 3), np.uint8)
     (row,) = predictor.rows(ProgressSample(Trajectory(frames=frames, task=TASK)))
-    # Each row has frames of its own, so that none is encoded once for all.
+    # Rows have different frames, so that they share no encoding.
     count = DEFAULT_TOKEN_BUDGET // row.num_tokens
     rows = [
         predictor.rows(ProgressSample(Trajectory(frames=frames + np.uint8(index), task=TASK)))[0]

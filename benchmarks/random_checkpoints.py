@@ -20,7 +20,7 @@ import torch
 
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
 ROBOMETER, QWEN = "robometer", "qwen"  # kinds of a checkpoint
-SOURCES = {  # small checkpoints with the other files
+SOURCES = {  # small checkpoints with all other files
     ROBOMETER: GOLDEN / "vlm" / "q3_tok_disc10_bf16" / "checkpoint",
     QWEN: GOLDEN / "reward_models" / "roboreward" / "rr_tied_bf16" / "checkpoint",
 }
@@ -29,7 +29,7 @@ PREFIX, EMBEDDING, HEAD = "model.", "model.language_model.embed_tokens.weight", 
 SHARDS = ("model-00001-of-00002.safetensors", "model-00002-of-00002.safetensors")
 ANSWER, PROMPT_END = "ANSWER: 4", "\n"
 STD = 0.02  # of the weights
-ADDED_STD = 1e-6  # of what layers add: so a state stays the embedding of its own token
+ADDED_STD = 1e-6  # of the weights that layers end in: a state stays the embedding of its token
 SCORE_HEADS = {"progress": 10, "success": 1, "preference": 1}  # outputs
 
 

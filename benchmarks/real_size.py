@@ -32,7 +32,7 @@ MAX_TOKENS = 10**6
 
 @dataclass(frozen=True)
 class Scale:
-    """What is measured, and how long.
+    """Sizes and durations of the measurements.
 
     small_px, usual_px: heights and widths of frames
     many_frames: of TOPReward's episode

@@ -63,13 +63,13 @@ class ExportConfig(Settings):
         DEFAULT_TOKEN_BUDGET, "Most tokens, with padding, of one forward pass of several samples.", **_COUNT
     )
     max_sample_tokens: int = setting(
-        DEFAULT_SAMPLE_TOKENS, "Most tokens of one sample, or of its longest prefix; it bounds memory.", **_COUNT
+        DEFAULT_SAMPLE_TOKENS, "Most tokens of one sample, or of the longest prefix; bounds memory.", **_COUNT
     )
     dtype: Dtype | None = setting(None, "Number type of the network; else as checkpoint and device decide.")
     weights: Weights | None = setting(
         None,
-        "Round a vision-language model's weights to 8 bits (int8) or 4 bits (nf4), for GPUs of 8 or 12 GB; scores are "
-        "then not the full checkpoint's. Default: as in the checkpoint.",
+        "Round the weights of a vision-language model to 8 bits (int8) or 4 bits (nf4), for GPUs of 8 or 12 GB. Scores "
+        "are then not the full checkpoint's. Default: as in the checkpoint.",
     )
     image_encoder: str | None = setting(None, "Folder or id of ReWiND's image encoder.")
     text_encoder: str | None = setting(None, "Folder or id of ReWiND's text encoder.")
@@ -105,8 +105,8 @@ class ExportConfig(Settings):
     )
     cuda_graphs: bool = setting(
         False,
-        "Launch the passes of single samples and small batches as CUDA graphs. For RFM, Robometer and RoboReward's "
-        "expected score on a Qwen backbone, on GPUs.",
+        "Run single samples and small batches as CUDA graphs. Needs a GPU, and RFM or Robometer on a Qwen backbone or "
+        "RoboReward's expected score.",
     )
     batch_size: int | None = setting(
         None, "Of no effect, as in the FastAPI server; max_batch_size bounds a batch.", least=1, has_option=False

@@ -108,7 +108,7 @@ class Ledger:
 def simulate(engine: Engine, file: Path, batch_s: float, row_s: float, least_s: float = 0.0) -> Engine:
     """Make the engine's forward passes sleep for ``batch_s``, plus ``row_s`` for each row. Scores are 0.5.
 
-    least_s: shortest time of a forward pass, for the launch of its kernels
+    least_s: shortest time of a forward pass, as the launch of kernels takes
     """
     ledger, num_bins = Ledger(file), engine.predictor.network.config.progress_bins
 

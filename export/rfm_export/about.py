@@ -32,7 +32,7 @@ from rfm_client.contract.model_info import (
     WEIGHTS_DIFFERENCE_PARAMETER,
 )
 
-# What the source and the export's own measurement say, which the exported files do not.
+# Facts from the source and from measurements of the export, which the exported files lack.
 _OF_ORIGIN = (
     *(SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER, LICENSE_PARAMETER),
     *(COMPUTATION_PARAMETER, WEIGHTS_DIFFERENCE_PARAMETER),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The largest batch that makes a GPU score more samples a second.
+"""Derive ``max_batch_size``: the largest batch that still makes a GPU score more samples a second.
 
 Small batches leave a GPU idle while the CPU launches kernels. From about SATURATING_FLOP on, each further sample adds
 its full time: on an H200, 8 samples of a Robometer-4B take 16 ms each, and so do 32. A larger batch gains nothing,
@@ -20,7 +20,7 @@ from rfm_client.contract import ProgressSample
 from rfm_client.contract.synthetic import random_trajectory
 
 SATURATING_FLOP = 20e12  # of matrix products
-MOST_SAMPLES = 64  # small networks: more samples hardly shorten the time of each
+MOST_SAMPLES = 64  # small networks hardly gain from more
 TYPICAL_FRAMES, TYPICAL_PX = 8, 224
 TYPICAL_TASK = "put the red block in the bowl"
 _TERA = 1e12
@@ -46,7 +46,7 @@ def with_batch_size(settings: ExportConfig, checkpoint: Checkpoint, say: Callabl
 
 
 def saturating_samples(flop: float) -> int:
-    """Return the power of two that comes nearest to SATURATING_FLOP, from 1 to MOST_SAMPLES. flop: of a sample"""
+    """Return the power of two, from 1 to MOST_SAMPLES, that comes nearest to SATURATING_FLOP. flop: of one sample"""
     power = round(math.log2(SATURATING_FLOP / max(flop, 1.0)))
     return int(2 ** min(max(power, 0), math.log2(MOST_SAMPLES)))
 

@@ -53,7 +53,7 @@ class _Source:
     """The checked input of an export.
 
     decisions: settings that the scores depend on
-    full: loads the checkpoint before ``weights`` of the settings rounds it; None: it stays as it is
+    full: loads the checkpoint with full weights; None: the settings round nothing
     """
 
     family: Family
@@ -156,7 +156,7 @@ def _check_gpus(num_gpus: int | None) -> None:
 
 
 def _check_graphs(settings: ExportConfig, description: Description) -> None:
-    """Raise ExportError for CUDA graphs that nothing would use."""
+    """Raise ExportError if CUDA graphs are on but nothing would use them."""
     if settings.cuda_graphs and not description.uses_graphs:
         expected = "an RFM, Robometer or RoboReward checkpoint (its expected score) on a Qwen backbone"
         raise ExportError(f"cuda_graphs: expected {expected}, got another; leave out --cuda-graphs")
@@ -189,7 +189,7 @@ def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, 
 
 
 def _difference(source: _Source, version: Version, named: torch.device | None, say: Say) -> str | None:
-    """Return the largest difference of progress that rounded weights make; None: they are as in the checkpoint."""
+    """Return the largest difference that rounding the weights makes to progress; None: nothing is rounded."""
     full = None if source.full is None else source.full()
     if full is None or full.config.weights is not None:
         return None

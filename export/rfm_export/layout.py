@@ -102,7 +102,7 @@ def generated_models(
     settings = replace(version.settings, instances=version.settings.instances or (2 if several else 1))
     # With several instances on a device, each cache would have to see all frames.
     keeps = description.keeps_features and cache_mib > 0 and settings.instances == 1
-    # A frame reference names a frame that one cache holds, and Triton chooses the instance: so there may be one alone.
+    # A frame reference needs the cache that holds the frame, but Triton chooses the instance: so only one may exist.
     has_one_cache = cache_mib > 0 and version.num_gpus <= 1
     bins = description.progress_bins if description.progress_bins > 1 else None
     outputs = wire.score_outputs(bins, has_log_prob=description.has_log_prob, marks_unclear=description.marks_unclear)

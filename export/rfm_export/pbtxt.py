@@ -102,7 +102,7 @@ def parse(text: str) -> pb.ModelConfig:
 
 
 def _config(interface: Interface, settings: ExportConfig, version: int) -> pb.ModelConfig:
-    assert settings.max_batch_size is not None  # by ``with_batch_size``
+    assert settings.max_batch_size is not None  # ``with_batch_size`` has set it
     config = pb.ModelConfig(name=interface.name, max_batch_size=settings.max_batch_size)
     config.version_policy.specific.versions.append(version)
     for spec in interface.inputs:

@@ -134,7 +134,7 @@ def verify(
 def largest_difference(full: Callable[[], Engine], rounded: Callable[[], Engine], samples: Sequence[Sample]) -> float:
     """Return the largest difference of progress between both engines. Only one engine exists at a time.
 
-    Samples that either refuses do not count.
+    Samples that either engine refuses do not count.
     """
     scores = [make().evaluate(samples) for make in (full, rounded)]
     pairs = [pair for pair in zip(*scores, strict=True) if not any(isinstance(each, RewardError) for each in pair)]
@@ -145,7 +145,7 @@ def largest_difference(full: Callable[[], Engine], rounded: Callable[[], Engine]
 def verify_graphs(make: Callable[[], Engine], description: Description, say: Callable[[str], object]) -> None:
     """Raise ExportDiffersError unless CUDA graphs give the scores of plain passes.
 
-    Each sample, and another of its shapes, is scored alone: first by plain passes, then by graphs.
+    Each sample, and another of the same shapes, is scored alone: first by plain passes, then by graphs.
 
     make: returns an engine with CUDA graphs, which has not scored yet
     say: takes a line for the user

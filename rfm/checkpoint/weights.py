@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 PICKLE_STEM = "pytorch_model"  # of the names of transformers' pickled weights
-# Of a rounded weight: in place of ``.weight`` in the names of its other tensors; values of a byte in NF4.
+# A rounded weight has more tensors, whose names end so instead of in ``.weight``. A byte of NF4 holds two values.
 SCALE, DECODED, VALUES_OF_BYTE = ".scale", ".decoded", 2
 _SHARDS = "model-*.safetensors"
 _ENCODERS = ("image_encoder", "text_encoder")  # subfolders of an exported checkpoint

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What decides the last digits of a score, besides checkpoint and device: number type, PyTorch, kernel of attention.
+"""Name the number type, PyTorch version and attention, which decide the last digits of a score.
 
 PyTorch chooses the kernel of ``scaled_dot_product_attention`` by its version, the GPU, the dtype and the shapes.
 """
@@ -14,7 +14,7 @@ ATTENTION = "scaled_dot_product_attention"
 
 
 def computation(checkpoint: Any, dtype: torch.dtype | None, *, on_gpu: bool) -> str:
-    """Return how this PyTorch scores the checkpoint, as one line.
+    """Return number type, PyTorch version and attention of the checkpoint's scores, as one line.
 
     dtype: of the network; None: float32 on the CPU, else the checkpoint's own
     """
@@ -24,7 +24,7 @@ def computation(checkpoint: Any, dtype: torch.dtype | None, *, on_gpu: bool) -> 
 
 
 def is_by_this_torch(told: str) -> bool:
-    """True if ``told``, a result of ``computation``, names the version of this process's PyTorch."""
+    """Return True if ``told``, a result of ``computation``, names the PyTorch version of this process."""
     return _torch() in told.split(", ")
 
 

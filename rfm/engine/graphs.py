@@ -23,7 +23,7 @@ MAX_GRAPHS = 8  # each holds 10 to 20 MB for a 4B network, and its inputs and ou
 PLAIN_CALLS = 2  # of a shape before its capture: they initialise libraries, and rare shapes need no graph
 MAX_TOKENS = 2_560  # more keep the device busy for longer than the host launches
 STEP_TOKENS = 64
-IDLE_CALLS = 256  # a graph that was not used in so many calls makes room for another
+IDLE_CALLS = 256  # a graph unused for this many calls makes room for another
 MAX_COUNTED = 1024  # shapes whose calls are counted
 
 Function: TypeAlias = Callable[..., Tensor]
@@ -56,7 +56,7 @@ class Captured:
 
 
 class Capture(Protocol):
-    """The form of ``CudaCapture`` and of what tests use in its place."""
+    """Captures a call: ``CudaCapture``, or a substitute in tests."""
 
     def __call__(self, function: Function, tensors: Sequence[Tensor], beside: Captured | None) -> Captured:
         """Return the captured call ``function(*tensors)``. Raises RuntimeError if it cannot be captured.
@@ -93,7 +93,7 @@ class CudaCapture:
 
 
 class Graphs:
-    """Calls functions of tensors, from the third call with the same shapes on as a CUDA graph. For one thread.
+    """Calls functions of tensors; from the third call with the same shapes, as a CUDA graph. For one thread.
 
     capture: captures a call
     max_graphs: number of graphs that are kept
@@ -135,7 +135,7 @@ class Graphs:
         return padded if num_rows * padded <= MAX_TOKENS and not self.has_failed else length
 
     def clear(self) -> None:
-        """Drop all graphs, whose memory is then free."""
+        """Drop all graphs and free the memory."""
         self._captured.clear()
         self._num_plain.clear()
 
@@ -151,7 +151,7 @@ class Graphs:
         return len(self._captured) < self._max_graphs or self._num_calls - oldest > IDLE_CALLS
 
     def _has_captured(self, key: Hashable, function: Function, tensors: Sequence[Tensor]) -> bool:
-        """Capture a call, and drop the graph that was not used for longest if there are too many."""
+        """Capture a call; if there are too many graphs, drop the least recently used one. Return False if it fails."""
         try:
             captured = self._capture(function, tensors, next(iter(self._captured.values()), None))
         except RuntimeError as error:  # also out of memory
@@ -161,7 +161,7 @@ class Graphs:
             _log.warning("CUDA graphs are off in this process, because a capture failed: %s", reason)
             return False
         self.num_captured += 1
-        if len(self._captured) >= self._max_graphs:  # only now: the memory of no graph would be gone
+        if len(self._captured) >= self._max_graphs:  # only now: the new graph shares memory with an old one
             del self._captured[min(self._captured, key=lambda each: self._captured[each].last_call)]
         self._captured[key] = captured
         return True

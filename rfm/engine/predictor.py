@@ -54,7 +54,7 @@ class Predictor(Protocol[Row, Batch]):
         """Return the number of tokens that the network computes. Rows with similar numbers share a batch."""
 
     def longest(self, row: Row) -> int:
-        """Return the number of tokens in the longest of the row's sequences, which often is its only one."""
+        """Return the number of tokens in the longest sequence of the row."""
 
     def work_ahead(self, rows: Sequence[Row]) -> None:
         """Do the slow, independent work on these rows; thread-safe. ``collate`` does the rest."""
@@ -88,7 +88,7 @@ class RowScores:
 
     frames: of each trajectory
     query: the preference or similarity of two trajectories; None: the row asks for neither
-    is_of_prefixes: in dense mode, the row has several prefixes, and one value for the last frame of each
+    is_of_prefixes: the row has several prefixes (dense mode), with one value for the last frame of each
     """
 
     frames: list[FrameScores]
@@ -125,7 +125,7 @@ def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> Fram
 
 
 def of_rows(sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
-    """Return a progress sample's scores: of its one row, in dense mode those of each prefix's last frame."""
+    """Return the scores of a progress sample: those of the only row; in dense mode, of each prefix's last frame."""
     if not getattr(sample, "frame_steps", 0):
         return rows[0].frames[0]
     frames = [

@@ -141,7 +141,7 @@ class Engine:
 
         dtype: of the network; None: a vision-language checkpoint's own on a GPU, else float32
         feature_cache_mib: MiB for features of raw frames; 0: no cache
-        cuda_graphs: small batches are CUDA graphs; without effect on the CPU and if not ``Description.uses_graphs``
+        cuda_graphs: run small batches as CUDA graphs; no effect on the CPU or without ``Description.uses_graphs``
         others: as in the class
         Raises CheckpointError.
         """

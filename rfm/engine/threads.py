@@ -31,7 +31,7 @@ def num_preparing(device: torch.device, num_threads: int) -> int:
 class FrameThreads:
     """Threads that prepare frames. Any thread may call ``parts``, and waits for the result.
 
-    number: 1: the calling thread does the work
+    number: of threads; 1: the calling thread does the work
     """
 
     def __init__(self, number: int) -> None:
@@ -45,7 +45,7 @@ class FrameThreads:
         return cls(num_preparing(device, torch.get_num_threads()))
 
     def parts(self, work: Callable[[Sequence[Item]], Made], items: Sequence[Item]) -> list[Made]:
-        """Split items into one part for each thread, and return what ``work`` makes of each part, in order."""
+        """Split items into one part for each thread; return the result of ``work`` for each part, in order."""
         if self._pool is None or len(items) < 2:
             return [work(items)]
         size = -(-len(items) // self.number)

@@ -123,7 +123,7 @@ class ImagePreprocessor:
     def crops(self, images: Tensor) -> Tensor:
         """Resize and crop images: uint8 [N, H, W, C] -> [N, *crop_px, C].
 
-        On the CPU: only there PyTorch resizes uint8 with antialiasing.
+        Runs on the CPU: only there can PyTorch resize uint8 with antialiasing.
         """
         return self._crop(self._resize(images.permute(0, 3, 1, 2))).permute(0, 2, 3, 1)
 

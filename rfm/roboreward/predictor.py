@@ -85,7 +85,7 @@ class RoboRewardPredictor(VlmPredictor):
     def write(
         self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution
     ) -> tuple[list[WrittenAnswer], Tensor | None]:
-        """Return the answers, token by token the likeliest, and the features that the vision tower computed.
+        """Return the answers, each token the likeliest, and the features that the vision tower computed.
 
         execution: its ``on_forward`` is called after each forward pass
         """

@@ -91,7 +91,7 @@ class RoboRewardCollator(LanguageCollator):
         """Return the batch of conversations with the draft behind each.
 
         length: as in ``VlmCollator.collate``
-        Its queries: each conversation's last token, and the tokens of the draft.
+        The queries are the last token of each conversation and the tokens of the draft.
         """
         batch = super().collate([self._drafted(row) for row in rows], length)
         back = torch.arange(-len(self.draft), 1)

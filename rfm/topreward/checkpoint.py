@@ -33,7 +33,7 @@ REWARD_MODELS = (LEROBOT, ROBOMETER)
 _TYPE = "topreward"  # the value of the key ``type`` of LeRobot's config.json
 FPS = 2.0  # LeRobot's default
 MAX_FRAMES, NUM_PREFIXES = 64, 15  # of Robometer's baseline
-MOST_FRAMES = 512  # of LeRobot's variant, by default: each prefix costs its question
+MOST_FRAMES = 512  # default limit of LeRobot's variant: each prefix costs a question
 # Keys of LeRobot's config.json about its own pipelines, uploads and cropping of online samples.
 _IDLE = {
     "attn_implementation", "default_task", "device", "image_key", "input_features", "license", "max_frames",

@@ -222,8 +222,8 @@ class VlmBatch:
     pixels: source of the arguments for pixels; None: these are in ``inputs``, or all shots are cached
     plan: of a Qwen backbone's vision tower; None: all shots are cached, or the backbone is SmolVLM
     layout: of a Qwen backbone's shots; None: the backbone is SmolVLM
-    packs: of conversations that begin like others (``rfm.vlm.tree``). If there are any, spans and queries have row 0,
-        and are indices among all B * L tokens and those of the packs
+    packs: of conversations that begin like others (``rfm.vlm.tree``). With packs, spans and queries have row 0 and
+        index all tokens: the B * L of the conversations, then those of the packs
     """
 
     inputs: dict[str, Tensor]

@@ -17,7 +17,7 @@ LANGUAGE_INPUTS = ("input_ids", "position_ids", "visual_tokens", "visual_feature
 
 
 def graphed_features(graphs: Graphs, visual: Any, patches: Tensor, plan: VisionPlan) -> Tensor:
-    """Return ``rfm.vlm.qwen.features``, by a graph if these shapes occur again."""
+    """Return ``rfm.vlm.qwen.features``, computed by a CUDA graph if the shapes recur."""
     of_plan = [value for value in vars(plan).values() if isinstance(value, Tensor)]
 
     def vision(patches: Tensor, *parts: Tensor) -> Tensor:
@@ -28,7 +28,7 @@ def graphed_features(graphs: Graphs, visual: Any, patches: Tensor, plan: VisionP
 
 
 def graphed_hidden_state(graphs: Graphs, language: Any, inputs: dict[str, Tensor], features: Tensor) -> Tensor:
-    """Return ``rfm.vlm.qwen.last_hidden_state``, by a graph if these shapes occur again."""
+    """Return ``rfm.vlm.qwen.last_hidden_state``, computed by a CUDA graph if the shapes recur."""
 
     def hidden_state(features: Tensor, *of_batch: Tensor) -> Tensor:
         return last_hidden_state(language, dict(zip(LANGUAGE_INPUTS, of_batch, strict=True)), features)

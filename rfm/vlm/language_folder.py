@@ -39,7 +39,7 @@ class LanguageFolder:
     dtype: stated by config.json, with its source
     base_model: source of the tokenizer and processor, with the reason
     video_prompt: form of the prompt, of a folder that is no export
-    rounded: how weights of layers are rounded, with its source; None: they are not
+    rounded: form of rounded layers, with the source of this setting; None: not rounded
     """
 
     folder: Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Conversations that begin like another one: they take the shared tokens from it, and add only the others.
+"""Conversations that begin like another one: they reuse its shared tokens and add only the others.
 
 The longest conversation is the trunk. A causal language model gives equal states to equal beginnings, so a leaf needs
 only the tokens behind the shared ones. Leaves lie behind each other in packs, which share calls of the layers.
@@ -21,15 +21,15 @@ from torch import Tensor
 Indices = npt.NDArray[np.int64]
 
 MOST_PACK_TOKENS = 8192  # in a call, with padding
-MOST_MASK_BYTES = 64 * 2**20  # of a call's mask, one for each of its tokens and the tokens that these may see
+MOST_MASK_BYTES = 64 * 2**20  # of the mask of a call: one for each pair of a token and a token that it may see
 
 
 @dataclass(frozen=True, eq=False)
 class Leaf:
     """The tokens of a conversation behind those that it takes from the trunk and from other leaves of its pack.
 
-    from_trunk: number of the trunk's tokens that it begins with
-    from_leaves: the leaves whose first tokens follow, by index in the pack, and their numbers of tokens
+    from_trunk: number of first tokens of the trunk that it begins with
+    from_leaves: index in the pack, and number of first tokens, of each leaf that follows
     input_ids: int64 [P], its tokens
     position_ids: int64 [3, P]
     shown: int64, the frames in the whole conversation
@@ -50,7 +50,7 @@ class Leaf:
 
 
 def fits(num_tokens: int, num_trunk_tokens: int) -> bool:
-    """True if a pack of so many tokens behind a trunk keeps both bounds."""
+    """Return True if a pack of ``num_tokens`` behind a trunk keeps both bounds."""
     return num_tokens <= MOST_PACK_TOKENS and num_tokens * (num_trunk_tokens + num_tokens) <= MOST_MASK_BYTES
 
 
@@ -93,7 +93,7 @@ class Packs:
         return {name: getattr(self, name) for name in ("input_ids", "position_ids", "visual_tokens", "visual_features")}
 
     def mask(self) -> Tensor:
-        """Return which tokens of its trunk and its pack each token sees, bool [R, 1, P, num_keys + P]."""
+        """Return the tokens of trunk and pack that each token sees, bool [R, 1, P, num_keys + P]."""
         keys = torch.arange(self.num_keys, device=self.from_trunk.device)
         own = torch.zeros_like(self.leaves[:, None] == self.leaves[..., None])
         for leaf, upto in zip(self.seen, self.upto, strict=True):

@@ -34,7 +34,7 @@ class BackboneConfig:
 
     backbone: transformers' configuration (config.json)
     video_prompt: form of a Qwen3-VL's prompt with a video (``rfm.vlm.video_prompt``)
-    weights: how weights of layers are rounded (``rfm.vlm.rounded``); None: they are not
+    weights: form of rounded layers (``rfm.vlm.rounded``); None: not rounded
     """
 
     backbone: dict[str, Any]
@@ -177,7 +177,7 @@ def qwen_states(
     The states have the shape [B, L, D], or [1, all tokens, D] for a batch with packs.
 
     key_values: receives the keys and values of all tokens, for ``next_hidden_state``
-    graphs: of small batches; without effect on a language model whose keys and values are wanted
+    graphs: for small batches; the language model uses none if ``key_values`` is given
     """
     made = None
     if batch.plan is not None:

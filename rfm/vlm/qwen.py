@@ -187,7 +187,7 @@ def _within(run: tuple[int, int], query: Tensor, key: Tensor, value: Tensor, *, 
 class Turn:
     """The rotary embedding: float32 [N, 1, 1, D / heads].
 
-    cosine, sine: of positions; the first half of the sines is negated, so that no other values have to be
+    cosine, sine: of positions; the first half of the sines is negated, so queries and keys need no negation
     """
 
     cosine: Tensor
@@ -366,12 +366,12 @@ def next_hidden_state(
     tokens: int64 [B]
     position_ids: int64 [B], equal in time, row and column, since the token is text
     lengths: int64 [B], number of tokens before
-    key_values: of the tokens before; receives this token's, and forgets those of all others
+    key_values: of the tokens before; receives those of this token, and forgets all others
     """
     device = language.embed_tokens.weight.device
     ids, at, before = torch.from_numpy(np.stack([tokens, position_ids, lengths])).to(device)
     longest, is_seen = int(lengths.max()), None
-    if int(lengths.min()) < longest:  # else no mask, with which PyTorch's fastest attention would not do
+    if int(lengths.min()) < longest:  # else no mask: PyTorch's fastest attention takes none
         is_seen = (torch.arange(longest + 1, device=device) <= before[:, None])[:, None, None]
     key_values.place(before, longest)
     hidden = language.embed_tokens(ids[:, None])

@@ -108,12 +108,12 @@ class Nf4Linear(RoundedLinear):
 
 
 def may_be_rounded(name: str) -> bool:
-    """True for the name of a weight, or of its LoRA-wrapped form, that belongs to a layer that may be rounded."""
+    """Return True if a weight of this name, also LoRA-wrapped, belongs to a layer that may be rounded."""
     return _LAYER.search(name) is not None
 
 
 def is_rounded(name: str, tensor: Tensor) -> bool:
-    """True if the tensor belongs to a rounded weight, and so keeps its dtype in a network of any other."""
+    """Return True if the tensor belongs to a rounded weight, which keeps its dtype in every network."""
     return not tensor.is_floating_point() or name.endswith((SCALE, DECODED))
 
 
@@ -124,9 +124,9 @@ def shape_of(weight: Tensor) -> list[int]:
 
 
 def fit(network: nn.Module, weights: Mapping[str, Tensor], factors: Mapping[str, Tensor] | None = None) -> None:
-    """Replace the network's layers whose weights are rounded by layers that take these weights.
+    """Replace layers of the network by rounded ones where the weights are rounded.
 
-    factors: of LoRA; those of rounded weights get a place beside them
+    factors: of LoRA; those of rounded weights stay beside them
     Raises CheckpointError if bitsandbytes is missing.
     """
     modules = dict(network.named_modules())
@@ -145,7 +145,7 @@ def fit(network: nn.Module, weights: Mapping[str, Tensor], factors: Mapping[str,
 def rounded(name: str, weight: Tensor, kind: Weights, dtype: torch.dtype) -> dict[str, Tensor]:
     """Return the tensors of a rounded weight by name.
 
-    name: of the weight, with its end ``.weight``
+    name: of the weight, which ends in ``.weight``
     weight: float32 [N, K]
     dtype: of the decoded values
     """

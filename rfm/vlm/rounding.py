@@ -24,7 +24,7 @@ _NF4: Weights = "nf4"
 
 
 def read_unrounded_config(backbone: dict[str, Any], file: Path) -> bool:
-    """Return True if the configuration says that weights are in NF4, and remove that from it.
+    """Return True if the configuration says that weights are in NF4, and remove this entry.
 
     Raises CheckpointError for weights that are rounded in another way.
     """
@@ -38,7 +38,7 @@ def read_unrounded_config(backbone: dict[str, Any], file: Path) -> bool:
 def read_published(folder: Path, is_nf4: bool) -> tuple[dict[str, Tensor], int]:
     """Return a folder's tensors, and the number of weights in NF4. Those of layers stay in NF4, others are decoded.
 
-    is_nf4: config.json says that some are in NF4
+    is_nf4: True if config.json says that some are in NF4
     Raises CheckpointError.
     """
     tensors = read_weights(folder)

@@ -17,7 +17,7 @@ from rfm.vlm.collator import VlmRow
 from rfm.vlm.leaves import Leaf, fits
 from rfm.vlm.video import Indices, Shot, shots_of
 
-WORTH = 1.5  # times as many tokens without a tree; for less, a pass over padded rows is as fast
+WORTH = 1.5  # a tree pays if it has this many times fewer tokens; else padded rows are as fast
 MOST_LEAF_TOKENS = 65_536  # of a tree: bounds the shots and states that a pass holds
 
 
@@ -48,7 +48,7 @@ class Conversation:
         return self.row.spans[0][-1]
 
     def shared(self, other: Conversation) -> int:
-        """Return how many first tokens equal those of ``other``, in position and features, too."""
+        """Return the number of first tokens that equal those of ``other``, also in position and features."""
         row, before = self.row, other.row
         assert row.position_ids is not None
         assert before.position_ids is not None
@@ -102,7 +102,7 @@ def _trees(conversations: Sequence[Conversation]) -> list[VlmRow]:
 
 
 def _packs(conversations: Sequence[Conversation], trunk: Conversation) -> tuple[tuple[Leaf, ...], ...]:
-    """Return the leaves of all conversations. A leaf that fits into no pack has one of its own."""
+    """Return the leaves of all conversations. A leaf that does not fit into the last pack starts a new one."""
     packs: list[list[Leaf]] = []
     num_tokens, before = 0, trunk
     for conversation in conversations:

@@ -83,7 +83,7 @@ class Recording(GrpcTransport):
 
     @property
     def digests(self) -> set[bytes]:
-        """Of all frames that it was asked about."""
+        """Digests of all frames in the requests."""
         return {row.tobytes() for inputs in self.requests for row in inputs[wire.FRAME_DIGESTS].reshape(-1, 32)}
 
     @property
@@ -170,7 +170,7 @@ def test_episodes_side_by_side_are_one_request_and_score_alike(transport: Record
 
 
 class Failing(Recording):
-    """To the real server, until it is down."""
+    """A connection to the real server, which can be down."""
 
     is_down = False
 

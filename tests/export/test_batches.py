@@ -90,7 +90,7 @@ def test_the_number_is_at_least_1_and_at_most_64() -> None:
     assert [saturating_samples(flop) for flop in (0.0, 1e9, 5e12, 6e12, 1e15)] == [64, 64, 4, 4, 1]
 
 
-def test_the_number_of_the_user_wins_also_in_the_check(tmp_path: Path) -> None:
+def test_a_set_number_wins_also_in_the_check(tmp_path: Path) -> None:
     config = goldens.config("c1_t1_disc10")
     settings = replace(serve_config(config), max_batch_size=7)
     export(config.checkpoint, tmp_path, settings)

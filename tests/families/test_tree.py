@@ -43,7 +43,7 @@ def robometer(name: str = "q3_tok_disc10", **options: Any) -> Engine:
 
 
 def values(outcomes: Any) -> list[Any]:
-    """What a network says of each sample."""
+    """Return progress, or log-probabilities, of each sample."""
     assert all(isinstance(outcome, ProgressResult) for outcome in outcomes), outcomes
     return [outcome.progress if outcome.log_prob is None else outcome.log_prob for outcome in outcomes]
 
@@ -81,7 +81,7 @@ def test_a_tree_has_few_tokens(name: str, num_frames: int, size_px: tuple[int, i
     assert sum(row.cost for row in planned(rows, collator)) <= most
 
 
-def test_the_budget_and_the_metrics_know_a_tree_s_tokens() -> None:
+def test_budget_and_metrics_count_the_tokens_of_a_tree() -> None:
     engine, execution = topreward(), Execution()
     asked = sample(64, 224, 224)
     prepared = engine.prepare(asked)
@@ -134,7 +134,7 @@ def test_bounds_of_memory_change_no_score(bounds: dict[str, int], monkeypatch: p
     assert max(masks) <= leaves.MOST_MASK_BYTES
 
 
-def test_the_longest_prefix_and_not_the_tree_is_what_a_server_may_refuse() -> None:
+def test_a_server_bounds_the_longest_prefix_and_not_the_tree() -> None:
     engine = topreward()
     asked = sample(16)
     (row,) = engine.predictor.rows(asked)

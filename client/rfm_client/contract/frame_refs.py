@@ -43,7 +43,7 @@ class TrajectoryRefs:
     def of(cls, frames: UInt8Array, task: str, digests: Iterable[bytes] | None = None) -> TrajectoryRefs:
         """Return the trajectory of frames, uint8 [T, H, W, 3], with all pixels.
 
-        digests: of the frames; None: they are computed here
+        digests: of the frames, in order; None: computed here
         """
         known = tuple(map(frame_digest, frames) if digests is None else digests)
         return cls(known, dict(zip(known, frames, strict=True)), task)

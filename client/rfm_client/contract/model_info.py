@@ -26,7 +26,7 @@ RUN_CONFIG_PARAMETER = "run_config"
 KIND_PARAMETER = "kind"
 LICENSE_PARAMETER = "license"
 LACKS_PARAMETER = "lacks"  # names of scores that the checkpoint does not give, with commas between
-WEIGHTS_DIFFERENCE_PARAMETER = "weights_difference"  # largest, of progress; empty: the weights are not rounded
+WEIGHTS_DIFFERENCE_PARAMETER = "weights_difference"  # largest difference of progress; empty: not measured
 WHOLE_EPISODE_PARAMETER = "needs_whole_episode"  # "true"; any other value: false
 
 
@@ -49,7 +49,7 @@ class ModelInfo:
     weights_digest: 16 hex digits, digest of the exported weights; None: unknown
     settings_digest: 16 hex digits, digest of all else that decides scores: files beside the weights (configuration,
         tokenizer, image processor), dtype, kind of device; None: unknown
-    computation: number type of the network, version of PyTorch and kernel of attention, as of its export; None: unknown
+    computation: number type, PyTorch version and attention kernel, as at the export; None: unknown
     network: ``class``, ``config``, and the number of weights of each part (``parameters``)
     run_config: config.yaml of the training run, without secrets; empty: the checkpoint has none
     kind: name of the reward model, such as TOPReward; None: unknown
@@ -91,7 +91,7 @@ class ModelInfo:
 
     @property
     def weights(self) -> str | None:
-        """How weights are rounded (int8, nf4), so that scores are not the full checkpoint's; None: they are not."""
+        """Form of rounded weights (int8, nf4), whose scores are not the full checkpoint's; None: not rounded."""
         found = self.network.get("config", {}).get("weights")
         return found if isinstance(found, str) else None
 

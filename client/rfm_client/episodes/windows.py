@@ -49,7 +49,7 @@ class EpisodeFrame:
 class Window:
     """Frames of one size with their task, to be scored for progress. Raises InvalidSampleError for an invalid task.
 
-    episode: stands for the frames' episode, whose windows all go to one server
+    episode: identifies the episode of the frames; all windows of an episode go to one server
     """
 
     frames: tuple[EpisodeFrame, ...]
@@ -78,7 +78,7 @@ class Window:
 
 
 class _Server:
-    """The digests of frames that a server was sent. number: among the client's servers"""
+    """Digests of the frames that one server has received. number: index of the server"""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -100,7 +100,7 @@ class _Server:
 
 
 class WindowScorer:
-    """Scores windows for one client, in its event loop. A new episode goes to the server with the fewest.
+    """Scores windows for one client, in its event loop. A new episode goes to the server with the fewest episodes.
 
     model: name of the exported model
     """
@@ -183,7 +183,7 @@ class WindowScorer:
         if window.episode not in self._server_of:
             counts = Counter(self._server_of.values())
             fewest = min(counts[server] for server in self._servers)
-            # at random, since each of many clients may have a single episode
+            # at random: each of many clients may have a single episode
             self._server_of[window.episode] = random.choice([each for each in self._servers if counts[each] == fewest])
         return self._server_of[window.episode]
 

@@ -23,7 +23,7 @@ class CheckpointFacts:
     source, revision: origin; None: unknown
     weights_digest: of the weights
     settings_digest: of all else that decides the scores: configuration, encoders, dtype, device
-    computation: number type of the network, version of PyTorch and kernel of attention; None: unknown
+    computation: number type, PyTorch version and attention kernel; None: unknown
     max_frames: most frames of a trajectory, in training or for the network, the smaller number; None: both unknown
     frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
     encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
@@ -31,7 +31,7 @@ class CheckpointFacts:
     trained_padding: True if training padded shorter trajectories, or if unknown
     has_log_prob: True if results have log-probabilities
     needs_whole_episode: True if scores are relative to the whole episode
-    weights: how the weights are rounded, so that scores are not the full checkpoint's; None: they are not
+    weights: form of rounded weights, whose scores are not the full checkpoint's; None: not rounded
     """
 
     source: str | None
@@ -115,7 +115,7 @@ class ClientScorer:
 
 
 def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:
-    """A model's name and digests. Raises InvalidSampleError if servers differ in them, or in the computation."""
+    """Return name and digests of a model. Raises InvalidSampleError if servers differ in these or the computation."""
     digests = {(info.name, info.weights_digest, info.settings_digest, info.computation) for info in infos}
     if len(digests) > 1:
         told = " and ".join(sorted(", ".join(map(str, values)) for _, *values in digests))

@@ -71,7 +71,7 @@ class Call:
         self.subsample, self.resize = subsample, resize
 
     def at(self, server: int) -> Call:
-        """Return the same call with a server that is asked first."""
+        """Return a copy of the call that asks this server first."""
         call = copy(self)
         call.server = server
         return call

@@ -195,9 +195,8 @@ class SampleScorer:
 
         tensors: makes the inputs of ``num_bytes`` when it is the request's turn
         """
-        async with self._concurrency.room(
-            num_bytes, call.deadline
-        ):  # tensors are made in turn, so that they do not pile up
+        # Tensors are made in turn, so that they do not pile up.
+        async with self._concurrency.room(num_bytes, call.deadline):
             inputs = await off_loop(num_bytes, tensors)
             answer = await self._servers.infer(
                 model, inputs, outputs, call.deadline, request_id=request_id, first=call.server

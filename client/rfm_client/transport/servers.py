@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Servers of one checkpoint, and the loop that retries a request until its deadline.
 
-The least busy server gets a request, unless the caller names the first to ask. A server that fails is left out until it
-reports ready; after more failures, it is asked later. A score depends on the request alone, so a request may be sent
-twice:
+The least busy server gets a request, unless the caller names the one to ask first. A server that fails is left out
+until it reports ready; after more failures, it is asked later. A score depends on the request alone, so a request may
+be sent twice:
 
 - the server is down, restarting or full: retry at once at another server, else after growing pauses
 - a process or the connection ended, perhaps because of this request: retry once, when a server can be back. So a
@@ -138,7 +138,7 @@ class Servers:
     ) -> Answer:
         """Return the named ``outputs`` of ``model`` for ``inputs``. Raises RewardError with the request's id.
 
-        first: number of the server to ask, if it fails the next in the list; None: the least busy
+        first: number of the server to ask; if it fails, the next in the list. None: the least busy
         """
 
         def request(server: Transport, left_s: float) -> Awaitable[Answer]:
@@ -268,7 +268,7 @@ class Servers:
         raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # says least
 
     def _best(self, avoided: Collection[KnownServer], first: int | None) -> KnownServer:
-        """Return the server to ask next: ``first``, or the next in the list that answers; None: the least busy."""
+        """Return the server to ask next: ``first`` or the next one that works; without ``first``, the least busy."""
 
         def rank(number: int) -> tuple[bool, bool, int, int, int]:
             server = self._servers[number]
