@@ -78,6 +78,15 @@ def test_labels_of_further_episodes_are_joined_to_those_that_are_there(
     assert len(found) == (len(formats) or 2)
 
 
+def test_a_server_that_names_no_computation_goes_on_with_the_labels_made_before(output: Path) -> None:
+    options = LabelOptions(output=output, cameras=(FRONT,), frames=2, formats=("progress",), episodes=[0])
+    label(open_dataset(TOY), BrightnessScorer(computation=None), options)
+    metadata = parquet.read_schema(output / PROGRESS).metadata
+    assert set(json.loads(metadata[b"rfm.provenance"])["checkpoint"]) == {
+        *("source", "revision", "weights_digest", "settings_digest")
+    }
+
+
 OTHERS: dict[str, tuple[BrightnessScorer, dict[str, Any], str]] = {
     "rule": (BrightnessScorer(), {"sampling": "linspace_round"}, "sampling.rule: {rule} there, linspace_round now"),
     "cameras": (

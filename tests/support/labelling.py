@@ -37,7 +37,7 @@ class BrightnessScorer:
         digest: str = "brightness",
         max_frames: int | None = 16,
         settings: str = "settings",
-        computation: str = "float32, torch 2.13.0, sdpa",
+        computation: str | None = "float32, torch 2.13.0, sdpa",
     ) -> None:
         self.seconds = seconds
         self.digest = digest

@@ -50,9 +50,9 @@ class CheckpointFacts:
 
     def document(self) -> dict[str, Any]:
         """Return the facts for the provenance."""
-        told = ["source", "revision", "weights_digest", "settings_digest", "computation"]
-        if self.weights is not None:
-            told.append("weights")
+        told = ["source", "revision", "weights_digest", "settings_digest"]
+        # as labels made before have no such fields, and the digests of episodes depend on the provenance
+        told += [name for name in ("computation", "weights") if getattr(self, name) is not None]
         return {name: value for name, value in asdict(self).items() if name in told}
 
 
