@@ -227,6 +227,8 @@ def _verify(source: _Source, version: Version, staged: Path, named: torch.device
         verify(original, exported, samples, may_not_answer=description.may_not_answer)
         if settings.cuda_graphs and device.type == "cuda":
             verify_graphs(partial(exported, cuda_graphs=True), description, say)
+        elif settings.cuda_graphs:
+            say(f"cuda_graphs: not compared with plain passes: {device} runs no CUDA graphs (--device names a GPU)")
 
 
 def _checkpoint_folder(description: Description, version: Version, repository: Path) -> Path:

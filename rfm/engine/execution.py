@@ -45,12 +45,18 @@ class Execution:
     num_unclear: int = 0
     on_forward: Callable[[], None] = field(default=lambda: None, compare=False, repr=False)
 
-    def run(self, forward: Callable[[Any], Sequence[Output]], rows: Any) -> list[Output | InferenceFailedError]:
+    def run(
+        self,
+        forward: Callable[[Any], Sequence[Output]],
+        rows: Any,
+        divided: Callable[[Any], Output | InferenceFailedError | None] | None = None,
+    ) -> list[Output | InferenceFailedError]:
         """Return the output of ``forward`` for each row.
 
         If the rows do not fit in memory, each half is tried. A row that does not fit alone gets an error.
 
         rows: a sequence, or a tensor with the rows along its first axis
+        divided: returns the output of a row that does not fit alone; None: the row cannot be divided
         """
         try:
             with memory_errors():
@@ -62,9 +68,10 @@ class Execution:
             self.on_forward()
         free_unused()
         if len(rows) == 1:
-            return [InferenceFailedError("the sample does not fit in the device's memory")]
+            output = None if divided is None else divided(rows[0])
+            return [output or InferenceFailedError("the sample does not fit in the device's memory")]
         half = len(rows) // 2
-        return [*self.run(forward, rows[:half]), *self.run(forward, rows[half:])]
+        return [*self.run(forward, rows[:half], divided), *self.run(forward, rows[half:], divided)]
 
     @contextmanager
     def collating(self) -> Iterator[None]:

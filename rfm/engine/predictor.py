@@ -53,8 +53,8 @@ class Predictor(Protocol[Row, Batch]):
     def num_tokens(self, row: Row) -> int:
         """Return the number of tokens that the network computes. Rows with similar numbers share a batch."""
 
-    def longest(self, row: Row) -> int:
-        """Return the number of tokens in the longest sequence of the row."""
+    def sequences(self, row: Row) -> Sequence[Row]:
+        """Return the row's token sequences, each as a row. Most rows have one."""
 
     def work_ahead(self, rows: Sequence[Row]) -> None:
         """Do the slow, independent work on these rows; thread-safe. ``collate`` does the rest."""
@@ -126,8 +126,11 @@ def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> Fram
 
 def of_rows(sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
     """Return the scores of a progress sample: those of the only row; in dense mode, of each prefix's last frame."""
-    if not getattr(sample, "frame_steps", 0):
-        return rows[0].frames[0]
+    return of_prefixes(rows) if getattr(sample, "frame_steps", 0) else rows[0].frames[0]
+
+
+def of_prefixes(rows: Sequence[RowScores]) -> FrameScores:
+    """Return the scores of the last frame of each prefix."""
     frames = [
         vars(row.frames[0]) if row.is_of_prefixes else vars(part_of(row.frames[0], slice(-1, None))) for row in rows
     ]

@@ -21,7 +21,7 @@ from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.engine.finite import finite
 from rfm.engine.graphs import CudaCapture, Graphs
 from rfm.engine.layers import keep_float32
-from rfm.engine.predictor import GraphedPredictor, Predictor, RowScores
+from rfm.engine.predictor import GraphedPredictor, Predictor, RowScores, of_prefixes
 from rfm.family import Checkpoint, FrameEncoders, VideoPrompt, Weights
 from rfm_client.contract import (
     BatchTiming,
@@ -217,7 +217,8 @@ class Engine:
             rows = self.predictor.rows(embedded_sample)
         except RewardError as error:
             return Prepared(sample, error)
-        longest = max(map(self.predictor.longest, rows))
+        sequences = (each for row in rows for each in self.predictor.sequences(row))
+        longest = max(map(self.predictor.num_tokens, sequences))
         if longest > self.max_sample_tokens:
             expected = f"at most {self.max_sample_tokens} tokens (max_sample_tokens of this server)"
             return Prepared(sample, InvalidSampleError.at("num_frames", expected, f"{longest} tokens"))
@@ -284,7 +285,11 @@ class Engine:
             self.predictor.count(of_part, execution)
             return scores
 
-        return execution.run(forward, rows)
+        def divided(row: Any) -> RowScores | RewardError | None:
+            sequences = self.predictor.sequences(row)
+            return _of_sequences(execution.run(forward, sequences)) if len(sequences) > 1 else None
+
+        return execution.run(forward, rows, divided)
 
     def _micro_batches(self, rows: Sequence[Any]) -> Iterator[list[int]]:
         """Yield the indices of the rows of each forward pass: similar in length, within the token budget."""
@@ -316,3 +321,11 @@ class Engine:
         if isinstance(sample, PreferenceSample):
             return PreferenceResult(preference=query, first=first, second=second, timing=timing)
         return SimilarityResult(similarity=query, reference=first, other=second, timing=timing)
+
+
+def _of_sequences(outcomes: Sequence[RowScores | RewardError]) -> RowScores | RewardError:
+    """Return the scores of a row from those of its sequences, which are prefixes, or the first error."""
+    error = next((outcome for outcome in outcomes if isinstance(outcome, RewardError)), None)
+    if error is not None:
+        return error
+    return RowScores([of_prefixes([each for each in outcomes if isinstance(each, RowScores)])], is_of_prefixes=True)

@@ -178,9 +178,9 @@ class RewindPredictor:
         """Return the number of tokens in the row."""
         return self.network.config.num_tokens(row.num_first, row.num_second)
 
-    def longest(self, row: RewindRow) -> int:
-        """Return the number of tokens in the row, which is one sequence."""
-        return self.num_tokens(row)
+    def sequences(self, row: RewindRow) -> Sequence[RewindRow]:
+        """Return the row, which is one sequence."""
+        return (row,)
 
     def work_ahead(self, rows: Sequence[RewindRow]) -> None:
         """Do nothing: collation is cheap."""

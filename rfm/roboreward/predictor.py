@@ -77,10 +77,6 @@ class RoboRewardPredictor(VlmPredictor):
         """Return the number of tokens in the row's first pass, which include the draft."""
         return row.num_tokens + len(self.collator.draft)
 
-    def longest(self, row: VlmRow) -> int:
-        """Return the number of tokens in the row's first pass."""
-        return self.num_tokens(row)
-
     @torch.inference_mode()
     def write(
         self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution

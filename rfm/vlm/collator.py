@@ -55,6 +55,7 @@ class VlmRow:
     picked: in dense mode int64 [frame_steps], the frames in the conversation; None: all
     position_ids: int64 [3, L] for a Qwen backbone; None: for SmolVLM
     packs: conversations about the same video that begin like this one, the trunk, and precede it (``rfm.vlm.tree``)
+    alone: all conversations of a row with packs, as rows
     """
 
     input_ids: Indices
@@ -65,6 +66,7 @@ class VlmRow:
     picked: Indices | None = None
     position_ids: Indices | None = None
     packs: tuple[tuple[Leaf, ...], ...] = ()
+    alone: tuple[VlmRow, ...] = ()
 
     @property
     def leaves(self) -> list[Leaf]:

@@ -75,9 +75,9 @@ class VlmPredictor:
         """Return the number of tokens that the language model computes."""
         return row.cost
 
-    def longest(self, row: VlmRow) -> int:
-        """Return the number of tokens in the row's longest conversation."""
-        return row.num_tokens
+    def sequences(self, row: VlmRow) -> Sequence[VlmRow]:
+        """Return the conversations of the row."""
+        return row.alone or (row,)
 
     def work_ahead(self, rows: Sequence[VlmRow]) -> None:
         """Resize the frames whose features are not cached, and start their copy to the device."""
@@ -90,7 +90,7 @@ class VlmPredictor:
         """Return one batch of conversations of any kind."""
         self.work_ahead(rows)
         graphs = self.network.graphs
-        length = None if graphs is None else graphs.padded(len(rows), max(map(self.longest, rows)))
+        length = None if graphs is None else graphs.padded(len(rows), max(row.num_tokens for row in rows))
         batch = self.collator.collate(rows, length)
         return batch.pinned() if self._copies.pins else batch
 

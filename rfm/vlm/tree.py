@@ -92,7 +92,7 @@ def _trees(conversations: Sequence[Conversation]) -> list[VlmRow]:
     rows = [each.row for each in conversations]
     packs = _packs(conversations[:-1], conversations[-1])
     ends: tuple[list[tuple[int, int]]] = ([] if rows[-1].query is not None else [conversations[-1].reads],)
-    tree = replace(rows[-1], packs=packs, spans=ends)
+    tree = replace(rows[-1], packs=packs, spans=ends, alone=tuple(rows))
     trunk = tree.num_tokens
     is_bounded = all(fits(sum(leaf.num_tokens for leaf in pack), trunk) for pack in packs)
     if not is_bounded or tree.cost - trunk > MOST_LEAF_TOKENS:

@@ -136,8 +136,10 @@ def test_graphs_are_refused_where_nothing_uses_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize("cuda_graphs", [False, True])
 def test_a_configuration_names_graphs_only_if_they_are_on(tmp_path: Path, cuda_graphs: bool) -> None:
     settings = replace(serve_config(PLAIN), cuda_graphs=cuda_graphs, num_gpus=1)
-    rfm_export.export(PLAIN.checkpoint, tmp_path, settings, other_machine=True, device="cpu")
+    said: list[str] = []
+    rfm_export.export(PLAIN.checkpoint, tmp_path, settings, other_machine=True, device="cpu", say=said.append)
     assert ("cuda_graphs" in (tmp_path / "rfm_frames" / "config.pbtxt").read_text()) == cuda_graphs
+    assert any(line.startswith("cuda_graphs: not compared with plain passes") for line in said) == cuda_graphs
 
 
 def test_label_refuses_a_device_that_is_not_there(free_bytes: list[float]) -> None:

@@ -49,7 +49,8 @@ class Pipelined:
     def num_tokens(self, row: int) -> int:
         return 1
 
-    longest = num_tokens
+    def sequences(self, row: Any) -> Sequence[Any]:
+        return (row,)
 
     def collate(self, rows: Sequence[int]) -> Any:
         self.collated[rows[0]].set()
@@ -91,7 +92,8 @@ class Fixed:
     def num_tokens(self, row: RowScores) -> int:
         return 1
 
-    longest = num_tokens
+    def sequences(self, row: Any) -> Sequence[Any]:
+        return (row,)
 
     def collate(self, rows: Sequence[RowScores]) -> None:
         pass

@@ -208,3 +208,26 @@ def test_a_gpu_gives_the_cpu_s_scores_of_a_tree(frame_steps: int) -> None:
     )
     for each, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(each, wanted, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("engine, frame_steps", [(topreward, 0), (robometer, 4)], ids=["TOPReward", "dense Robometer"])
+def test_a_tree_that_does_not_fit_in_memory_is_scored_prefix_by_prefix(
+    engine: Any, frame_steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_tree, small = engine(), engine()
+    episodes = [sample(8, frame_steps=frame_steps), sample(6, frame_steps=frame_steps)]
+    expected = values(of_tree.evaluate(episodes))
+    rows = [row for episode in episodes for row in small.predictor.rows(episode)]
+    longest = max(each.num_tokens for row in rows for each in small.predictor.sequences(row))
+    score, execution = small.predictor.score, Execution()
+
+    def limited(rows: Any, batch: Any, execution: Execution) -> Any:
+        if batch.num_slots > longest:
+            raise torch.OutOfMemoryError("no room")
+        return score(rows, batch, execution)
+
+    monkeypatch.setattr(small.predictor, "score", limited)
+    found = values(small.evaluate(episodes, execution))
+    assert execution.out_of_memory_count > 0
+    for each, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(each, wanted, rtol=0, atol=TOLERANCE)

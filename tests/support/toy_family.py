@@ -122,7 +122,8 @@ class ToyPredictor:
     def num_tokens(self, row: list[np.ndarray]) -> int:
         return sum(map(len, row))
 
-    longest = num_tokens
+    def sequences(self, row: Any) -> Sequence[Any]:
+        return (row,)
 
     def work_ahead(self, rows: Sequence[list[np.ndarray]]) -> None:
         pass

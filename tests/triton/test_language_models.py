@@ -323,9 +323,8 @@ def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path)
     ]
     refused = CliRunner().invoke(app, list(map(str, words)))
     assert refused.exit_code != 0
-    assert "mode: expected whole of this model, whose scores are relative to the whole episode, got prefix" in (
-        refused.output + refused.stderr
-    )
+    expected = "whole of this model, whose scores are relative to the whole episode, got prefix; give --mode whole"
+    assert f"mode: expected {expected}" in refused.output + refused.stderr
     unknown = CliRunner().invoke(app, ["robo" if word == "top" else str(word) for word in words])
     assert unknown.exit_code != 0
     assert "name them (--frames), or show all (--sampling all)" in " ".join((unknown.output + unknown.stderr).split())

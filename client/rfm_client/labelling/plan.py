@@ -60,7 +60,7 @@ class Recipe:
         require(dataset.source, bool(cameras), "at least one camera", "none")
         if checkpoint.needs_whole_episode and options.mode != "whole":
             why = "of this model, whose scores are relative to the whole episode"
-            raise InvalidSampleError.at("mode", f"whole {why}", options.mode)
+            raise InvalidSampleError.at("mode", f"whole {why}", f"{options.mode}; give --mode whole")
         rule = "all" if options.mode == "whole" else options.sampling
         padding = checkpoint.trained_padding
         try:
