@@ -37,7 +37,7 @@ from rfm_client.transport.calls import Answer, GrpcTransport
 from rfm_client.transport.credentials import Credentials
 from rfm_export.pbtxt import parse, render
 
-FRAMES, FRAME_PX = 2, 32  # of a sample: the CPU has little to prepare
+FRAMES, FRAME_PX = 2, (32, 32)  # of a sample: the CPU has little to prepare
 STEP_FRAMES, STEP_PX = 8, 64  # of a window
 METRICS_S = 1.5  # until instances have reported all frames to Triton
 TASK = "lift the block"
