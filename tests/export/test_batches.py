@@ -71,7 +71,7 @@ def test_a_longer_clip_in_training_makes_smaller_batches() -> None:
     ("folder", "reward_model", "expected"),
     [
         ("roboreward/rr_tied_bf16/checkpoint", "roboreward", 2),
-        ("topreward/checkpoints/vlm_fp32_untied", "topreward", 2),
+        ("topreward/checkpoints/vlm_fp32_untied", "topreward", 4),
         ("topreward/checkpoints/vlm_fp32_untied", "topreward-robometer", 1),
     ],
 )
