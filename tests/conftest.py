@@ -97,4 +97,3 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if shared:
             item.add_marker("triton")
         item.add_marker(pytest.mark.xdist_group("served" if shared else str(item.path)))
-    items.sort(key=lambda item: item.path.parent.name != "supervise")  # these wait longest: other files run meanwhile
