@@ -62,7 +62,7 @@ def test_an_actor_opens_the_dataset_as_it_is_told_and_its_scorer_for_as_long_as_
     assert any(np.array_equal(frame, np.rot90(stored[-1], -1)[..., ::-1]) for frame in scorer.seen)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # a minute
 def test_a_cluster_goes_on_without_a_node_that_is_killed_and_one_machine_with_what_it_has_left(
     output: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -238,6 +238,7 @@ def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(
     assert running.served.said == []  # nothing was healed
 
 
+@pytest.mark.nightly  # a minute and a half
 def test_what_was_served_is_served_again_and_not_what_was_exported_since(running: Running, other: Path) -> None:
     """Models that were loaded since, too; those that were unloaded are not."""
     served, samples = running.served, rollout.questions()
