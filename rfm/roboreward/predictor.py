@@ -22,9 +22,9 @@ from rfm.engine.layers import progress_from_logits
 from rfm.engine.predictor import RowScores, no_success
 from rfm.roboreward.prompts import SCORES, RoboRewardCollator, RoboRewardConfig, is_unclear, parsed
 from rfm.vlm.batch import VlmBatch
-from rfm.vlm.collator import VlmRow
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.qwen import Indices, KeyValues, next_hidden_state
+from rfm.vlm.row import VlmRow
 from rfm_client.contract import FrameScores, InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.samples import Float32Array
 

@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from rfm.vlm.batch import VlmBatch
-from rfm.vlm.collator import VlmRow, group_times
+from rfm.vlm.collator import group_times
 from rfm.vlm.images import QwenImages
 from rfm.vlm.language import LanguageCollator, LanguageConfig
+from rfm.vlm.row import VlmRow
 from rfm.vlm.video import VlmVideo
 from rfm_client.contract.samples import UInt8Array
 

@@ -13,9 +13,9 @@ from rfm.engine.execution import Execution
 from rfm.engine.predictor import RowScores, no_success
 from rfm.topreward.prompts import TopRewardConfig
 from rfm.vlm.batch import VlmBatch
-from rfm.vlm.collator import VlmRow
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.predictor import VlmPredictor
+from rfm.vlm.row import VlmRow
 from rfm_client.contract import FrameScores, RewardError, Sample
 from rfm_client.contract.frame_refs import ProgressSampleRefs
 from rfm_client.contract.samples import Float32Array

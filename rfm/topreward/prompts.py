@@ -16,7 +16,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rfm.vlm.collator import VlmRow
 from rfm.vlm.images import (
     FRAMES_PER_GROUP,
     MAX_QWEN_ASPECT_RATIO,
@@ -27,6 +26,7 @@ from rfm.vlm.images import (
     scaled_video,
 )
 from rfm.vlm.language import LanguageCollator, LanguageConfig
+from rfm.vlm.row import VlmRow
 from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import InvalidSampleError, Sample
 from rfm_client.contract.frame_refs import ProgressSampleRefs

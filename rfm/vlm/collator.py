@@ -8,11 +8,11 @@ Making a row is cheap. Resizing its frames is not, and may be done before its ba
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,17 +21,17 @@ from torch import Tensor
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import check_type
 from rfm.engine.threads import IN_TURN, FrameThreads
-from rfm.vlm.batch import FramesOfOneSize, QwenPixels, Shots, SmolPixels, VlmBatch
+from rfm.vlm.batch import QwenPixels, Shots, VlmBatch
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages, SmolImages
 from rfm.vlm.leaves import Leaf, PlacedPack, calls, padded, starts
 from rfm.vlm.network import VlmConfig
 from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, Chat, TrajectoryPart, Visual, question
 from rfm.vlm.qwen import Box, plan, positions
+from rfm.vlm.row import Spans, VlmRow
 from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo, named_frames
 from rfm.vlm.video_prompt import WRAPPED
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs
-from rfm_client.contract.samples import UInt8Array
 
 SECONDS_PER_GROUP = 1  # upstream's value for videos of Qwen2.5-VL
 TOKENS_PER_SECOND = 4  # transformers' default for Qwen2.5-VL
@@ -39,59 +39,6 @@ VIDEO_FPS = 1  # upstream's value for Qwen3-VL, whose prompt has the time of eac
 QWEN3 = "qwen3_vl"
 VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
 IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
-SMOL_IMAGE, GLOBAL_IMAGE, FAKE = "<image>", "<global-img>", "<fake_token_around_image>"
-
-Spans: TypeAlias = list[tuple[int, int]]
-
-
-@dataclass(frozen=True, eq=False)
-class VlmRow:
-    """A conversation.
-
-    input_ids: int64 [L]
-    videos: of each trajectory
-    spans: for each trajectory, the tokens (first, behind the last) whose states are read for each frame
-    query: index of the token whose state gives preference or similarity; None: a single trajectory
-    picked: in dense mode int64 [frame_steps], the frames in the conversation; None: all
-    position_ids: int64 [3, L] for a Qwen backbone; None: for SmolVLM
-    packs: conversations about the same video that begin like this one, the trunk, and precede it (``rfm.vlm.tree``)
-    alone: all conversations of a row with packs, as rows
-    """
-
-    input_ids: Indices
-    videos: tuple[VlmVideo, ...]
-    spans: tuple[Spans, ...]
-    query: int | None
-    is_similarity: bool
-    picked: Indices | None = None
-    position_ids: Indices | None = None
-    packs: tuple[tuple[Leaf, ...], ...] = ()
-    alone: tuple[VlmRow, ...] = ()
-
-    @property
-    def leaves(self) -> list[Leaf]:
-        """The conversations that begin like this one, in order."""
-        return [leaf for pack in self.packs for leaf in pack]
-
-    @property
-    def cost(self) -> int:
-        """Number of tokens that the language model computes: the conversation's, and those that its leaves add."""
-        return self.num_tokens + sum(leaf.num_tokens for leaf in self.leaves)
-
-    @property
-    def frames(self) -> tuple[Sequence[UInt8Array] | UInt8Array, ...]:
-        """The frames of each trajectory before resizing, uint8 [H, W, 3] each."""
-        return tuple(video.frames for video in self.videos)
-
-    @property
-    def shown(self) -> Iterator[tuple[VlmVideo, Indices]]:
-        """Each trajectory, and the indices of its frames in the conversation."""
-        return ((video, np.arange(video.num_shown) if self.picked is None else self.picked) for video in self.videos)
-
-    @property
-    def num_tokens(self) -> int:
-        """L, the number of tokens in the conversation."""
-        return len(self.input_ids)
 
 
 class VlmCollator:
@@ -395,45 +342,6 @@ class QwenCollator(VlmCollator):
             query_rows=torch.zeros(len(queries), dtype=torch.int64),
             query_tokens=torch.tensor(queries, dtype=torch.int64),
         )
-
-
-class SmolCollator(VlmCollator):
-    """The collator for SmolVLM: images are image tokens between two FAKE tokens."""
-
-    images: SmolImages
-
-    def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
-        return self.images.images_to_size(video.stack(needed))
-
-    def num_patches(self, video: VlmVideo) -> int:
-        """Return the number of patches of all frames."""
-        return video.num_shown * self.images.tokens * int(self.config.backbone["scale_factor"]) ** 2
-
-    def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
-        text = text.replace(SMOL_IMAGE, FAKE + GLOBAL_IMAGE + SMOL_IMAGE + FAKE)
-        return text, SMOL_IMAGE, [self.images.tokens] * sum(video.num_shown for video in videos)
-
-    def _spans(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> tuple[Spans, ...]:
-        around = self._positions(ids, FAKE).tolist()
-        return self._image_spans(ids, videos, list(zip(around[::2], around[1::2], strict=True)))
-
-    def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Add each conversation's squares; the frames of a video in several conversations are in the batch once."""
-        firsts: dict[VlmVideo, int] = {}
-        for video in (video for row in rows for video, _ in row.shown):
-            if video not in firsts:
-                firsts[video] = sum(len(each.frames) for each in firsts)
-        frames = [np.concatenate([firsts[video] + shown for video, shown in row.shown]) for row in rows]
-        counts = torch.tensor([len(each) for each in frames])
-        pixels = SmolPixels(
-            self.images,
-            FramesOfOneSize([video.ready.pixels for video in firsts], None),
-            rows=torch.arange(len(rows)).repeat_interleave(counts),
-            places=torch.cat([torch.arange(count) for count in counts.tolist()]),
-            frames=torch.from_numpy(np.concatenate(frames)),
-            shape=(len(rows), int(counts.max())),
-        )
-        return replace(batch, pixels=pixels)
 
 
 def video_of(trajectory: Trajectory | TrajectoryRefs, frame_steps: int) -> VlmVideo:

@@ -32,7 +32,6 @@ from rfm.vlm.collator import (
     VISION_END,
     VISION_START,
     QwenCollator,
-    VlmRow,
     expanded,
     timed_groups,
     video_of,
@@ -45,6 +44,7 @@ from rfm.vlm.preprocessor import SIZED_BY_PROCESSOR, normalisation_of, patch_px
 from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, read_processor, save_processor
 from rfm.vlm.qwen import Box, KeyValues, positions
 from rfm.vlm.rounded import fit
+from rfm.vlm.row import VlmRow
 from rfm.vlm.video import Indices, VlmVideo
 from rfm.vlm.work import flop
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample

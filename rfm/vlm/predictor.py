@@ -19,9 +19,10 @@ from rfm.engine.layers import progress_from_logits, speed_up
 from rfm.engine.predictor import RowScores, no_success, of_rows, part_of
 from rfm.engine.threads import FrameThreads
 from rfm.vlm.batch import Layout, VlmBatch
-from rfm.vlm.collator import QwenCollator, VlmCollator, VlmRow
+from rfm.vlm.collator import QwenCollator, VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.network import VlmOutput
+from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees
 from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
 from rfm_client.contract.frame_refs import ProgressSampleRefs

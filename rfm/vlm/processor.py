@@ -16,11 +16,9 @@ from rfm.vlm.backbone import QWEN_2_5, SMOL, is_at_least
 from rfm.vlm.collator import (
     IMAGE_PAD,
     QWEN3,
-    SMOL_IMAGE,
     VIDEO_PAD,
     VISION_START,
     QwenCollator,
-    SmolCollator,
     VlmCollator,
 )
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, QwenImages, SmolImages, fitted_size
@@ -36,6 +34,7 @@ from rfm.vlm.preprocessor import (
     resample_of,
 )
 from rfm.vlm.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS, Chat, Visual
+from rfm.vlm.smol_collator import SMOL_IMAGE, SmolCollator
 from rfm_client.contract import FrameSize
 
 PROCESSOR_FOLDER = "processor"  # in an exported checkpoint

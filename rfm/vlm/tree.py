@@ -13,8 +13,8 @@ from itertools import groupby
 
 import numpy as np
 
-from rfm.vlm.collator import VlmRow
 from rfm.vlm.leaves import Leaf, fits
+from rfm.vlm.row import VlmRow
 from rfm.vlm.video import Indices, Shot, shots_of
 
 WORTH = 1.5  # a tree pays if it has this many times fewer tokens; else padded rows are as fast

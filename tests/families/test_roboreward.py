@@ -23,8 +23,8 @@ from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.roboreward.predictor import RoboRewardPredictor, WrittenAnswer
 from rfm.roboreward.prompts import as_jpeg, is_unclear, parsed
-from rfm.vlm.collator import VlmRow
 from rfm.vlm.qwen import ROOM
+from rfm.vlm.row import VlmRow
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Trajectory
 from rfm_client.contract import InferenceFailedError, InvalidSampleError
 

@@ -17,7 +17,7 @@ from rfm import families
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.vlm import leaves, tree
-from rfm.vlm.collator import VlmRow
+from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees
 from rfm_client import ProgressResult, ProgressSample, Trajectory
 from rfm_client.contract import InvalidSampleError

@@ -13,9 +13,10 @@ import goldens
 from engines import load_engine
 from rfm import families
 from rfm.vlm.checkpoint import VlmCheckpoint
-from rfm.vlm.collator import QwenCollator, VlmRow
+from rfm.vlm.collator import QwenCollator
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.qwen import UNIT
+from rfm.vlm.row import VlmRow
 from rfm_client import (
     Trajectory,
 )
