@@ -24,7 +24,7 @@ from rfm_client.labelling.cost import Cost
 from rfm_client.labelling.episode_scores import FrameMemory, episode_scores
 from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item, Plan
-from rfm_client.labelling.scorer import Scorer
+from rfm_client.labelling.scorer import IDENTITY, Scorer
 
 _NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNotFoundError, AccessDeniedError)
 
@@ -134,7 +134,7 @@ class Run:
         """Stop the run and raise _StoppedError if another checkpoint is served now."""
         try:
             planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
-            for name in ("weights_digest", "settings_digest", "computation"):
+            for name in IDENTITY:
                 if getattr(now, name) != getattr(planned, name):
                     raise InvalidSampleError.at(name, getattr(planned, name), getattr(now, name))
         except InvalidSampleError as error:

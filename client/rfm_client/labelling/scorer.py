@@ -15,6 +15,8 @@ from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
 from rfm_client.data.datasets.protocol import digest_of
 
+IDENTITY = ("weights_digest", "settings_digest", "computation")  # equal if scores are
+
 
 @dataclass(frozen=True)
 class CheckpointFacts:
@@ -50,10 +52,10 @@ class CheckpointFacts:
 
     def document(self) -> dict[str, Any]:
         """Return the facts for the provenance."""
-        told = ["source", "revision", "weights_digest", "settings_digest"]
-        # as labels made before have no such fields, and the digests of episodes depend on the provenance
-        told += [name for name in ("computation", "weights") if getattr(self, name) is not None]
-        return {name: value for name, value in asdict(self).items() if name in told}
+        told, newer = ("source", "revision", *IDENTITY, "weights"), ("computation", "weights")
+        there = {name: value for name, value in asdict(self).items() if name in told}
+        # Labels made before lack the newer fields, and the digests of episodes depend on the provenance.
+        return {name: value for name, value in there.items() if value is not None or name not in newer}
 
 
 class Scorer(Protocol):
@@ -116,9 +118,9 @@ class ClientScorer:
 
 def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:
     """Return name and digests of a model. Raises InvalidSampleError if servers differ in these or the computation."""
-    digests = {(info.name, info.weights_digest, info.settings_digest, info.computation) for info in infos}
+    digests = {(info.name, *(getattr(info, name) for name in IDENTITY)) for info in infos}
     if len(digests) > 1:
         told = " and ".join(sorted(", ".join(map(str, values)) for _, *values in digests))
-        expected = "the same weights_digest, settings_digest and computation at every server"
+        expected = f"the same {', '.join(IDENTITY[:-1])} and {IDENTITY[-1]} at every server"
         raise InvalidSampleError.at(f"model {infos[0].name}", expected, told)
     return digests.pop()[:3]
