@@ -244,6 +244,21 @@ def test_a_proxy_denies_who_shows_no_key_or_certificate_and_is_not_trusted_by_st
         asked.progress(TRAJECTORY)
 
 
+def test_a_closed_client_leaves_no_connection_to_a_server_that_hangs(papers: Papers) -> None:
+    """The server never says the goodbye of TLS, which the cancelled call's connection would wait for."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(papers.certificate, papers.key)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        with client(f"https://127.0.0.1:{listener.getsockname()[1]}", ca_file=papers.ca) as asked:
+            asked.submit(ProgressSample(TRAJECTORY))
+            hung = context.wrap_socket(listener.accept()[0], server_side=True)
+            assert hung.recv(1)  # the request
+        with socket.socket(fileno=hung.detach()) as beneath:
+            beneath.settimeout(AT_ONCE_S)
+            while beneath.recv(1024):
+                pass
+
+
 BAD = {
     "certificates without TLS": (
         lambda p: {"url": "grpc://h:1", "ca_file": p.ca},

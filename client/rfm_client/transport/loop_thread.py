@@ -74,4 +74,7 @@ class LoopThread:
             await last()
             await self._loop.shutdown_default_executor()
         finally:
+            # A TLS connection whose call was cancelled waits for its peer's goodbye, which comes too late or never.
+            for transport in [*getattr(self._loop, "_transports", {}).values()]:
+                transport.abort()
             self._loop.call_soon(self._loop.stop)
