@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
-WORKERS := --numprocesses 3 --dist loadgroup
+WORKERS := --numprocesses 3 --dist loadgroup --no-loadscope-reorder
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
@@ -23,9 +23,11 @@ test: check
 	$(BIN)/pytest $(WORKERS) -m "not gpu and not slow and not nightly"
 
 # All that CI runs: also the tests that kill, wait or restart, or need programs of Debian.
-test-all: check docs ops-tools
+# The site of the documents is built beside the installation and the checks.
+test-all:
+	+$(MAKE) --jobs 2 --output-sync check docs ops-tools
 	$(BIN)/pytest $(WORKERS) -m "not gpu and not alone and not nightly"
-	$(BIN)/pytest -m "alone and not nightly"
+	$(BIN)/pytest -m "alone and not nightly" $$(grep --recursive --files-with-matches mark.alone tests)
 
 # What takes too long for CI: chaos, a cold install, every snippet of the documents, more reference cases.
 # RFM_GOLDENS names a folder with more reference cases.
@@ -145,9 +147,9 @@ ops-tools: $(INSTALLED)
 	  $(call MISSING,chromium and chromedriver,apt-get install chromium chromium-driver)
 
 # Build the documents as a site, build/site, with the Python API. A broken link is an error.
-docs:
+docs: | $(VENV)
 	$(PYTHON) -m venv $(VENV)/docs
-	$(VENV)/docs/bin/pip install --quiet --disable-pip-version-check "mkdocs-material>=9.8,<10" \
+	$(VENV)/docs/bin/pip install --no-compile --quiet --disable-pip-version-check "mkdocs-material>=9.8,<10" \
 	  "mkdocstrings[python]>=1,<2" ruff
 	NO_MKDOCS_2_WARNING=1 $(VENV)/docs/bin/mkdocs build --strict --quiet
 
@@ -195,10 +197,14 @@ model_repository: $(INSTALLED)
 	  --checkpoint build/demo_checkpoint/checkpoint \
 	  --image-encoder build/demo_checkpoint/image_encoder --text-encoder build/demo_checkpoint/text_encoder
 
-$(INSTALLED): pyproject.toml client/pyproject.toml gateway/pyproject.toml constraints.txt
+$(VENV):
+	mkdir -p $@
+
+# What is imported is compiled then; to compile all of the packages takes a minute.
+$(INSTALLED): pyproject.toml client/pyproject.toml gateway/pyproject.toml constraints.txt | $(VENV)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check --constraint constraints.txt torch
+	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check --constraint constraints.txt \
 	  --editable "client[gym,hdf5,label,ray,rerun]" --editable gateway --editable ".[encoders,vlm,quantized,triton,demo,dev]"
 	touch $@
 

@@ -22,6 +22,8 @@ from rfm.engine import Engine
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import Endpoints
 
+LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the others run meanwhile
+
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start, which share the cores with other tests
 os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started
@@ -97,3 +99,4 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if shared:
             item.add_marker("triton")
         item.add_marker(pytest.mark.xdist_group("served" if shared else str(item.path)))
+    items.sort(key=lambda item: item.path.parent.name not in LONGEST)
