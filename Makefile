@@ -149,7 +149,7 @@ ops-tools: $(INSTALLED)
 # Build the documents as a site, build/site, with the Python API. A broken link is an error.
 docs: | $(VENV)
 	$(PYTHON) -m venv $(VENV)/docs
-	$(VENV)/docs/bin/pip install --no-compile --quiet --disable-pip-version-check "mkdocs-material>=9.8,<10" \
+	$(VENV)/docs/bin/pip install --quiet --disable-pip-version-check "mkdocs-material>=9.8,<10" \
 	  "mkdocstrings[python]>=1,<2" ruff
 	NO_MKDOCS_2_WARNING=1 $(VENV)/docs/bin/mkdocs build --strict --quiet
 
@@ -200,11 +200,10 @@ model_repository: $(INSTALLED)
 $(VENV):
 	mkdir -p $@
 
-# What is imported is compiled then; to compile all of the packages takes a minute.
 $(INSTALLED): pyproject.toml client/pyproject.toml gateway/pyproject.toml constraints.txt | $(VENV)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check --constraint constraints.txt torch
-	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check --constraint constraints.txt \
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
 	  --editable "client[gym,hdf5,label,ray,rerun]" --editable gateway --editable ".[encoders,vlm,quantized,triton,demo,dev]"
 	touch $@
 
