@@ -22,6 +22,7 @@ from rfm.engine import Engine
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import Endpoints
 
+SHARED = ("served", "triton")  # fixtures that start a server for the tests of many files
 LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the others run meanwhile
 
 torch.set_num_threads(1)
@@ -90,13 +91,13 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whoever asks the shared server asks a Triton. Where two processes test, one of them has that server.
+    """Whoever asks a shared server asks a Triton. Where several processes test, one of them has that server.
 
     The tests of a file stay together, too, since they share what its fixtures start.
     """
     for item in items:
-        shared = "served" in getattr(item, "fixturenames", ())
+        shared = next((name for name in SHARED if name in getattr(item, "fixturenames", ())), None)
         if shared:
             item.add_marker("triton")
-        item.add_marker(pytest.mark.xdist_group("served" if shared else str(item.path)))
+        item.add_marker(pytest.mark.xdist_group(shared or str(item.path)))
     items.sort(key=lambda item: item.path.parent.name not in LONGEST)

@@ -9,8 +9,9 @@ import os
 import signal
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -419,15 +420,12 @@ def test_a_model_that_is_not_served_and_tasks_that_are_too_few_are_told(served: 
             client.episodes(3, ["a", "b"])
 
 
-@pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
-    """An ``rfm serve`` of MODEL without a cache, and of IMAGES, whose process a test may kill."""
-    repository = tmp_path_factory.mktemp("own") / "model_repository"
-    for name, cache_mib in ((MODEL, 0), (IMAGES, 64)):
-        config = goldens.config(name)
-        rfm_export.export(
-            config.checkpoint, repository, replace(serve_config(config, name), feature_cache_mib=cache_mib)
-        )
+@contextmanager
+def own(folder: Path, name: str, feature_cache_mib: int) -> Iterator[Serving]:
+    """An ``rfm serve`` of one model, whose process a test may kill."""
+    config, repository = goldens.config(name), folder / "model_repository"
+    export_config = replace(serve_config(config, name), feature_cache_mib=feature_cache_mib)
+    rfm_export.export(config.checkpoint, repository, export_config)
     with serving(repository) as server:
         server.wait_ready()
         yield server
@@ -435,11 +433,15 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
 
 @pytest.mark.slow
 @pytest.mark.triton
-def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(own: Serving) -> None:
+def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(tmp_path: Path) -> None:
     frames = video(118, 9)
-    with own.client(model=IMAGES) as client, client.episode(TASK, frames=4) as episode:
+    with (
+        own(tmp_path, IMAGES, feature_cache_mib=64) as server,
+        server.client(model=IMAGES) as client,
+        client.episode(TASK, frames=4) as episode,
+    ):
         scores = [episode.add(frame) for frame in frames[:5]]
-        (pid,) = own.model_processes(f"{IMAGES}_frames")
+        (pid,) = server.model_processes(f"{IMAGES}_frames")
         os.kill(pid, signal.SIGKILL)
         while len(scores) < len(frames):
             with suppress(ServerUnavailableError, ProcessEndedError):  # then the episode has not grown
@@ -450,9 +452,12 @@ def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(own
 
 
 @pytest.mark.slow
-def test_a_server_that_knows_some_frames_and_one_that_keeps_none_score_alike(served: Served, own: Serving) -> None:
+def test_a_server_that_knows_some_frames_and_one_that_keeps_none_score_alike(served: Served, tmp_path: Path) -> None:
     frames = video(112, 12)
-    with RewardClient([served.url("grpc"), own.endpoints.grpc_url], model=MODEL) as client:
+    with (
+        own(tmp_path, MODEL, feature_cache_mib=0) as server,
+        RewardClient([served.url("grpc"), server.endpoints.grpc_url], model=MODEL) as client,
+    ):
         expected = offline(client, frames)
         for _ in range(3):
             with client.episode(TASK, frames=4) as episode:

@@ -12,11 +12,10 @@ import requests
 
 import goldens
 import rfm_export
-from engines import serve_config
+from engines import load_engine, serve_config
 from environments import MODEL, TASK, cart_pole, play
 from gateways import running
 from one_model import BriefServer
-from reference_server import Served
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressResult, ProgressSample, RewardClient, Trajectory
@@ -40,14 +39,13 @@ def video(seed: int, count: int) -> Trajectory:
     return Trajectory(frames=frames, task=TASK)
 
 
-def test_progress_is_what_it_was_and_a_preference_fails_alone(
-    endpoints: Endpoints, served: Served, tmp_path: Path
-) -> None:
+def test_progress_is_what_it_was_and_a_preference_fails_alone(endpoints: Endpoints, tmp_path: Path) -> None:
     good = video(0, 3)
     samples = [ProgressSample(good), PreferenceSample(video(1, 2), video(2, 3))]
-    with RewardClient(endpoints.grpc_url, model=MODEL) as client, served.client("grpc", MODEL) as with_heads:
+    with RewardClient(endpoints.grpc_url, model=MODEL) as client:
         result, refused = client.evaluate(samples, return_errors=True)
-        expected = with_heads.progress(good)
+    (expected,) = load_engine(MODEL).evaluate([ProgressSample(good)])  # with both heads
+    assert isinstance(expected, ProgressResult)
     assert isinstance(refused, InvalidSampleError)
     assert "sample_type: expected progress or similarity (this checkpoint has no preference head)" in str(refused)
     assert isinstance(result, ProgressResult)

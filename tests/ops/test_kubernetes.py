@@ -76,7 +76,7 @@ def _built(folder: str) -> str:
 
 def built(folder: str, *kinds: str) -> list[Object]:
     """What ``kubectl apply -k`` would send; of the kinds alone, if any are named."""
-    return [found for found in yaml.safe_load_all(_built(folder)) if not kinds or found["kind"] in kinds]
+    return [found for found in yaml.load_all(_built(folder), yaml.CSafeLoader) if not kinds or found["kind"] in kinds]
 
 
 def named(folder: str, kind: str, name: str) -> Object:
