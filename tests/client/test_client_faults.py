@@ -172,7 +172,7 @@ def test_calls_that_share_a_connection_with_one_that_hits_its_deadline_go_on(dem
 def test_a_full_queue_is_waited_for(repository: Path) -> None:
     configure(repository / "rfm", batch_size=1)
     bound_queue(repository / "rfm", max_queue_size=1)
-    samples = [ProgressSample(trajectory(seed, 32), frame_steps=16) for seed in range(40)]
+    samples = [ProgressSample(trajectory(seed, 32), frame_steps=16) for seed in range(16)]
     with OneModelServer(repository, Endpoints.free()) as server:
         for url in (server.endpoints.grpc_url, server.endpoints.http_url):
             with RewardClient(url, retry=False) as client:
