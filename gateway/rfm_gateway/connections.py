@@ -55,7 +55,7 @@ class Connection(HttpToolsProtocol):
         super().on_headers_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the timer."""
+        """Forget the timer of the head."""
         self._forget_head()
         super().connection_lost(exc)
 
