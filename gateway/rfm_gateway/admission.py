@@ -15,7 +15,7 @@ from prometheus_client import Gauge
 
 from rfm_gateway.config import MIB, GatewayConfig
 
-PACE_BYTES, PACE_S = 64 * 2**10, 10.0  # a body arrives at this pace or faster
+PACE_BYTES, PACE_S = 64 * 2**10, 30.0  # a body arrives at this pace or faster; a robot's Wi-Fi may drop out meanwhile
 AHEAD_BYTES = 256 * MIB  # of all bodies whose requests have no place yet
 RETRY_AFTER = {"Retry-After": "1"}
 
