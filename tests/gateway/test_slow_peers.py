@@ -9,7 +9,7 @@ import resource
 import socket
 import threading
 from collections.abc import AsyncGenerator, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -157,10 +157,9 @@ def test_callers_without_the_key_wait_for_no_place_and_the_gateway_has_all_descr
     triton: Triton, tmp_path: Path
 ) -> None:
     options = ("--max-in-flight", "1", "--max-waiting", "0")
-    with (
-        few_descriptors(256),
-        running(triton.endpoints, tmp_path, TINY, *options, RFM_GATEWAY_API_KEY=KEY) as gateway,
-    ):
+    with ExitStack() as stack:
+        with few_descriptors(256):
+            gateway = stack.enter_context(running(triton.endpoints, tmp_path, TINY, *options, RFM_GATEWAY_API_KEY=KEY))
         soft, hard = resource.prlimit(gateway.process.pid, resource.RLIMIT_NOFILE)
         assert soft == min(hard, MOST)
         with paused(triton):
