@@ -20,6 +20,7 @@ from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import TritonServer, short_spin
 from rfm.supervise.supervisor import Supervisor
 from rfm_client.cli.command import Given, OptionsOf, with_options
+from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import from_here
 
 try:
@@ -152,6 +153,7 @@ def serve(
 
     Only requests with the admin key can change its models, logging and tracing; without an admin key, no request can.
     """
+    raise_limit()  # Triton and the gateway inherit it
     folder, more_arguments = _folder_and_arguments(words or (), repository)
     config = _config(config_file, serve=given, gateway=gateway_given)
     if accept_known_vulnerabilities and not config.serve.is_loopback:

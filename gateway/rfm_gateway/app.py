@@ -22,12 +22,12 @@ from rfm_client.async_client import AsyncRewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_gateway import pages, schema
+from rfm_gateway.admission import RETRY_AFTER
 from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
 from rfm_gateway.config import MIB, GatewayConfig
 from rfm_gateway.observe import (
     CALLER_LEFT,
     REQUEST_ID_HEADER,
-    RETRY_AFTER,
     CallerLeftError,
     GatewayMetrics,
     RequestMiddleware,

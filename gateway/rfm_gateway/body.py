@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, TypeAlias
 
-import anyio
 import numpy as np
 from fastapi import HTTPException, Request
 from fastapi.exceptions import RequestValidationError
@@ -24,8 +23,10 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 from rfm_client.data.inputs import BROKEN_NPY
 from rfm_client.transport.off_loop import off_loop
 from rfm_gateway import schema
+from rfm_gateway.admission import Turn, arriving
 
-MAX_PARTS = 10_000  # files, and fields, of one multipart request
+MAX_PARTS = 1000  # of one multipart request: each takes memory, also if it is empty
+IN_MEMORY_BYTES = 32 * 2**20  # of a file; larger files lie on disk
 MAX_SAMPLES = 10_000  # of one request
 MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files
 MAX_ERRORS = 1000  # listed in an answer
@@ -85,7 +86,7 @@ def field_errors(error: ValidationError) -> list[dict[str, Any]]:
 class BodyLimits:
     """Limits of a request's body: its size, of JSON at most MAX_JSON_BYTES, and its time of arrival.
 
-    Reading raises HTTPException 413 as soon as the announced or received size is too large, and TimeoutError.
+    Reading raises HTTPException 413 and 503, and TimeoutError, as ``arriving`` and ``Turn`` do.
     """
 
     max_bytes: int
@@ -93,8 +94,7 @@ class BodyLimits:
 
     async def read(self, request: Request, max_bytes: int = MAX_JSON_BYTES) -> bytes:
         """Return the whole body."""
-        with anyio.fail_after(self.timeout_s):
-            return b"".join([chunk async for chunk in _chunks(request, min(self.max_bytes, max_bytes))])
+        return b"".join([chunk async for chunk in self._chunks(request, min(self.max_bytes, max_bytes))])
 
     @asynccontextmanager
     async def form(self, request: Request) -> AsyncIterator[Parts]:
@@ -109,14 +109,13 @@ class BodyLimits:
             raise HTTPException(415, f"{expected}, got {kind.decode('latin-1') or 'none'}")
         parser = _Form(
             request.headers,
-            _chunks(request, self.max_bytes),
+            self._chunks(request, self.max_bytes),
             max_files=MAX_PARTS,
             max_fields=MAX_PARTS,
             max_part_size=MAX_JSON_BYTES,
         )
         try:
-            with anyio.fail_after(self.timeout_s):
-                form = await parser.parse()
+            form = await parser.parse()
         except (MultiPartException, ValueError) as error:  # ValueError: the charset, or python_multipart
             raise HTTPException(400, f"body: expected multipart/form-data, got: {error}") from None
         try:
@@ -135,27 +134,28 @@ class BodyLimits:
         finally:
             await form.close()
 
+    def _chunks(self, request: Request, max_bytes: int) -> AsyncGenerator[bytes, None]:
+        chunks = arriving(request, max_bytes, self.timeout_s)
+        turn: Turn | None = request.state.turn
+        return chunks if turn is None else turn.admitted(chunks)
+
 
 class _Form(MultiPartParser):
-    """Starlette's parser, with a flag for the last boundary."""
+    """Starlette's parser, with a bound for parts and a flag for the last boundary."""
 
+    spool_max_size = IN_MEMORY_BYTES
     has_ended = False
+    num_parts = 0
+
+    def on_part_begin(self) -> None:
+        self.num_parts += 1
+        if self.num_parts > MAX_PARTS:
+            limit = f"{MAX_PARTS} parts, fields and files together"
+            raise HTTPException(413, f"body: expected at most {limit}, got more; send the samples in several requests")
+        super().on_part_begin()
 
     def on_end(self) -> None:
         self.has_ended = True
-
-
-async def _chunks(request: Request, max_bytes: int) -> AsyncGenerator[bytes, None]:
-    too_large = HTTPException(413, f"body: expected at most {max_bytes} bytes, got more")
-    announced = request.headers.get("content-length", "")
-    if announced.isdecimal() and int(announced) > max_bytes:
-        raise too_large
-    come = 0
-    async for chunk in request.stream():
-        come += len(chunk)
-        if come > max_bytes:
-            raise too_large
-        yield chunk
 
 
 class Decoded:
@@ -221,6 +221,7 @@ def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
         raise ValueError(f"expected a .npy file of numbers, got {array.dtype}")
     if upload.file.read(1):
         raise ValueError(f"expected a .npy file of {array.nbytes} bytes behind its header, got more")
+    upload.file.close()  # frees its memory
     return array
 
 

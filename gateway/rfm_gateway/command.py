@@ -12,6 +12,7 @@ import typer
 
 from rfm_client.cli.command import OptionsOf, with_options
 from rfm_client.contract.addresses import is_loopback
+from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import check_free, from_here, in_url
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.settings import ConfigError, settings_of
@@ -49,6 +50,7 @@ def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
         import uvicorn
 
         from rfm_gateway.app import create_app
+        from rfm_gateway.connections import Connection, most_connections
     except ModuleNotFoundError as error:
         raise typer.BadParameter(f"the gateway needs {error.name}: pip install ./client ./gateway") from None
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
@@ -71,6 +73,8 @@ def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
         port=port,
         access_log=False,
         log_config=None,
+        http=Connection,
+        limit_concurrency=most_connections(raise_limit()),
         timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=STOP_WITHIN_S,
         **tls,

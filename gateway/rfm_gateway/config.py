@@ -49,7 +49,7 @@ class GatewayConfig(Settings):
     allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
     timeout_s: float = setting(
         120.0,
-        "Seconds that a request may wait, then take to arrive, then to be scored.",
+        "Seconds that a request may take to arrive, then wait, then take to be scored.",
         least=_SHORTEST_S,
         most=_LONGEST_S,
         flag="--timeout",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Limit concurrent evaluations, count requests for Prometheus, and cancel the work of callers who hang up."""
+"""Count requests for Prometheus, and cancel the work of callers who hang up."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ import time
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
-import anyio
 from fastapi import Request
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.wire import REQUEST_ID
+from rfm_gateway.admission import Room, Turn
 from rfm_gateway.config import GatewayConfig
 
 Returned = TypeVar("Returned")
@@ -37,7 +36,6 @@ REJECTIONS = {
 }
 
 REQUEST_ID_HEADER = "X-Request-ID"
-RETRY_AFTER = {"Retry-After": "1"}
 _ID_BYTES = 8  # random, for a request without an id
 
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
@@ -81,14 +79,12 @@ class GatewayMetrics:
 
 
 class RequestMiddleware:
-    """ASGI middleware that gives requests ids, times and counts them, and limits concurrent evaluations."""
+    """ASGI middleware that gives requests ids, times and counts them, and ends the turns of evaluations."""
 
     def __init__(self, app: ASGIApp, metrics: GatewayMetrics, config: GatewayConfig) -> None:
         self._app = app
         self._metrics = metrics
-        self._config = config
-        self._room = asyncio.Semaphore(config.max_in_flight)
-        self._waiting = 0
+        self._room = Room(config, metrics.in_flight, metrics.waiting)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a request, and count it with its answer."""
@@ -107,32 +103,14 @@ class RequestMiddleware:
                 MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
             await send(message)
 
+        turn = Turn(self._room) if scope["path"] in EVALUATIONS else None
+        scope["state"]["turn"] = turn  # `BodyLimits` takes it
         try:
-            if scope["path"] not in EVALUATIONS:
-                await self._app(scope, receive, send_counted)
-            elif await self._has_entered():
-                try:
-                    with self._metrics.in_flight.track_inprogress():
-                        await self._app(scope, receive, send_counted)
-                finally:
-                    self._room.release()
-            else:
-                refused = {"detail": f"expected at most {self._config.max_in_flight} evaluations at a time, got more"}
-                await JSONResponse(refused, 503, RETRY_AFTER)(scope, receive, send_counted)
+            await self._app(scope, receive, send_counted)
         finally:
+            if turn is not None:
+                turn.end()
             self._metrics.count(scope["path"], code, time.perf_counter() - started_s)
-
-    async def _has_entered(self) -> bool:
-        """Wait for room, first come, first served; True if there was room in time."""
-        if self._room.locked() and self._waiting >= self._config.max_waiting:
-            return False
-        self._waiting += 1
-        try:
-            with self._metrics.waiting.track_inprogress(), anyio.move_on_after(self._config.timeout_s):
-                return await self._room.acquire()
-            return False
-        finally:
-            self._waiting -= 1
 
 
 def _request_id(scope: Scope) -> str:

@@ -128,6 +128,14 @@ def test_too_large_a_body_is_a_413(gateway: TestClient, path: str, content: Any)
     assert failure(response, 413) == "body: expected at most 1048576 bytes, got more"
 
 
+def test_too_many_parts_are_a_413(gateway: TestClient) -> None:
+    files = [ZERO, *((f"array_{number}", (f"{number}.npy", b"")) for number in range(1000))]
+    response = gateway.post(NPY, files=files)
+    expected = "body: expected at most 1000 parts, fields and files together, got more"
+    assert failure(response, 413) == f"{expected}; send the samples in several requests"
+    assert gateway.post(NPY, files=files[:-1]).status_code == 503  # there is no Triton
+
+
 def test_json_is_smaller_than_other_bodies() -> None:
     with inside() as client:
         response = client.post("/evaluate_batch", content=b" " * (32 * 2**20 + 1))

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import http.client
 import json
 from pathlib import Path
 from typing import Any
@@ -20,16 +19,15 @@ from gateway_requests import (
     SECOND,
     TINY,
     TINY_CONFIG,
-    Json,
     Triton,
     answered,
     ask_json,
     begun,
-    dumped,
     expected,
     failure,
     numbers,
     paused,
+    post_body,
     preference,
     progress,
 )
@@ -53,21 +51,24 @@ HALVES = {
 
 
 @pytest.mark.parametrize(("path", "half"), HALVES.items(), ids=HALVES)
-def test_a_body_that_does_not_come_is_a_408(strict: Gateway, path: str, half: Any) -> None:
+def test_a_body_that_does_not_come_is_a_408_and_lets_others_pass(strict: Gateway, path: str, half: Any) -> None:
     connection = begun(strict, *half, path=path)
+    assert answered(ask_json(strict, [progress(FIRST)]))
     response = connection.getresponse()
     assert (response.status, response.getheader("Connection")) == (408, "close")
     assert json.loads(response.read())["detail"] == "body: expected all of it in time, got a part"
     connection.close()
 
 
-def test_more_requests_than_allowed_are_a_503_and_health_is_not_one(strict: Gateway) -> None:
-    connection = begun(strict, *HALVES["/evaluate_batch"])
-    poll(lambda: strict.metric("requests_in_flight") == 1)
-    response = ask_json(strict, [progress(FIRST)])
-    assert failure(response, 503) == "expected at most 1 evaluations at a time, got more"
-    assert response.headers["Retry-After"] == "1"
-    assert requests.get(f"{strict.url}/health").ok
+def test_more_requests_than_allowed_are_a_503_and_health_is_not_one(triton: Triton, strict: Gateway) -> None:
+    with paused(triton):
+        connection = post_body(strict, progress(FIRST))
+        poll(lambda: strict.metric("requests_in_flight") == 1)
+        response = ask_json(strict, [progress(FIRST)])
+        assert failure(response, 503) == "expected at most 1 evaluations at a time, got more"
+        assert response.headers["Retry-After"] == "1"
+        assert "evaluations" not in failure(strict.get("/health"), 503)
+    assert connection.getresponse().status == 504
     connection.close()
     poll(lambda: strict.metric("requests_in_flight") == 0)
     assert answered(ask_json(strict, [progress(FIRST)]))
@@ -77,13 +78,6 @@ def test_a_caller_who_leaves_is_no_failure_of_the_gateway(tiny: Gateway) -> None
     for path, half in HALVES.items():
         begun(tiny, *half, path=path).close()
         poll(lambda path=path: tiny.metric("requests_total", endpoint=path, code="400") >= 1)  # type: ignore[misc]
-
-
-def post_body(gateway: Gateway, sample: Json) -> http.client.HTTPConnection:
-    """A connection on which a whole request has been sent."""
-    body = dumped([sample]).encode()
-    connection: http.client.HTTPConnection = begun(gateway, {"Content-Length": str(len(body))}, body)
-    return connection
 
 
 def test_three_hundred_callers_at_once_are_all_answered(triton: Triton, tiny: Gateway) -> None:

@@ -266,8 +266,8 @@ def test_a_gateway_asks_triton_over_http_and_answers_what_it_has_begun_when_it_i
         assert answered(ask_json(gateway, mixed(embedded))) == expected(gateway, mixed(embedded))
         assert requests.get(f"{gateway.url}/health").ok
         answer = expected(gateway, [progress(FIRST)])
-        connection = begun(gateway, {"Content-Length": str(len(body))}, body[:20])
-        poll(lambda: gateway.metric("requests_in_flight") == 1)
+        connection = begun(gateway, {"Content-Length": str(len(body)), "Expect": "100-continue"}, body[:20])
+        assert connection.sock.recv(1024).startswith(b"HTTP/1.1 100 ")  # it reads the body
         gateway.process.terminate()
         poll(lambda: "Shutting down" in gateway.log)
         connection.send(body[20:])

@@ -311,6 +311,7 @@ def test_every_service_is_confined(name: str) -> None:
     assert service["read_only"] is True
     assert service["cap_drop"] == ["ALL"]
     assert service["security_opt"] == ["no-new-privileges:true"]
+    assert service["ulimits"]["nofile"] == {"soft": 65536, "hard": 65536}
     assert service["pids_limit"] > 0
     assert service["deploy"]["resources"]["limits"]["memory"]
     assert all(port.startswith("${RFM_BIND:-127.0.0.1}:") for port in service["ports"])

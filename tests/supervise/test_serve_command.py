@@ -30,6 +30,7 @@ from rfm.launch.endpoints import free_ports
 from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
+from rfm_client.contract.descriptors import MOST
 from rfm_commands.cli import app
 from rfm_serve import children, model_processes, wait_for
 
@@ -229,6 +230,14 @@ def test_a_plain_tritonserver_serves_the_repository_too(tmp_path: Path) -> None:
         finally:
             process.terminate()
             process.wait(EXIT_S)
+
+
+def test_triton_may_have_as_many_files_and_connections_open_as_its_user(tmp_path: Path) -> None:
+    program = executable(tmp_path / "tritonserver", "#!/bin/sh\nulimit -Sn\nulimit -Hn\nexit 3\n")
+    words = [*command(REPOSITORY, Endpoints.free()), f"--tritonserver={program}"]
+    done = subprocess.run(["sh", "-c", 'ulimit -Sn 256; exec "$@"', "sh", *words], capture_output=True, text=True)
+    soft, hard = done.stdout.split()
+    assert int(soft) == (MOST if hard == "unlimited" else min(int(hard), MOST))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import http.client
 import io
 import json
 import re
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -230,6 +232,15 @@ def begun(gateway: Gateway, headers: Mapping[str, str], *parts: bytes, path: str
     connection.endheaders()
     for part in parts:
         connection.send(part)
+    return connection
+
+
+def post_body(
+    gateway: Gateway, sample: Json, headers: Mapping[str, str] = MappingProxyType({})
+) -> http.client.HTTPConnection:
+    """A connection on which a whole request has been sent."""
+    body = dumped([sample]).encode()
+    connection: http.client.HTTPConnection = begun(gateway, {"Content-Length": str(len(body)), **headers}, body)
     return connection
 
 

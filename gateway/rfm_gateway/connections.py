@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: MIT
+"""uvicorn's connections, with bounds that uvicorn lacks."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from starlette.responses import JSONResponse
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+from rfm_gateway.admission import RETRY_AFTER
+
+_refusal = JSONResponse(
+    {"detail": "expected fewer connections at a time, got more"}, 503, {**RETRY_AFTER, "Connection": "close"}
+)
+
+
+def most_connections(num_descriptors: int) -> int:
+    """Return how many connections leave an eighth of the descriptors for files and for Triton."""
+    return num_descriptors - num_descriptors // 8
+
+
+class Connection(HttpToolsProtocol):
+    """A connection that is closed if the head of its next request does not arrive within ``head_s``.
+
+    The time begins when the connection opens, and later with the first byte after an answer; until then uvicorn's
+    timeout_keep_alive counts. Beyond uvicorn's limit_concurrency, requests get JSON and Retry-After.
+    """
+
+    head_s = 10.0
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._most, self.limit_concurrency = self.limit_concurrency, None
+        self._head_due: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
+        """Wait for the first head."""
+        super().connection_made(transport)
+        self._await_head()
+
+    def data_received(self, data: bytes) -> None:
+        """Wait for the next head, from its first byte on, also while the rest of a refused body arrives."""
+        is_between_requests = self.cycle is None or self.cycle.response_complete
+        if is_between_requests and self._head_due is None:
+            self._await_head()
+        super().data_received(data)
+
+    def on_headers_complete(self) -> None:
+        """Hand the request to the application, or refuse it."""
+        self._forget_head()
+        is_full = self._most is not None and len(self.connections) > self._most
+        self.app = _refusal if is_full else self.config.loaded_app
+        super().on_headers_complete()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the timer of the head."""
+        self._forget_head()
+        super().connection_lost(exc)
+
+    def _await_head(self) -> None:
+        self._head_due = self.loop.call_later(self.head_s, self.transport.close)
+
+    def _forget_head(self) -> None:
+        if self._head_due is not None:
+            self._head_due.cancel()
+            self._head_due = None
