@@ -76,6 +76,8 @@ class Request(Generic[Question]):
         try:
             request.tensors = {tensor.name(): tensor.as_numpy() for tensor in inference.inputs()}
             request.num_samples = len(request.tensors[wire.NUM_FRAMES])
+            if not request.num_samples:
+                request.error = InvalidSampleError.at(wire.NUM_FRAMES, "a batch of at least 1 sample", "0 samples")
         except Exception as error:  # noqa: BLE001  fails this request alone
             request.fail(error)
         return request
