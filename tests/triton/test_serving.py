@@ -240,6 +240,16 @@ def test_what_cannot_be_scored_is_refused_with_what_was_expected(served: Served,
         infer(served.url("grpc"), model, question | changes, [wire.PROGRESS])
 
 
+@pytest.mark.parametrize("model", [MODEL, f"{FRAMES_MODEL}_encoder", f"{FRAMES_MODEL}_frames", f"{VLM}_frames"])
+def test_a_batch_of_no_samples_is_refused(served: Served, protocol: str, model: str) -> None:
+    question = embedded() if model == MODEL else QUESTION
+    if model.endswith("_encoder"):
+        question = {name: question[name] for name in (wire.NUM_FRAMES, wire.FRAMES, wire.TASK)}
+    outputs = [wire.VIDEO_EMBEDDINGS] if model.endswith("_encoder") else [wire.PROGRESS]
+    with pytest.raises(InvalidSampleError, match=r"^num_frames: expected a batch of at least 1 sample, got 0 samples"):
+        infer(served.url(protocol), model, {name: array[:0] for name, array in question.items()}, outputs)
+
+
 def test_a_rewound_trajectory_is_scored(served: Served) -> None:
     """Its array has negative strides."""
     forwards = random_trajectory(1, 6)
