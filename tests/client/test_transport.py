@@ -139,9 +139,9 @@ def test_a_redirect_is_told_and_never_followed() -> None:
 @pytest.mark.parametrize("protocol", ["grpc", "http"])
 def test_a_request_over_two_gib_is_refused_before_it_is_copied(protocol: str) -> None:
     frames = np.broadcast_to(np.zeros(3, np.uint8), (2**13, 512, 512, 3))  # 6 GiB, all in the same three bytes
-    with RewardClient(f"{protocol}://127.0.0.1:1", timeout_s=WITHIN_S) as client:
-        with pytest.raises(InvalidSampleError) as refused:
-            client.encode(Trajectory(frames=frames, task="stack the cups"))
+    client = RewardClient(f"{protocol}://127.0.0.1:1", timeout_s=WITHIN_S)
+    with client, pytest.raises(InvalidSampleError) as refused:
+        client.encode(Trajectory(frames=frames, task="stack the cups"))
     assert refused.value.message == (
         "frames: expected at most 2.15 GB in a request, got 6.44 GB: shrink the frames (resize, --resize), score fewer "
         "(subsample, --max-frames), or share memory with a server on this host (shared_memory)"
@@ -151,7 +151,7 @@ def test_a_request_over_two_gib_is_refused_before_it_is_copied(protocol: str) ->
 def test_what_goes_through_shared_memory_does_not_count() -> None:
     inputs = {"frames": np.broadcast_to(np.zeros(1, np.uint8), 2**31), "task": np.array([b"lift"], np.object_)}
     check_size(inputs, {"frames"})
-    with pytest.raises(InvalidSampleError, match="^frames: "):
+    with pytest.raises(InvalidSampleError, match=r"^frames: "):
         check_size(inputs, set())
 
 
