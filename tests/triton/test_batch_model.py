@@ -169,10 +169,12 @@ def test_all_cancelled_requests_ahead_of_the_others_are_dropped_behind_a_short_b
 def test_a_request_without_samples_is_refused(tmp_path: Path) -> None:
     model = Model(tmp_path)
     empty = Request({name: array[:0] for name, array in request(1).tensors.items()})
-    refused, scored = model.respond(empty, request(1))
-    assert refused.error == ("invalid", "num_frames: expected a batch of at least 1 sample, got 0 samples")
+    without_axis = Request({name: array[0] for name, array in request(1).tensors.items()})
+    *refused, scored = model.respond(empty, without_axis, request(1))
+    told = ("invalid", "num_frames: expected a batch of at least 1 sample, got 0 samples")
+    assert [response.error for response in refused] == [told, told]
     assert scored.error is None
-    assert [entry["event"] for entry in LOGGED] == ["request_refused"]
+    assert [entry["event"] for entry in LOGGED] == ["request_refused"] * 2
 
 
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:
