@@ -13,6 +13,7 @@ from rfm_client.client import RewardClient
 from rfm_client.contract import (
     AccessDeniedError,
     BatchTiming,
+    ClientClosedError,
     DeadlineExceededError,
     FrameScores,
     FrameSize,
@@ -42,6 +43,7 @@ __all__ = [
     "AccessDeniedError",
     "AsyncRewardClient",
     "BatchTiming",
+    "ClientClosedError",
     "DeadlineExceededError",
     "FrameScores",
     "FrameSize",

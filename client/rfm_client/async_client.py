@@ -9,7 +9,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
-from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError, ModelNotFoundError, RewardError
+from rfm_client.contract.errors import (
+    ClientClosedError,
+    DeadlineExceededError,
+    InferenceFailedError,
+    InvalidSampleError,
+    ModelNotFoundError,
+    RewardError,
+)
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import DEFAULT_MODEL, Part, encoder_name, frames_name
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
@@ -234,14 +241,14 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         self._servers.stop_retrying()
 
     async def close(self) -> None:
-        """Close the connections and release shared memory."""
+        """Close the connections and release shared memory. Running calls raise ClientClosedError."""
         self._is_closed = True
         await self._servers.close()
 
     async def _why_unready(self) -> str:
         try:
             await self._servers.model_info(frames_name(self._model), Deadline(PROBE_TIMEOUT_S))
-        except ModelNotFoundError as error:
+        except (ModelNotFoundError, InferenceFailedError) as error:
             return f": {error}"
         except RewardError:
             pass
@@ -255,7 +262,7 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     def _deadline(self, timeout_s: float | None) -> Deadline:
         """Deadline of a call that begins now; timeout_s: None: the client's."""
         if self._is_closed:
-            raise RuntimeError("this AsyncRewardClient is closed")
+            raise ClientClosedError("this AsyncRewardClient is closed")
         loop = asyncio.get_running_loop()
         self._loop = self._loop or loop
         if self._loop is not loop:

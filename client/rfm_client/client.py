@@ -184,7 +184,7 @@ class RewardClient(Closing, OneProcess):
         return self._loop.wait(self._client.model_infos(timeout_s=timeout_s))
 
     def close(self) -> None:
-        """Cancel running calls, close the connections and release shared memory."""
+        """End running calls, which raise ClientClosedError, close the connections and release shared memory."""
         self._finalizer()
 
 

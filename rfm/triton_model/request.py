@@ -75,7 +75,10 @@ class Request(Generic[Question]):
         request = cls(request_id, inference.requested_output_names(), inference.is_cancelled, is_counted)
         try:
             request.tensors = {tensor.name(): tensor.as_numpy() for tensor in inference.inputs()}
-            request.num_samples = len(request.tensors[wire.NUM_FRAMES])
+            lengths = request.tensors[wire.NUM_FRAMES]
+            request.num_samples = len(lengths) if lengths.ndim > 1 else 0  # Triton 2.51 drops a batch axis of 0
+            if not request.num_samples:
+                request.error = InvalidSampleError.at(wire.NUM_FRAMES, "a batch of at least 1 sample", "0 samples")
         except Exception as error:  # noqa: BLE001  fails this request alone
             request.fail(error)
         return request

@@ -14,7 +14,7 @@ import sys
 import sysconfig
 import venv
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -30,9 +30,11 @@ from paths import ROOT
 from reference_server import Served
 from rfm_client import (
     AsyncRewardClient,
+    ClientClosedError,
     ProgressResult,
     ProgressSample,
     RewardClient,
+    RewardError,
 )
 from rfm_client.gym import RewardModelWrapper
 from trajectories import random_trajectory
@@ -42,7 +44,7 @@ def test_a_closed_client_says_so(served: Served) -> None:
     client = served.client("grpc")
     client.close()
     client.close()
-    with pytest.raises(RuntimeError, match="is closed"):
+    with pytest.raises(ClientClosedError, match="is closed"):
         client.progress(random_trajectory(0, 2))
 
     async def ask() -> None:
@@ -50,15 +52,41 @@ def test_a_closed_client_says_so(served: Served) -> None:
             pass
         await client.progress(random_trajectory(0, 2))
 
-    with pytest.raises(RuntimeError, match="this AsyncRewardClient is closed"):
+    with pytest.raises(ClientClosedError, match="this AsyncRewardClient is closed"):
         asyncio.run(ask())
 
 
-def test_closing_cancels_what_is_under_way(served: Served) -> None:
-    with served.client("grpc") as client:
-        pending = [client.submit(sample) for sample in plug()]
-    assert all(future.done() for future in pending)
-    assert any(future.cancelled() for future in pending)
+def test_closing_ends_the_calls_of_all_threads_and_futures_with_an_error_that_says_so(served: Served) -> None:
+    """Also the calls that have not been sent yet."""
+    with ThreadPoolExecutor(4) as pool:
+        with served.client("grpc") as client:
+            pending = [client.submit(sample) for sample in plug()]
+            pending += [pool.submit(client.evaluate, plug()) for _ in range(4)]
+            assert client.is_ready()
+        errors = [future.exception(timeout=30) for future in pending]
+    assert {type(error) for error in errors} <= {ClientClosedError, type(None)}
+    told = {str(error) for error in errors if error is not None}
+    assert "this RewardClient was closed during the call" in told
+    assert isinstance(ClientClosedError(), RewardError)
+
+
+def test_closing_an_async_client_ends_the_calls_of_other_tasks(served: Served, protocol: str) -> None:
+    async def outcomes() -> list[object]:
+        client = AsyncRewardClient(served.url(protocol), model=MODEL, max_in_flight=2)
+        asked = [asyncio.create_task(client.score(sample)) for sample in plug()]
+        assert await client.is_ready()
+        cancelled = asked.pop()
+        if sys.version_info >= (3, 11):  # before, nobody can tell who cancelled it
+            cancelled.cancel()
+        await client.close()
+        if sys.version_info >= (3, 11):
+            with pytest.raises(asyncio.CancelledError):
+                await cancelled
+        return list(await asyncio.gather(*asked, return_exceptions=True))
+
+    told = [outcome for outcome in asyncio.run(outcomes()) if isinstance(outcome, BaseException)]
+    assert {type(error) for error in told} == {ClientClosedError}
+    assert any("this client was closed during the call" in str(error) for error in told)
 
 
 FORKING = """

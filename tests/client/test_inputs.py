@@ -160,6 +160,16 @@ BAD_EPISODES: dict[str, tuple[Any, str | None, str]] = {
         None,
         f"{TOP}: expected {SHAPED}, got uint16 [1, 6, 8]",
     ),
+    "a PIL image with a palette": (
+        {TOP: [Image.fromarray(FRAMES[0]).convert("P")]},
+        None,
+        f'{TOP}.picture: expected mode RGB, got mode P: call picture.convert("RGB")',
+    ),
+    "a PIL image of other colours, which would be read as RGB": (
+        {TOP: [Image.fromarray(FRAMES[0]).convert("HSV")]},
+        None,
+        f'{TOP}.picture: expected mode RGB, got mode HSV: call picture.convert("RGB")',
+    ),
     "floats in 0..255": (
         {TOP: FRAMES.astype(np.float32)},
         None,

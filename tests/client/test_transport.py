@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import grpc
+import numpy as np
 import pytest
 
 from rfm_client import (
@@ -20,9 +21,13 @@ from rfm_client import (
     RewardClient,
     RewardError,
     ServerUnavailableError,
+    Trajectory,
 )
 from rfm_client.contract.triton import error_of
 from rfm_client.transport.connection import grpc_options
+from rfm_client.transport.credentials import Credentials
+from rfm_client.transport.request_size import check_size
+from rfm_client.transport.status import read_status
 from trajectories import random_trajectory
 
 TIMEOUT_S = 1.0
@@ -100,6 +105,54 @@ def test_whatever_answers_the_error_is_ours(
         with pytest.raises(kind) as caught:
             client.progress(random_trajectory(0, 2))
     assert caught.value.may_have_ended_server is may_have_ended
+
+
+def test_a_redirect_is_told_and_never_followed() -> None:
+    """It would carry frames and headers to a server that nobody named."""
+    arrived: list[bytes] = []
+
+    def stranger(connection: socket.socket) -> None:
+        arrived.append(connection.recv(65536))
+        connection.close()
+
+    with listening(stranger) as other:
+        head = "HTTP/1.1 307 Temporary Redirect\r\nLocation: {}\r\nContent-Length: 0\r\n\r\n"
+        with listening(saying(head.format(f"http://127.0.0.1:{other}/v2").encode())) as port:
+            url = f"http://127.0.0.1:{port}"
+            told = (
+                f"^{url}: expected an answer of Triton, got a redirect to 'http://127.0.0.1:{other}/v2': "
+                "give that server's address as URL if you trust it"
+            )
+            with RewardClient(url, headers={"x-secret": "s"}, timeout_s=TIMEOUT_S) as client:
+                with pytest.raises(InferenceFailedError, match=told):
+                    client.progress(random_trajectory(0, 2))
+                with pytest.raises(InferenceFailedError, match=told):
+                    client.model_info()
+                assert not client.is_ready()
+                with pytest.raises(DeadlineExceededError, match="got a redirect to"):
+                    client.wait_ready(TIMEOUT_S / 10)
+            with pytest.raises(InferenceFailedError, match=told):
+                read_status(url, credentials=Credentials(headers={"x-secret": "s"}))
+    assert arrived == []
+
+
+@pytest.mark.parametrize("protocol", ["grpc", "http"])
+def test_a_request_over_two_gib_is_refused_before_it_is_copied(protocol: str) -> None:
+    frames = np.broadcast_to(np.zeros(3, np.uint8), (2**13, 512, 512, 3))  # 6 GiB, all in the same three bytes
+    client = RewardClient(f"{protocol}://127.0.0.1:1", timeout_s=WITHIN_S)
+    with client, pytest.raises(InvalidSampleError) as refused:
+        client.encode(Trajectory(frames=frames, task="stack the cups"))
+    assert refused.value.message == (
+        "frames: expected at most 2.15 GB in a request, got 6.44 GB: shrink the frames (resize, --resize), score fewer "
+        "(subsample, --max-frames), or share memory with a server on this host (shared_memory)"
+    )
+
+
+def test_what_goes_through_shared_memory_does_not_count() -> None:
+    inputs = {"frames": np.broadcast_to(np.zeros(1, np.uint8), 2**31), "task": np.array([b"lift"], np.object_)}
+    check_size(inputs, {"frames"})
+    with pytest.raises(InvalidSampleError, match=r"^frames: "):
+        check_size(inputs, set())
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from rfm.engine.execution import Execution
 from rfm.engine.threads import use_threads
 from rfm.probe_request import probe_request
 from rfm.triton_model import batch_model
-from rfm.triton_model.batch_model import GIVEN_UP_S
+from rfm.triton_model.batch_model import ASKING_S
 from rfm.triton_model.placement import Placement
 from rfm.triton_model.watchdog import FAILED_BATCHES, Watchdog
 from rfm_client import (
@@ -130,22 +130,51 @@ def test_a_log_that_cannot_be_written_costs_no_answer(tmp_path: Path, monkeypatc
     assert model.samples == {("progress", "scored"): 1, ("progress", "failed"): 1}
 
 
-def test_behind_a_batch_that_took_long_a_cancelled_request_is_not_scored(tmp_path: Path) -> None:
-    """Also if the batch was split, and its last request alone took no time."""
+class Slow(Model):
+    """Takes ``seconds`` for a batch of several questions."""
 
-    class Slow(Model):
-        def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
-            time.sleep(2 * GIVEN_UP_S if len(questions) > 1 else 0.0)
-            return super().answer(questions, execution)
+    seconds = 0.0
 
+    def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
+        time.sleep(self.seconds if len(questions) > 1 else 0.0)
+        return super().answer(questions, execution)
+
+
+def test_a_cancelled_request_is_not_scored(tmp_path: Path) -> None:
+    """Also if the batch before was split, and its last request alone took no time."""
     model = Slow(tmp_path)
+    model.seconds = 1.5 * ASKING_S
     model.respond(request(1), request(BREAKS))
     cancelled, scored = model.respond(request(5, is_given_up=True), request(6))
     assert cancelled.error == ("cancelled", "cancelled by the client")
     assert scored.error is None
-    (scored,) = model.respond(request(5, is_given_up=True))  # nobody asks Triton behind a short batch
+    (scored,) = model.respond(request(5, is_given_up=True))  # asking would take longer than a batch that took no time
     assert scored.error is None
     assert model.samples[("progress", "cancelled")] == 1
+
+
+def test_all_cancelled_requests_ahead_of_the_others_are_dropped_behind_a_short_batch(tmp_path: Path) -> None:
+    """Asking behind a living request is worth it only behind a long batch."""
+    model = Slow(tmp_path)
+    model.seconds = 1.5 * ASKING_S
+    model.respond(request(1, 1))
+    asked = [request(5, is_given_up=True), request(6, is_given_up=True), request(7), request(8, is_given_up=True)]
+    assert [response.error is None for response in model.respond(*asked)] == [False, False, True, True]
+    model.seconds = 5 * ASKING_S
+    model.respond(request(1, 1))
+    asked = [request(7), request(8, is_given_up=True)]
+    assert [response.error is None for response in model.respond(*asked)] == [True, False]
+
+
+def test_a_request_without_samples_is_refused(tmp_path: Path) -> None:
+    model = Model(tmp_path)
+    empty = Request({name: array[:0] for name, array in request(1).tensors.items()})
+    without_axis = Request({name: array[0] for name, array in request(1).tensors.items()})
+    *refused, scored = model.respond(empty, without_axis, request(1))
+    told = ("invalid", "num_frames: expected a batch of at least 1 sample, got 0 samples")
+    assert [response.error for response in refused] == [told, told]
+    assert scored.error is None
+    assert [entry["event"] for entry in LOGGED] == ["request_refused"] * 2
 
 
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:

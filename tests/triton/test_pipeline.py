@@ -127,7 +127,7 @@ def test_a_batch_has_no_more_tokens_than_its_budget(tmp_path: Path) -> None:
 
 
 def test_refused_failed_and_cancelled_requests_fail_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rfm.triton_model.batch_model.GIVEN_UP_S", -1.0)  # after any batch clients may have given up
+    monkeypatch.setattr("rfm.triton_model.batch_model.ASKING_S", 1e-9)  # any batch is long enough to ask
     model = Ahead(tmp_path)
     first = model.begin()
     unreadable = Request(request(1).tensors | {"num_frames": np.zeros((1, 2), np.int32)})

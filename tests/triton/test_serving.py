@@ -5,9 +5,12 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
+import grpc
 import numpy as np
 import pytest
 import tritonclient.grpc
+from tritonclient.grpc import service_pb2, service_pb2_grpc
+from tritonclient.utils import np_to_triton_dtype
 
 import goldens
 import rfm_export
@@ -238,6 +241,24 @@ def test_what_cannot_be_scored_is_refused_with_what_was_expected(served: Served,
     model, question = (f"{FRAMES_MODEL}_frames", QUESTION) if is_video else (MODEL, embedded())
     with pytest.raises(InvalidSampleError, match=message):
         infer(served.url("grpc"), model, question | changes, [wire.PROGRESS])
+
+
+@pytest.mark.parametrize("model", [MODEL, f"{FRAMES_MODEL}_encoder", f"{VLM}_frames"])
+def test_a_batch_of_no_samples_is_refused(served: Served, model: str) -> None:
+    """Triton lets it pass if the bytes are those of one sample. An ensemble answers it as that sample."""
+    question = embedded() if model == MODEL else {**QUESTION, wire.TASK: np.array([[4, 0, 0, 0, *b"lift"]], np.uint8)}
+    if model.endswith("_encoder"):
+        question = {name: question[name] for name in (wire.NUM_FRAMES, wire.FRAMES, wire.TASK)}
+    request = service_pb2.ModelInferRequest(model_name=model)
+    for name, array in question.items():
+        is_text, axes = name == wire.TASK, [1] if name == wire.TASK else array.shape[1:]
+        datatype = "BYTES" if is_text else np_to_triton_dtype(array.dtype)
+        request.inputs.add(name=name, datatype=datatype, shape=[0, *axes])
+        request.raw_input_contents.append(array.tobytes())
+    address = served.url("grpc").removeprefix("grpc://")
+    with grpc.insecure_channel(address) as channel, pytest.raises(grpc.RpcError) as refused:
+        service_pb2_grpc.GRPCInferenceServiceStub(channel).ModelInfer(request)
+    assert refused.value.code() == grpc.StatusCode.INVALID_ARGUMENT, refused.value
 
 
 def test_a_rewound_trajectory_is_scored(served: Served) -> None:

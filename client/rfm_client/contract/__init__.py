@@ -3,6 +3,7 @@
 
 from rfm_client.contract.errors import (
     AccessDeniedError,
+    ClientClosedError,
     DeadlineExceededError,
     InferenceFailedError,
     InvalidSampleError,
@@ -34,6 +35,7 @@ from rfm_client.contract.samples import (
 __all__ = [
     "AccessDeniedError",
     "BatchTiming",
+    "ClientClosedError",
     "DeadlineExceededError",
     "FrameScores",
     "FrameSize",

@@ -3,6 +3,7 @@
 
     RewardError
     +-- InvalidSampleError        the sample is at fault; a retry gives the same answer
+    +-- ClientClosedError         the client was closed before or during the call
     +-- ServerError               the server is at fault or unreachable
         +-- ServerUnavailableError    no connection, not ready, or a full queue
             +-- ProcessEndedError     a process or the connection ended, perhaps because of this request
@@ -49,6 +50,10 @@ class InvalidSampleError(RewardError, ValueError):
         located = type(self)(f"{where}.{self.message}")
         located.request_id = self.request_id
         return located
+
+
+class ClientClosedError(RewardError, RuntimeError):
+    """A call of a client that was closed before it, or during it."""
 
 
 class ServerError(RewardError):

@@ -22,6 +22,7 @@ UInt8Array: TypeAlias = npt.NDArray[np.uint8]
 
 MIN_FRAME_STEPS = 2  # a prefix sampled to a single frame is no trajectory
 MAX_FRAME_STEPS = 4096  # more frames than any checkpoint takes
+_PLAIN_NUMBERS = ("I", "F")  # Pillow's modes of depth pictures, which no conversion makes a colour picture
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -198,10 +199,12 @@ def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
 def as_array(values: Any) -> npt.NDArray[Any]:
     """Return the values as an array; torch tensors too, on a GPU or with a gradient, bfloat16 as float32.
 
-    Raises ValueError for rows of unequal length.
+    Raises ValueError for rows of unequal length, InvalidSampleError for a picture of Pillow whose numbers are not RGB.
     """
-    if isinstance(values, (list, tuple)) and values and hasattr(values[0], "detach"):
-        values = [as_array(tensor) for tensor in values]
+    if isinstance(values, (list, tuple)) and values and (hasattr(values[0], "detach") or hasattr(values[0], "getexif")):
+        values = [as_array(each) for each in values]
+    if hasattr(values, "getexif") and values.mode != "RGB" and not values.mode.startswith(_PLAIN_NUMBERS):
+        raise InvalidSampleError.at("picture", "mode RGB", f'mode {values.mode}: call picture.convert("RGB")')
     if hasattr(values, "detach"):  # a tensor; torch may not be installed
         tensor = values.detach().cpu()
         values = (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
@@ -211,6 +214,8 @@ def as_array(values: Any) -> npt.NDArray[Any]:
 def _checked_frames(frames: Any) -> UInt8Array:
     try:
         array = as_array(frames)
+    except InvalidSampleError as error:
+        raise error.inside("frames") from None
     except ValueError:  # lists of unequal length
         raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3]", "frames of unequal size") from None
     got = f"{array.dtype} {list(array.shape)}"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from typing import Any
+from urllib.parse import urljoin
 
 from rfm_client.contract import errors
 from rfm_client.contract.wire import SECOND_FRAMES
@@ -19,6 +20,8 @@ OUT_OF_TIME = ("StatusCode.DEADLINE_EXCEEDED", "504")
 CANCELLED = ("StatusCode.CANCELLED", "499")
 BAD_GATEWAY = ("502",)  # a proxy's connection to the server ended or was refused
 DENIED = ("StatusCode.UNAUTHENTICATED", "StatusCode.PERMISSION_DENIED", "401", "403")
+
+_REDIRECTS = range(300, 400)
 
 _ERRORS: dict[tuple[str, ...], type[errors.RewardError]] = {
     ("StatusCode.INVALID_ARGUMENT", "400"): errors.InvalidSampleError,
@@ -128,6 +131,20 @@ def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -
         is_lost = _LOST_CONNECTION.search(text) is not None and not _NO_CONNECTION.search(text)
         error.may_have_ended_server = is_lost or status in BAD_GATEWAY
     return error
+
+
+def is_redirect(status: int) -> bool:
+    """True for an HTTP status that names another address."""
+    return status in _REDIRECTS
+
+
+def redirected(url: str, location: str) -> errors.InferenceFailedError:
+    """Return the error of a redirect, which no call follows. location: as in the answer's header"""
+    target = urljoin(url, location)
+    return errors.InferenceFailedError(
+        f"{url}: expected an answer of Triton, got a redirect to {target!r:.200}: give that server's address as URL if "
+        "you trust it"
+    )
 
 
 def is_denied(status: str, message: str) -> bool:

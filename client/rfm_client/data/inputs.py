@@ -184,7 +184,10 @@ def _camera_key(columns: Mapping[str, Any], camera: str | None) -> str:
 
 def _frames(where: str, values: Any) -> UInt8Array:
     is_sequence = isinstance(values, Sequence)
-    images = [_image(each) for each in values] if is_sequence else np.atleast_1d(as_array(values))
+    try:
+        images = [_image(each) for each in values] if is_sequence else np.atleast_1d(as_array(values))
+    except InvalidSampleError as error:
+        raise error.inside(where) from None
     kinds = {(image.dtype, image.shape) for image in images}
     got = " and ".join(sorted(f"{dtype} {list(shape)}" for dtype, shape in kinds)) or "none"
     require(where, len(kinds) == 1, "images of one type and size", got, InvalidSampleError)

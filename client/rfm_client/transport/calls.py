@@ -12,6 +12,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib import import_module
+from types import SimpleNamespace
 from typing import Any, ClassVar, Protocol, TypeVar
 
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
@@ -25,6 +26,7 @@ from rfm_client.transport.connection import Connection, grpc_options
 from rfm_client.transport.credentials import SECURE_SCHEMES, Credentials
 from rfm_client.transport.deadline import timeout
 from rfm_client.transport.off_loop import MIN_BYTES, off_loop
+from rfm_client.transport.request_size import check_size
 from rfm_client.transport.shared_memory import Region, SharedMemory
 
 Answered = TypeVar("Answered")
@@ -134,12 +136,13 @@ class TritonTransport:
         self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float, client: Any
     ) -> Answer:
         requested = [self._triton.InferRequestedOutput(name) for name in outputs]
-        # Triton drops requests that wait longer in its queue, over HTTP too: no client waits for their answers.
+        # With queue_timeout_ms exported, Triton drops requests that wait longer in its queue, over HTTP too.
         waits_us = max(int(timeout_s * _US_PER_S), 1)
         largest = max(inputs, key=lambda name: inputs[name].nbytes)
         lent = nullcontext() if self._shared_memory is None else self._shared_memory.lend(client, inputs[largest])
         async with lent as region:
             regions = {largest: region} if region is not None else {}
+            check_size(inputs, regions)
             num_bytes = 0 if regions else inputs[largest].nbytes
             tensors = await off_loop(num_bytes, self._inputs, inputs, regions)
             answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
@@ -247,13 +250,20 @@ class GrpcTransport(TritonTransport):
 
 
 class HttpTransport(TritonTransport):
-    """HTTP transport: one connection per concurrent call. Triton finishes a request even if its caller has left."""
+    """HTTP transport: one connection per concurrent call. Triton finishes a request even if its caller has left.
+
+    It follows no redirect, which would carry frames and headers to another server.
+    """
 
     _module = "tritonclient.http.aio"
 
     def _open(self) -> Any:
         secure = {"ssl": True, "ssl_context": self._credentials.ssl_context} if self._scheme in SECURE_SCHEMES else {}
         client = self._triton.InferenceServerClient(self._address, conn_limit=0, conn_timeout=None, **secure)
+        session = client._stub
+        client._stub = SimpleNamespace(
+            get=partial(self._straight, session.get), post=partial(self._straight, session.post), close=session.close
+        )
         post = client._post
 
         async def post_stream(request_uri: str, request_body: Any, headers: Any, query_params: Any) -> Any:
@@ -264,6 +274,14 @@ class HttpTransport(TritonTransport):
 
         client._post = post_stream
         return client
+
+    async def _straight(self, send: Callable[..., Awaitable[Any]], **request: Any) -> Any:
+        """Return the answer to a request. Raises InferenceFailedError for a redirect."""
+        answer = await send(allow_redirects=False, **request)
+        if triton.is_redirect(answer.status):
+            answer.release()
+            raise triton.redirected(self.url, answer.headers.get("Location", ""))
+        return answer
 
 
 def _outputs(answer: Any, names: Collection[str]) -> Tensors:

@@ -10,6 +10,8 @@ from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
+from rfm_client.contract.errors import ClientClosedError
+
 Returned = TypeVar("Returned")
 
 
@@ -25,17 +27,21 @@ class LoopThread:
         self._thread.start()
 
     def start(self, coroutine: Coroutine[Any, Any, Returned]) -> Future[Returned]:
-        """Return the coroutine's future, which can cancel it. Raises RuntimeError after ``stop`` and in a fork."""
-        problem = None
+        """Return the coroutine's future, which can cancel it.
+
+        Raises ClientClosedError after ``stop``, as does the future of a coroutine that ``stop`` cancelled, and
+        RuntimeError in a fork.
+        """
+        error: RuntimeError = ClientClosedError("this RewardClient is closed")
         if os.getpid() != self._process_id:
-            problem = f"was made in process {self._process_id}, which forked this one: make one in each process"
-        with self._starting:
-            if self._is_stopped:
-                problem = "is closed"
-            if problem is None:
-                return asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+            made = f"was made in process {self._process_id}, which forked this one: make one in each process"
+            error = RuntimeError(f"this RewardClient {made}")
+        else:
+            with self._starting:
+                if not self._is_stopped:
+                    return asyncio.run_coroutine_threadsafe(self._until_stopped(coroutine), self._loop)
         coroutine.close()
-        raise RuntimeError(f"this RewardClient {problem}")
+        raise error
 
     def wait(self, coroutine: Coroutine[Any, Any, Returned]) -> Returned:
         """Return the coroutine's result. Raises RuntimeError in a future's callback, which would wait for itself."""
@@ -64,6 +70,14 @@ class LoopThread:
         finally:
             self._thread.join()
             self._loop.close()
+
+    async def _until_stopped(self, coroutine: Coroutine[Any, Any, Returned]) -> Returned:
+        try:
+            return await coroutine
+        except asyncio.CancelledError:
+            if not self._is_stopped:
+                raise
+            raise ClientClosedError("this RewardClient was closed during the call") from None
 
     async def _end(self, last: Callable[[], Coroutine[Any, Any, None]]) -> None:
         others = asyncio.all_tasks() - {asyncio.current_task()}

@@ -24,6 +24,7 @@ from typing import TypeVar
 
 from rfm_client.contract.errors import (
     AccessDeniedError,
+    ClientClosedError,
     DeadlineExceededError,
     InferenceFailedError,
     ModelNotFoundError,
@@ -118,6 +119,7 @@ class Servers:
             raise ValueError("url: expected at least one, got none")
         self._servers = [KnownServer(transport) for transport in transports]
         self._retry = retry
+        self._is_closed = False
         self._moments = itertools.count(1)
 
     def __len__(self) -> int:
@@ -198,17 +200,22 @@ class Servers:
         self._retry = False
 
     async def close(self) -> None:
-        """Close the connections to all servers."""
+        """Close the connections to all servers. Running requests raise ClientClosedError."""
         self.stop_retrying()
+        self._is_closed = True
         await asyncio.gather(*(server.close() for server in self._servers))
 
     async def _request(
         self, model: str, request: Request[Answered], deadline: Deadline, first: int | None = None
     ) -> Answered:
         try:
+            if self._is_closed:
+                raise ClientClosedError("this client is closed")
             return await self._until_answered(model, request, deadline, first)
-        except OF_A_PORT as error:
-            if not any(server.has_answered for server in self._servers):
+        except (asyncio.CancelledError, Exception) as error:
+            if self._is_closed and not _is_task_cancelled():  # connections that close raise errors of many classes
+                raise ClientClosedError("this client was closed during the call") from error
+            if isinstance(error, OF_A_PORT) and not any(server.has_answered for server in self._servers):
                 for named in filter(None, await self._wrong_ports()):
                     raise ServerUnavailableError(named) from error
             raise
@@ -279,8 +286,8 @@ class Servers:
 
     def _leave_out(self, server: KnownServer, model: str, error: RewardError) -> None:
         """Leave the server out until it is ready. A single server still gets requests."""
-        if server.is_left_out:
-            return  # the same failure
+        if server.is_left_out or self._is_closed:
+            return  # the same failure, or none
         server.failures += 1
         if error.may_have_ended_server:
             was_down = not isinstance(error, ProcessEndedError)
@@ -292,6 +299,12 @@ class Servers:
         """Fault of each server's port; None: no fault found."""
         ours = [server.transport.url for server in self._servers if isinstance(server.transport, TritonTransport)]
         return [await asyncio.to_thread(wrong_port, url) for url in ours]
+
+
+def _is_task_cancelled() -> bool:
+    """True if the caller cancelled the task that runs, as Python 3.11 and later tell."""
+    task = asyncio.current_task()
+    return bool(task is not None and getattr(task, "cancelling", int)())
 
 
 def pause_s(attempt: int, longest_s: float) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import textwrap
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from http.client import HTTPException
 from typing import Any, TypeAlias
@@ -218,6 +218,8 @@ def _read_server(
 
         options = {"connection_timeout": timeout_s, "network_timeout": timeout_s, **credentials.http_options(scheme)}
     client = InferenceServerClient(address, **options)
+    if not is_grpc:
+        client._get, client._post = (_straight(send, f"{scheme}://{address}") for send in (client._get, client._post))
     credentials.show_with_each_request(client)
     try:
         version = client.get_server_metadata(**as_json)["version"]
@@ -226,6 +228,18 @@ def _read_server(
         return version, client.is_server_ready(**limited), index, statistics
     finally:
         client.close()
+
+
+def _straight(send: Callable[..., Any], url: str) -> Callable[..., Any]:
+    """Return ``send`` with an error for a redirect, which it does not follow. Raises InferenceFailedError."""
+
+    def answer(**request: Any) -> Any:
+        response = send(**request)
+        if triton.is_redirect(response.status_code):
+            raise triton.redirected(url, response.get("location", ""))
+        return response
+
+    return answer
 
 
 def _index(
