@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Refuse requests of web pages that the gateway did not serve.
 
-A page of another site may send requests to addresses that only its visitor reaches, such as 127.0.0.1. Browsers say so in
-``Origin`` and ``Sec-Fetch-Site``, which a page cannot change. With DNS rebinding, its own name leads to such an address,
-and the browser takes the gateway for the page's own server; then the name in ``Host`` tells.
+A page of another site can send requests to addresses that only its visitor reaches, such as 127.0.0.1. Browsers say so
+in ``Origin`` and ``Sec-Fetch-Site``, which no page can change. With DNS rebinding, the page's own name leads to such an
+address, and browsers take both servers for one. Then ``Host`` has the page's name.
 """
 
 from __future__ import annotations

@@ -33,7 +33,13 @@ def gateway() -> Iterator[TestClient]:
 HOSTS_OF_LOOPBACK = ("localhost", "LOCALHOST:8100", "localhost.", "page.localhost", "127.0.0.1:8100", "[::1]:8100")
 ADDRESSES = ("10.0.0.5:8100", "192.168.1.7", "[fe80::1]:8100")  # which no DNS can change
 HOSTS_OF_NETWORK = ("robot:8100", "gateway", "robot.local", "rfm.prod.svc.cluster.local:80", "host.docker.internal")
-FOREIGN_HOSTS = ("evil.example.com", "evil.example.com:8100", "127.0.0.1.evil.example", "localhost.evil.example", "[::1")
+FOREIGN_HOSTS = (
+    "evil.example.com",
+    "evil.example.com:8100",
+    "127.0.0.1.evil.example",
+    "localhost.evil.example",
+    "[::1",
+)
 
 
 @pytest.mark.parametrize("path", GETS)
@@ -97,7 +103,9 @@ def test_a_page_of_another_origin_gets_nothing(gateway: TestClient, headers: dic
         for kind in ("text/plain", "application/json"):
             told = failure(gateway.post(path, content=SAMPLE, headers={"Content-Type": kind, **headers}), 403)
             assert told.startswith("origin: expected the gateway's own, got ")
-            assert told.endswith("; start the gateway with --cors-origin (rfm serve: --gateway-cors-origin) to allow it")
+            assert told.endswith(
+                "; start the gateway with --cors-origin (rfm serve: --gateway-cors-origin) to allow it"
+            )
     for path in GETS:
         assert gateway.get(path, headers=headers).status_code == 403
     with inside(KEY) as client:

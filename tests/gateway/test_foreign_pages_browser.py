@@ -9,7 +9,6 @@ import functools
 import threading
 from collections.abc import Iterator
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from shown_datasets import copied
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 DATASETS, VIDEO, LIVE = "/viewer/datasets", "/viewer/datasets/0/episodes/0/videos/0", "/viewer/live"
-REPORT = {"episodes": [], "frames": {}}
+REPORT = '{"episodes": [], "frames": {}}'
 TRY = """
 const [base, paths, video, report, done] = arguments;
 const told = async (request) => {
@@ -79,8 +78,7 @@ def other_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 
 def tried(browser: Browser, base: str) -> Json:
     """What a script gets in the page that is open."""
-    report = '{"episodes": [], "frames": {}}'
-    return dict(browser.driver.execute_async_script(TRY, base, [DATASETS, VIDEO, LIVE, "/metrics"], VIDEO, report))
+    return dict(browser.driver.execute_async_script(TRY, base, [DATASETS, VIDEO, LIVE, "/metrics"], VIDEO, REPORT))
 
 
 def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
@@ -98,7 +96,10 @@ def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
     browser.driver.get(f"http://{REBOUND}:{port}/")
     rebound = tried(browser, "")
     for found in asked.values():
-        assert found == dict.fromkeys(("json", "plain", "unread", "scored"), None) | {"read": [None] * 4, "shown": False}
+        assert found == dict.fromkeys(("json", "plain", "unread", "scored"), None) | {
+            "read": [None] * 4,
+            "shown": False,
+        }
     assert rebound.pop("shown") is False
     answers = [*rebound.pop("read"), *rebound.values()]
     assert [status for status, _ in answers] == [421] * 8
