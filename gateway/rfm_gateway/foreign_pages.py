@@ -19,7 +19,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from rfm_client.contract.addresses import is_loopback
 from rfm_gateway.config import GatewayConfig
 
-ANY_ORIGIN = "*"
+EMBEDDED_HERE_ALONE = {"Cross-Origin-Resource-Policy": "same-origin"}  # for old browsers, and HTTP without TLS
+_ANY_ORIGIN = "*"
 _NEVER_PUBLIC = ("local", "internal")  # top-level domains that the public DNS does not have
 _MOST_LETTERS = 100  # of a header in an answer
 
@@ -69,7 +70,7 @@ class ForeignPageMiddleware:
 
     def _is_foreign(self, headers: Headers, method: str) -> bool:
         origin, site = headers.get("origin"), headers.get("sec-fetch-site")
-        if origin is not None and (origin in self._origins or ANY_ORIGIN in self._origins):
+        if origin is not None and (origin in self._origins or _ANY_ORIGIN in self._origins):
             return False
         if site is not None:
             return site not in ("same-origin", "none") and not _follows_link(headers, method)

@@ -17,6 +17,7 @@ from rfm_client import LiveView
 from rfm_client.contract.settings import ConfigError
 from rfm_client.episodes import StepScore
 from rfm_gateway.config import GatewayConfig
+from shown_datasets import copied
 
 SAMPLE, KEY, LAB = dumped(progress(FIRST)), "open sesame", "http://lab.example"
 OWN = "http://127.0.0.1"
@@ -124,6 +125,12 @@ def test_the_page_and_programs_are_answered(gateway: TestClient, headers: dict[s
 def test_a_link_elsewhere_opens_the_page_and_a_form_elsewhere_posts_nothing(gateway: TestClient) -> None:
     assert gateway.get("/", headers=A_LINK).status_code == 200
     assert gateway.post("/live/reports", content=b"", headers=A_LINK).status_code == 403
+
+
+def test_browsers_that_tell_no_site_embed_pictures_and_videos_of_ours_in_our_page_alone(tmp_path: Path) -> None:
+    with inside(dataset=(str(copied("toy_v30_many", tmp_path)),)) as client:
+        for path in ("/viewer/live", "/viewer/datasets/0/episodes/0/videos/0"):
+            assert client.get(path).headers["Cross-Origin-Resource-Policy"] == "same-origin"
 
 
 @pytest.mark.parametrize("allowed", [LAB, "*"])

@@ -16,6 +16,7 @@ from fastapi.responses import JSONResponse
 
 from rfm_client.data.datasets.protocol import DatasetError
 from rfm_gateway.body import Decoded
+from rfm_gateway.foreign_pages import EMBEDDED_HERE_ALONE
 from rfm_gateway.observe import while_connected
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 Read = TypeVar("Read")
 
-_HEADERS = {"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
+_HEADERS = {"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff", **EMBEDDED_HERE_ALONE}
 
 
 def dataset_routes(datasets: Sequence[ShownDataset], timeout_s: float, max_video_bytes: int) -> APIRouter:
