@@ -51,11 +51,13 @@ class ForeignPageMiddleware:
         if host is not None and not self._has_key and not self._is_known(_name_in(host)):
             expected = "localhost or an IP address" if self._is_local else "a local name or an IP address"
             remedy = "start the gateway with a key, or name this host: --allow-host (rfm serve: --gateway-allow-host)"
-            return _failure(421, f"host: expected {expected}, got {host[:_MOST_LETTERS]!r}; {remedy}")
+            detail = f"host: expected {expected}, got {host[:_MOST_LETTERS]!r}; {remedy}"
+            return JSONResponse({"detail": detail}, 421)
         if self._is_foreign(headers, method):
             got = headers.get("origin") or "none, of another site"
             remedy = "start the gateway with --cors-origin (rfm serve: --gateway-cors-origin) to allow it"
-            return _failure(403, f"origin: expected the gateway's own, got {got[:_MOST_LETTERS]!r}; {remedy}")
+            detail = f"origin: expected the gateway's own, got {got[:_MOST_LETTERS]!r}; {remedy}"
+            return JSONResponse({"detail": detail}, 403)
         return None
 
     def _is_known(self, name: str) -> bool:
@@ -96,7 +98,3 @@ def _is_ip_address(name: str) -> bool:
 def _follows_link(headers: Headers, method: str) -> bool:
     """True if a browser opens an answer as a page, which the page with the link cannot read."""
     return method in ("GET", "HEAD") and headers.get("sec-fetch-dest") == "document"
-
-
-def _failure(status: int, detail: str) -> JSONResponse:
-    return JSONResponse({"detail": detail}, status)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Pages of other origins in Chromium, which try to read from a gateway and to use it: by its address, and by a name of
-their own that leads to it.
+their own that leads to it. No Triton is needed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rfm_client import LiveView
 from rfm_client.episodes import StepScore
 from shown_datasets import copied
 
-pytestmark = [pytest.mark.triton, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 DATASETS, VIDEO, LIVE = "/viewer/datasets", "/viewer/datasets/0/episodes/0/videos/0", "/viewer/live"
 REPORT = '{"episodes": [], "frames": {}}'
@@ -57,9 +57,9 @@ class _Page(SimpleHTTPRequestHandler):
 
 
 @pytest.fixture(scope="module")
-def gateway(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     folder = tmp_path_factory.mktemp("gateway")
-    with running(demo_server, folder, "rfm", "--dataset", str(copied("toy_v30_many", folder))) as started:
+    with running(Endpoints.free(), folder, "rfm", "--dataset", str(copied("toy_v30_many", folder))) as started:
         yield started
 
 
@@ -76,14 +76,24 @@ def other_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
         thread.join()
 
 
+@pytest.fixture
+def loud_browser(browser: Browser) -> Iterator[Browser]:
+    """The browser, whose requests and complaints in this test count in no other."""
+    yield browser
+    browser.driver.get("about:blank")
+    browser.asked()
+    browser.complaints()
+
+
 def tried(browser: Browser, base: str) -> Json:
     """What a script gets in the page that is open."""
     return dict(browser.driver.execute_async_script(TRY, base, [DATASETS, VIDEO, LIVE, "/metrics"], VIDEO, REPORT))
 
 
 def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
-    gateway: Gateway, browser: Browser, other_port: int
+    gateway: Gateway, loud_browser: Browser, other_port: int
 ) -> None:
+    browser = loud_browser
     with LiveView(gateway.url) as view:
         view.episode("stack the cups").add(np.zeros((8, 8, 3), np.uint8), StepScore(0.5, 0.25, False, 0, 3.0))
     poll(lambda: bool(gateway.get(LIVE).json()["episodes"]))
@@ -106,7 +116,7 @@ def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
     assert not [text for _, text in answers if "expected localhost or an IP address" not in text]
     assert gateway.metric("requests_total") <= answered + 2  # of this test
 
-    browser.open(f"{gateway.url}/")
+    browser.driver.get(f"{gateway.url}/")
     own = tried(browser, "")
     assert [status for status, _ in own["read"]] == [200] * 4
     assert own["shown"]
