@@ -217,7 +217,6 @@ class TritonServer:
                 stderr=self._log,
                 preexec_fn=ending_with_parent(),
                 pass_fds=[self._claim.lock_file],
-                umask=0o077,  # other users cannot read its regions of shared memory
                 start_new_session=True,  # so that only this process passes on a Ctrl-C in the terminal
             )
         except OSError as error:
