@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from contextlib import suppress
 from pathlib import Path
@@ -15,4 +14,4 @@ def close_to_other_users() -> None:
     """Give the shared memory of this process the mode 0600. Triton creates it with 0644, whatever the umask says."""
     for region in {*_REGION.findall(Path("/proc/self/maps").read_text())}:
         with suppress(OSError):  # of another user
-            os.chmod(region, 0o600)
+            Path(region).chmod(0o600)
