@@ -25,6 +25,7 @@ from rfm_gateway import pages, schema
 from rfm_gateway.admission import RETRY_AFTER
 from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
 from rfm_gateway.config import MIB, GatewayConfig
+from rfm_gateway.foreign_pages import ForeignPageMiddleware
 from rfm_gateway.observe import (
     CALLER_LEFT,
     REQUEST_ID_HEADER,
@@ -94,6 +95,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
             allow_headers=["*"],
             expose_headers=[REQUEST_ID_HEADER],
         )
+    app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # the outermost
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
     max_decoded_bytes = DECODED_PER_BODY * limits.max_bytes
     state = TritonState(client, config.triton_url, config.metrics_url, model, credentials)

@@ -35,6 +35,7 @@ _format: Any = np.lib.format  # numpy declares no types for it
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _STEPS_FIELD = "use_frame_steps"
+_CHARSETS = ("utf-8", "utf8", "us-ascii")
 _FLAGS = {"true": True, "1": True, "false": False, "0": False, "": False}
 _FORM_FLAGS = {**_FLAGS, "1": False}  # as the evaluation server reads forms
 _EXPECTED = {  # the expected value, by pydantic's kind of error
@@ -107,6 +108,9 @@ class BodyLimits:
         if kind != b"multipart/form-data" or not options.get(b"boundary"):
             expected = "content-type: expected multipart/form-data with a boundary"
             raise HTTPException(415, f"{expected}, got {kind.decode('latin-1') or 'none'}")
+        charset = options.get(b"charset", b"utf-8").decode("latin-1")
+        if charset.lower() not in _CHARSETS:  # some of Python's codecs fail, others change the text
+            raise HTTPException(415, f"content-type: expected the charset utf-8, got {reprlib.repr(charset)}")
         parser = _Form(
             request.headers,
             self._chunks(request, self.max_bytes),
@@ -116,7 +120,7 @@ class BodyLimits:
         )
         try:
             form = await parser.parse()
-        except (MultiPartException, ValueError) as error:  # ValueError: the charset, or python_multipart
+        except (MultiPartException, ValueError) as error:  # ValueError: of python_multipart
             raise HTTPException(400, f"body: expected multipart/form-data, got: {error}") from None
         try:
             if not parser.has_ended:

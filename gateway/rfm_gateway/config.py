@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from rfm_gateway.viewer.shown import ShownDataset
 
 MIB = 2**20
+_HOST_NAME = re.compile(r"[\w.-]+", re.ASCII)
 _SHORTEST_S, _LONGEST_S = 0.001, 86_400.0  # a day
 
 
@@ -45,7 +47,8 @@ class GatewayConfig(Settings):
     triton_ca_file: Path | None = setting(None, "Authorities (PEM) that Triton is trusted by; else the system's.")
     triton_certificate: Path | None = setting(None, "By which Triton knows the gateway (PEM).")
     triton_key: Path | None = setting(None, "That certificate's key (PEM).")
-    cors_origin: Texts = setting((), "Origin from which browsers may ask. Again for more.")
+    cors_origin: Texts = setting((), "Origin from which browsers may ask. Repeat for more.")
+    allow_host: Texts = setting((), "Host name by which callers may ask without a key. Repeat for more.")
     allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
     timeout_s: float = setting(
         120.0,
@@ -64,6 +67,9 @@ class GatewayConfig(Settings):
         super().__post_init__()
         if (self.certificate is None) != (self.key is None):
             raise ConfigError("certificate, key", "expected both or none, got one")
+        for name in self.allow_host:
+            if not _HOST_NAME.fullmatch(name):
+                raise ConfigError("allow_host", f"expected a host name without scheme and port, got {name!r}")
 
     @property
     def triton_url(self) -> str:

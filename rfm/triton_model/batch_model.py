@@ -24,6 +24,7 @@ from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.placement import Placement
 from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Request
 from rfm.triton_model.request_log import RequestLog
+from rfm.triton_model.shared_memory import close_to_other_users
 from rfm.triton_model.watchdog import Watchdog
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
@@ -58,6 +59,7 @@ class BatchModel(Generic[Question, Answer]):
 
     def initialize(self, args: Mapping[str, str]) -> None:
         """Called once by Triton when the model is loaded."""
+        close_to_other_users()  # before any frames
         config = json.loads(args["model_config"])
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
         placement = Placement.of(args, config, settings)

@@ -185,6 +185,7 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path
         "model": "reward",
         "api_key_file": str(tmp_path / "key.txt"),
         "cors_origin": "http://lab.example",
+        "allow_host": "robot.lab.example",
         "allow_folder": str(tmp_path),
         "timeout_s": "90.0",
         "max_body_mib": "1",

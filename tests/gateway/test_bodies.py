@@ -97,6 +97,7 @@ def test_no_part_of_a_form_is_lost_silently(
 NAMELESS = b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n"
 NO_FORM = "content-type: expected multipart/form-data with a boundary, got"
 NO_PARTS, NO_END = "body: expected multipart/form-data, got: ", "body: expected its last boundary"
+NO_CHARSET = "content-type: expected the charset utf-8, got "
 WHOLE = NAMED + SAMPLE.encode() + b"\r\n"
 UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
     "JSON": (415, f"{NO_FORM} application/json", "application/json", b"[]"),
@@ -104,7 +105,10 @@ UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
     "no boundary": (415, f"{NO_FORM} multipart/form-data", "multipart/form-data", NAMED),
     "no multipart": (400, NO_PARTS, MULTIPART, b"hello"),
     "no name": (400, NO_PARTS, MULTIPART, NAMELESS),
-    "a charset of nothing": (400, NO_PARTS, f"{MULTIPART}; charset=undefined", WHOLE + b"--b--\r\n"),
+    **{
+        f"charset {name}": (415, f"{NO_CHARSET}'{name}'", f"{MULTIPART}; charset={name}", WHOLE + b"--b--\r\n")
+        for name in ("undefined", "unicode_escape", "idna", "rot13", "latin-1")
+    },
     "nothing": (400, NO_END, MULTIPART, b""),
     "cut off": (400, NO_END, MULTIPART, WHOLE + NAMED + b"{"),
     "cut off in a boundary": (400, NO_END, MULTIPART, WHOLE + b"--"),
@@ -123,8 +127,7 @@ def test_what_is_no_multipart_is_refused(
 def test_too_large_a_body_is_a_413(gateway: TestClient, path: str, content: Any) -> None:
     is_form = path in (NPY, "/viewer/score")
     body = content if isinstance(content, bytes) else iter([NAMED, *content] if is_form else content)
-    kind = "application/json" if path == "/live/reports" else MULTIPART
-    response = gateway.post(path, content=body, headers={"Content-Type": kind})
+    response = gateway.post(path, content=body, headers={"Content-Type": MULTIPART})
     assert failure(response, 413) == "body: expected at most 1048576 bytes, got more"
 
 

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
+import os
 import re
 import shutil
 import sys
@@ -219,6 +221,32 @@ def test_a_dataset_with_links_that_leave_it_is_refused(folders: list[Path], tmp_
     (root / name).symlink_to(folders[V30] / name)
     expected = f"{root / name}: expected a file in the dataset's folder, got a link that leaves it"
     with pytest.raises(ConfigError, match=expected):
+        GatewayConfig(dataset=(str(root),)).shown_datasets()
+
+
+@pytest.mark.parametrize(("name", "path"), [(VIDEO, "/0/episodes/0/videos/0"), ("rfm_progress.parquet", "/0")])
+def test_a_file_that_becomes_a_link_out_of_the_dataset_is_not_read(
+    folders: list[Path], tmp_path: Path, name: str, path: str
+) -> None:
+    root = Path(shutil.copytree(folders[V30], tmp_path / "swapped"))
+    with serving(root) as get:
+        assert get(path).status_code == 200
+        (root / name).unlink()
+        (root / name).symlink_to(folders[V30] / name)
+        expected = f"swapped/{name}: expected a file in the dataset's folder, got a link that leaves it"
+        assert failure(get(path), 500).startswith(expected)
+
+
+def test_a_folder_that_hides_its_links_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root, listed = copied("toy_v30_many", tmp_path), os.scandir
+
+    def scandir(folder: Path) -> Any:
+        if folder == root / "videos":  # as if it had mode 0711, which does not keep root out
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return listed(folder)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    with pytest.raises(ConfigError, match="videos: expected a folder whose files can be listed, got Permission denied"):
         GatewayConfig(dataset=(str(root),)).shown_datasets()
 
 

@@ -106,6 +106,29 @@ def test_a_file_that_would_show_another_file_is_refused(
         GatewayConfig(dataset=(str(demos),)).shown_datasets()
 
 
+def test_a_file_that_changes_to_show_another_file_is_not_read(demos: Path, tmp_path: Path) -> None:
+    path, other = "/viewer/datasets/0/episodes/3/videos/0", tmp_path / "other.hdf5"
+    shutil.copy(demos, other)
+    with inside(dataset=(str(demos),)) as gateway:
+        assert gateway.get(path).status_code == 200
+        with h5py.File(demos, "r+") as opened:
+            del opened["data/demo_3/obs/front"]
+            opened["data/demo_3/obs/front"] = h5py.ExternalLink(str(other), "/data/demo_3/obs/front")
+        assert "expected data in the file, got data in another file" in failure(gateway.get(path), 500)
+        demos.unlink()
+        demos.symlink_to(other)
+        assert "got a link that leaves it" in failure(gateway.get(path), 500)
+
+
+def test_labels_in_another_folder_are_not_read(demos: Path, tmp_path: Path) -> None:
+    with inside(dataset=(str(demos),)) as gateway:
+        label(open_dataset(demos), BrightnessScorer(), LabelOptions())
+        assert gateway.get("/viewer/datasets/0").json()["labels"] == "demos.rfm_rewards.hdf5/rfm"
+        labels = demos.with_name("demos.rfm_rewards.hdf5")
+        labels.symlink_to(labels.rename(tmp_path / labels.name))
+        assert "got a link that leaves it" in failure(gateway.get("/viewer/datasets/0"), 500)
+
+
 def test_a_demonstration_without_a_task_is_shown(demos: Path) -> None:
     with h5py.File(demos, "r+") as opened:
         del opened["data"].attrs["env_args"]

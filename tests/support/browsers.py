@@ -24,10 +24,11 @@ IMAGES_VARIABLE = "RFM_IMAGES"  # a folder for new pictures of the documents
 AXE = Path(__file__).parents[1] / "gateway" / "vendored" / "axe-core" / "axe.min.js"
 WINDOW_PX = (1280, 1400)
 PICTURE_PX = (1440, 900)
+REBOUND = "rebound.example"  # a name of elsewhere that leads here, as with DNS rebinding
 QUIET = (  # nothing but the page asks for anything
     "--disable-background-networking", "--disable-component-update", "--disable-default-apps", "--disable-sync",
     "--no-first-run", "--no-default-browser-check", "--disable-features=OptimizationHints,MediaRouter",
-    "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
+    f"--host-resolver-rules=MAP {REBOUND} 127.0.0.1 , MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
 )  # fmt: skip
 
 

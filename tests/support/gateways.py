@@ -110,5 +110,5 @@ def running(
 def inside(api_key: str | None = None, **settings: Any) -> Iterator[TestClient]:
     """A gateway inside this process, before no Triton."""
     app = create_app(GatewayConfig(triton="grpc://127.0.0.1:1", **settings), api_key)
-    with TestClient(app, raise_server_exceptions=False) as client:
+    with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
         yield client

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from concurrent.futures import ThreadPoolExecutor
 
 import grpc
@@ -19,6 +21,7 @@ from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, mixed_samples, pl
 from patients import answering_after
 from reference_server import Served
 from repositories import bound_queue, configure, forget_input
+from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
 from rfm.launch.repository_api import RepositoryApi
 from rfm_client import (
     InvalidSampleError,
@@ -38,6 +41,7 @@ from trajectories import random_trajectory
 pytestmark = pytest.mark.triton
 
 VLM = "q3_tok_disc10"
+LEAST_REGION_BYTES = 2**20  # of the Python backend, for one model process
 
 
 @pytest.mark.reference
@@ -293,6 +297,13 @@ def test_a_pair_of_two_frame_sizes_may_be_sent_through_shared_memory(served: Ser
         with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as triton:
             assert triton.get_system_shared_memory_status().regions
     assert_same(result, load_engine(FRAMES_MODEL).evaluate([pair])[0])
+
+
+@pytest.mark.usefixtures("served")
+def test_no_other_user_can_read_the_shared_memory_of_a_server() -> None:
+    found = [path.stat() for path in SHARED_MEMORY.glob(f"{REGION_PREFIX}_{os.getpid()}_*")]
+    assert any(stat.S_ISREG(each.st_mode) and each.st_size >= LEAST_REGION_BYTES for each in found)
+    assert {stat.S_IMODE(each.st_mode) & 0o077 for each in found} == {0}
 
 
 @pytest.mark.parametrize("model", [FRAMES_MODEL, VLM])

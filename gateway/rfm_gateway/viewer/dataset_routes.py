@@ -16,6 +16,7 @@ from fastapi.responses import JSONResponse
 
 from rfm_client.data.datasets.protocol import DatasetError
 from rfm_gateway.body import Decoded
+from rfm_gateway.foreign_pages import EMBEDDED_HERE_ALONE
 from rfm_gateway.observe import while_connected
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 Read = TypeVar("Read")
 
-_HEADERS = {"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
+_HEADERS = {"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff", **EMBEDDED_HERE_ALONE}
 
 
 def dataset_routes(datasets: Sequence[ShownDataset], timeout_s: float, max_video_bytes: int) -> APIRouter:
@@ -31,15 +32,20 @@ def dataset_routes(datasets: Sequence[ShownDataset], timeout_s: float, max_video
     router = APIRouter(include_in_schema=False)
 
     async def read(request: Request, number: int, reading: Callable[[ShownDataset], Read]) -> Read:
-        """Read from a dataset in a thread, and return the result.
+        """Check a dataset and read from it, in a thread, and return the result.
 
         Raises HTTPException 404 for a missing part, 500 for a broken dataset, 504 if reading takes too long.
         """
         if not 0 <= number < len(datasets):
             raise HTTPException(404, f"dataset: expected one of {len(datasets)}, got {number}")
+
+        def checked(shown: ShownDataset) -> Read:
+            shown.check()
+            return reading(shown)
+
         try:
             with anyio.move_on_after(timeout_s):
-                return await while_connected(request, asyncio.to_thread(reading, datasets[number]))
+                return await while_connected(request, asyncio.to_thread(checked, datasets[number]))
         except DatasetError as error:
             raise HTTPException(500, datasets[number].without_folder(str(error))) from None
         raise HTTPException(504, f"dataset: expected an answer within {timeout_s:g} s, got none")

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: MIT
 """LeRobot datasets for the page, in folders that the operator names, with or without labels. Needs pyarrow.
 
-A dataset with a link that leaves its folder is refused, since its author could show other files of this machine.
 T frames of an episode.
 """
 
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +23,7 @@ from rfm_client.data.datasets.lerobot_tasks import TASK_COLUMN
 from rfm_client.data.datasets.protocol import DatasetEpisode, DatasetError, TaskOverride
 from rfm_client.data.datasets.video_frames import Span
 from rfm_client.data.video_decoding import VideoError, video_stream
+from rfm_gateway.viewer.links import check_links, links_in
 from rfm_gateway.viewer.shown import ShownDataset
 
 _AS_STORED = TaskOverride(column=TASK_COLUMN, is_needed=False)  # blank and outdated tasks are shown, too
@@ -51,11 +50,16 @@ class ShownLeRobot(ShownDataset):
             raise ConfigError("dataset", expected)
         root = Path(folder).resolve()
         try:
-            _check_links(root)
             half_s = 0.5 / Info.read(root).fps  # a player shows the nearest frame, too
-            return cls(root, root, LeRobotDataset(root, task=_AS_STORED, tolerance_s=half_s))
+            shown = cls(root, root, LeRobotDataset(root, task=_AS_STORED, tolerance_s=half_s))
+            shown.check()
+            return shown
         except DatasetError as error:
             raise ConfigError("dataset", str(error)) from None
+
+    def check(self) -> None:
+        """Raise DatasetError for a link out of the folder."""
+        check_links(self.root, links_in(self.root))
 
     @property
     def cameras(self) -> Sequence[str]:
@@ -74,20 +78,6 @@ class ShownLeRobot(ShownDataset):
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
         """Return the episode's part of the stored video. Raises DatasetError."""
         return _cut(self.dataset.span(episode, camera), take)
-
-
-def _check_links(root: Path) -> None:
-    """Raise DatasetError for a link that leads out of the folder."""
-    for folder, folders, files in os.walk(root):
-        for path in (Path(folder, name) for name in (*folders, *files)):
-            try:
-                is_inside = not path.is_symlink() or path.resolve().is_relative_to(root)
-            except (OSError, RuntimeError):  # links in a circle
-                is_inside = False
-            if not is_inside:
-                raise DatasetError.at(
-                    path, "a file in the dataset's folder", "a link that leaves it: copy the file there"
-                )
 
 
 def _cut(span: Span, take: Callable[[int], object]) -> bytes:

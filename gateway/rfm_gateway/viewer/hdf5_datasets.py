@@ -10,6 +10,7 @@ import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,10 @@ from rfm_client.data.datasets.hdf5_contents import opened_hdf5
 from rfm_client.data.datasets.protocol import DatasetEpisode, DatasetError, TaskOverride, chosen_cameras
 from rfm_client.labelling.hdf5_tables import stored_in
 from rfm_client.labelling.label_files import find_label_files
+from rfm_gateway.viewer.links import check_links
 from rfm_gateway.viewer.shown import ShownDataset
 
+_FILES_KNOWN = 64  # files whose last check is remembered
 _CODING = {"crf": "12", "g": "10", "preset": "veryfast"}  # of H.264: hardly any loss, and quick to move in
 
 
@@ -43,11 +46,18 @@ class ShownHdf5(ShownDataset):
         path = Path(file).resolve()
         try:
             dataset = Hdf5Dataset(path, task=TaskOverride(is_needed=False))
-            for each in dict.fromkeys([path, *map(stored_in, find_label_files(path))]):
-                _check_inside(each)
-            return cls(path.parent, path, dataset)
+            shown = cls(path.parent, path, dataset)
+            shown.check()
+            return shown
         except (DatasetError, ImportError) as error:
             raise ConfigError("dataset", str(error)) from None
+
+    def check(self) -> None:
+        """Raise DatasetError for data in other files, in the dataset or its labels."""
+        files = dict.fromkeys([self.path, *map(stored_in, find_label_files(self.path))])
+        check_links(self.root, files)
+        for file in files:
+            _check_inside(file, _changed_ns(file))
 
     @property
     def cameras(self) -> Sequence[str]:
@@ -68,7 +78,16 @@ class ShownHdf5(ShownDataset):
         return _encoded(self.dataset.stored_frames(episode, camera), self.fps, take)
 
 
-def _check_inside(file: Path) -> None:
+def _changed_ns(file: Path) -> int:
+    """The time of a file's last change, which its author cannot set. Raises DatasetError."""
+    try:
+        return file.stat().st_ctime_ns
+    except OSError as error:
+        raise DatasetError.at(file, "an HDF5 file", error.strerror) from error
+
+
+@lru_cache(_FILES_KNOWN)
+def _check_inside(file: Path, _changed_ns: int) -> None:
     """Raise DatasetError for data in another file."""
     import h5py
 

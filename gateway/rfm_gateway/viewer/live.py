@@ -13,7 +13,6 @@ import binascii
 import io
 import itertools
 import json
-import reprlib
 import secrets
 import time
 from collections import deque
@@ -28,6 +27,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, St
 
 from rfm_client.transport.off_loop import off_loop
 from rfm_gateway.body import BodyLimits, field_errors
+from rfm_gateway.foreign_pages import EMBEDDED_HERE_ALONE
 
 MOST_BODY_BYTES = 4 * 2**20
 MOST_EPISODES = 128  # ended episodes are forgotten first, then the longest silent
@@ -40,7 +40,7 @@ _MOST_STEPS = 2000  # of a report by our client
 _MOST_LETTERS = 2000
 _MOST_NUMBER = 10**9  # the limit of a step's number
 _MOST_DIGITS = 15  # of a cursor's number
-_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", **EMBEDDED_HERE_ALONE}
 
 
 def _jpeg(text: Any) -> bytes:
@@ -212,9 +212,6 @@ def live_routes(limits: BodyLimits) -> APIRouter:
 
     @router.post("/live/reports", status_code=204)
     async def report(request: Request) -> None:
-        kind = request.headers.get("content-type", "").partition(";")[0].strip()
-        if kind != "application/json":  # pages of other origins cannot send this type without a preflight
-            raise HTTPException(415, f"content-type: expected application/json, got {reprlib.repr(kind)}")
         body = await limits.read(request, MOST_BODY_BYTES)
         episodes.take(await off_loop(len(body), LiveReport.read, body))
 

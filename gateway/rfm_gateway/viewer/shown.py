@@ -51,6 +51,10 @@ class ShownDataset(ABC):
     path: Path
     dataset: Dataset
 
+    @abstractmethod
+    def check(self) -> None:
+        """Raise DatasetError if the dataset would show other files of this machine. Before every reading."""
+
     @property
     @abstractmethod
     def cameras(self) -> Sequence[str]:

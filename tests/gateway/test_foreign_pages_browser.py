@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: MIT
+"""Pages of other origins in Chromium, which try to read from a gateway and to use it: by its address, and by a name of
+their own that leads to it. No Triton is needed.
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import numpy as np
+import pytest
+
+from browsers import REBOUND, Browser
+from gateway_requests import Json
+from gateways import Gateway, poll, running
+from rfm.launch.triton_server import Endpoints
+from rfm_client import LiveView
+from rfm_client.episodes import StepScore
+from shown_datasets import copied
+
+pytestmark = pytest.mark.slow
+
+DATASETS, VIDEO, LIVE = "/viewer/datasets", "/viewer/datasets/0/episodes/0/videos/0", "/viewer/live"
+REPORT = '{"episodes": [], "frames": {}}'
+TRY = """
+const [base, paths, video, report, done] = arguments;
+const told = async (request) => {
+  try {
+    const response = await request;
+    return response.type === "opaque" ? null : [response.status, await response.text()];
+  } catch { return null; }
+};
+const post = (path, options) => told(fetch(base + path, { method: "POST", body: report, ...options }));
+const shown = (element) => new Promise((resolve) => {
+  element.onloadedmetadata = () => resolve(true);
+  element.onerror = () => resolve(false);
+  element.src = base + video;
+});
+(async () => done({
+  read: await Promise.all(paths.map((path) => told(fetch(base + path)))),
+  shown: await shown(document.createElement("video")),
+  json: await post("/live/reports", { headers: { "Content-Type": "application/json" } }),
+  plain: await post("/live/reports", {}),
+  unread: await post("/live/reports", { mode: "no-cors" }),
+  scored: await post("/evaluate_batch", { mode: "no-cors" }),
+}))();
+"""
+
+
+class _Page(SimpleHTTPRequestHandler):
+    def log_message(self, *_arguments: Any) -> None:
+        """Stay silent."""
+
+
+@pytest.fixture(scope="module")
+def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    folder = tmp_path_factory.mktemp("gateway")
+    with running(Endpoints.free(), folder, "rfm", "--dataset", str(copied("toy_v30_many", folder))) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def other_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """The port of another server of this machine, which serves a page."""
+    folder = tmp_path_factory.mktemp("other")
+    (folder / "index.html").write_text("<!doctype html><title>another page</title>")
+    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Page, directory=str(folder))) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server.server_port
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def loud_browser(browser: Browser) -> Iterator[Browser]:
+    """The browser, whose requests and complaints in this test count in no other."""
+    yield browser
+    browser.driver.get("about:blank")
+    browser.asked()
+    browser.complaints()
+
+
+def tried(browser: Browser, base: str) -> Json:
+    """What a script gets in the page that is open."""
+    return dict(browser.driver.execute_async_script(TRY, base, [DATASETS, VIDEO, LIVE, "/metrics"], VIDEO, REPORT))
+
+
+def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
+    gateway: Gateway, loud_browser: Browser, other_port: int
+) -> None:
+    browser = loud_browser
+    with LiveView(gateway.url) as view:
+        view.episode("stack the cups").add(np.zeros((8, 8, 3), np.uint8), StepScore(0.5, 0.25, False, 0, 3.0))
+    poll(lambda: bool(gateway.get(LIVE).json()["episodes"]))
+    port, answered = int(gateway.url.rpartition(":")[2]), gateway.metric("requests_total")
+    asked: Json = {}
+    for host in ("127.0.0.1", REBOUND):
+        browser.driver.get(f"http://{host}:{other_port}/")
+        assert browser.driver.title == "another page"
+        asked[host] = tried(browser, gateway.url)
+    browser.driver.get(f"http://{REBOUND}:{port}/")
+    rebound = tried(browser, "")
+    for found in asked.values():
+        assert found == dict.fromkeys(("json", "plain", "unread", "scored"), None) | {
+            "read": [None] * 4,
+            "shown": False,
+        }
+    assert rebound.pop("shown") is False
+    answers = [*rebound.pop("read"), *rebound.values()]
+    assert [status for status, _ in answers] == [421] * 8
+    assert not [text for _, text in answers if "expected localhost or an IP address" not in text]
+    assert gateway.metric("requests_total") <= answered + 2  # of this test
+
+    browser.driver.get(f"{gateway.url}/")
+    own = tried(browser, "")
+    assert [status for status, _ in own["read"]] == [200] * 4
+    assert own["shown"]
+    assert [own[name][0] for name in ("json", "plain", "unread", "scored")] == [204, 204, 204, 422]
