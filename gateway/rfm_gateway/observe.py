@@ -17,6 +17,7 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rfm_client.contract.names import PROBE_PREFIX
+from rfm_client.contract.process_log import log_requests
 from rfm_client.contract.wire import REQUEST_ID
 from rfm_gateway.config import GatewayConfig
 
@@ -98,6 +99,7 @@ class RequestMiddleware:
         started_s = time.perf_counter()
         request_id = _request_id(scope)
         scope.setdefault("state", {})["request_id"] = request_id
+        log_requests([request_id])
         code = 500  # unless an answer begins
 
         async def send_counted(message: Message) -> None:
