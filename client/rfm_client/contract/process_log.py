@@ -38,7 +38,7 @@ def write_log(process: str, environment: Mapping[str, str]) -> None:
     if level not in _LEVELS:
         raise ConfigError(LEVEL_VARIABLE, f"expected one of {', '.join(_LEVELS)}, got {level!r:.100}")
     handler = _StandardError()
-    handler.setFormatter(_Lines(process))
+    handler.setFormatter(LogLines(process))
     logging.basicConfig(handlers=[handler], level=logging.INFO)
     for name in _OURS:
         logging.getLogger(name).setLevel(level)
@@ -73,14 +73,18 @@ class _StandardError(logging.Handler):
                 os.write(2, self.format(record).encode(errors="backslashreplace"))
 
 
-class _Lines(logging.Formatter):
-    """A head before each line of a record: also of a traceback, and of a caller's text that would forge a line."""
+class LogLines(logging.Formatter):
+    """Formatter that puts a head before each line of a record, so that neither tracebacks nor callers can forge lines.
+
+    process: name of the process in each line
+    """
 
     def __init__(self, process: str) -> None:
         super().__init__()
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
+        """Return the lines of a record, each with a newline."""
         text = record.getMessage()
         if record.exc_info:
             text += f"\n{self.formatException(record.exc_info)}"
