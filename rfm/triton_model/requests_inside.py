@@ -40,7 +40,7 @@ class RequestsInside:
             self._write()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file of the notes."""
         if self._file >= 0:
             os.close(self._file)
 
