@@ -31,34 +31,27 @@ def stop_signals_to(handler: Callable[[int, FrameType | None], object]) -> Itera
 
 
 class ProcessGroup:
-    """A process, and the processes that it starts, in a process group. The group ends with this process.
+    """A process and all that it starts. They end with this process, even if SIGKILL ends it.
 
-    A shell leads the group. It reads from a pipe to which only this process could write, and kills the group at the end
-    of the pipe: also if SIGKILL ends this process. Until ``end``, no other group can have the id.
-
-    Raises OSError if ``command`` cannot be run.
+    A shell leads the group. It reads a pipe that only this process can write, and kills the group at the end of the
+    pipe. Until ``end``, no other group can have its id.
     """
 
     def __init__(self, command: Sequence[str | os.PathLike[str]], **options: Any) -> None:
-        self._sentinel = subprocess.Popen(
-            _SENTINEL,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            preexec_fn=os.setpgrp,
-        )
+        """Start the process. Raises OSError."""
+        quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        self._sentinel = subprocess.Popen(_SENTINEL, stdin=subprocess.PIPE, preexec_fn=os.setpgrp, **quiet)
         self.id = self._sentinel.pid
         try:
             self.process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
-                preexec_fn=partial(os.setpgid, 0, self.id),  # a Ctrl-C in the terminal goes to this process alone
+                preexec_fn=partial(os.setpgid, 0, self.id),  # so that only this process passes on a Ctrl-C
                 restore_signals=False,  # SIGPIPE stays ignored: a log that nobody reads ends no process
                 **options,
             )
         except OSError:
-            self.kill()
-            self._reap()
+            self._sentinel.communicate()
             raise
 
     def kill(self) -> None:
@@ -68,19 +61,13 @@ class ProcessGroup:
 
     def end(self) -> None:
         """End the process gracefully, by force after KILL_AFTER_S, then all others."""
-        if self._sentinel.returncode is not None:  # they have ended
-            return
         self.process.terminate()
         with suppress(subprocess.TimeoutExpired):
             self.process.wait(KILL_AFTER_S)
         self.kill()
         self.process.wait()
-        self._reap()
-
-    def _reap(self) -> None:
-        """Wait for the killed group: for orphans, too, which this process inherits if it is a container's first."""
         with suppress(ChildProcessError):
-            while True:
+            while True:  # orphans, too: this process inherits them if it is the first of a container
                 os.waitpid(-self.id, 0)
         self._sentinel.communicate()  # closes the pipe, and notes the end
 

@@ -45,11 +45,6 @@ def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
             raise ServerStartError(f"tritonserver: expected an option that rfm serve leaves open, got {match[1]}")
 
 
-def quiet(given: Sequence[str]) -> list[str]:
-    """Return the option that limits Triton's log to warnings and errors; empty if ``given`` has a log option."""
-    return [] if any(argument.startswith("--log-") for argument in given) else ["--log-info=false"]
-
-
 def size_limits(installation: Installation, given: Sequence[str]) -> list[str]:
     """Return the option that limits a request's size; empty if ``given`` has it, or tritonserver (2.51) lacks it."""
     if any(argument.startswith(f"--{_SIZE_OPTION}=") for argument in given):

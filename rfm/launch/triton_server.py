@@ -27,7 +27,7 @@ from rfm.launch.installation import WHEEL_VERSION, Installation, ServerStartErro
 from rfm.launch.process_table import cpu_s_of_group
 from rfm.launch.repository_api import INDEX_PATH, versions_of
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
-from rfm.launch.triton_options import check_arguments, quiet, size_limits
+from rfm.launch.triton_options import check_arguments, size_limits
 from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE, INSIDE_VARIABLE
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
@@ -205,7 +205,8 @@ class TritonServer:
         arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
         arguments += self._installation.lay_out_backends(self._claim.backends)
         arguments += self.endpoints.grpc_tls.arguments() if self.endpoints.grpc_tls else []
-        arguments += [] if self._log else quiet(self._more_arguments)
+        if self._log is None and not any(each.startswith("--log-") for each in self._more_arguments):
+            arguments += ["--log-info=false"]
         arguments += [*size_limits(self._installation, self._more_arguments), *self._more_arguments]
         program = self._installation.executable
         try:
