@@ -48,9 +48,9 @@ class Claim:
     def requests_inside(self) -> list[str]:
         """Return the requests that model processes which have ended had noted; if none has ended, those of all."""
         files = SHARED_MEMORY.glob(f"{self.requests.name}*")
-        notes = {int(file.name.rpartition("_")[2]): file.read_text() for file in files}
+        notes = {int(file.name.rpartition("_")[2]): file.read_text(errors="replace") for file in files}
         ended = [pid for pid in notes if (stat := stat_of(pid)) is None or stat.state == ZOMBIE]
-        return [each for pid in ended or notes for each in notes[pid].partition("\n")[0].split()]
+        return [each for pid in ended or notes for each in notes[pid].partition("\0\0")[0].split("\0") if each]
 
     def release(self) -> None:
         """Remove the regions, the folder and the lock."""

@@ -101,7 +101,6 @@ class BatchModel(Generic[Question, Answer]):
             self._pipeline.close()
         self._metrics.close()
         self._watchdog.close()
-        self._inside.close()
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         """Load the weights in the folder ``version`` onto ``device``."""
@@ -229,9 +228,10 @@ class BatchModel(Generic[Question, Answer]):
         return [(batch, execution)]
 
     def _send(self, scored: Scored[Question]) -> None:
-        for request in [request for part, _ in scored for request in part]:
+        batch = [request for part, _ in scored for request in part]
+        for request in batch:
             request.send(self._response(request))
-            self._inside.remove([request])
+        self._inside.remove(batch)
         self._count(scored)
 
     def _response(self, request: Request[Question]) -> Any:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import threading
 from collections.abc import Iterable
@@ -10,13 +11,13 @@ from contextlib import suppress
 from typing import Any
 
 from rfm.triton_model.request import Request
-from rfm_client.contract.process_log import ids_in_log
 
-MOST_BYTES = 4096
+SIZE = 4096  # bytes; ids that do not fit are left out
+_END = b"\0\0"
 
 
 class RequestsInside:
-    """The ids of the requests inside this process, in a file.
+    """The ids of the requests inside this process, in a file in memory: a zero byte between ids, two at the end.
 
     prefix: path of the file without the process id at its end; empty: no file
     """
@@ -24,12 +25,18 @@ class RequestsInside:
     def __init__(self, prefix: str) -> None:
         self._lock = threading.Lock()
         self._ids: dict[int, str] = {}
-        self._file = os.open(f"{prefix}{os.getpid()}", os.O_CREAT | os.O_WRONLY, 0o600) if prefix else -1
+        self._notes: mmap.mmap | None = None
+        if prefix:
+            with suppress(OSError):  # no room
+                file = os.open(f"{prefix}{os.getpid()}", os.O_CREAT | os.O_RDWR, 0o600)
+                os.posix_fallocate(file, 0, SIZE)
+                self._notes = mmap.mmap(file, SIZE)
+                os.close(file)
 
     def add(self, requests: Iterable[Request[Any]]) -> None:
         """Note requests before any work on them."""
         with self._lock:
-            self._ids |= {id(request): ids_in_log([request.request_id]) or "unnamed" for request in requests}
+            self._ids |= {id(request): request.request_id or "unnamed" for request in requests}
             self._write()
 
     def remove(self, requests: Iterable[Request[Any]]) -> None:
@@ -39,12 +46,7 @@ class RequestsInside:
                 del self._ids[id(request)]
             self._write()
 
-    def close(self) -> None:
-        """Close the file of the notes."""
-        if self._file >= 0:
-            os.close(self._file)
-
     def _write(self) -> None:
-        if self._file >= 0:
-            with suppress(OSError):  # no room
-                os.pwrite(self._file, " ".join(self._ids.values())[:MOST_BYTES].encode() + b"\n", 0)
+        if self._notes is not None:
+            notes = "\0".join(self._ids.values()).encode()[: SIZE - len(_END)] + _END
+            self._notes[: len(notes)] = notes

@@ -108,4 +108,9 @@ def test_rfm_serve_heals_without_a_log_and_if_it_is_killed_no_process_stays(tmp_
         for pid in started:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        cleanup.clear()
+
+        def nothing_left() -> bool:
+            cleanup.clear()
+            return not list(cleanup.SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
+
+        wait_for(nothing_left)

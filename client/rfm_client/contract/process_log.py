@@ -21,7 +21,7 @@ LEVEL_VARIABLE = "RFM_LOG_LEVEL"
 
 _LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 _OURS = ("rfm", "rfm_client", "rfm_gateway")  # loggers that the level is for: at DEBUG, libraries would log too much
-_IN_IDS = "._:/+=@-%"  # besides letters and digits
+_IN_IDS = "._:/+=@-"  # besides letters and digits
 
 _requests: ContextVar[str] = ContextVar("requests", default="")
 
@@ -46,21 +46,21 @@ def write_log(process: str, environment: Mapping[str, str]) -> None:
 
 def log_requests(ids: Iterable[str]) -> None:
     """Name these requests in every line that is logged in this context from now on."""
-    _requests.set(ids_in_log(ids))
+    _requests.set(_in_log(ids))
 
 
 @contextmanager
 def about(ids: Iterable[str]) -> Iterator[None]:
     """Context manager in which every logged line names these requests."""
-    token = _requests.set(ids_in_log(ids))
+    token = _requests.set(_in_log(ids))
     try:
         yield
     finally:
         _requests.reset(token)
 
 
-def ids_in_log(ids: Iterable[str]) -> str:
-    """Return ids as the log has them: without spaces, separated by commas."""
+def _in_log(ids: Iterable[str]) -> str:
+    """Return ids without spaces, separated by commas."""
     return ",".join(quote(each, safe=_IN_IDS) for each in ids)
 
 
