@@ -39,8 +39,7 @@ class ProcessGroup:
 
     def __init__(self, command: Sequence[str | os.PathLike[str]], **options: Any) -> None:
         """Start the process. Raises OSError."""
-        quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        self._sentinel = subprocess.Popen(_SENTINEL, stdin=subprocess.PIPE, preexec_fn=os.setpgrp, **quiet)
+        self._sentinel = subprocess.Popen(_SENTINEL, stdin=subprocess.PIPE, preexec_fn=os.setpgrp)
         self.id = self._sentinel.pid
         try:
             self.process = subprocess.Popen(
@@ -61,6 +60,8 @@ class ProcessGroup:
 
     def end(self) -> None:
         """End the process gracefully, by force after KILL_AFTER_S, then all others."""
+        if self._sentinel.returncode is not None:  # they have ended
+            return
         self.process.terminate()
         with suppress(subprocess.TimeoutExpired):
             self.process.wait(KILL_AFTER_S)
