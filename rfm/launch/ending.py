@@ -16,6 +16,7 @@ EXIT_TIMEOUT_S = 10  # for requests in flight; Triton also waits this long for a
 KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
 
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SIGNALS = {each.value: each.name for each in signal.Signals}
 _SENTINEL = ("/bin/sh", "-c", "trap '' HUP INT TERM; read _; kill -KILL 0")  # 0: its process group
 
 
@@ -75,4 +76,4 @@ class ProcessGroup:
 
 def how_it_ended(status: int) -> str:
     """Return an exit status in words. status: as of Popen, negative after a signal"""
-    return f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+    return f"killed by {_SIGNALS.get(-status, -status)}" if status < 0 else f"exit status {status}"
