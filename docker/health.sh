@@ -4,4 +4,4 @@
 # RFM_URL names a server that is not on this host's default port, RFM_MODEL a checkpoint not exported as rfm.
 set -u
 
-rfm-client sample --model "${RFM_MODEL:-rfm}" --num-samples 1 --num-frames 2 --timeout 15 --json -
+exec rfm-client sample --model "${RFM_MODEL:-rfm}" --num-samples 1 --num-frames 2 --timeout 15 --json -

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import logging
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,10 +19,11 @@ from rfm.launch.admin_key import take_key
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import TritonServer, short_spin
-from rfm.supervise.supervisor import Supervisor
+from rfm.supervise.supervisor import CrashLoopError, Supervisor
 from rfm_client.cli.command import Given, OptionsOf, with_options
 from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import from_here
+from rfm_client.contract.process_log import write_log
 
 try:
     import rfm_gateway  # noqa: F401  before the modules below, which import parts of it
@@ -39,6 +41,8 @@ from rfm_gateway.config import GatewayConfig
 ACCEPTED_WARNING = "a Triton with known remote vulnerabilities is accepted: use NVIDIA's container 26.07 or newer"
 EXPORT_EXAMPLE = "\b\nExample:\n  rfm export org/name --repository my_models --config serve.yaml"
 SERVE_EXAMPLE = "\b\nExample:\n  rfm serve my_models --gateway-port 8100 -- --log-verbose=1"
+
+logger = logging.getLogger("rfm.serve")
 
 app = typer.Typer(
     name="rfm",
@@ -156,8 +160,9 @@ def serve(
     raise_limit()  # Triton and the gateway inherit it
     folder, more_arguments = _folder_and_arguments(words or (), repository)
     config = _config(config_file, serve=given, gateway=gateway_given)
+    write_log("rfm-serve", os.environ)
     if accept_known_vulnerabilities and not config.serve.is_loopback:
-        say(f"warning: {config.serve.host} is no loopback address, and {ACCEPTED_WARNING}")
+        logger.warning("%s is no loopback address, and %s", config.serve.host, ACCEPTED_WARNING)
     server = TritonServer(
         folder,
         Endpoints.of(config.serve),
@@ -175,9 +180,12 @@ def serve(
         probe_s=config.serve.probe_s,
         hang_s=config.serve.hang_s,
         triton_silent_s=config.serve.triton_silent_s,
-        say=say,
     )
-    raise typer.Exit(supervisor.run())
+    try:
+        supervisor.run()
+    except CrashLoopError as error:  # as the lines about the faults before it
+        logger.error("%s", error)
+        raise typer.Exit(1) from None
 
 
 app.command(cls=RfmCommand)(gateway)

@@ -223,8 +223,8 @@ def _handlers() -> dict[Any, Any]:
         code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
         return JSONResponse({"detail": str(error)}, code, RETRY_AFTER if code == 503 else None)
 
-    async def unexpected(request: Request, error: Exception) -> JSONResponse:
-        logger.error("request %s: unexpected", request.state.request_id, exc_info=error)
+    async def unexpected(_request: Request, error: Exception) -> JSONResponse:
+        logger.error("unexpected", exc_info=error)
         return JSONResponse({"detail": "the gateway failed; its log has the reason"}, 500)
 
     return {

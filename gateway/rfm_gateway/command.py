@@ -15,6 +15,7 @@ from rfm_client.contract.addresses import is_loopback
 from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import check_free, from_here, in_url
 from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.contract.process_log import write_log
 from rfm_client.contract.settings import ConfigError, settings_of
 from rfm_gateway.config import GatewayConfig
 
@@ -53,7 +54,7 @@ def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
         from rfm_gateway.connections import Connection, most_connections
     except ModuleNotFoundError as error:
         raise typer.BadParameter(f"the gateway needs {error.name}: pip install ./client ./gateway") from None
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    write_log("rfm-gateway", os.environ)
     host, port = config.host or DEFAULT_HOST, config.port or DEFAULT_PORT
     try:
         api_key, tls = config.api_key(os.environ), config.tls

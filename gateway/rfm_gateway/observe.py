@@ -15,6 +15,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rfm_client.contract.names import PROBE_PREFIX
+from rfm_client.contract.process_log import log_requests
 from rfm_client.contract.wire import REQUEST_ID
 from rfm_gateway.admission import Room, Turn
 from rfm_gateway.config import GatewayConfig
@@ -94,6 +95,7 @@ class RequestMiddleware:
         started_s = time.perf_counter()
         request_id = _request_id(scope)
         scope.setdefault("state", {})["request_id"] = request_id
+        log_requests([request_id])
         code = 500  # unless an answer begins
 
         async def send_counted(message: Message) -> None:

@@ -96,7 +96,7 @@ class Evaluator:
         conversion = _Conversion(served, texts, files, FRAME_STEPS if batch.use_frame_steps and not by_prefix else 0)
         num_bytes = batch.num_bytes if self._folder is None else MIN_BYTES  # files may be large
         samples = await off_loop(num_bytes, conversion.samples, batch.samples)
-        await off_loop(num_bytes, _log_blank_samples, samples, request_id)
+        await off_loop(num_bytes, _log_blank_samples, samples)
         asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
         flat = await self._client.evaluate(
             [each for of_sample in asked for each in of_sample],
@@ -275,7 +275,7 @@ class _Conversion:
         return Trajectory(frames=_uint8(given.frames), task=given.task or "")
 
 
-def _log_blank_samples(samples: Sequence[Sample], request_id: str) -> None:
+def _log_blank_samples(samples: Sequence[Sample]) -> None:
     """Log a line about the samples with frames that show nothing."""
     blank: dict[int, int] = {}
     for index, sample in enumerate(samples):
@@ -285,7 +285,7 @@ def _log_blank_samples(samples: Sequence[Sample], request_id: str) -> None:
                 blank[index] = max(highest, blank.get(index, 0))
     if blank:
         names, told = first_names(blank, 12), what_is_shown(max(blank.values()))
-        logger.warning("request %s: samples %s: %s: their scores mean nothing", request_id, names, told)
+        logger.warning("samples %s: %s: their scores mean nothing", names, told)
 
 
 def _prefixes(sample: Sample) -> list[Sample]:

@@ -10,6 +10,7 @@ import shutil
 from pathlib import Path
 
 from rfm.launch.installation import ServerStartError
+from rfm.launch.process_table import ZOMBIE, stat_of
 
 SHARED_MEMORY = Path("/dev/shm")
 # Beginning of the names of the Python backend's regions. Newer Tritons let no client map a region with this name.
@@ -31,6 +32,7 @@ class Claim:
         name = f"{os.getpid()}_{secrets.token_hex(4)}"
         self.region_prefix = f"{REGION_PREFIX}_{name}_"
         self.backends = SHARED_MEMORY / f"{self.region_prefix}backends"
+        self.requests = SHARED_MEMORY / f"{self.region_prefix}requests_"  # and the id of a model process: its notes
         self._lock = SHARED_MEMORY / f"{self.region_prefix}{_LOCK}"
         new_lock = SHARED_MEMORY / f"rfm-new-{name}"
         try:
@@ -42,6 +44,13 @@ class Claim:
             raise ServerStartError(
                 f"{error.filename}: expected room for a server's files, got: {error.strerror}; {NEEDS_ROOM}"
             ) from error
+
+    def requests_inside(self) -> list[str]:
+        """Return the requests that model processes which have ended had noted; if none has ended, those of all."""
+        files = SHARED_MEMORY.glob(f"{self.requests.name}*")
+        notes = {int(file.name.rpartition("_")[2]): file.read_text(errors="replace") for file in files}
+        ended = [pid for pid in notes if (stat := stat_of(pid)) is None or stat.state == ZOMBIE]
+        return [each for pid in ended or notes for each in notes[pid].partition("\0\0")[0].split("\0") if each]
 
     def release(self) -> None:
         """Remove the regions, the folder and the lock."""

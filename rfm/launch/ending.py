@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Stop signals of this process, and the ending of its child processes."""
+"""Stop signals of this process, and the end of the processes that it starts."""
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
 from types import FrameType
+from typing import Any
 
 EXIT_TIMEOUT_S = 10  # for requests in flight; Triton also waits this long for a dead model process
 KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
 
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_PR_SET_PDEATHSIG = 1
-
-_prctl = ctypes.CDLL(None).prctl
+_SIGNALS = {each.value: each.name for each in signal.Signals}
+_SENTINEL = ("/bin/sh", "-c", "trap '' HUP INT TERM; read _; kill -KILL 0")  # 0: its process group
 
 
 @contextmanager
@@ -31,24 +31,49 @@ def stop_signals_to(handler: Callable[[int, FrameType | None], object]) -> Itera
             signal.signal(number, before)
 
 
-def end(process: subprocess.Popen[bytes]) -> None:
-    """End a process that leads a session: gracefully, by force after KILL_AFTER_S."""
-    if process.poll() is None:
-        process.terminate()
-    try:
-        process.wait(KILL_AFTER_S)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+class ProcessGroup:
+    """A process and all that it starts. They end with this process, even if SIGKILL ends it.
+
+    A shell leads the group. It reads a pipe that only this process can write, and kills the group at the end of the
+    pipe. Until ``end``, no other group can have its id.
+    """
+
+    def __init__(self, command: Sequence[str | os.PathLike[str]], **options: Any) -> None:
+        """Start the process. Raises OSError."""
+        self._sentinel = subprocess.Popen(_SENTINEL, stdin=subprocess.PIPE, preexec_fn=os.setpgrp)
+        self.id = self._sentinel.pid
+        try:
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                preexec_fn=partial(os.setpgid, 0, self.id),  # so that only this process passes on a Ctrl-C
+                restore_signals=False,  # SIGPIPE stays ignored: a log that nobody reads ends no process
+                **options,
+            )
+        except OSError:
+            self._sentinel.communicate()
+            raise
+
+    def kill(self) -> None:
+        """Kill all processes of the group."""
+        if self._sentinel.returncode is None:  # else the id may be another group's
+            os.killpg(self.id, signal.SIGKILL)
+
+    def end(self) -> None:
+        """End the process gracefully, by force after KILL_AFTER_S, then all others."""
+        if self._sentinel.returncode is not None:  # they have ended
+            return
+        self.process.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(KILL_AFTER_S)
+        self.kill()
+        self.process.wait()
+        with suppress(ChildProcessError):
+            while True:  # orphans, too: this process inherits them if it is the first of a container
+                os.waitpid(-self.id, 0)
+        self._sentinel.communicate()  # closes the pipe, and notes the end
 
 
-def ending_with_parent() -> Callable[[], None]:
-    """``preexec_fn`` for Popen: the kernel kills the new process when the thread that started it ends."""
-    parent = os.getpid()
-
-    def bind() -> None:
-        _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # the parent has ended already
-            os._exit(1)
-
-    return bind
+def how_it_ended(status: int) -> str:
+    """Return an exit status in words. status: as of Popen, negative after a signal"""
+    return f"killed by {_SIGNALS.get(-status, -status)}" if status < 0 else f"exit status {status}"

@@ -7,10 +7,8 @@ import json
 import os
 import re
 import signal
-import subprocess
 import time
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
@@ -22,7 +20,7 @@ from tritonclient.grpc.model_config_pb2 import ModelConfig
 
 from rfm.launch.admin_key import VARIABLE, http_headers, new_key, restrictions
 from rfm.launch.cleanup import NEEDS_ROOM, Claim
-from rfm.launch.ending import EXIT_TIMEOUT_S, end, ending_with_parent
+from rfm.launch.ending import EXIT_TIMEOUT_S, ProcessGroup, how_it_ended
 from rfm.launch.endpoints import Endpoints, check_version
 from rfm.launch.http import NO_ANSWER, Http
 from rfm.launch.installation import WHEEL_VERSION, Installation, ServerStartError
@@ -30,7 +28,7 @@ from rfm.launch.process_table import cpu_s_of_group
 from rfm.launch.repository_api import INDEX_PATH, versions_of
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm.launch.triton_options import check_arguments, size_limits
-from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE
+from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE, INSIDE_VARIABLE
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
@@ -69,11 +67,11 @@ class SpoiltStartError(ServerStartError):
 class TritonServer:
     """A tritonserver with all models of ``repository``. The context manager starts and stops it.
 
-    The kernel kills it when the thread that started it ends.
+    It ends with this process, whatever ends that.
 
     http_threads: threads that read HTTP requests; None: Triton's choice
     hang_s: seconds without progress of a batch after which a model process ends itself
-    log: file for Triton's log; None: this process's standard output and error
+    log: file for Triton's log; None: warnings and errors go to this process's standard error
     admin_key: key of the restricted APIs; None: a new random key
     accepts_known_vulnerabilities: True: listen on any address, even with a vulnerable Triton
     more_arguments: further arguments of tritonserver, such as ``--trace-config=...``
@@ -104,7 +102,7 @@ class TritonServer:
         self._http = Http(endpoints.http_host, endpoints.http_port, http_headers(self.admin_key))
         self._claim: Claim | None = None
         self._signal: int | None = None  # the last signal that was sent
-        self._process: subprocess.Popen[bytes] | None = None
+        self._group: ProcessGroup | None = None  # the newest
 
     @property
     def models(self) -> list[str]:
@@ -114,24 +112,29 @@ class TritonServer:
     @property
     def pid(self) -> int:
         """Id of the newest process."""
-        assert self._process is not None  # started
-        return self._process.pid
+        assert self._group is not None  # started
+        return self._group.process.pid
 
     @property
     def exit_status(self) -> int | None:
         """Exit status of the process; None while it runs."""
-        assert self._process is not None  # started
-        return self._process.poll()
+        assert self._group is not None  # started
+        return self._group.process.poll()
 
     def signal(self, number: int) -> None:
         """Send a signal to the process, now or as soon as it starts."""
         self._signal = number
-        if self._process is not None:
-            self._process.send_signal(number)
+        if self._group is not None:
+            self._group.process.send_signal(number)
+
+    def requests_inside(self) -> list[str]:
+        """Return the ids of requests inside model processes that have ended; if none has, inside all."""
+        return [] if self._claim is None else self._claim.requests_inside()
 
     def kill(self) -> None:
         """Kill the process and its children."""
-        self._kill_group()
+        assert self._group is not None  # started
+        self._group.kill()
 
     def start_ready(self, served: Mapping[str, Config] | None = None) -> None:
         """Start the process and wait until every model is ready. Repeat a spoilt start once.
@@ -147,17 +150,13 @@ class TritonServer:
             self.stop()
             self._start_ready(served)
 
-    def stop(self) -> int:
-        """End the server gracefully, by force after KILL_AFTER_S. Return its exit status, 0 if it never ran."""
-        status = 0
-        if self._process is not None:
-            end(self._process)
-            status = self._process.wait()
-            self._kill_group()  # model processes that Triton did not end in time
+    def stop(self) -> None:
+        """End the server gracefully, by force after KILL_AFTER_S."""
+        if self._group is not None:
+            self._group.end()
         if self._claim is not None:
             self._claim.release()
             self._claim = None
-        return status
 
     def __enter__(self) -> TritonServer:
         try:
@@ -206,37 +205,36 @@ class TritonServer:
         arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
         arguments += self._installation.lay_out_backends(self._claim.backends)
         arguments += self.endpoints.grpc_tls.arguments() if self.endpoints.grpc_tls else []
+        if self._log is None and not any(each.startswith("--log-") for each in self._more_arguments):
+            arguments += ["--log-info=false"]
         arguments += [*size_limits(self._installation, self._more_arguments), *self._more_arguments]
         program = self._installation.executable
         try:
-            self._process = subprocess.Popen(
+            self._group = ProcessGroup(
                 [program, *arguments],
-                env=self._environment(),
-                stdin=subprocess.DEVNULL,
+                env=self._environment(self._claim),
                 stdout=self._log,
                 stderr=self._log,
-                preexec_fn=ending_with_parent(),
                 pass_fds=[self._claim.lock_file],
-                start_new_session=True,  # so that only this process passes on a Ctrl-C in the terminal
             )
         except OSError as error:
             self._claim.release()
             self._claim = None
             raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
         if self._signal is not None:
-            self._process.send_signal(self._signal)
+            self._group.process.send_signal(self._signal)
 
     def _wait_ready(self, models: Collection[str]) -> None:
         """Wait until ``models`` are ready. Raises ServerStartError with the reasons of the models that failed."""
-        assert self._process is not None  # started
+        assert self._group is not None  # started
         started_s = worked_s = time.monotonic()
         cpu_s = 0.0
-        while self._process.poll() is None:
+        while (status := self.exit_status) is None:
             try:
                 version = self._http.json("/v2", ANSWER_TIMEOUT_S).get("version", "")
                 index = self._http.json(INDEX_PATH, ANSWER_TIMEOUT_S, "POST")
             except NO_ANSWER:  # usual while Triton loads
-                now_s, used_s = time.monotonic(), cpu_s_of_group(self.pid)
+                now_s, used_s = time.monotonic(), cpu_s_of_group(self._group.id)
                 if used_s - cpu_s > WORK_S:
                     cpu_s, worked_s = used_s, now_s
                 is_stalled, is_late = now_s - worked_s > STALLED_S, now_s - started_s > LOAD_S
@@ -253,8 +251,8 @@ class TritonServer:
                 raise ServerStartError(why, failed[0].name)
             check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
             return
-        kind = SpoiltStartError if self._process.returncode == -signal.SIGABRT else ServerStartError
-        raise kind(f"tritonserver: expected to run, got exit status {self._process.returncode}")
+        kind = SpoiltStartError if status == -signal.SIGABRT else ServerStartError
+        raise kind(f"tritonserver: expected to run, got {how_it_ended(status)}")
 
     def _load(self, name: str, config: Config) -> None:
         """Load a model with this configuration, over HTTP, since the gRPC port may demand a certificate."""
@@ -266,10 +264,6 @@ class TritonServer:
             raise ServerStartError(f"models: expected {name} to load, got: {error}", name) from error
         if status != HTTPStatus.OK:
             raise ServerStartError(f"models: expected {name} to load, got: {text}", name)
-
-    def _kill_group(self) -> None:
-        with suppress(ProcessLookupError):
-            os.killpg(self.pid, signal.SIGKILL)
 
     def _arguments(self, models: Sequence[str]) -> list[str]:
         return [
@@ -285,10 +279,10 @@ class TritonServer:
             *restrictions(self.admin_key),
         ]
 
-    def _environment(self) -> dict[str, str]:
+    def _environment(self, claim: Claim) -> dict[str, str]:
         own = {name: value for name, value in os.environ.items() if name not in SECRETS}
-        set_here = {**self._installation.environment, **NO_BYTECODE, HANG_VARIABLE: str(self._hang_s)}
-        return {**short_spin(own), **own, **set_here}
+        of_models = {HANG_VARIABLE: str(self._hang_s), INSIDE_VARIABLE: str(claim.requests)}
+        return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE, **of_models}
 
 
 def _remedy(reasons: str) -> str:

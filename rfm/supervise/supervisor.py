@@ -3,26 +3,29 @@
 
 from __future__ import annotations
 
+import logging
 import signal
-import subprocess
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from functools import partial
 from types import FrameType
 
 from rfm.launch import cleanup
-from rfm.launch.ending import end, ending_with_parent, stop_signals_to
+from rfm.launch.ending import ProcessGroup, how_it_ended, stop_signals_to
 from rfm.launch.installation import ServerStartError
 from rfm.launch.triton_server import POLL_S, Config, TritonServer
 from rfm.supervise.status import Status, StatusServer
 from rfm.supervise.watch import TRITON, TritonWatch, parts_of
+from rfm_client.contract.process_log import about
 
 GATEWAY = "gateway"
 STEADY_S = 60.0  # after a longer run, a process is not in a crash loop
 MOST = 5  # restarts in a row
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
+
+logger = logging.getLogger(__name__)
 
 
 class CrashLoopError(ServerStartError):
@@ -59,33 +62,32 @@ class GatewayProcess:
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
         self._back_off = BackOff(GATEWAY)
-        self._process: subprocess.Popen[bytes] | None = None
+        self._group: ProcessGroup | None = None
         self._due_s: float | None = None
 
     def start(self) -> None:
         """Start the gateway as a child process."""
-        self._process = subprocess.Popen(
-            self._command, stdin=subprocess.DEVNULL, preexec_fn=ending_with_parent(), start_new_session=True
-        )
+        self._group = ProcessGroup(self._command)
         self._back_off.started()
 
     def look(self) -> str | None:
         """Restart an ended gateway. Return why it ended; None: no restart. Raises CrashLoopError."""
-        if self._process is None or self._process.poll() is None:
+        if self._group is None or (status := self._group.process.poll()) is None:
             return None
-        why = f"exit status {self._process.returncode}"
+        why = how_it_ended(status)
         if self._due_s is None:
             self._due_s = time.monotonic() + self._back_off.pause_s(why)
         if time.monotonic() < self._due_s:
             return None
         self._due_s = None
+        self._group.end()
         self.start()
         return why
 
     def stop(self) -> None:
         """End the gateway after its requests in flight, by force after KILL_AFTER_S."""
-        if self._process is not None:
-            end(self._process)
+        if self._group is not None:
+            self._group.end()
 
 
 class Supervisor:
@@ -94,7 +96,6 @@ class Supervisor:
     gateway: command line of a gateway beside the server; None: no gateway
     status_port: port of the status server, on Triton's host; None: no status server
     probe_s, hang_s, triton_silent_s: see TritonWatch
-    say: prints a line about an event
     """
 
     def __init__(
@@ -106,12 +107,10 @@ class Supervisor:
         probe_s: float,
         hang_s: float,
         triton_silent_s: float,
-        say: Callable[[str], None],
     ) -> None:
         self._server = server
         self._gateway = None if gateway is None else GatewayProcess(gateway)
         self._status_port = status_port
-        self._say = say
         self._status = Status()
         self._new_watch = partial(
             TritonWatch, server, self._status, probe_s=probe_s, hang_s=hang_s, silent_s=triton_silent_s
@@ -123,10 +122,10 @@ class Supervisor:
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
         self._left_out: dict[str, str] = {}  # reasons by model: left out after too many faults in a row
 
-    def run(self) -> int:
-        """Serve. Return Triton's exit status. Raises ServerStartError for a failed start or a crash loop."""
+    def run(self) -> None:
+        """Serve until a stop signal. Raises ServerStartError for a failed start or a crash loop."""
         for path in cleanup.clear():
-            self._say(f"removed {path}, left by a killed server")
+            logger.info("removed %s, left by a killed server", path)
         self._status.record(dict.fromkeys(self._server.models, "it is loading"))
         for what in (TRITON, *self._server.models, *(() if self._gateway is None else (GATEWAY,))):
             self._status.restarts.labels(what)  # begins at 0, so that the first restart is an increase
@@ -135,14 +134,14 @@ class Supervisor:
             stop_signals_to(self._stop),
             nullcontext() if port is None else closing(StatusServer(host, port, self._status)),
         ):
-            return self._serve()
+            self._serve()
 
     def _stop(self, number: int, _frame: FrameType | None) -> None:
         self._is_to_stop.set()
         if self._watch is None:  # Triton is loading
             self._server.signal(signal.SIGTERM if number == signal.SIGHUP else number)
 
-    def _serve(self) -> int:
+    def _serve(self) -> None:
         try:
             self._start()
             if self._gateway is not None and self._watch is not None:
@@ -157,8 +156,7 @@ class Supervisor:
             if self._gateway is not None:  # before the server, so that requests in flight get answers
                 self._gateway.stop()
             self._close_watch()
-            status = self._server.stop()
-        return status
+            self._server.stop()
 
     def _start(self) -> None:
         """Start Triton with the versions served before (at first, the repository's). Raises ServerStartError."""
@@ -168,7 +166,7 @@ class Supervisor:
         if self._served is None:
             ends = self._server.endpoints
             urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
-            self._say(f"ready: {', '.join(self._server.models)} at {urls}")
+            logger.info("ready: %s at %s", ", ".join(self._server.models), urls)
         self._back_off.started()
         self._watch = self._new_watch(served=self._served or {})
 
@@ -177,7 +175,7 @@ class Supervisor:
         if self._watch is None:
             return
         if self._server.exit_status is not None:
-            self._start_again(TRITON, f"exit status {self._server.exit_status}")
+            self._start_again(TRITON, how_it_ended(self._server.exit_status))
         elif self._watch.fault is not None:
             self._start_again(*self._watch.fault)
         if self._gateway is not None and (why := self._gateway.look()):
@@ -192,6 +190,10 @@ class Supervisor:
 
         what: the model with the fault, or TRITON
         """
+        began_s = time.monotonic()
+        if inside := self._server.requests_inside():
+            with about(inside):
+                logger.warning("%s: these requests were inside when it failed", what)
         while not self._is_to_stop.is_set():
             self._close_watch()
             reason = why if what == TRITON else f"{what}: {why}"
@@ -209,6 +211,8 @@ class Supervisor:
             self._count(what, why)
             try:
                 self._start()
+                if self._watch is not None:
+                    logger.info("ready again after %.1f s", time.monotonic() - began_s)
                 return
             except ServerStartError as error:
                 what, why = error.model or what, str(error)
@@ -221,7 +225,7 @@ class Supervisor:
         if what not in served or not others:
             return False
         fault = f"had the last of {MOST + 1} faults in a row: {why}"
-        self._say(f"{what} is left out, since it {fault}")
+        logger.error("%s is left out, since it %s", what, fault)
         remedy = "`rfm models load`, or a restart of `rfm serve`, serves it again"
         reason = f"it is left out, since {what} {fault}; {remedy}"
         self._left_out |= dict.fromkeys(left_out, reason)
@@ -232,7 +236,7 @@ class Supervisor:
     def _count(self, what: str, why: str) -> None:
         self._status.restarts.labels(what).inc()
         restarted = GATEWAY if what == GATEWAY else TRITON
-        self._say(f"{restarted} is started again: {why if what == restarted else f'{what}: {why}'}")
+        logger.warning("%s is started again: %s", restarted, why if what == restarted else f"{what}: {why}")
 
     def _close_watch(self) -> None:
         if self._watch is not None:

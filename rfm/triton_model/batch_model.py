@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
 import time
-import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -17,13 +17,14 @@ import torch
 
 from rfm.engine.computation import is_by_this_torch
 from rfm.engine.execution import Execution
-from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, OLD_QUEUE_PARAMETERS
+from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, INSIDE_VARIABLE, OLD_QUEUE_PARAMETERS
 from rfm.probe_request import probe_request
+from rfm.triton_model import request_log
 from rfm.triton_model.metrics import InstanceMetrics
 from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.placement import Placement
 from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Request
-from rfm.triton_model.request_log import RequestLog
+from rfm.triton_model.requests_inside import RequestsInside
 from rfm.triton_model.shared_memory import close_to_other_users
 from rfm.triton_model.watchdog import Watchdog
 from rfm.triton_model.weights import check_digest
@@ -36,10 +37,13 @@ from rfm_client.contract.model_info import (
     REVISION_PARAMETER,
     SOURCE_PARAMETER,
 )
+from rfm_client.contract.process_log import write_log
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import Tensors
 
 ASKING_S = 0.01  # of the last batch, for each request that is asked for in vain; asking takes 0.1 ms
+
+logger = logging.getLogger(__name__)
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
@@ -60,6 +64,7 @@ class BatchModel(Generic[Question, Answer]):
     def initialize(self, args: Mapping[str, str]) -> None:
         """Called once by Triton when the model is loaded."""
         close_to_other_users()  # before any frames
+        write_log(f"{args['model_name']}/{args['model_version']}", os.environ)
         config = json.loads(args["model_config"])
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
         placement = Placement.of(args, config, settings)
@@ -70,19 +75,20 @@ class BatchModel(Generic[Question, Answer]):
         self._watchdog = Watchdog(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), self._is_working)
         check_digest(version, settings.get(DIGEST_PARAMETER, ""))
         placement.run(lambda: self.load(version, placement.device, settings))
+        self._inside = RequestsInside(os.environ.get(INSIDE_VARIABLE, ""))
         model = {"model": args["model_name"], "version": args["model_version"]}
         labels = {**model, "device": str(placement.device), "instance": args["model_instance_name"]}
         sample_types = _sample_types([spec["name"] for spec in config["input"]])
-        self._log = RequestLog(model)
         self._metrics = InstanceMetrics(labels, _checkpoint(settings), sample_types, lambda: self._watchdog.num_steps)
         self._blank_tensors = probe_request(config)
         self._num_warmups = sum(warmup.get("count") or 1 for warmup in config.get("model_warmup", []))
         if any(settings.get(name) for name in OLD_QUEUE_PARAMETERS):
-            self._log.note(f"{', '.join(OLD_QUEUE_PARAMETERS)} of an older export have no effect: export again")
+            logger.warning("%s of an older export have no effect: export again", ", ".join(OLD_QUEUE_PARAMETERS))
         told = settings.get(COMPUTATION_PARAMETER)
         if told and not is_by_this_torch(told):
             here = f"torch {torch.__version__}"
-            self._log.note(f"labels will name the export's computation, {told}, but this is {here}: export with {here}")
+            differs = "labels will name the export's computation, %s, but this is %s: export with %s"
+            logger.warning(differs, told, here, here)
         if self.works_ahead:
             max_tokens = int(settings.get(BUDGET_PARAMETER) or sys.maxsize)
             self._pipeline = Pipeline(
@@ -132,6 +138,7 @@ class BatchModel(Generic[Question, Answer]):
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
         """Take requests from Triton. Return their responses; None: the pipeline sends them later."""
         batch: list[Request[Question]] = [Request.of(inference) for inference in requests]
+        self._inside.add(batch)
         pipeline = self._pipeline
         if pipeline is None:
             return self._responses(batch, self._score)
@@ -157,6 +164,7 @@ class BatchModel(Generic[Question, Answer]):
             responses = [self._response(request) for request in batch]
         finally:
             self._is_executing = False
+            self._inside.remove(batch)
         self._count(scored)
         return responses
 
@@ -226,15 +234,17 @@ class BatchModel(Generic[Question, Answer]):
                 request.error = _first_error(request.answers)
         except Exception as error:  # noqa: BLE001  every request gets an answer or an error
             if len(batch) > 1:
-                _tell(self._log.report_batch, batch, error)
+                _tell(request_log.report_batch, batch, error)
                 return [scored for request in batch for scored in self._scored([request])]
             batch[0].fail(error)
             execution = Execution()
         return [(batch, execution)]
 
     def _send(self, scored: Scored[Question]) -> None:
-        for request in [request for part, _ in scored for request in part]:
+        batch = [request for part, _ in scored for request in part]
+        for request in batch:
             request.send(self._response(request))
+        self._inside.remove(batch)
         self._count(scored)
 
     def _response(self, request: Request[Question]) -> Any:
@@ -249,7 +259,7 @@ class BatchModel(Generic[Question, Answer]):
         for part, execution in scored:
             for request in part:
                 if request.error is not None:
-                    _tell(self._log.report, request)
+                    _tell(request_log.report, request)
             _tell(self._metrics.add, part, execution)
 
     def _score_blank(self) -> None:
@@ -262,11 +272,11 @@ class BatchModel(Generic[Question, Answer]):
 
 
 def _tell(tell: Callable[..., None], *what: Any) -> None:
-    """Call a function that logs or counts. Print its errors, since requests need their answers all the same."""
+    """Call a function that logs or counts. Log its errors, since requests need their answers all the same."""
     try:
         tell(*what)
-    except Exception:  # noqa: BLE001
-        traceback.print_exc()
+    except Exception:
+        logger.exception("requests could not be logged or counted")
 
 
 def _first_error(answers: Sequence[Any]) -> RewardError | None:

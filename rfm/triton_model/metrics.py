@@ -7,14 +7,16 @@ the sums every FLUSH_INTERVAL_S.
 
 from __future__ import annotations
 
+import logging
 import threading
-import traceback
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 from rfm.engine.execution import Execution
 from rfm.triton_model.request import OUTCOMES, SCORED, UNKNOWN_TYPE, Request
+
+logger = logging.getLogger(__name__)
 
 FLUSH_INTERVAL_S = 0.25
 
@@ -172,8 +174,6 @@ class InstanceMetrics:
         self._checkpoint_metric.set(float(is_served))
 
     def _log_once(self) -> None:
-        import triton_python_backend_utils as pb_utils
-
         if not self._has_failed:
             self._has_failed = True
-            pb_utils.Logger.log_error(f"metrics cannot be reported: {traceback.format_exc()}")
+            logger.exception("metrics cannot be reported")

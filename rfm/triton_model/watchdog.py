@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The watchdog of a model process: ends it if Triton has ended, a batch hangs, or the device is broken.
+"""The watchdog of a model process: ends it if a batch hangs, or the device is broken.
 
 ``rfm serve`` notices the end and restarts Triton.
 """
@@ -7,11 +7,10 @@
 from __future__ import annotations
 
 import faulthandler
+import logging
 import os
-import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -20,6 +19,8 @@ from rfm.triton_model.request import FAILED, SCORED, Request
 FAILED_BATCHES = 3  # failures in a row before the blank sample is scored
 _LOOK_S = 1.0
 _STDERR = 2
+
+logger = logging.getLogger(__name__)
 
 
 class Watchdog:
@@ -36,7 +37,6 @@ class Watchdog:
         self._num_failed = 0
         self._has_scored_blank = False  # only then a failure of the blank sample means a broken device
         self._closed = threading.Event()
-        self._triton = os.getppid()
         self._thread = threading.Thread(target=self._watch, name="rfm-watchdog", daemon=True)
         self._thread.start()
 
@@ -80,13 +80,10 @@ class Watchdog:
             if is_getting_on and time.monotonic() - armed_s > self._hang_s / 10:
                 seen, armed_s = self.num_steps, time.monotonic()
                 faulthandler.dump_traceback_later(self._hang_s, file=_STDERR, exit=True)
-            if os.getppid() != self._triton:
-                os._exit(1)
             self._closed.wait(min(_LOOK_S, self._hang_s / 10))
 
 
 def end(why: str) -> None:
-    """Print the current exception and the reason, and end the process at once."""
-    traceback.print_exc()
-    print(f"rfm: the model process ends: {why}", file=sys.stderr, flush=True)
+    """Log the current exception and the reason, and end the process at once."""
+    logger.exception("the model process ends: %s", why)
     os._exit(1)

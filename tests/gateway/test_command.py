@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,11 +13,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from gateways import running
+from gateways import inside, running
 from rfm.launch.triton_server import Endpoints
+from rfm_client.contract.process_log import LogLines
 from rfm_commands.cli import app
 from rfm_gateway.command import page_link
 from rfm_gateway.config import GatewayConfig
+from rfm_gateway.state import TritonState
 
 KEY = "open sesame"
 
@@ -27,7 +31,7 @@ def test_an_open_address_without_a_key_is_warned_of(tmp_path: Path, has_key: boo
     with running(Endpoints.free(), tmp_path, "rfm", *options) as gateway:
         assert gateway.get("/viewer/live", headers={"X-API-Key": KEY}).ok
         assert gateway.get("/viewer/live").ok is not has_key
-        warning = "WARNING rfm_gateway: 0.0.0.0 is no loopback address, and no key is required"
+        warning = "]: 0.0.0.0 is no loopback address, and no key is required"
         assert (warning in gateway.log) is not has_key
         assert f"look at rewards in the browser: {gateway.url}/\n" in gateway.log
         assert KEY not in gateway.log
@@ -89,3 +93,24 @@ LINKS = {
 @pytest.mark.parametrize(("link", "config"), LINKS.items())
 def test_a_browser_can_open_the_link(link: str, config: GatewayConfig) -> None:
     assert page_link(config) == link
+
+
+def test_every_line_about_a_failed_request_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def broken(_: TritonState) -> None:
+        raise RuntimeError("made up")
+
+    class Log(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            lines.extend(LogLines("rfm-gateway").format(record).splitlines())
+
+    lines: list[str] = []
+    monkeypatch.setattr(TritonState, "model_info", broken)
+    log, handler = logging.getLogger("rfm_gateway"), Log()
+    log.addHandler(handler)
+    try:
+        with inside() as client:
+            assert client.get("/model_info", headers={"X-Request-ID": "a/caller-s"}).status_code == 500
+    finally:
+        log.removeHandler(handler)
+    assert lines[-1].endswith(": RuntimeError: made up")
+    assert all(re.search(r" ERROR rfm-gateway\[\d+\] request=a/caller-s: ", line) for line in lines)

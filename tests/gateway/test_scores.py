@@ -290,7 +290,7 @@ def test_the_log_tells_of_samples_whose_pictures_show_nothing(encoders: Gateway,
     assert answered(response) == numbers(expected(encoders, samples))
     told = [line for line in encoders.log[begun:].splitlines() if "pictures" in line]
     got = "black pictures, no value above 2 (multiply floats in 0..1 by 255 before they become uint8)"
-    request = f"request {response.headers['X-Request-ID']}: samples 1, 2: {got}: their scores mean nothing"
-    assert [line.partition("WARNING rfm_gateway: ")[2] for line in told] == [request]
+    request = f" request={response.headers['X-Request-ID']}: samples 1, 2: {got}: their scores mean nothing"
+    assert [line.partition("]")[2] for line in told] == [request]
     answered(ask(encoders, [progress(filmed(1, 12))]))
     assert encoders.log[begun:].count("pictures") == 1

@@ -180,7 +180,7 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(trito
     finally:
         process.terminate()
         process.wait(WITHIN_S)
-    assert "rfm: gateway is started again: exit status -9" in gateway.log.splitlines()
+    assert "]: gateway is started again: killed by SIGKILL\n" in gateway.log
     assert len(set(started)) >= 4  # Triton, its model process, the first gateway and the second
     assert not [child for child in started if child.is_running()]
     assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))

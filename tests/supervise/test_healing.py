@@ -86,7 +86,11 @@ def test_what_dies_stops_hangs_or_is_silent_is_healed_and_no_call_is_lost_until_
         assert served.metric("rfm_serve_probe_seconds_count", model=MODEL) > 3
         assert len(served.said) == len(faults), served.said
         assert served.said[-1] == "rfm: triton is started again: no answer for 3 s"
-        assert "Timeout (0:00:03)!" in served.log.read_text()
+        log = served.log.read_text()
+        assert "Timeout (0:00:03)!" in log
+        again = re.findall(r"^\S+Z INFO rfm-serve\[\d+\]: ready again after \d+\.\d s$", log, re.MULTILINE)
+        assert len(again) == len(faults)
+        assert "rfm: triton is started again: killed by SIGKILL" in served.said
 
         def kill() -> bool:
             for pid in children(served.process.pid, "tritonserver"):
@@ -96,7 +100,7 @@ def test_what_dies_stops_hangs_or_is_silent_is_healed_and_no_call_is_lost_until_
 
         wait_for(kill)
     assert served.process.returncode == 1
-    wanted = r"rfm: triton: expected to run, got 6 faults in a row; the last: .*exit status -9"
+    wanted = r"rfm: triton: expected to run, got 6 faults in a row; the last: .*killed by SIGKILL"
     assert re.fullmatch(wanted, served.said[-1]), served.said
 
 
@@ -147,11 +151,13 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
         assert served.said == []
         config.write_text(one_version)
 
-        with pytest.raises(ServerUnavailableError, match="ended twice during this request"):
+        with pytest.raises(ServerUnavailableError, match="ended twice during this request") as ended:
             client.progress(trajectory(99, mark=DEADLY))
         # A process that dies before the supervisor has seen its command line counts as Triton's.
         wait_for(lambda: served.restarts(MODEL, "triton") == 2)
         served.wait_ready()
+        inside = re.findall(r" request=(\S+): \w+: these requests were inside", served.log.read_text())
+        assert [ended.value.request_id in ids.split(",") for ids in inside] == [True, True]
         np.testing.assert_allclose(client.progress(trajectory(0)).progress, references[0], rtol=0, atol=TOLERANCE)
 
         with Callers(client, references) as callers:

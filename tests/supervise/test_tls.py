@@ -363,4 +363,4 @@ def test_rfm_serve_heals_with_tls(mutual: Endpoints, papers: Papers, running: Se
     kill_model(repository)
     with client(mutual.grpc_url, **papers.client) as asked:  # it asks again until the model is back
         scores_right(asked)
-    assert re.search("rfm: triton is started again: (rfm: )?a process of it is dead", running.log.read_text())
+    assert re.search("triton is started again: (rfm: )?a process of it is dead", running.log.read_text())

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,6 +29,7 @@ from rfm_client import (
     Sample,
 )
 from rfm_client.contract import wire
+from rfm_client.contract.process_log import LEVEL_VARIABLE, LogLines
 from rfm_serve import wait_for
 from trajectories import random_trajectory
 
@@ -190,7 +192,7 @@ class MetricFamily:
 
 
 METRICS: list[Metric] = []
-LOGGED: list[dict[str, Any]] = []
+LOGGED: list[str] = []  # lines
 
 
 @pytest.fixture(autouse=True)
@@ -202,19 +204,23 @@ def backend(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for name, code in codes.items():
         setattr(error_of, name, code)
 
-    def log(line: str) -> None:
-        LOGGED.append(json.loads(line))
+    class Log(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            LOGGED.extend(LogLines("rfm/1").format(record).splitlines())
 
     module = SimpleNamespace(
         InferenceResponse=Response,
         TritonError=error_of,
         Tensor=lambda name, array: (name, array.tolist()),
         TRITONSERVER_RESPONSE_COMPLETE_FINAL=FINAL,
-        Logger=SimpleNamespace(log_error=log, log_info=log, log_verbose=log),
         MetricFamily=MetricFamily,
     )
     monkeypatch.setitem(sys.modules, "triton_python_backend_utils", module)  # type: ignore[arg-type]
+    monkeypatch.setenv(LEVEL_VARIABLE, "DEBUG")
+    log, handler = logging.getLogger("rfm"), Log()
+    log.addHandler(handler)
     yield
+    log.removeHandler(handler)
     while MODELS:
         MODELS.pop().finalize()
     METRICS.clear()

@@ -28,9 +28,9 @@ class BriefServer(TritonServer):
         if self._num_stops > before:  # the first start hung for a minute: too long for callers with a deadline
             CRASHES.append(self.repository)
 
-    def stop(self) -> int:
+    def stop(self) -> None:
         self._num_stops += 1
-        return super().stop()
+        super().stop()
 
     def __exit__(self, *raised: Any) -> None:
         if self.exit_status == -signal.SIGABRT:
@@ -49,7 +49,7 @@ class OneModelServer(BriefServer):
         self._own_log = log
 
     def signal(self, number: signal.Signals) -> None:
-        os.killpg(self.pid, number)
+        os.killpg(os.getpgid(self.pid), number)
 
     def kill(self) -> None:
         super().kill()

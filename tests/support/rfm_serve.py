@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import time
@@ -103,9 +104,11 @@ class Serving:
 
     @property
     def said(self) -> list[str]:
-        """By ``rfm serve`` itself, but for that it is ready."""
-        lines = self.log.read_text(errors="replace").splitlines()
-        return [line for line in lines if line.startswith("rfm: ") and not line.startswith("rfm: ready: ")]
+        """Messages of ``rfm serve`` itself, without the heads of its log, but for those about requests and readiness."""
+        log = re.sub(
+            r"^\S+Z [A-Z]+ rfm-serve\[\d+\]: ", "rfm: ", self.log.read_text(errors="replace"), flags=re.MULTILINE
+        )
+        return [line for line in log.splitlines() if re.match("rfm: (?!ready)", line)]
 
 
 @contextmanager
@@ -124,7 +127,7 @@ def serving(repository: Path, *more: str) -> Iterator[Serving]:
         yield served
     except BaseException:
         print("\n".join(served.said), file=sys.stderr)  # shown with the failed test
-        if any("exit status -6" in line for line in served.said):
+        if any("SIGABRT" in line for line in served.said):
             CRASHES.append(repository)
         raise
     finally:

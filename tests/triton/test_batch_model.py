@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -76,8 +77,9 @@ def test_refused_and_failed_requests_fail_alone(tmp_path: Path) -> None:
         ("unknown", "refused"): 1, ("unknown", "failed"): 1,
     }  # fmt: skip
     assert model.told("frames_total") == {(): 1}  # of what was scored
-    assert [entry["event"] for entry in LOGGED].count("request_refused") == 3
-    assert [entry["event"] for entry in LOGGED].count("request_failed") == 2
+    refused = [line for line in LOGGED if re.search(r" DEBUG rfm/1\[\d+\]: refused \((progress|unknown)\): ", line)]
+    failed = [line for line in LOGGED if re.search(r" ERROR rfm/1\[\d+\]: failed \((progress|unknown)\): ", line)]
+    assert (len(refused), len(failed)) == (3, 2)
 
 
 def test_a_question_that_cannot_be_prepared_is_refused_with_its_place(tmp_path: Path) -> None:
@@ -99,10 +101,12 @@ def test_a_request_that_breaks_a_batch_is_found(tmp_path: Path) -> None:
     responses = model.respond(request(1, id="a"), request(BREAKS, id="b"), request(5, id="c"))
     assert [response.error for response in responses] == [None, ("internal", REASON), None]
     assert model.batches == [3, 1, 1, 1]
-    together, alone = LOGGED
-    assert (together["event"], together["request_ids"]) == ("batch_failed", ["a", "b", "c"])
-    assert (alone["event"], alone["request_id"], alone["error"]) == ("request_failed", "b", REASON)
-    assert "RuntimeError: made up" in alone["traceback"]
+    together = [line for line in LOGGED if " request=a,b,c: " in line]
+    alone = [line for line in LOGGED if " request=b: " in line]
+    assert [*together, *alone] == LOGGED
+    assert together[0].endswith("the batch failed, now each request is scored alone")
+    assert alone[0].endswith(f": failed (progress): {REASON}")
+    assert [lines[-1].endswith(": RuntimeError: made up") for lines in (together, alone)] == [True, True]
     assert model.samples == {("progress", "scored"): 2, ("progress", "failed"): 1}
 
 
@@ -120,11 +124,11 @@ def test_answers_that_cannot_be_written_fail_alone(tmp_path: Path) -> None:
 
 
 def test_a_log_that_cannot_be_written_costs_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(line: str) -> None:
+    def full(*_: Any, **__: Any) -> None:
         raise OSError("no space")
 
     model = Model(tmp_path)
-    monkeypatch.setattr("triton_python_backend_utils.Logger.log_error", full)
+    monkeypatch.setattr("rfm.triton_model.request_log.logger.log", full)
     responses = model.respond(request(1), request(BREAKS))
     assert [response.error for response in responses] == [None, ("internal", REASON)]
     assert model.samples == {("progress", "scored"): 1, ("progress", "failed"): 1}
@@ -230,15 +234,12 @@ def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(
     def refused(*_: Any, **__: Any) -> None:
         raise ValueError("of another kind")
 
-    said: list[str] = []
     monkeypatch.setattr("triton_python_backend_utils.MetricFamily.__init__", refused)
-    monkeypatch.setattr("triton_python_backend_utils.Logger.log_error", said.append)
     model = Model(tmp_path)
     for _ in range(3):
         assert [response.error for response in model.respond(request(1), request(5))] == [None, None]
-    (line,) = said
-    assert line.startswith("metrics cannot be reported: ")
-    assert "of another kind" in line
+    assert [line.endswith(": metrics cannot be reported") for line in LOGGED].count(True) == 1
+    assert LOGGED[-1].endswith(": ValueError: of another kind")
 
 
 def test_metrics_know_the_checkpoint_and_what_can_be_asked(tmp_path: Path) -> None:
@@ -321,14 +322,14 @@ def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_watchdog_k
 def test_an_instance_notes_that_labels_name_another_pytorch(tmp_path: Path, told: str) -> None:
     """Clients read the PyTorch of the export, and write it into label files."""
     Model(tmp_path, settings={"computation": told})
-    noted = [entry["note"] for entry in LOGGED if "labels will name" in entry.get("note", "")]
+    noted = [line for line in LOGGED if "labels will name" in line]
     assert len(noted) == ("torch 1.0" in told)
     assert all(f"export with torch {torch.__version__}" in note for note in noted)
 
 
 def test_an_older_export_s_bound_of_the_queue_is_ignored_with_a_note(tmp_path: Path) -> None:
     model = Model(tmp_path, settings={"queue_timeout_ms": "1"})
-    assert "of an older export have no effect: export again" in LOGGED[0]["note"]
+    assert LOGGED[0].endswith("of an older export have no effect: export again")
     assert [response.error for response in model.respond(request(1), request(5))] == [None, None]
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 import re
@@ -38,6 +37,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
+from rfm_client.contract.process_log import LEVEL_VARIABLE
 from rfm_serve import Serving, children, serving, wait_for
 from trajectories import random_trajectory
 
@@ -69,23 +69,17 @@ class Running:
         endpoints = self.served.endpoints
         return RewardClient(endpoints.grpc_url if protocol == "grpc" else endpoints.http_url, retry=False)
 
-    def lines(self) -> list[tuple[str, dict[str, Any]]]:
-        """The model's own: severity and content."""
-        # With its verbose log on, Triton now and then writes two messages without a newline between them.
-        pattern = r'([IWE])\d{4} \S+ \d+ request_log\.py:\d+\] ("\{(?:[^"\\]|\\.)*\}")'
-        return [
-            (match[1], json.loads(json.loads(match[2]))) for match in re.finditer(pattern, self.served.log.read_text())
-        ]
+    def said_of(self, request_id: str, process: str = "rfm/1") -> list[tuple[str, str]]:
+        """Level and message of each line about a request. A process may write it a moment after its answer."""
+        head = (
+            rf"^\d{{4}}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{{3}}Z ([A-Z]+) {process}\[\d+\] request={re.escape(request_id)}: "
+        )
 
-    def said_of(self, request_id: str) -> tuple[str, dict[str, Any]]:
-        """The one line about a request. Triton may write it a moment after it has answered."""
+        def found() -> list[tuple[str, str]]:
+            return re.findall(f"{head}(.*)$", self.served.log.read_text(), re.MULTILINE)
 
-        def found() -> list[tuple[str, dict[str, Any]]]:
-            return [line for line in self.lines() if line[1].get("request_id") == request_id]
-
-        wait_for(lambda: bool(found()), PATIENCE_S)
-        (line,) = found()
-        return line
+        wait_for(found, PATIENCE_S)
+        return found()
 
 
 class Collector(ThreadingHTTPServer):
@@ -111,11 +105,8 @@ class Taker(BaseHTTPRequestHandler):
 def documented_options(traces_url: str) -> list[str]:
     """What docs/reference/logs_and_metrics.md tells to give tritonserver, but with this collector, and for every request."""
     text = " ".join(
-        re.findall(
-            r"--(?:trace-config|log-verbose)=[^\s`]+", (ROOT / "docs" / "reference" / "logs_and_metrics.md").read_text()
-        )
+        re.findall(r"--trace-config=[^\s`]+", (ROOT / "docs" / "reference" / "logs_and_metrics.md").read_text())
     )
-    assert "--log-verbose" in text
     text, count = re.subn(r"=opentelemetry,url=\S+", f"=opentelemetry,url={traces_url}", text)
     text, others = re.subn(r"=rate=\S+", "=rate=1", text)
     assert (count, others) == (1, 1)
@@ -133,6 +124,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     with Collector() as collector, pytest.MonkeyPatch.context() as environment:
         threading.Thread(target=collector.serve_forever).start()
         environment.setitem(os.environ, VARIABLE, KEY)
+        environment.setitem(os.environ, LEVEL_VARIABLE, "debug")
         options = documented_options(f"http://127.0.0.1:{collector.server_address[1]}/v1/traces")
         port = Endpoints.free().http_port
         with serving(repository, f"--gateway-port={port}", "--", *options) as served:
@@ -149,18 +141,14 @@ FAILING = ProgressSample(random_trajectory(0, 3), frame_steps=FAILING_STEPS)
 
 
 @pytest.mark.triton
-def test_what_is_refused_is_told_with_its_request_and_logged_as_verbose(running: Running, protocol: str) -> None:
+def test_what_is_refused_is_told_with_its_request_and_logged_at_debug(running: Running, protocol: str) -> None:
     with running.client(protocol) as client, pytest.raises(InvalidSampleError, match="at most 16") as raised:
         client.evaluate([TOO_LONG])
     request_id = str(raised.value.request_id)
     assert re.fullmatch(f"{RANDOM_ID.pattern}-1", request_id)
     assert str(raised.value) == f"{raised.value.message} (request {request_id})"
-    severity, said = running.said_of(request_id)
-    assert severity == "I"
-    assert said == {
-        "event": "request_refused", "model": "rfm", "version": "1", "request_id": request_id, "sample_type": "progress",
-        "error": raised.value.message.partition(": score some")[0],  # the remedy is the client's
-    }  # fmt: skip
+    reason = raised.value.message.partition(": score some")[0]  # the remedy is the client's
+    assert running.said_of(request_id) == [("DEBUG", f"refused (progress): {reason}")]
 
 
 @pytest.mark.triton
@@ -169,11 +157,11 @@ def test_what_failed_is_logged_as_an_error_with_its_traceback(running: Running) 
     with running.client() as client, pytest.raises(InferenceFailedError) as raised:
         client.evaluate([FAILING], request_id=name)
     assert str(raised.value) == f"scoring failed; the server's log has the reason (request {name}-1)"
-    severity, said = running.said_of(f"{name}-1")
-    assert severity == "E"
-    assert (said["event"], said["sample_type"]) == ("request_failed", "progress")
-    assert said["traceback"].startswith("Traceback (most recent call last):\n")
-    assert said["traceback"].endswith("ZeroDivisionError: a fault of the model's\n")
+    said = running.said_of(f"{name}-1")
+    assert {level for level, _ in said} == {"ERROR"}
+    assert said[0][1] == "failed (progress): scoring failed; the server's log has the reason"
+    assert said[1][1] == "Traceback (most recent call last):"
+    assert said[-1][1] == "ZeroDivisionError: a fault of the model's"
 
 
 @pytest.mark.triton
@@ -252,7 +240,7 @@ def test_the_gateway_passes_the_caller_s_id_on_and_returns_it(running: Running) 
     refused = asked(running, "of-the-caller", json=body(TOO_LONG))
     assert (refused.status_code, refused.headers["X-Request-ID"]) == (422, "of-the-caller")
     assert "(request" not in refused.text
-    assert running.said_of("of-the-caller-1")[1]["error"].startswith("num_frames: expected at most 16")
+    assert running.said_of("of-the-caller-1")[0][1].startswith("refused (progress): num_frames: expected at most 16")
     scored = asked(running, "of-the-caller", json=body(GOOD))
     assert (scored.status_code, scored.headers["X-Request-ID"]) == (200, "of-the-caller")
     answer = asked(running, "odd", data=b"no JSON")  # which it refuses itself

@@ -196,4 +196,4 @@ def test_a_pipeline_that_breaks_ends_the_process(stage: str) -> None:
     ended = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert ended.returncode == 1
     assert "SystemError: made up" in ended.stderr
-    assert "rfm: the model process ends: its pipeline has failed" in ended.stderr
+    assert "the model process ends: its pipeline has failed" in ended.stderr

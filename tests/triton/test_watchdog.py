@@ -81,18 +81,3 @@ def test_an_instance_that_fails_at_the_blank_sample_after_three_failed_batches_e
     """)
     assert (ended.returncode, ended.stdout) == (1, "goes on\n"), ended.stderr
     assert "a lost device" in ended.stderr
-
-
-def test_a_model_process_ends_with_triton() -> None:
-    code = textwrap.dedent(GUARD) + "print('runs', flush=True); time.sleep(3600)"
-    parent = subprocess.Popen(
-        [sys.executable, "-c", f"import subprocess, sys; subprocess.run([sys.executable, '-c', {code!r}])"],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert parent.stdout is not None
-    with parent.stdout as told:
-        assert told.readline() == "runs\n"
-        parent.kill()
-        parent.wait(PATIENCE_S)
-        assert told.read() == ""  # ends when the model process, which has inherited it, has ended

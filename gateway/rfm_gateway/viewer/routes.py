@@ -141,7 +141,7 @@ def viewer_routes(
         except RewardError as error:
             yield _event("failed", detail=str(error))
         except Exception as error:
-            logger.error("request %s: unexpected", asked.request_id, exc_info=error)
+            logger.error("unexpected", exc_info=error)
             yield _event("failed", detail="the gateway failed; its log has the reason")
         else:
             yield _event("done", model_version=version, took_s=time.monotonic() - began_s)
