@@ -27,6 +27,7 @@ from typing import Any
 
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.integrations.own_rewards import WritingMonitor, refuse_relabelling, warn_of_file, with_statistics
 from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
 try:
@@ -72,6 +73,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
     ) -> None:
         check_kind(env, gymnasium.Env)
         check_frame_source(options, env.render_mode, env.observation_space)
+        _check_statistics(env, options)
         super().__init__(env)
         self._rewarder = EpisodeRewarder(client, options)
         self._options = options
@@ -108,7 +110,15 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._rewarder.score({episode: self._has_ended})
         reward = episode.reward(float(env_reward))
         scores = {**episode.info(), "env_reward": float(env_reward)}
-        return observation, reward, bool(terminated or episode.succeeded), truncated, {**info, INFO: scores}
+        return (
+            observation,
+            reward,
+            bool(terminated or episode.succeeded),
+            truncated,
+            {**with_statistics(info, episode), INFO: scores},
+        )
+
+    compute_reward = refuse_relabelling
 
     def close(self) -> None:
         """Cancel open requests; close the environment, and the client if it was made here."""
@@ -155,6 +165,19 @@ def _check_shows_its_end(info: Info) -> None:
         expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"
         remedy = "turn off its own reset, and wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
         raise InvalidSampleError.at("info", expected, f"{', '.join(found)}; {remedy}")
+
+
+def _check_statistics(env: gymnasium.Env[Any, Any], options: RewardOptions) -> None:
+    """Raise ValueError for statistics that would miss episodes; warn of a file with the environment's rewards."""
+    ends = options.terminate_on_success
+    is_counted = ends is not None and env.has_wrapper_attr("episode_returns")
+    expected = "None with a Monitor or RecordEpisodeStatistics inside, which does not see this end"
+    remedy = "wrap in the other order: Monitor(RewardModelWrapper(...)); call make_vec_env with a function that makes "
+    require("terminate_on_success", not is_counted, expected, f"{ends}; {remedy}RewardModelWrapper(...)")
+    while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, WritingMonitor):
+            warn_of_file("env", "Monitor(RewardModelWrapper(...), filename)")
+        env = env.env
 
 
 def tasks_of(task: str | Sequence[str], num_envs: int) -> list[str]:
