@@ -18,6 +18,10 @@ does not predict it), its ``step``, its ``lag`` in steps, and the steps ``skippe
 ``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
 frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
 ResetNeeded. A step after an episode's end does, too, unless the environment resets in that step.
+
+``compute_reward`` raises NotImplementedError: hindsight relabelling would mix the environment's rewards with the model's.
+If a Monitor or RecordEpisodeStatistics inside the wrapper reports an episode, the wrapper puts the sum of the model's
+rewards into ``info["episode"]``.
 """
 
 from __future__ import annotations
@@ -60,7 +64,8 @@ class RewardModelWrapper(gymnasium.Wrapper):
     of ``env`` does the same, but does not see an end by ``terminate_on_success``. ``env`` itself must not reset in the
     step that ends an episode.
 
-    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, TypeError if ``env`` is no
+    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, and for ``terminate_on_success`` with
+    a Monitor or RecordEpisodeStatistics inside, which would miss that end; TypeError if ``env`` is no
     ``gymnasium.Env``.
     """
 

@@ -23,8 +23,9 @@ def refuse_relabelling(*_args: object, **_kwargs: object) -> NoReturn:
 def with_statistics(info: Info, episode: RewardedEpisode) -> Info:
     """Return the info of a step. Statistics from a Monitor inside the wrapper show the model's rewards."""
     told = info.get(_STATISTICS)
-    is_told = isinstance(told, dict) and "r" in told
-    return {**info, _STATISTICS: {**told, **_statistics(episode)}} if is_told else info
+    if not isinstance(told, dict) or "r" not in told:
+        return info
+    return {**info, _STATISTICS: {**told, **_statistics(episode)}}
 
 
 def correct_statistics(infos: Info, index: int, episode: RewardedEpisode) -> None:

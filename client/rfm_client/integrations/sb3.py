@@ -73,8 +73,9 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
 
     Raises ValueError if ``options`` names a source of frames that ``venv`` lacks; for frames from ``render()`` unless
     each environment is wrapped in RenderedFrame; and for ``terminate_on_success``, because an environment that resets
-    by itself does not know of the success: wrap each environment in RewardModelWrapper instead. Raises TypeError if
-    ``venv`` is no ``VecEnv``.
+    by itself does not know of the success: wrap each environment in RewardModelWrapper instead. Raises ValueError for a
+    ``VecNormalize`` inside: off-policy algorithms would store the rewards that it got. Raises TypeError if ``venv`` is
+    no ``VecEnv``.
     """
 
     def __init__(
