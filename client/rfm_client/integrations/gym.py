@@ -19,9 +19,9 @@ does not predict it), its ``step``, its ``lag`` in steps, and the steps ``skippe
 frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
 ResetNeeded. A step after an episode's end does, too, unless the environment resets in that step.
 
-``compute_reward`` raises NotImplementedError: hindsight relabelling would mix the environment's rewards with the model's.
-If a Monitor or RecordEpisodeStatistics inside the wrapper reports an episode, the wrapper puts the sum of the model's
-rewards into ``info["episode"]``.
+``compute_reward`` raises NotImplementedError: hindsight relabelling would mix the environment's rewards with the
+model's. If a Monitor or RecordEpisodeStatistics inside the wrapper reports an episode, the wrapper puts the sum of the
+model's rewards into ``info["episode"]``.
 """
 
 from __future__ import annotations
