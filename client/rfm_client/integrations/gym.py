@@ -18,6 +18,10 @@ does not predict it), its ``step``, its ``lag`` in steps, and the steps ``skippe
 ``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
 frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
 ResetNeeded. A step after an episode's end does, too, unless the environment resets in that step.
+
+``compute_reward`` raises NotImplementedError: hindsight relabelling would mix the environment's rewards with the
+model's. If a Monitor or RecordEpisodeStatistics inside the wrapper reports an episode, the wrapper puts the sum of the
+model's rewards into ``info["episode"]``.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ from typing import Any
 
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.integrations.own_rewards import WritingMonitor, refuse_relabelling, warn_of_file, with_statistics
 from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
 try:
@@ -59,7 +64,8 @@ class RewardModelWrapper(gymnasium.Wrapper):
     of ``env`` does the same, but does not see an end by ``terminate_on_success``. ``env`` itself must not reset in the
     step that ends an episode.
 
-    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, TypeError if ``env`` is no
+    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, and for ``terminate_on_success`` with
+    a Monitor or RecordEpisodeStatistics inside, which would miss that end; TypeError if ``env`` is no
     ``gymnasium.Env``.
     """
 
@@ -72,6 +78,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
     ) -> None:
         check_kind(env, gymnasium.Env)
         check_frame_source(options, env.render_mode, env.observation_space)
+        _check_statistics(env, options)
         super().__init__(env)
         self._rewarder = EpisodeRewarder(client, options)
         self._options = options
@@ -108,7 +115,15 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._rewarder.score({episode: self._has_ended})
         reward = episode.reward(float(env_reward))
         scores = {**episode.info(), "env_reward": float(env_reward)}
-        return observation, reward, bool(terminated or episode.succeeded), truncated, {**info, INFO: scores}
+        return (
+            observation,
+            reward,
+            bool(terminated or episode.succeeded),
+            truncated,
+            {**with_statistics(info, episode), INFO: scores},
+        )
+
+    compute_reward = refuse_relabelling
 
     def close(self) -> None:
         """Cancel open requests; close the environment, and the client if it was made here."""
@@ -155,6 +170,19 @@ def _check_shows_its_end(info: Info) -> None:
         expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"
         remedy = "turn off its own reset, and wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
         raise InvalidSampleError.at("info", expected, f"{', '.join(found)}; {remedy}")
+
+
+def _check_statistics(env: gymnasium.Env[Any, Any], options: RewardOptions) -> None:
+    """Raise ValueError for statistics that would miss episodes; warn of a file with the environment's rewards."""
+    ends = options.terminate_on_success
+    is_counted = ends is not None and env.has_wrapper_attr("episode_returns")
+    expected = "None with a Monitor or RecordEpisodeStatistics inside, which does not see this end"
+    remedy = "wrap in the other order: Monitor(RewardModelWrapper(...)); call make_vec_env with a function that makes "
+    require("terminate_on_success", not is_counted, expected, f"{ends}; {remedy}RewardModelWrapper(...)")
+    while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, WritingMonitor):
+            warn_of_file("env", "Monitor(RewardModelWrapper(...), filename)")
+        env = env.env
 
 
 def tasks_of(task: str | Sequence[str], num_envs: int) -> list[str]:

@@ -16,6 +16,7 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.episodes.steps import copied
 from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind, tasks_of
+from rfm_client.integrations.own_rewards import correct_statistics
 from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
 OfEnvs: TypeAlias = dict[int, RewardedEpisode]  # by number of the environment
@@ -95,6 +96,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         rewards = np.zeros(self.num_envs)
         for index, episode in stepped.items():
             rewards[index] = episode.reward(float(env_rewards[index]))
+            correct_statistics(infos, index, episode)
             scores: Info = {INFO: episode.info() | {"env_reward": float(env_rewards[index])}}
             infos = self._add_info(infos, {"final_info": scores} if index in final else scores, index)
         return observations, rewards, terminations | self._succeeded(), truncations, self._with_scores(infos, fresh)

@@ -167,6 +167,7 @@ class RewardedEpisode:
     size: size to which frames shrink; None: no change
     pending: open requests, with the future of each window
     known: the newest known score
+    total_reward: sum of its rewards until now
     """
 
     def __init__(self, options: RewardOptions, task: str, index: int | None, size: FrameSize | None) -> None:
@@ -176,6 +177,7 @@ class RewardedEpisode:
         self.pending: list[tuple[StepRequest, list[Future[ProgressResult]]]] = []
         self.known: StepScore | None = None
         self._paid_progress = np.nan
+        self.total_reward = 0.0
         self.num_skipped = 0
         self.succeeded = False  # ends the episode
         self._has_succeeded = self._has_bonus = self._has_ended = False
@@ -237,7 +239,9 @@ class RewardedEpisode:
         if self._has_succeeded and not self._has_bonus:
             self._has_bonus = True
             reward += options.success_bonus
-        return reward + env_reward if options.add_to_env_reward else reward
+        reward += env_reward if options.add_to_env_reward else 0.0
+        self.total_reward += reward
+        return reward
 
     def info(self) -> Info:
         """Return the newest known scores, and their lag in steps."""

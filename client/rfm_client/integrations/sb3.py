@@ -22,10 +22,23 @@ from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.episodes.steps import copied
 from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, tasks_of
 from rfm_client.integrations.gym_vector import check_differ
+from rfm_client.integrations.own_rewards import (
+    RELABELS,
+    WritingMonitor,
+    refuse_relabelling,
+    warn_of_file,
+    with_statistics,
+)
 from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
 try:
-    from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+    from stable_baselines3.common.vec_env import (
+        DummyVecEnv,
+        SubprocVecEnv,
+        VecEnv,
+        VecEnvWrapper,
+        unwrap_vec_normalize,
+    )
 except ImportError as error:
     raise ImportError('rfm_client.sb3 needs stable-baselines3: pip install "./client[sb3]"') from error
 
@@ -60,8 +73,9 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
 
     Raises ValueError if ``options`` names a source of frames that ``venv`` lacks; for frames from ``render()`` unless
     each environment is wrapped in RenderedFrame; and for ``terminate_on_success``, because an environment that resets
-    by itself does not know of the success: wrap each environment in RewardModelWrapper instead. Raises TypeError if
-    ``venv`` is no ``VecEnv``.
+    by itself does not know of the success: wrap each environment in RewardModelWrapper instead. Raises ValueError for a
+    ``VecNormalize`` inside: off-policy algorithms would store the rewards that it got. Raises TypeError if ``venv`` is
+    no ``VecEnv``.
     """
 
     def __init__(
@@ -82,6 +96,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         )
         instead = f"{options.terminate_on_success}; wrap each environment in RewardModelWrapper instead"
         require("terminate_on_success", options.terminate_on_success is None, "None, since a VecEnv resets", instead)
+        _check_own_rewards(venv)
         tasks = tasks_of(task, venv.num_envs)
         self._rewarder = EpisodeRewarder(client, options)  # before super, which reads the attributes
         self._reward_options, self._tasks = options, tasks
@@ -138,10 +153,25 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         rewards = np.zeros(self.num_envs, np.float32)
         for index, episode in enumerate(stepped):
             rewards[index] = episode.reward(float(env_rewards[index]))
+            infos[index] = with_statistics(infos[index], episode)
             infos[index][INFO] = episode.info() | {"env_reward": float(env_rewards[index])}
         for index in ended:
             self.reset_infos[index] |= {INFO: self._episodes[index].info()}
         return observations, rewards, dones, infos
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Call a method of the environments. Raises NotImplementedError for ``compute_reward``, which HER calls."""
+        if method_name == RELABELS:
+            refuse_relabelling()
+        results: list[Any] = self.venv.env_method(method_name, *args, indices=indices, **kwargs)
+        return results
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the environments. Raises NotImplementedError for ``compute_reward``."""
+        if attr_name == RELABELS:
+            refuse_relabelling()
+        values: list[Any] = self.venv.get_attr(attr_name, indices)
+        return values
 
     def close(self) -> None:
         """Cancel open requests; close the environments, and the client if it was made here."""
@@ -169,6 +199,16 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         where, expected = f"infos[{index}]", "the terminal_observation of the episode that ended in this step"
         require(where, "terminal_observation" in info, expected, f"none in {list(info)}", InvalidSampleError)
         return self._reward_options.frames_of(info["terminal_observation"])
+
+
+def _check_own_rewards(venv: Any) -> None:
+    """Raise ValueError where the environments' rewards would be learnt; warn where they would be written to a file."""
+    expected = "no VecNormalize inside, whose rewards SAC and other off-policy algorithms would learn from"
+    instead = "one; wrap in the other order: VecNormalize(RewardModelVecEnv(...))"
+    require("venv", unwrap_vec_normalize(venv) is None, expected, instead)
+    has_envs = isinstance(venv.unwrapped, (DummyVecEnv, SubprocVecEnv))  # other kinds may not be able to look
+    if isinstance(venv, WritingMonitor) or (has_envs and any(venv.env_is_wrapped(WritingMonitor))):
+        warn_of_file("venv", "VecMonitor(RewardModelVecEnv(...), filename)")
 
 
 def _of_env(observations: Any, index: int) -> Any:
