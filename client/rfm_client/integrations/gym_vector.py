@@ -25,9 +25,7 @@ from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info,
 OfEnvs: TypeAlias = dict[int, RewardedEpisode]  # by number of the environment
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
-_INSTEAD_OF_SAME_STEP = (
-    "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP (a ManiSkillVectorEnv with auto_reset=True)"
-)
+_INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
 _MANI_SKILL_MASK = "env_idx"  # ManiSkill's key in the options of a reset
 _RESET_MASK = "reset_mask"  # key in the options of a reset, which Gymnasium's vectors remove
 
@@ -222,7 +220,8 @@ class RewardModelVectorWrapper(VectorWrapper):
         missing = [index for index, observation in final.items() if observation is None]
         if missing:
             expected = f"final_obs of the environments {missing}, whose episodes ended in this step"
-            raise InvalidSampleError.at("infos", expected, f"none in {list(infos)}; {_INSTEAD_OF_SAME_STEP}")
+            remedy = f"{_INSTEAD_OF_SAME_STEP}, or a ManiSkillVectorEnv with auto_reset=True"
+            raise InvalidSampleError.at("infos", expected, f"none in {list(infos)}; {remedy}")
         return final
 
     def _with_scores(self, infos: Info, fresh: OfEnvs) -> Info:
