@@ -109,6 +109,17 @@ def test_success_ends_an_episode_of_a_vector_that_the_caller_resets(client: Rewa
     assert told[4]["reward_model"]["step"].tolist() == [2, 2]
 
 
+def test_a_mask_of_a_reset_may_be_a_list(client: RewardClient) -> None:
+    env = RewardModelVectorWrapper(vector_env([cart_pole] * 2, DISABLED), client, TASK)
+    env.reset(seed=0)
+    given = {"reset_mask": [True, False]}
+    infos = env.reset(options=given)[1]
+    assert infos["reward_model"]["_progress"].tolist() == [True, False]
+    assert given == {"reset_mask": [True, False]}
+    with pytest.raises(ValueError, match=r"^reset_mask: expected bool \[2\], got int64 \[1\]$"):
+        env.reset(options={"reset_mask": [0]})
+
+
 REFUSED_VECTORS: dict[str, tuple[AutoresetMode, Any, dict[str, Any], str]] = {
     "tasks": (DISABLED, [TASK] * 3, {}, "^task: expected one for each of the 2 environments, got 3$"),
     "rendered, SAME_STEP": (

@@ -74,10 +74,22 @@ PAID: dict[str, tuple[dict[str, Any], list[float]]] = {
     "absolute": ({}, list(PROGRESS[1:])),
     "delta": ({"mode": "delta"}, changes(1)),
     "shaping": ({"mode": "shaping", "gamma": GAMMA}, changes(GAMMA)),
+    "shaping with a bonus": (
+        {"mode": "shaping", "gamma": GAMMA, "success_bonus": 10.0, "success": SuccessRule(0.65)},
+        [*changes(GAMMA)[:-1], 10 - PROGRESS[3]],
+    ),
+    "shaping of the environment's own, ended by a success": (
+        {"mode": "shaping", "gamma": GAMMA, "add_to_env_reward": True, "terminate_on_success": SuccessRule(0.5)},
+        [1 + changes(GAMMA)[0], 1 - PROGRESS[1]],
+    ),
+    "shaping, ended by a success": (
+        {"mode": "shaping", "gamma": GAMMA, "terminate_on_success": SuccessRule(0.5)},
+        changes(GAMMA)[:2],
+    ),
     "shaping, every second step": ({"mode": "shaping", "gamma": GAMMA, "every": 2}, changes(GAMMA, STALE)),
     "shaping of the environment's own": (
         {"mode": "shaping", "gamma": GAMMA, "scale": 2.0, "add_to_env_reward": True},
-        [1 + 2 * change for change in changes(GAMMA)],
+        [*(1 + 2 * change for change in changes(GAMMA)[:-1]), 1 - 2 * PROGRESS[3]],
     ),
     "final": ({"mode": "final"}, [0, 0, 0, PROGRESS[LAST]]),
     "final, scaled": ({"mode": "final", "scale": 3.0}, [0, 0, 0, 3 * PROGRESS[LAST]]),
@@ -108,6 +120,38 @@ def test_a_policy_that_hovers_earns_nothing_by_shaping(judge: Judge) -> None:
         paid = rewards(judge, mode="shaping", gamma=GAMMA, every=every)
         discounted = sum(GAMMA**t * reward for t, reward in enumerate(paid))
         assert discounted == pytest.approx(GAMMA**LAST * PROGRESS[LAST] - PROGRESS[0], abs=1e-6)
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["terminated", "truncated"])
+@pytest.mark.parametrize("kind", ["one", "vector", "VecEnv"])
+def test_shaping_of_another_reward_leaves_its_best_policies_as_they_are(judge: Judge, kind: str, number: int) -> None:
+    """What shaping adds to an episode that terminates depends on its reset alone; after a time limit, on its last state."""
+    options = RewardOptions(
+        mode="shaping", gamma=GAMMA, add_to_env_reward=True, sampling="all", frames_from="pixels", scale=2.0
+    )
+    sums = []
+    for length in (2, LAST):
+        paid = paid_by(kind, partial(CodedEnv, number, (length,)), judge, options, length)
+        sums.append(sum(GAMMA**t * (reward - 1) for t, reward in enumerate(paid)))
+    kept = [0.0, 0.0] if number == 0 else [2 * GAMMA**length * PROGRESS[length] for length in (2, LAST)]
+    assert sums == pytest.approx([left - 2 * PROGRESS[0] for left in kept], abs=1e-6)
+
+
+def paid_by(kind: str, make: Any, judge: Judge, options: RewardOptions, length: int) -> list[float]:
+    """Rewards of an episode's steps, by a wrapper of each kind."""
+    if kind == "one":
+        env: Any = RewardModelWrapper(make(), judge, TASK, options)
+        env.reset()
+        return [env.step(0)[1] for _ in range(length)]
+    if kind == "vector":
+        env = RewardModelVectorWrapper(SyncVectorEnv([make]), judge, TASK, options)
+    else:
+        vectors = pytest.importorskip("stable_baselines3.common.vec_env", reason="the extra sb3 is not installed")
+        from rfm_client.sb3 import RewardModelVecEnv
+
+        env = RewardModelVecEnv(vectors.DummyVecEnv([make]), judge, TASK, options)
+    env.reset()
+    return [float(env.step(np.zeros(1, int))[1][0]) for _ in range(length)]
 
 
 def test_final_scores_only_the_ends_unless_a_success_is_looked_for(judge: Judge) -> None:

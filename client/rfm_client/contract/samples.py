@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
@@ -209,6 +210,14 @@ def as_array(values: Any) -> npt.NDArray[Any]:
         tensor = values.detach().cpu()
         values = (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
     return np.asarray(values)
+
+
+def checked_mask(where: str, mask: npt.ArrayLike, count: int) -> npt.NDArray[np.bool_]:
+    """Return a mask, bool [count], given as an array, list or tensor. Raises ValueError."""
+    array = as_array(mask)
+    is_mask = array.dtype == np.bool_ and array.shape == (count,)
+    require(where, is_mask, f"bool [{count}]", f"{array.dtype} {list(array.shape)}")
+    return array
 
 
 def _checked_frames(frames: Any) -> UInt8Array:

@@ -16,7 +16,7 @@ import numpy as np
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
-from rfm_client.contract.samples import as_array
+from rfm_client.contract.samples import checked_mask
 from rfm_client.data.sampling import Sampling
 from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, StepScores, copied
 from rfm_client.episodes.windows import EpisodeFrame
@@ -278,7 +278,4 @@ def _indices(mask: npt.ArrayLike | None, count: int) -> list[int]:
     """Indices of the episodes in a mask. Raises ValueError unless it is bool [count]."""
     if mask is None:
         return list(range(count))
-    array = np.asarray(as_array(mask))
-    is_mask = array.dtype == np.bool_ and array.shape == (count,)
-    require("mask", is_mask, f"bool [{count}]", f"{array.dtype} {list(array.shape)}")
-    return [int(index) for index in np.flatnonzero(array)]
+    return [int(index) for index in np.flatnonzero(checked_mask("mask", mask, count))]

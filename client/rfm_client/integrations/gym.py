@@ -22,11 +22,14 @@ ResetNeeded. A step after an episode's end does, too, unless the environment res
 ``compute_reward`` raises NotImplementedError: hindsight relabelling would mix the environment's rewards with the
 model's. If a Monitor or RecordEpisodeStatistics inside the wrapper reports an episode, the wrapper puts the sum of the
 model's rewards into ``info["episode"]``.
+
+A time limit belongs inside the wrapper, as ``gymnasium.make`` puts it. A reset of an unended episode that drops a
+reward logs a warning, once. In mode ``final``, a second such reset in a row raises ValueError.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from rfm_client.contract.checks import require
@@ -49,6 +52,10 @@ _ENDS = (
 )  # in info, if the step that ended an episode also reset
 
 DEFAULTS = RewardOptions()
+_UNBATCH = (
+    "ManiSkill: RewardModelVectorWrapper(ManiSkillVectorEnv(env), ...), or CPUGymWrapper(env) if there is one; "
+    "Isaac Lab never shows an episode's last frame: score its frames with client.episodes(num_envs, task)"
+)
 LOST = "an earlier call failed before its frame was kept"
 
 
@@ -83,17 +90,15 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._rewarder = EpisodeRewarder(client, options)
         self._options = options
         self._task = task
-        self._autoresets: list[gymnasium.wrappers.Autoreset] = []  # among the environment's wrappers
-        while isinstance(env, gymnasium.Wrapper):
-            if isinstance(env, gymnasium.wrappers.Autoreset):
-                self._autoresets.append(env)
-            env = env.env
+        self._autoresets = [layer for layer in _layers(env) if isinstance(layer, gymnasium.wrappers.Autoreset)]
         self._episode: RewardedEpisode | None = None
         self._is_whole = False  # all frames of the episode are kept
         self._has_ended = False
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment and score its first frame. Cancel open requests. Raises RewardError."""
+        """Reset the environment and score its first frame. Cancel open requests. Raises RewardError, ValueError."""
+        if self._episode is not None and self._is_whole:
+            self._rewarder.check_reset([self._episode])
         self._is_whole = False
         observation, info = self.env.reset(seed=seed, options=options)
         self._has_ended = False
@@ -113,7 +118,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         episode.add(self._frame(observation))
         self._is_whole = True
         self._rewarder.score({episode: self._has_ended})
-        reward = episode.reward(float(env_reward))
+        reward = episode.reward(float(env_reward), bool(terminated))
         scores = {**episode.info(), "env_reward": float(env_reward)}
         return (
             observation,
@@ -157,11 +162,29 @@ class RewardModelWrapper(gymnasium.Wrapper):
 
 
 def check_kind(env: Any, kind: type[Any]) -> None:
-    """Raise TypeError for another kind of environment."""
-    if not isinstance(env, kind):
-        got = f"{type(env).__module__}.{type(env).__name__}"
+    """Raise TypeError for another kind of environment, and for an ``Env`` that is a batch of environments."""
+    is_batch = isinstance(env, gymnasium.Env) and _is_batch(env)
+    if is_batch or not isinstance(env, kind):
+        of = env.unwrapped if is_batch else env
+        got = f"{type(of).__module__}.{type(of).__name__}"
         remedy = "for a gymnasium vector use RewardModelVectorWrapper; else wrap each environment in RewardModelWrapper"
+        if is_batch:
+            got, remedy = f"an Env that is a batch of environments, {got}", _UNBATCH
         raise TypeError(f"env: expected a gymnasium {kind.__name__}, got {got}; {remedy}")
+
+
+def _layers(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
+    """The environment, and those inside its wrappers."""
+    yield env
+    while isinstance(env, gymnasium.Wrapper):
+        env = env.env
+        yield env
+
+
+def _is_batch(env: gymnasium.Env[Any, Any]) -> bool:
+    """True for an environment of ManiSkill or Isaac Lab, unless a wrapper picks the only environment of its batch."""
+    single = getattr(env.unwrapped, "single_observation_space", None)
+    return single is not None and all(layer.observation_space != single for layer in _layers(env))
 
 
 def _check_shows_its_end(info: Info) -> None:

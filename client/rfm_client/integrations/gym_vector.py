@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Vectors of Gymnasium environments with the reward of a served reward model. ``gym.py`` states the rules."""
+"""Vectors of Gymnasium environments with the reward of a served reward model. ``gym.py`` states the rules.
+
+A vector may return torch tensors on a GPU, as ManiSkillVectorEnv does. Nothing here imports torch.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from gymnasium.vector.utils import iterate
 
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.samples import as_array, checked_mask
 from rfm_client.episodes.steps import copied
 from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind, tasks_of
 from rfm_client.integrations.own_rewards import correct_statistics
@@ -23,6 +27,8 @@ OfEnvs: TypeAlias = dict[int, RewardedEpisode]  # by number of the environment
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
 _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
+_MANI_SKILL_MASK = "env_idx"  # ManiSkill's key in the options of a reset
+_RESET_MASK = "reset_mask"  # key in the options of a reset, which Gymnasium's vectors remove
 
 
 class RewardModelVectorWrapper(VectorWrapper):
@@ -33,7 +39,9 @@ class RewardModelVectorWrapper(VectorWrapper):
     client: as in RewardModelWrapper
     task: one task sentence for all sub-environments, or a sequence with a sentence for each
 
-    ``infos["reward_model"]`` has arrays and masks, like Gymnasium's own infos. The mode of autoreset matters:
+    Rewards are float64 [num_envs]. If ``env`` returns tensors, they are a float32 tensor on its device; terminations
+    are a tensor, too. ``infos["reward_model"]`` has arrays and masks, like Gymnasium's own infos. The mode of autoreset
+    matters:
 
     - SAME_STEP: the last scores of an ended episode are in ``infos["final_info"]``.
     - NEXT_STEP: a step that only resets a sub-environment has reward 0, as in Gymnasium. It waits for the score of that
@@ -67,15 +75,22 @@ class RewardModelVectorWrapper(VectorWrapper):
         self._ended: Mask = np.zeros(env.num_envs, np.bool_)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environments, or those in ``reset_mask``, and score their first frames. Raises RewardError."""
-        everyone = np.ones(self.num_envs, np.bool_)
-        reset_mask = (options or {}).get("reset_mask", everyone)  # read first: env.reset removes it
+        """Reset the environments, or those in ``reset_mask``, and score their first frames.
+
+        options: passed on; ``reset_mask`` may be an array, a list or a tensor, bool [num_envs]
+
+        Raises RewardError; ValueError for a wrong mask, a vector that does not read it, and as RewardModelWrapper.
+        """
+        reset_mask, options = self._masked(options)
         self._check_can_reset(self._resetting & reset_mask)
+        indices = np.flatnonzero(reset_mask).tolist()
+        before = [self._episodes[index] for index in indices if index in self._episodes]
+        self._rewarder.check_reset(self._episodes[index] for index in np.flatnonzero(reset_mask & self._whole).tolist())
         whole, self._whole = self._whole, np.zeros_like(self._whole)
         observations, infos = self.env.reset(seed=seed, options=options)
+        self._check_was_masked(options)
         self._whole, self._ended = whole & ~reset_mask, self._ended & ~reset_mask
-        indices = np.flatnonzero(reset_mask).tolist()
-        for episode in [self._episodes[index] for index in indices if index in self._episodes]:
+        for episode in before:
             episode.end()
         shown = self._shown(observations)
         fresh = {index: self._begin(index, self._frame(shown[index])) for index in indices}
@@ -83,23 +98,26 @@ class RewardModelVectorWrapper(VectorWrapper):
         return observations, self._with_scores(infos, fresh)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Info]:
-        """Step the environments; return the model's rewards, float64 [num_envs]. Raises RewardError, ResetNeeded."""
+        """Step the environments; return the model's rewards, [num_envs]. Raises RewardError, ResetNeeded."""
         self._check_can_step()
         resetting = self._resetting
         self._whole = np.zeros_like(self._whole)  # until each frame is kept
         observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
-        self._ended = ended = terminations | truncations
+        terminated, truncated, paid = map(as_array, (terminations, truncations, env_rewards))
+        self._ended = ended = terminated | truncated
         stepped, fresh, final = self._added(self._shown(observations), infos, resetting)
         self._rewarder.score(
             {episode: bool(ended[index]) for index, episode in stepped.items()} | dict.fromkeys(fresh.values(), False)
         )
         rewards = np.zeros(self.num_envs)
         for index, episode in stepped.items():
-            rewards[index] = episode.reward(float(env_rewards[index]))
+            rewards[index] = episode.reward(float(paid[index]), bool(terminated[index]))
             correct_statistics(infos, index, episode)
-            scores: Info = {INFO: episode.info() | {"env_reward": float(env_rewards[index])}}
+            scores: Info = {INFO: episode.info() | {"env_reward": float(paid[index])}}
             infos = self._add_info(infos, {"final_info": scores} if index in final else scores, index)
-        return observations, rewards, terminations | self._succeeded(), truncations, self._with_scores(infos, fresh)
+        terminated = terminated | self._succeeded()
+        infos = self._with_scores(infos, fresh)
+        return observations, _like(env_rewards, rewards), _like(terminations, terminated), truncations, infos
 
     def close(self, **kwargs: Any) -> None:
         """Cancel open requests; close the environments, and the client if it was made here."""
@@ -107,6 +125,21 @@ class RewardModelVectorWrapper(VectorWrapper):
             episode.end()
         self._rewarder.close()
         super().close(**kwargs)
+
+    def _masked(self, options: Info | None) -> tuple[Mask, Info | None]:
+        """The environments to reset, and the options with the mask as an array. Raises ValueError."""
+        got = f"{_MANI_SKILL_MASK}; ManiSkillVectorEnv resets ended environments itself"
+        require("options", _MANI_SKILL_MASK not in (options or {}), "a reset of all environments", got)
+        if options is None or _RESET_MASK not in options:
+            return np.ones(self.num_envs, np.bool_), options
+        mask = checked_mask(_RESET_MASK, options[_RESET_MASK], self.num_envs)
+        return mask, {**options, _RESET_MASK: mask}
+
+    def _check_was_masked(self, options: Info | None) -> None:
+        """Raise ValueError if a vector with a reset of its own has not read the mask: it may have reset all."""
+        is_left = options is not None and _RESET_MASK in options and self._autoreset_mode is not AutoresetMode.DISABLED
+        got = f"{type(self.unwrapped).__name__}, which left it there; reset all environments"
+        require(_RESET_MASK, not is_left, "a vector that takes it out of the options", got)
 
     def _check_can_reset(self, twice: Mask) -> None:
         """Raise ValueError where workers of Gymnasium (1.4) would reset again in the next step, despite this reset.
@@ -169,7 +202,8 @@ class RewardModelVectorWrapper(VectorWrapper):
 
     def _shown(self, observations: Any) -> Sequence[Any]:
         if self._options.renders:
-            shown = list(self.env.render() or ())
+            rendered = self.env.render()
+            shown = [] if rendered is None else list(rendered)
         else:
             shown = list(iterate(self.env.observation_space, observations))
         expected = f"one of each of the {self.num_envs} environments"
@@ -182,17 +216,28 @@ class RewardModelVectorWrapper(VectorWrapper):
     def _final_observations(self, infos: Info) -> dict[int, Any]:
         """Last observations of ended episodes, whose environments already show the next episode."""
         observations = infos.get("final_obs", [None] * self.num_envs)
+        if "final_obs" not in infos and "final_observation" in infos:  # ManiSkill's, a batch like the observations
+            observations = list(iterate(self.env.observation_space, infos["final_observation"]))
         final = {index: observations[index] for index in np.flatnonzero(self._ended).tolist()}
         missing = [index for index, observation in final.items() if observation is None]
         if missing:
             expected = f"final_obs of the environments {missing}, whose episodes ended in this step"
-            raise InvalidSampleError.at("infos", expected, f"none in {list(infos)}; {_INSTEAD_OF_SAME_STEP}")
+            remedy = f"{_INSTEAD_OF_SAME_STEP}, or a ManiSkillVectorEnv with auto_reset=True"
+            raise InvalidSampleError.at("infos", expected, f"none in {list(infos)}; {remedy}")
         return final
 
     def _with_scores(self, infos: Info, fresh: OfEnvs) -> Info:
         for index, episode in fresh.items():
             infos = self._add_info(infos, {INFO: episode.info()}, index)
         return infos
+
+
+def _like(given: Any, values: npt.NDArray[Any]) -> Any:
+    """The values, as a tensor on the device of ``given`` if this is a tensor: float32, or bool."""
+    if not hasattr(given, "new_tensor"):  # torch may not be installed
+        return values
+    typed = given.bool() if values.dtype == np.bool_ else given.float()  # ManiSkill's sparse rewards are bool
+    return typed.new_tensor(values)
 
 
 def check_differ(where: str, last: Any, first: Any, instead: str) -> None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,6 +24,7 @@ from rfm_client.data.orientation import ChannelOrder, Orientation
 from rfm_client.data.sampling import Rule
 from rfm_client.episodes.live import LiveView
 from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, SuccessRule
+from rfm_client.integrations.unpaid import UnpaidResets
 
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
@@ -43,9 +44,9 @@ class RewardOptions:
 
     mode: ``absolute``: the reward is the newest known progress. ``delta``: its change since the step before, so that an
         episode's rewards add up to its last known progress minus its first, however late scores come. ``shaping``:
-        ``gamma`` times the newest known progress minus that of the step before (potential-based shaping). ``final``: 0,
-        and at the last step of an episode its progress; without a rule of success, only the reset and the last step
-        are scored
+        ``gamma`` times the newest known progress minus that of the step before (potential-based shaping; where it is
+        added to a reward, the progress of a terminal state counts as 0). ``final``: 0, and at the last step of an
+        episode its progress; without a rule of success, only the reset and the last step are scored
     gamma: discount of the policy's training, above 0 and at most 1, for ``shaping`` alone
     scale: factor of this reward
     success_bonus: added once an episode, at the first step that is known to succeed by ``success``, or by
@@ -134,6 +135,15 @@ class RewardOptions:
         """The rule that ends episodes or decides the bonus; None: success decides nothing."""
         return self.terminate_on_success or self.success or (SuccessRule() if self.success_bonus else None)
 
+    @property
+    def shapes_another(self) -> bool:
+        """True if ``shaping`` is added to another reward, whose best policies it then keeps.
+
+        This needs a potential of 0 in terminal states (Ng, Harada and Russell 1999; Grzes 2017). Alone, such a shaping
+        would add up to the same return for every policy, so there the last progress counts.
+        """
+        return self.mode == "shaping" and (self.add_to_env_reward or self.success_bonus != 0)
+
     def is_due(self, step: int) -> bool:
         """True if a step between the first and the last of an episode is scored."""
         return (self.mode != "final" or self.success_rule is not None) and step % self.every == 0
@@ -172,6 +182,7 @@ class RewardedEpisode:
 
     def __init__(self, options: RewardOptions, task: str, index: int | None, size: FrameSize | None) -> None:
         where = "" if index is None else f"envs[{index}]"
+        self.index = index
         self.frames = EpisodeFrames(task, options.scoring, index or 0, where)
         self._options, self._size = options, size
         self.pending: list[tuple[StepRequest, list[Future[ProgressResult]]]] = []
@@ -181,6 +192,17 @@ class RewardedEpisode:
         self.num_skipped = 0
         self.succeeded = False  # ends the episode
         self._has_succeeded = self._has_bonus = self._has_ended = False
+
+    @property
+    def num_steps(self) -> int:
+        """Number of steps since the reset."""
+        return self.frames.step
+
+    @property
+    def is_unpaid(self) -> bool:
+        """True if the episode goes on, and a step of it is not yet paid."""
+        paid = 0 if self.known is None or self._options.mode == "final" else self.known.step
+        return not self._has_ended and self.num_steps > paid
 
     def add(self, frame: Any) -> None:
         """Add a copy of a frame, uint8 [H, W, 3], or of a dict of these by camera. Raises InvalidSampleError."""
@@ -230,10 +252,15 @@ class RewardedEpisode:
         self.succeeded |= ending is not None and score.succeeded
         self.frames.report(score)
 
-    def reward(self, env_reward: float) -> float:
-        """Return the reward of the newest step, once it has been scored if it is due."""
+    def reward(self, env_reward: float, terminated: bool) -> float:
+        """Return the reward of the newest step, once it has been scored if it is due.
+
+        terminated: True if the environment has reached a terminal state; False at a time limit
+        """
         options = self._options
         progress = np.nan if self.known is None else self.known.progress
+        if options.shapes_another and (terminated or self.succeeded):
+            progress = 0.0
         before, self._paid_progress = self._paid_progress, progress
         reward = options.scale * _PAID[options.mode](progress, before, options.gamma or 1.0, self._has_ended)
         if self._has_succeeded and not self._has_bonus:
@@ -262,6 +289,14 @@ class EpisodeRewarder:
         self._source = client
         self._options = options
         self._made: RewardClient | None = None
+        self._unpaid_resets = UnpaidResets(refuses=options.mode == "final")
+
+    def check_reset(self, episodes: Iterable[RewardedEpisode]) -> None:
+        """Warn once of a reset that drops the reward of unended episodes. Call it before the reset.
+
+        Raises ValueError for the second such reset of an environment in a row, in mode ``final``.
+        """
+        self._unpaid_resets.check(episodes)
 
     def begin(self, task: str, frame: Any, index: int | None = None) -> RewardedEpisode:
         """Return a new episode with its first frame. Raises RewardError.
@@ -283,6 +318,7 @@ class EpisodeRewarder:
         finally:
             for episode in (episode for episode, ends in episodes.items() if ends or episode.succeeded):
                 episode.end()
+                self._unpaid_resets.ended(episode)
 
     def close(self) -> None:
         """Close the client if it was made here."""

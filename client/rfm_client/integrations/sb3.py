@@ -106,6 +106,8 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
 
     def reset(self) -> Any:
         """Reset the environments and score their first frames. Cancel open requests. Raises RewardError."""
+        if self._is_whole:
+            self._rewarder.check_reset(self._episodes)
         self._is_whole = False
         observations = self.venv.reset()
         for episode in self._episodes:
@@ -152,7 +154,8 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         self._rewarder.score(questions | dict.fromkeys(fresh, False))
         rewards = np.zeros(self.num_envs, np.float32)
         for index, episode in enumerate(stepped):
-            rewards[index] = episode.reward(float(env_rewards[index]))
+            terminated = bool(dones[index]) and not infos[index].get("TimeLimit.truncated", False)
+            rewards[index] = episode.reward(float(env_rewards[index]), terminated)
             infos[index] = with_statistics(infos[index], episode)
             infos[index][INFO] = episode.info() | {"env_reward": float(env_rewards[index])}
         for index in ended:
