@@ -78,7 +78,7 @@ class Status:
 
 
 class StatusServer(ThreadingHTTPServer):
-    """HTTP server with ``/live``, ``/ready`` and ``/metrics``. Raises ServerStartError for a taken port."""
+    """HTTP server with ``/live``, ``/ready``, ``/ready?strict`` and ``/metrics``. Raises ServerStartError for a taken port."""
 
     daemon_threads = True
 
@@ -109,8 +109,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         code, body, content_type = HTTPStatus.OK, b"{}", "application/json"
-        if self.path == "/ready":
+        if self.path in ("/ready", "/ready?strict"):
             is_ready, told = self.server.status.ready
+            if self.path.endswith("?strict"):  # a model that is left out counts, too
+                is_ready = is_ready and all(model["ready"] for model in told["models"].values())
             code = HTTPStatus.OK if is_ready else HTTPStatus.SERVICE_UNAVAILABLE
             body = json.dumps(told).encode()
         elif self.path == "/metrics":

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from commands import REPOSITORY, nothing_left_behind
 from repositories import changing
@@ -17,6 +18,7 @@ from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.repository_check import fault_in
 from rfm.launch.triton_server import TritonServer
 from rfm.parameters import EXPORT_PARAMETER, PYTHON_PARAMETERS
+from rfm_commands.cli import app
 
 FOREIGN = 'name: "foreign"\nbackend: "python"\nmax_batch_size: 1\na_field_of_a_newer_triton: 1\n'
 
@@ -80,6 +82,15 @@ def test_the_faults_of_several_models_are_told_together(tmp_path: Path) -> None:
         (repository / model / "1" / "model.py").unlink()
     with pytest.raises(ServerStartError, match=r"/rfm/1/model\.py: .*; .*/rfm_encoder/1/model\.py: "):
         TritonServer(repository, Endpoints.free(), find_installation()).start_ready()
+
+
+def test_a_model_with_broken_files_is_refused_before_a_running_server_loads_it(tmp_path: Path) -> None:
+    repository = shutil.copytree(REPOSITORY, tmp_path / "models")
+    (repository / "rfm" / "1" / "model.py").unlink()
+    words = ["models", "load", "rfm", f"--repository={repository}", "--url=grpc://127.0.0.1:1"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 1
+    assert done.stderr.startswith(f"rfm: {repository}/rfm/1/model.py: expected the model's program, got none; ")
 
 
 def test_a_model_of_another_program_needs_only_what_triton_needs(tmp_path: Path) -> None:
