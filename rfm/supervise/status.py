@@ -78,7 +78,10 @@ class Status:
 
 
 class StatusServer(ThreadingHTTPServer):
-    """HTTP server with ``/live``, ``/ready``, ``/ready?strict`` and ``/metrics``. Raises ServerStartError for a taken port."""
+    """HTTP server with ``/live``, ``/ready``, ``/ready?strict`` and ``/metrics``.
+
+    Raises ServerStartError for a taken port.
+    """
 
     daemon_threads = True
 

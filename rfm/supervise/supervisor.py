@@ -226,8 +226,9 @@ class Supervisor:
             self._count(GATEWAY, why)
         if self._watch is not None and self._watch.reasons:
             reasons = self._watch.reasons
-            back = reasons.keys() | self._watch.unloaded
-            self._left_out = {model: why for model, why in self._left_out.items() if model not in back}
+            if self._left_out:
+                lasting = set(self._server.models) - reasons.keys()  # neither deleted nor loaded again
+                self._left_out = {model: why for model, why in self._left_out.items() if model in lasting}
             self._status.record({**self._left_out, **reasons}, self._left_out)
 
     def _start_again(self, what: str, why: str) -> None:
@@ -273,7 +274,7 @@ class Supervisor:
         whose = "all" if set(row) == {what} else "the last"
         fault = f"had {whose} of {len(row)} faults in a row: {why}"
         self._say(f"{what} is left out, since it {fault}")
-        remedy = "`rfm models load`, or a restart of `rfm serve`, serves it again"
+        remedy = "`rfm models load`, or a restart of `rfm serve`, serves it again; without its folder it is forgotten"
         reason = f"it is left out, since {what} {fault}; {remedy}"
         self._left_out |= dict.fromkeys(left_out, reason)
         self._served = others

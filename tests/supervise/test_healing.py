@@ -186,9 +186,12 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
         assert served.is_ready()
         assert np.isfinite(client.progress(trajectory(0)).progress).all()
         deadly.unlink()
+        away = (repository / OTHER).rename(tmp_path / OTHER)
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON})  # without its folder it is forgotten
+        away.rename(repository / OTHER)
         with served.api() as api:
             api.load(OTHER)
-        served.wait_ready()
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON, OTHER: NO_REASON})
     assert served.process.returncode == 0
     told = f"rfm: {OTHER} is left out, since it had all of 4 faults in a row: "
     assert any(line.startswith(told) for line in served.said)
