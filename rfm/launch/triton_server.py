@@ -146,6 +146,8 @@ class TritonServer:
         try:
             self._start_ready(served)
         except SpoiltStartError:
+            if self._signal is not None:  # it is to end
+                raise
             self.stop()
             self._start_ready(served)
 
@@ -275,7 +277,7 @@ class TritonServer:
             return
         self.kill()
         model, why = found or (UNKNOWN, f"no answer in {LOAD_S:g} s")
-        raise SpoiltStartError(f"models: expected {model or 'all'} to load, got: {why}", model or None)
+        raise SpoiltStartError(f"models: expected {model or 'each'} to load, got: {why}", model or None)
 
     def _kill_group(self) -> None:
         with suppress(ProcessLookupError):
