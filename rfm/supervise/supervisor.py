@@ -16,7 +16,7 @@ from types import FrameType
 from rfm.launch import cleanup
 from rfm.launch.ending import end, ending_with_parent, stop_signals_to
 from rfm.launch.installation import ServerStartError
-from rfm.launch.triton_server import POLL_S, Config, TritonServer
+from rfm.launch.triton_server import POLL_S, Config, SpoiltStartError, TritonServer
 from rfm.supervise.status import Status, StatusServer
 from rfm.supervise.watch import TRITON, TritonWatch, parts_of
 
@@ -249,7 +249,9 @@ class Supervisor:
                 self._start()
                 return
             except ServerStartError as error:
-                what, why = error.model or TRITON, str(error)
+                # A crash of Triton itself is the fault of the model before; a kill from outside is not.
+                was_killed = self._server.exit_status == -signal.SIGKILL and not isinstance(error, SpoiltStartError)
+                what, why = error.model or (TRITON if was_killed else what), str(error)
 
     def _pause_s(self, what: str, why: str, reason: str) -> float:
         """Return the seconds to wait before the restart; none if a model is left out. Raises CrashLoopError."""
