@@ -68,7 +68,7 @@ class BackOff:
 class GatewayProcess:
     """The gateway as a child process. Call ``look`` often: it restarts a gateway that has ended.
 
-    A thread kills a gateway that has answered before and then is silent.
+    A thread kills a gateway that listens but is silent.
 
     address: host and port of the gateway
     silent_s: seconds without an answer after which the gateway counts as silent
@@ -91,13 +91,13 @@ class GatewayProcess:
         threading.Thread(target=self._listen, args=(self._process,), name="rfm-gateway", daemon=True).start()
 
     def _listen(self, process: subprocess.Popen[bytes]) -> None:
-        has_answered, num_missed = False, 0
+        num_missed = 0
         while process.poll() is None:
             try:
                 self._ask()
-                has_answered, num_missed = True, 0
+                num_missed = 0
             except TimeoutError:
-                num_missed += has_answered
+                num_missed += 1
             except OSError:  # it does not listen yet, or has ended
                 pass
             if num_missed == TRIES:
