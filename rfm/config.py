@@ -156,7 +156,7 @@ class ServeConfig(Settings):
         **_COUNT,
     )
     triton_silent_s: int = setting(
-        10, "Seconds that Triton may give no answer before it is killed and restarted.", **_COUNT
+        10, "Seconds without an answer after which Triton, or the gateway, is killed and restarted.", **_COUNT
     )
 
     def __post_init__(self) -> None:

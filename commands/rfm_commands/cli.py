@@ -19,7 +19,7 @@ from rfm.launch.admin_key import take_key
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import TritonServer, short_spin
-from rfm.supervise.supervisor import CrashLoopError, Supervisor
+from rfm.supervise.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm_client.cli.command import Given, OptionsOf, with_options
 from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import from_here
@@ -175,7 +175,7 @@ def serve(
     )
     supervisor = Supervisor(
         server,
-        gateway=None if config.gateway.port is None else gateway_command(_beside(server, config)),
+        gateway=None if config.gateway.port is None else _gateway_beside(server, config),
         status_port=config.serve.status_port,
         probe_s=config.serve.probe_s,
         hang_s=config.serve.hang_s,
@@ -201,6 +201,13 @@ def _folder_and_arguments(words: Sequence[str], repository: Path | None) -> tupl
         got = "none" if folder is None else "both"
         raise typer.BadParameter(f"expected it, or --repository, got {got}", param_hint="FOLDER")
     return (repository, words) if repository is not None else (Path(str(folder)), words[1:])
+
+
+def _gateway_beside(server: TritonServer, config: Config) -> GatewayProcess:
+    gateway = _beside(server, config)
+    assert gateway.host is not None and gateway.port is not None  # completed
+    address = from_here(gateway.host), gateway.port
+    return GatewayProcess(gateway_command(gateway), address, config.serve.triton_silent_s)
 
 
 def _beside(server: TritonServer, config: Config) -> GatewayConfig:

@@ -22,7 +22,7 @@ from rfm_client.cli.command import Given, OptionsOf, with_options
 from rfm_client.cli.options import CredentialFiles
 from rfm_client.contract.settings import Settings, setting
 from rfm_commands.command import RfmCommand, fail
-from rfm_commands.rollout import Rollout, models_of, previous_version
+from rfm_commands.rollout import Rollout, check_files, models_of, previous_version
 
 SECURE = "grpcs://"
 
@@ -93,7 +93,9 @@ def list_models(
 def load(context: typer.Context, name: ExportedName, server: Administered, files: FilesGiven) -> None:
     """Serve NAME, a new or unloaded model, as configured."""
     with server.connected(context, files) as api:
-        for model in models_of(server.repository, name):
+        models = models_of(server.repository, name)
+        check_files(server.repository, dict.fromkeys(models))
+        for model in models:
             api.load(model)
             typer.echo(f"{model}: {', '.join(map(str, api.ready_versions(model)))} ready")
 

@@ -32,6 +32,7 @@ from google.protobuf.text_format import ParseError
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
+from rfm.launch.repository_check import fault_in
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm_client import PreferenceSample, ProgressSample, RewardError
 from rfm_client.contract import wire
@@ -109,6 +110,7 @@ class Rollout:
             old |= self._configs(models, {model: max(served[model]) for model in models if served[model]})
         except (OSError, ParseError) as error:
             raise RolloutError(f"{self.name} version {version}: expected an exported version, got {error}") from error
+        check_files(self.repository, new)
         try:
             self._switch(new, served, version)
         except (RepositoryApiError, RewardError, OSError) as error:
@@ -183,6 +185,13 @@ def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
     for sample in (ProgressSample(trajectory), PreferenceSample(trajectory, trajectory)):
         scores = server.infer(config.name, version, wire.encode_samples([sample]), SCORES)
         wire.decode_results(scores, [sample])
+
+
+def check_files(repository: Path, models: Mapping[str, pb.ModelConfig | None]) -> None:
+    """Raise RolloutError for a model whose files are not whole. models: configurations; None: as in the file"""
+    for model, config in models.items():
+        if (fault := fault_in(repository, model, config)) is not None:
+            raise RolloutError(fault)
 
 
 def _dims(tensors: Iterable[Any]) -> dict[str, int]:

@@ -16,7 +16,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.config import ExportConfig
 from rfm.family import Description, EncodersDescription
-from rfm.launch.repository_folder import CONFIG_FILE
+from rfm.launch.repository_folder import CONFIG_FILE, MODEL_FILE
 from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER, GRAPHS_PARAMETER
 from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
 from rfm_client.contract.model_info import (
@@ -33,7 +33,6 @@ from rfm_client.contract.synthetic import blank_trajectory
 from rfm_export.about import about_encoders
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
 
-MODEL_FILE = "model.py"
 WARMUP_FOLDER = "warmup"
 KEEP_FILE = ".keep"  # Triton needs an ensemble's version folder, but git drops empty folders
 

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Start a Triton, secure it, and leave nothing behind.
 
-- ``repository_folder``: the models that Triton reads.
+- ``repository_folder``: the models that Triton reads; ``repository_check``: their files, before a load.
 - ``triton_server``: a tritonserver process, from an ``installation``, with ``triton_options``; ``temporary``: the
   same for the time of a context.
 - Access: ``endpoints``, optionally with TLS, and the ``admin_key`` of restricted APIs.
-- ``ending`` ends processes; ``cleanup`` removes the shared memory of killed servers; ``process_table`` reads /proc.
+- ``model_processes`` finds dead and stopped model processes; ``ending`` ends processes; ``cleanup`` removes the shared
+  memory of killed servers; ``process_table`` reads /proc.
 - Calls to a running Triton: ``http``, and over gRPC ``repository_api``, which loads and unloads models.
 
 ``rfm.supervise`` builds on this package: it watches Triton and restarts it.

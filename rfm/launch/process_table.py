@@ -11,19 +11,16 @@ from pathlib import Path
 ZOMBIE, STOPPED = "Z", "T"  # states
 
 _PROC = Path("/proc")
-_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
-_STATE, _PARENT, _GROUP, _USER, _SYSTEM = 0, 1, 2, 11, 12  # fields of /proc/PID/stat behind the name
+_STATE, _PARENT = 0, 1  # fields of /proc/PID/stat behind the name
 
 
 @dataclass(frozen=True)
 class ProcessStat:
-    """Name (at most 15 characters), state, parent, group and CPU time of a process, zombies included."""
+    """Name (at most 15 characters), state and parent of a process, zombies included."""
 
     name: str
     state: str
     parent: int
-    group: int
-    cpu_s: float
 
 
 def all_pids() -> list[int]:
@@ -62,12 +59,4 @@ def stat_of(pid: int) -> ProcessStat | None:
     except (FileNotFoundError, ProcessLookupError):
         return None
     fields = tail.split()
-    ticks = int(fields[_USER]) + int(fields[_SYSTEM])
-    return ProcessStat(
-        head.partition("(")[2], fields[_STATE], int(fields[_PARENT]), int(fields[_GROUP]), ticks / _TICKS_PER_S
-    )
-
-
-def cpu_s_of_group(group: int) -> float:
-    """Return the CPU time of a process group, in seconds."""
-    return sum(stat.cpu_s for pid in all_pids() if (stat := stat_of(pid)) is not None and stat.group == group)
+    return ProcessStat(head.partition("(")[2], fields[_STATE], int(fields[_PARENT]))

@@ -9,6 +9,7 @@ import re
 import signal
 import time
 from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
@@ -24,15 +25,15 @@ from rfm.launch.ending import EXIT_TIMEOUT_S, ProcessGroup, how_it_ended
 from rfm.launch.endpoints import Endpoints, check_version
 from rfm.launch.http import NO_ANSWER, Http
 from rfm.launch.installation import WHEEL_VERSION, Installation, ServerStartError
-from rfm.launch.process_table import cpu_s_of_group
+from rfm.launch.model_processes import UNKNOWN, ModelProcesses
 from rfm.launch.repository_api import INDEX_PATH, versions_of
+from rfm.launch.repository_check import check_models
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm.launch.triton_options import check_arguments, size_limits
 from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE, INSIDE_VARIABLE
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
-STALLED_S, WORK_S = 60.0, 0.05  # a start with less CPU time than WORK_S in STALLED_S is stuck
 LOAD_S = 1800.0
 ANSWER_TIMEOUT_S = 10.0  # while the server starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # else a version's folder changes, and a `load` reloads all versions
@@ -43,6 +44,7 @@ _REMEDIES = {  # by a pattern of the reason why a model is not loaded
     ),
     "No space left on device": NEEDS_ROOM,
 }
+_DIED = "Stub process .* is not healthy"  # Triton's words for a process that died during a load
 _REGIONS = "--backend-config=python,shm-region-prefix-name="
 
 Config = Mapping[str, Any]  # a model's configuration in Triton's JSON
@@ -58,9 +60,9 @@ def short_spin(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 class SpoiltStartError(ServerStartError):
-    """Triton lost a model process during loading, and ended or hangs.
+    """A model process died while it loaded. Triton reports it, ends, or hangs.
 
-    With Triton 2.51 this happens when the machine stands still for a second.
+    Triton 2.51 also kills a model process when the machine stands still for a second.
     """
 
 
@@ -147,6 +149,8 @@ class TritonServer:
         try:
             self._start_ready(served)
         except SpoiltStartError:
+            if self._signal is not None:  # it is to end
+                raise
             self.stop()
             self._start_ready(served)
 
@@ -188,6 +192,7 @@ class TritonServer:
             as_in_file = [name for name in served if _names_the_same_versions(self.repository, name, served[name])]
             if len(as_in_file) < len(served):  # an ensemble would load its parts from their files
                 as_in_file = []
+        check_models(self.repository, sorted(as_in_file))
         self._start(sorted(as_in_file))
         self._wait_ready(as_in_file)
         others = {name: served[name] for name in served.keys() - set(as_in_file)} if served else {}
@@ -226,29 +231,19 @@ class TritonServer:
 
     def _wait_ready(self, models: Collection[str]) -> None:
         """Wait until ``models`` are ready. Raises ServerStartError with the reasons of the models that failed."""
-        assert self._group is not None  # started
-        started_s = worked_s = time.monotonic()
-        cpu_s = 0.0
+        processes, ends_s = ModelProcesses(self.pid), time.monotonic() + LOAD_S
         while (status := self.exit_status) is None:
             try:
                 version = self._http.json("/v2", ANSWER_TIMEOUT_S).get("version", "")
                 index = self._http.json(INDEX_PATH, ANSWER_TIMEOUT_S, "POST")
             except NO_ANSWER:  # usual while Triton loads
-                now_s, used_s = time.monotonic(), cpu_s_of_group(self._group.id)
-                if used_s - cpu_s > WORK_S:
-                    cpu_s, worked_s = used_s, now_s
-                is_stalled, is_late = now_s - worked_s > STALLED_S, now_s - started_s > LOAD_S
-                if is_stalled or is_late:
-                    self.kill()
-                    got = f"{STALLED_S:g} s without CPU time" if is_stalled else f"no answer in {LOAD_S:g} s"
-                    raise SpoiltStartError(f"tritonserver: expected to be ready, got {got}") from None
-                time.sleep(POLL_S)
+                self._pause(processes, ends_s)
                 continue
             failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in models]
             if failed:
                 reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
-                why = f"models: expected all to be ready, got {reasons}{_remedy(reasons)}"
-                raise ServerStartError(why, failed[0].name)
+                kind = SpoiltStartError if re.search(_DIED, reasons) else ServerStartError
+                raise kind(f"models: expected all to be ready, got {reasons}{_remedy(reasons)}", failed[0].name)
             check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
             return
         kind = SpoiltStartError if status == -signal.SIGABRT else ServerStartError
@@ -258,12 +253,28 @@ class TritonServer:
         """Load a model with this configuration, over HTTP, since the gRPC port may demand a certificate."""
         body = json.dumps({"parameters": {"config": json.dumps(config)}}).encode()
         path = f"/v2/repository/models/{quote(name, safe='')}/load"
+        processes, ends_s = ModelProcesses(self.pid), time.monotonic() + LOAD_S
+        with ThreadPoolExecutor(1, "rfm-load") as thread:
+            answer = thread.submit(self._http.request, "POST", path, LOAD_S, body)
+            while not answer.done():
+                self._pause(processes, ends_s)
         try:
-            status, text = self._http.request("POST", path, LOAD_S, body)
+            status, text = answer.result()
         except NO_ANSWER as error:
             raise ServerStartError(f"models: expected {name} to load, got: {error}", name) from error
         if status != HTTPStatus.OK:
-            raise ServerStartError(f"models: expected {name} to load, got: {text}", name)
+            kind = SpoiltStartError if re.search(_DIED, text) else ServerStartError
+            raise kind(f"models: expected {name} to load, got: {text}", name)
+
+    def _pause(self, processes: ModelProcesses, ends_s: float) -> None:
+        """Wait for POLL_S. Kill Triton and raise SpoiltStartError if a model process is dead, or after ``ends_s``."""
+        found = processes.fault()
+        if found is None and time.monotonic() < ends_s:
+            time.sleep(POLL_S)
+            return
+        self.kill()
+        model, why = found or (UNKNOWN, f"no answer in {LOAD_S:g} s")
+        raise SpoiltStartError(f"models: expected {model or 'each'} to load, got: {why}", model or None)
 
     def _arguments(self, models: Sequence[str]) -> list[str]:
         return [

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import socket
 import threading
 import time
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from types import FrameType
 from rfm.launch import cleanup
 from rfm.launch.ending import ProcessGroup, how_it_ended, stop_signals_to
 from rfm.launch.installation import ServerStartError
-from rfm.launch.triton_server import POLL_S, Config, TritonServer
+from rfm.launch.triton_server import POLL_S, Config, SpoiltStartError, TritonServer
 from rfm.supervise.status import Status, StatusServer
 from rfm.supervise.watch import TRITON, TritonWatch, parts_of
 from rfm_client.contract.process_log import about
@@ -23,6 +24,11 @@ from rfm_client.contract.process_log import about
 GATEWAY = "gateway"
 STEADY_S = 60.0  # after a longer run, a process is not in a crash loop
 MOST = 5  # restarts in a row
+MOST_OF_A_MODEL = (
+    3  # before it is left out; a call and its repeat end a process twice, so one call alone costs no model
+)
+ASK_S = 1.0  # between the requests to the gateway
+TRIES = 2  # requests in a row without an answer; one alone may be due to a machine that stood still
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 
 logger = logging.getLogger(__name__)
@@ -33,48 +39,84 @@ class CrashLoopError(ServerStartError):
 
 
 class BackOff:
-    """Growing pauses between the restarts of one process; none before the first."""
+    """Growing pauses between the restarts of one process; none before the first.
+
+    row: what had each of the faults in a row
+    """
 
     def __init__(self, what: str, steady_s: float = STEADY_S) -> None:
         self._what, self._steady_s = what, steady_s
-        self._row = 0
+        self.row: list[str] = []
         self._running_since_s: float | None = None  # None: not running
 
     def started(self) -> None:
         """Record a successful start."""
         self._running_since_s = time.monotonic()
 
-    def pause_s(self, reason: str) -> float:
-        """Record a fault or a failed start. Return the seconds to wait before the next start. Raises CrashLoopError."""
+    def pause_s(self, reason: str, cause: str = "") -> float:
+        """Record a fault or a failed start. Return the seconds to wait before the next start. Raises CrashLoopError.
+
+        cause: what had the fault; empty: the process itself
+        """
         if self._running_since_s is not None and time.monotonic() - self._running_since_s >= self._steady_s:
-            self._row = 0
+            self.row = []
         self._running_since_s = None  # a failed start does not count as running
-        self._row += 1
-        if self._row > MOST:
-            got = f"{self._row} faults in a row; the last: {reason}"
+        self.row.append(cause or self._what)
+        if len(self.row) > MOST:
+            got = f"{len(self.row)} faults in a row; the last: {reason}"
             raise CrashLoopError(f"{self._what}: expected to run, got {got}")
-        return 0.0 if self._row == 1 else min(FIRST_PAUSE_S * 2.0 ** (self._row - 2), LONGEST_PAUSE_S)
+        return 0.0 if len(self.row) == 1 else min(FIRST_PAUSE_S * 2.0 ** (len(self.row) - 2), LONGEST_PAUSE_S)
 
 
 class GatewayProcess:
-    """The gateway as a child process. Call ``look`` often: it restarts an ended gateway."""
+    """The gateway as a child process. Call ``look`` often: it restarts a gateway that has ended.
 
-    def __init__(self, command: Sequence[str]) -> None:
-        self._command = command
+    A thread kills a gateway that listens but is silent.
+
+    address: host and port of the gateway
+    silent_s: seconds without an answer after which the gateway counts as silent
+    """
+
+    def __init__(self, command: Sequence[str], address: tuple[str, int], silent_s: float) -> None:
+        self._command, self._address, self._silent_s = command, address, silent_s
         self._back_off = BackOff(GATEWAY)
         self._group: ProcessGroup | None = None
         self._due_s: float | None = None
+        self._fault: str | None = None
 
     def start(self) -> None:
         """Start the gateway as a child process."""
         self._group = ProcessGroup(self._command)
         self._back_off.started()
+        self._fault = None
+        threading.Thread(target=self._listen, args=(self._group,), name="rfm-gateway", daemon=True).start()
+
+    def _listen(self, group: ProcessGroup) -> None:
+        num_missed = 0
+        while group.process.poll() is None:
+            try:
+                self._ask()
+                num_missed = 0
+            except TimeoutError:
+                num_missed += 1
+            except OSError:  # it does not listen yet, or has ended
+                pass
+            if num_missed == TRIES:
+                self._fault = f"no answer for {self._silent_s:g} s"
+                group.kill()
+            time.sleep(ASK_S)
+
+    def _ask(self) -> None:
+        """Wait for a sign of life: an answer, also without the key, or the end of a connection that demands TLS."""
+        with socket.create_connection(self._address, self._silent_s / TRIES) as connection:
+            connection.sendall(b"HEAD / HTTP/1.0\r\n\r\n")
+            connection.recv(1)
 
     def look(self) -> str | None:
         """Restart an ended gateway. Return why it ended; None: no restart. Raises CrashLoopError."""
         if self._group is None or (status := self._group.process.poll()) is None:
             return None
-        why = how_it_ended(status)
+        why = self._fault or how_it_ended(status)
         if self._due_s is None:
             self._due_s = time.monotonic() + self._back_off.pause_s(why)
         if time.monotonic() < self._due_s:
@@ -93,7 +135,7 @@ class GatewayProcess:
 class Supervisor:
     """Serves until a stop signal. For the main thread.
 
-    gateway: command line of a gateway beside the server; None: no gateway
+    gateway: a gateway beside the server; None: no gateway
     status_port: port of the status server, on Triton's host; None: no status server
     probe_s, hang_s, triton_silent_s: see TritonWatch
     """
@@ -102,14 +144,14 @@ class Supervisor:
         self,
         server: TritonServer,
         *,
-        gateway: Sequence[str] | None = None,
+        gateway: GatewayProcess | None = None,
         status_port: int | None = None,
         probe_s: float,
         hang_s: float,
         triton_silent_s: float,
     ) -> None:
         self._server = server
-        self._gateway = None if gateway is None else GatewayProcess(gateway)
+        self._gateway = gateway
         self._status_port = status_port
         self._status = Status()
         self._new_watch = partial(
@@ -182,8 +224,10 @@ class Supervisor:
             self._count(GATEWAY, why)
         if self._watch is not None and self._watch.reasons:
             reasons = self._watch.reasons
-            self._left_out = {model: why for model, why in self._left_out.items() if model not in reasons}
-            self._status.record({**self._left_out, **reasons})
+            if self._left_out:
+                lasting = set(self._server.models) - reasons.keys()  # neither deleted nor loaded again
+                self._left_out = {model: why for model, why in self._left_out.items() if model in lasting}
+            self._status.record({**self._left_out, **reasons}, self._left_out)
 
     def _start_again(self, what: str, why: str) -> None:
         """Restart Triton; return when it is ready, or after a stop signal. Raises CrashLoopError.
@@ -200,13 +244,7 @@ class Supervisor:
             self._status.record_down(f"{TRITON} is started again: {reason}")
             self._server.kill()
             self._server.stop()
-            try:
-                pause_s = self._back_off.pause_s(reason)
-            except CrashLoopError:
-                if not self._leaves_out(what, why):
-                    raise
-                pause_s = 0.0
-            if self._is_to_stop.wait(pause_s):
+            if self._is_to_stop.wait(self._pause_s(what, why, reason)):
                 return
             self._count(what, why)
             try:
@@ -215,7 +253,21 @@ class Supervisor:
                     logger.info("ready again after %.1f s", time.monotonic() - began_s)
                 return
             except ServerStartError as error:
-                what, why = error.model or what, str(error)
+                # A crash of Triton itself is the fault of the model before; a kill from outside is not.
+                was_killed = self._server.exit_status == -signal.SIGKILL and not isinstance(error, SpoiltStartError)
+                what, why = error.model or (TRITON if was_killed else what), str(error)
+
+    def _pause_s(self, what: str, why: str, reason: str) -> float:
+        """Return the seconds to wait before the restart; none if a model is left out. Raises CrashLoopError."""
+        try:
+            pause_s = self._back_off.pause_s(reason, what)
+        except CrashLoopError:
+            if not self._leaves_out(what, why):
+                raise
+            return 0.0
+        row = self._back_off.row
+        is_one_models = len(row) > MOST_OF_A_MODEL and set(row) == {what}
+        return 0.0 if is_one_models and self._leaves_out(what, why) else pause_s
 
     def _leaves_out(self, what: str, why: str) -> bool:
         """Leave out the model ``what`` and its ensembles. False if it is no served model, or no other is left."""
@@ -224,9 +276,11 @@ class Supervisor:
         others = {name: config for name, config in served.items() if name not in left_out}
         if what not in served or not others:
             return False
-        fault = f"had the last of {MOST + 1} faults in a row: {why}"
+        row = self._back_off.row
+        whose = "all" if set(row) == {what} else "the last"
+        fault = f"had {whose} of {len(row)} faults in a row: {why}"
         logger.error("%s is left out, since it %s", what, fault)
-        remedy = "`rfm models load`, or a restart of `rfm serve`, serves it again"
+        remedy = "`rfm models load`, or a restart of `rfm serve`, serves it again; without its folder it is forgotten"
         reason = f"it is left out, since {what} {fault}; {remedy}"
         self._left_out |= dict.fromkeys(left_out, reason)
         self._served = others

@@ -4,7 +4,7 @@
 | fault | found by |
 |---|---|
 | Triton is silent | no answer of ``/metrics`` |
-| a model process is dead or stopped | ``ModelProcesses`` |
+| a model process is dead or stopped, also while its model loads | ``ModelProcesses`` |
 | a model hangs outside of a batch, or its requests fail before they reach model.py | its ``probe`` |
 
 A process with a hung batch or a broken device ends itself (``rfm.triton_model.watchdog``).
@@ -19,12 +19,11 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from urllib.parse import quote
 
 from rfm.launch.admin_key import http_headers
 from rfm.launch.http import NO_ANSWER, Http
-from rfm.launch.process_table import STOPPED, ZOMBIE, arguments_of, children_of, stat_of
+from rfm.launch.model_processes import UNKNOWN, ModelProcesses
 from rfm.launch.repository_api import INDEX_PATH, LOADING, READY, UNLOADING, ModelVersion, versions_of
 from rfm.launch.triton_server import Config, TritonServer
 from rfm.supervise.probe import Probe, can_be_probed
@@ -40,51 +39,9 @@ _PROGRESS = re.compile(  # counts that grow with a model's progress
     re.MULTILINE,
 )
 
-_PROGRAM = "triton_python_backend_stub"
-_PROGRAM_IN_KERNEL = _PROGRAM[:15]
-_STATES = {ZOMBIE: "a process of it is dead", STOPPED: "a process of it is stopped"}
-
 TRITON = "triton"
-UNKNOWN = ""  # the model of a process that died before the first look
 
 logger = logging.getLogger(__name__)
-
-
-class ModelProcesses:
-    """The model processes of a Triton, one for each instance, from /proc.
-
-    Triton notices a dead process only at the next request to it, and keeps a zombie until then.
-    """
-
-    def __init__(self, triton_pid: int) -> None:
-        self._triton_pid = triton_pid
-        self._models: dict[int, str] = {}  # by process; a zombie's command line is empty
-        self._suspects: set[int] = set()
-
-    def fault(self, settled: Collection[str]) -> tuple[str, str] | None:
-        """Return a model of ``settled`` and the fault of its process: dead or stopped in this and the previous call."""
-        states = self._states()
-        suspects = {pid for pid, state in states.items() if state in _STATES and self._models[pid] in settled}
-        confirmed = suspects & self._suspects
-        self._suspects = suspects
-        return next(((self._models[pid], _STATES[states[pid]]) for pid in sorted(confirmed)), None)
-
-    def _states(self) -> dict[int, str]:
-        """Return the state of each model process, and note its model."""
-        states = {}
-        for pid in children_of(self._triton_pid):
-            stat = stat_of(pid)
-            if stat is None:
-                continue
-            words = arguments_of(pid)  # .../triton_python_backend_stub .../MODEL/VERSION/model.py ...
-            if len(words) > 1 and words[0].endswith(_PROGRAM):
-                self._models[pid] = Path(words[1]).parent.parent.name
-            elif stat.name == _PROGRAM_IN_KERNEL:
-                self._models.setdefault(pid, UNKNOWN)
-            if pid in self._models:
-                states[pid] = stat.state
-        self._models = {pid: model for pid, model in self._models.items() if pid in states}
-        return states
 
 
 class TritonWatch:
@@ -167,7 +124,8 @@ class TritonWatch:
     def _dead(self) -> tuple[str, str] | None:
         settled = self._ready.keys() - self._going
         found = self._processes.fault(settled if self._going else {*settled, UNKNOWN})
-        return found and (found[0] or TRITON, found[1])
+        loading = next(iter(self._going), TRITON) if len(self._going) <= 1 else TRITON
+        return found and (found[0] or loading, found[1])
 
     def _probed(self) -> tuple[str, str] | None:
         probed = {name: probe.fault(self._progress_s.get(name, 0.0)) for name, probe in self._probes.items()}

@@ -149,12 +149,14 @@ def test_no_request_that_the_schemas_allow_breaks_the_gateway(encoders: Gateway,
 
 
 @pytest.mark.slow
-def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(triton: Triton, tmp_path: Path) -> None:
+def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_silent(
+    triton: Triton, tmp_path: Path
+) -> None:
     repository, endpoints, port = tmp_path / "model_repository", Endpoints.free(), free_port()
     shutil.copytree(triton.repository / TINY, repository / TINY)
     ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
     options = [word for name, number in (ports | {"gateway": port}).items() for word in (f"--{name}-port", str(number))]
-    options += ["--gateway-timeout", "90", "--gateway-max-waiting", "7"]
+    options += ["--gateway-timeout", "90", "--gateway-max-waiting", "7", "--triton-silent-s", "4"]
     rfm = [str(Path(sys.executable).parent / "rfm"), "serve", "--repository", str(repository), *options]
     log_file = tmp_path / "rfm.log"
     with log_file.open("wb") as log:
@@ -175,13 +177,20 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(trito
         poll(lambda: answers(url))
         assert answered(ask_json(gateway, [progress(FIRST)])) == expected(gateway, [progress(FIRST)])
         started += psutil.Process(process.pid).children(recursive=True)
+        (stopped,) = (child for child in set(started) - {own} if "rfm_gateway" in child.cmdline())
+        stopped.suspend()
+        poll(lambda: not stopped.is_running())
+        poll(lambda: answers(url))
+        assert answered(ask_json(gateway, [progress(FIRST)])) == expected(gateway, [progress(FIRST)])
+        started += psutil.Process(process.pid).children(recursive=True)
         process.terminate()
         assert process.wait(WITHIN_S) == 0
     finally:
         process.terminate()
         process.wait(WITHIN_S)
-    assert "]: gateway is started again: killed by SIGKILL\n" in gateway.log
-    assert len(set(started)) >= 4  # Triton, its model process, the first gateway and the second
+    for why in ("killed by SIGKILL", "no answer for 4 s"):
+        assert f"]: gateway is started again: {why}\n" in gateway.log
+    assert len(set(started)) >= 5  # Triton, its model process, and three gateways
     assert not [child for child in started if child.is_running()]
     assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
 

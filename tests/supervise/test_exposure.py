@@ -178,3 +178,20 @@ def test_the_status_tells_nothing_of_what_there_was() -> None:
     }
     about.record_down("restarted")
     assert about.ready[1]["models"]["a_frames"] == {"ready": False, "reason": "restarted"}
+
+
+def test_a_server_without_a_model_that_is_left_out_is_ready_and_names_it() -> None:
+    about = Status()
+    about.record({"a": NO_REASON, "b": "it is left out"}, left_out=["b"])
+    is_ready, body = about.ready
+    assert is_ready
+    assert body["models"]["b"] == {"ready": False, "reason": "it is left out"}
+    assert told(about)['rfm_serve_ready{model="b"}'] == 0
+    port = Endpoints.free().http_port
+    with closing(StatusServer("127.0.0.1", port, about)):
+        codes = [httpx.get(f"http://127.0.0.1:{port}/ready{query}").status_code for query in ("", "?strict")]
+    assert codes == [200, 503]
+    about.record({"a": "it is loading", "b": "it is left out"}, left_out=["b"])
+    assert not about.ready[0]
+    about.record({"b": "it is left out"}, left_out=["b"])
+    assert not about.ready[0]

@@ -294,6 +294,9 @@ def test_a_broken_version_is_never_asked_and_the_old_one_stays(running: Running,
             assert reason in line
             assert line.endswith(f"(served as before: {name}: version 1)")
             assert (running.served_by_restart(name), running.ready(name)) == ([1], ["1"])
+        (running.repository / name / "2" / "model.py").unlink()  # as in a folder that was copied in part
+        assert f"/{name}/2/model.py: expected the model's program, got none" in running.refused("rollout", name, "2")
+        assert (running.served_by_restart(name), running.ready(name)) == ([1], ["1"])
     assert (tally.failed, tally.unlike, set(tally.by_version)) == ([], [], {"1"})
     with running.client(NAME) as client:
         assert client.is_ready()  # what failed is no reason to ask nobody here

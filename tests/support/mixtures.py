@@ -8,12 +8,13 @@ from collections.abc import Callable
 
 import httpx
 import numpy as np
+import psutil
 import tritonclient.grpc
 from prometheus_client.parser import text_string_to_metric_families
 
 import goldens
 from reference_server import Served
-from rfm.launch.process_table import all_pids, arguments_of, stat_of
+from rfm.launch.process_table import all_pids, arguments_of
 from rfm_client import (
     PreferenceSample,
     ProgressSample,
@@ -68,7 +69,7 @@ def wait_until_at_work(model: str) -> None:
 
     def cpu_s() -> float:
         ours = [pid for pid in all_pids() if any(f"/{model}/" in word for word in arguments_of(pid)[:2])]
-        return sum(stat.cpu_s for pid in ours if (stat := stat_of(pid)) is not None)
+        return sum(sum(psutil.Process(pid).cpu_times()[:2]) for pid in ours)
 
     before_s = cpu_s()
     wait_for(lambda: cpu_s() > before_s + 0.05)

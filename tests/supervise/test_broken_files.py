@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: MIT
+"""Files that Triton cannot load are refused with a remedy before it starts, or loads them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from commands import REPOSITORY, nothing_left_behind
+from repositories import changing
+from rfm.launch.endpoints import Endpoints
+from rfm.launch.installation import ServerStartError, find_installation
+from rfm.launch.repository_check import fault_in
+from rfm.launch.triton_server import TritonServer
+from rfm.parameters import EXPORT_PARAMETER, PYTHON_PARAMETERS
+from rfm_commands.cli import app
+
+FOREIGN = 'name: "foreign"\nbackend: "python"\nmax_batch_size: 1\na_field_of_a_newer_triton: 1\n'
+
+
+def write_config(text: str) -> Callable[[Path], object]:
+    return lambda model: (model / "config.pbtxt").write_text(text)
+
+
+def change_stamp(version: str) -> Callable[[Path], None]:
+    def change(model: Path) -> None:
+        with changing(model) as config:
+            config.parameters[EXPORT_PARAMETER].string_value = version
+
+    return change
+
+
+def forget(parameter: str) -> Callable[[Path], None]:
+    def change(model: Path) -> None:
+        with changing(model) as config:
+            del config.parameters[parameter]
+
+    return change
+
+
+DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "garbage": (
+        "rfm",
+        write_config("%%% nonsense {"),
+        "/rfm/config.pbtxt: expected a model's configuration, got 1:1 : ",
+    ),
+    "empty": ("rfm", write_config(""), "/rfm/config.pbtxt: expected a model's configuration, got an empty file; "),
+    "of no version": ("rfm", forget(EXPORT_PARAMETER), "/rfm/config.pbtxt: .* got one by an older version; "),
+    "of an older version": ("rfm_frames", change_stamp("0"), "/rfm_frames/config.pbtxt: .* by an older version; "),
+    "of a newer version": ("rfm_encoder", change_stamp("999"), "/rfm_encoder/config.pbtxt: .* by a newer version; "),
+    "no program": ("rfm", lambda model: (model / "1/model.py").unlink(), "/rfm/1/model.py: expected the model's pro"),
+    "no version": ("rfm", lambda model: shutil.rmtree(model / "1"), "/rfm/1: expected the folder of a version, got no"),
+    "no version of an ensemble": ("rfm_frames", lambda model: shutil.rmtree(model / "1"), "/rfm_frames/1: expected "),
+    **{
+        name: ("rfm", forget(name), f"/rfm/config.pbtxt: .* parameter {name}, got none; ") for name in PYTHON_PARAMETERS
+    },
+}
+
+
+@pytest.mark.parametrize(("model", "damage", "told"), DAMAGES.values(), ids=DAMAGES)
+def test_a_repository_with_broken_files_is_refused_before_triton_starts(
+    tmp_path: Path, model: str, damage: Callable[[Path], object], told: str
+) -> None:
+    repository = shutil.copytree(REPOSITORY, tmp_path / "models")
+    damage(repository / model)
+    server = TritonServer(repository, Endpoints.free(), find_installation())
+    with nothing_left_behind(), pytest.raises(ServerStartError) as refused:
+        server.start_ready()
+    assert re.match(re.escape(str(repository)) + told, str(refused.value)), refused.value
+    assert f"export again with `rfm export --checkpoint CHECKPOINT --repository {repository}`" in str(refused.value)
+    assert refused.value.model == model
+
+
+def test_the_faults_of_several_models_are_told_together(tmp_path: Path) -> None:
+    repository = shutil.copytree(REPOSITORY, tmp_path / "models")
+    for model in ("rfm", "rfm_encoder"):
+        (repository / model / "1" / "model.py").unlink()
+    with pytest.raises(ServerStartError, match=r"/rfm/1/model\.py: .*; .*/rfm_encoder/1/model\.py: "):
+        TritonServer(repository, Endpoints.free(), find_installation()).start_ready()
+
+
+def test_a_model_with_broken_files_is_refused_before_a_running_server_loads_it(tmp_path: Path) -> None:
+    repository = shutil.copytree(REPOSITORY, tmp_path / "models")
+    (repository / "rfm" / "1" / "model.py").unlink()
+    words = ["models", "load", "rfm", f"--repository={repository}", "--url=grpc://127.0.0.1:1"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 1
+    assert done.stderr.startswith(f"rfm: {repository}/rfm/1/model.py: expected the model's program, got none; ")
+
+
+def test_a_model_of_another_program_needs_only_what_triton_needs(tmp_path: Path) -> None:
+    folder = tmp_path / "foreign"
+    (folder / "3").mkdir(parents=True)
+    write_config(FOREIGN)(folder)
+    fault = fault_in(tmp_path, "foreign")
+    assert fault is not None
+    assert fault.startswith(f"{folder / '3' / 'model.py'}: expected the model's program, got none")
+    (folder / "3" / "model.py").touch()
+    assert fault_in(tmp_path, "foreign") is None
+    write_config(FOREIGN + 'default_model_filename: "other.py"\n')(folder)
+    assert "/3/other.py: expected" in str(fault_in(tmp_path, "foreign"))
