@@ -6,7 +6,7 @@
   same for the time of a context.
 - Access: ``endpoints``, optionally with TLS, and the ``admin_key`` of restricted APIs.
 - ``model_processes`` finds dead and stopped model processes; ``ending`` ends processes; ``cleanup`` removes the shared
-  memory of killed servers; ``process_table`` reads /proc.
+  memory of killed servers.
 - Calls to a running Triton: ``http``, and over gRPC ``repository_api``, which loads and unloads models.
 
 ``rfm.supervise`` builds on this package: it watches Triton and restarts it.

@@ -10,7 +10,7 @@ import shutil
 from pathlib import Path
 
 from rfm.launch.installation import ServerStartError
-from rfm.launch.process_table import ZOMBIE, stat_of
+from rfm.launch.model_processes import has_ended
 
 SHARED_MEMORY = Path("/dev/shm")
 # Beginning of the names of the Python backend's regions. Newer Tritons let no client map a region with this name.
@@ -49,7 +49,7 @@ class Claim:
         """Return the requests that model processes which have ended had noted; if none has ended, those of all."""
         files = SHARED_MEMORY.glob(f"{self.requests.name}*")
         notes = {int(file.name.rpartition("_")[2]): file.read_text(errors="replace") for file in files}
-        ended = [pid for pid in notes if (stat := stat_of(pid)) is None or stat.state == ZOMBIE]
+        ended = [pid for pid in notes if has_ended(pid)]
         return [each for pid in ended or notes for each in notes[pid].partition("\0\0")[0].split("\0") if each]
 
     def release(self) -> None:

@@ -4,17 +4,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import suppress
 from pathlib import Path
 
-from rfm.launch.process_table import STOPPED, ZOMBIE, arguments_of, children_of, stat_of
+import psutil
 
 UNKNOWN = ""  # the model of a process that died before the first look
 LOADING_DEAD_S = 5.0  # Triton ends a failed load within about 1 s, unless the process died before its handshake
 
 _PROGRAM = "triton_python_backend_stub"
 _PROGRAM_IN_KERNEL = _PROGRAM[:15]
-_STATES = {ZOMBIE: "a process of it is dead", STOPPED: "a process of it is stopped"}
+_STATES = {psutil.STATUS_ZOMBIE: "a process of it is dead", psutil.STATUS_STOPPED: "a process of it is stopped"}
 
 
 class ModelProcesses:
@@ -44,17 +45,39 @@ class ModelProcesses:
 
     def _states(self) -> dict[int, str]:
         """Return the state of each model process, and note its model."""
-        states = {}
+        states: dict[int, str] = {}
         for pid in children_of(self._triton_pid):
-            stat = stat_of(pid)
-            if stat is None:
-                continue
-            words = arguments_of(pid)  # .../triton_python_backend_stub .../MODEL/VERSION/model.py ...
-            if len(words) > 1 and words[0].endswith(_PROGRAM):
-                self._models[pid] = Path(words[1]).parent.parent.name
-            elif stat.name == _PROGRAM_IN_KERNEL:
-                self._models.setdefault(pid, UNKNOWN)
-            if pid in self._models:
-                states[pid] = stat.state
+            with suppress(psutil.NoSuchProcess):  # it has ended
+                process = psutil.Process(pid)
+                state = process.status()
+                words = [] if state == psutil.STATUS_ZOMBIE else process.cmdline()
+                if len(words) > 1 and words[0].endswith(_PROGRAM):  # then .../MODEL/VERSION/model.py
+                    self._models[pid] = Path(words[1]).parent.parent.name
+                elif process.name().startswith(_PROGRAM_IN_KERNEL):
+                    self._models.setdefault(pid, UNKNOWN)
+                if pid in self._models:
+                    states[pid] = state
         self._models = {pid: model for pid, model in self._models.items() if pid in states}
         return states
+
+
+def children_of(pid: int) -> Iterator[int]:
+    """Yield the child processes of a process, zombies included.
+
+    Reads the kernel's lists of children if they exist, since a machine may have thousands of processes.
+    """
+    lists = list(Path(f"/proc/{pid}/task").glob("*/children"))
+    for file in lists:
+        with suppress(FileNotFoundError, ProcessLookupError):  # the thread has ended
+            yield from map(int, file.read_text().split())
+    if not lists:
+        with suppress(psutil.NoSuchProcess):
+            yield from (child.pid for child in psutil.Process(pid).children())
+
+
+def has_ended(pid: int) -> bool:
+    """True for a zombie and an unknown id."""
+    try:
+        return bool(psutil.Process(pid).status() == psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return True

@@ -24,9 +24,7 @@ from rfm_client.contract.process_log import about
 GATEWAY = "gateway"
 STEADY_S = 60.0  # after a longer run, a process is not in a crash loop
 MOST = 5  # restarts in a row
-MOST_OF_A_MODEL = (
-    3  # before it is left out; a call and its repeat end a process twice, so one call alone costs no model
-)
+MOST_OF_A_MODEL = 3  # of them; a call ends a process twice at most, so one call alone costs no model
 ASK_S = 1.0  # between the requests to the gateway
 TRIES = 2  # requests in a row without an answer; one alone may be due to a machine that stood still
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
@@ -53,15 +51,16 @@ class BackOff:
         """Record a successful start."""
         self._running_since_s = time.monotonic()
 
-    def pause_s(self, reason: str, cause: str = "") -> float:
-        """Record a fault or a failed start. Return the seconds to wait before the next start. Raises CrashLoopError.
-
-        cause: what had the fault; empty: the process itself
-        """
+    def failed(self, cause: str) -> int:
+        """Record a fault of ``cause``, or a failed start. Return its number of faults in this row."""
         if self._running_since_s is not None and time.monotonic() - self._running_since_s >= self._steady_s:
             self.row = []
         self._running_since_s = None  # a failed start does not count as running
-        self.row.append(cause or self._what)
+        self.row.append(cause)
+        return self.row.count(cause)
+
+    def pause_s(self, reason: str) -> float:
+        """Return the seconds to wait before the next start. Raises CrashLoopError. reason: that of the last fault"""
         if len(self.row) > MOST:
             got = f"{len(self.row)} faults in a row; the last: {reason}"
             raise CrashLoopError(f"{self._what}: expected to run, got {got}")
@@ -118,6 +117,7 @@ class GatewayProcess:
             return None
         why = self._fault or how_it_ended(status)
         if self._due_s is None:
+            self._back_off.failed(GATEWAY)
             self._due_s = time.monotonic() + self._back_off.pause_s(why)
         if time.monotonic() < self._due_s:
             return None
@@ -244,7 +244,8 @@ class Supervisor:
             self._status.record_down(f"{TRITON} is started again: {reason}")
             self._server.kill()
             self._server.stop()
-            if self._is_to_stop.wait(self._pause_s(what, why, reason)):
+            is_left_out = self._back_off.failed(what) > MOST_OF_A_MODEL and self._leaves_out(what, why)
+            if not is_left_out and self._is_to_stop.wait(self._back_off.pause_s(reason)):
                 return
             self._count(what, why)
             try:
@@ -257,18 +258,6 @@ class Supervisor:
                 was_killed = self._server.exit_status == -signal.SIGKILL and not isinstance(error, SpoiltStartError)
                 what, why = error.model or (TRITON if was_killed else what), str(error)
 
-    def _pause_s(self, what: str, why: str, reason: str) -> float:
-        """Return the seconds to wait before the restart; none if a model is left out. Raises CrashLoopError."""
-        try:
-            pause_s = self._back_off.pause_s(reason, what)
-        except CrashLoopError:
-            if not self._leaves_out(what, why):
-                raise
-            return 0.0
-        row = self._back_off.row
-        is_one_models = len(row) > MOST_OF_A_MODEL and set(row) == {what}
-        return 0.0 if is_one_models and self._leaves_out(what, why) else pause_s
-
     def _leaves_out(self, what: str, why: str) -> bool:
         """Leave out the model ``what`` and its ensembles. False if it is no served model, or no other is left."""
         served = self._served or {}
@@ -277,8 +266,7 @@ class Supervisor:
         if what not in served or not others:
             return False
         row = self._back_off.row
-        whose = "all" if set(row) == {what} else "the last"
-        fault = f"had {whose} of {len(row)} faults in a row: {why}"
+        fault = f"had {row.count(what)} of {len(row)} faults in a row; the last: {why}"
         logger.error("%s is left out, since it %s", what, fault)
         remedy = "`rfm models load`, or a restart of `rfm serve`, serves it again; without its folder it is forgotten"
         reason = f"it is left out, since {what} {fault}; {remedy}"

@@ -10,6 +10,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+import psutil
 import pytest
 
 from commands import RFM, is_alive
@@ -17,7 +18,6 @@ from patients import make_repository
 from rfm.launch import cleanup
 from rfm.launch.ending import ProcessGroup, how_it_ended
 from rfm.launch.endpoints import Endpoints
-from rfm.launch.process_table import all_pids
 from rfm_serve import PATIENCE_S, Serving, children, wait_for
 
 AT_ONCE_S = 10.0  # a model process used to stay for two minutes
@@ -32,7 +32,7 @@ group = ProcessGroup(["/bin/sh", "-c", "trap '' HUP; sleep 600 & sleep 601 & wai
 def of_group(group: int) -> list[int]:
     """Processes of a group that live."""
     found = []
-    for pid in all_pids():
+    for pid in psutil.pids():
         with suppress(ProcessLookupError):  # it has ended
             found += [pid] if os.getpgid(pid) == group and is_alive(pid) else []
     return found
@@ -51,14 +51,14 @@ def test_a_process_that_is_killed_takes_its_groups_along() -> None:
 
 def test_an_ended_group_leaves_no_orphan_and_no_zombie() -> None:
     code = """
-from rfm.launch.process_table import children_of
-while len(children_of(group.process.pid)) < 2:
+from rfm.launch.model_processes import children_of
+while len(list(children_of(group.process.pid))) < 2:
     time.sleep(0.01)
 os.kill(group.process.pid, 9)  # so that its children are orphans
 group.end()
 group.kill()  # whoever has the id now
 group.end()
-sys.exit(len(children_of(os.getpid())))
+sys.exit(len(list(children_of(os.getpid()))))
 """
     assert subprocess.run([sys.executable, "-c", GROUP + code], check=False, timeout=PATIENCE_S).returncode == 0
 

@@ -17,9 +17,10 @@ from typer.testing import CliRunner
 
 from commands import REPOSITORY, nothing_left_behind
 from rfm.config import ConfigError, ServeConfig
-from rfm.launch import endpoints, process_table
+from rfm.launch import endpoints
 from rfm.launch.endpoints import PORTS, Endpoints, GrpcTls, check_version, free_ports
 from rfm.launch.installation import ServerStartError
+from rfm.launch.model_processes import children_of, has_ended
 from rfm.launch.triton_server import TritonServer
 from rfm.supervise.status import NO_REASON, Status, StatusServer
 from rfm_commands.cli import app
@@ -133,20 +134,18 @@ def test_ports_are_free_and_given_once(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("has_lists", [True, False])
 def test_children_are_found_dead_or_alive(monkeypatch: pytest.MonkeyPatch, has_lists: bool) -> None:
     if not has_lists:  # a kernel without CONFIG_PROC_CHILDREN
-        monkeypatch.setattr(Path, "exists", lambda *_: False)
+        monkeypatch.setattr(Path, "glob", lambda *_: iter(()))
     children = [subprocess.Popen(["sleep", "3600"]) for _ in range(2)]
     try:
         children[0].kill()
-        wait_for(
-            lambda: (stat := process_table.stat_of(children[0].pid)) is not None and stat.state == process_table.ZOMBIE
-        )
-        assert {child.pid for child in children} <= set(process_table.children_of(os.getpid()))
-        assert os.getppid() not in process_table.children_of(os.getpid())
+        wait_for(lambda: has_ended(children[0].pid))
+        assert {child.pid for child in children} <= set(children_of(os.getpid()))
+        assert os.getppid() not in children_of(os.getpid())
     finally:
         for child in children:
             child.kill()
             child.wait()
-    assert not {child.pid for child in children} & set(process_table.children_of(os.getpid()))
+    assert not {child.pid for child in children} & set(children_of(os.getpid()))
 
 
 @pytest.mark.slow

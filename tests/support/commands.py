@@ -12,9 +12,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from paths import ROOT
 from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
-from rfm.launch.process_table import ZOMBIE, all_pids, arguments_of, stat_of
+from rfm.launch.model_processes import has_ended
 from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
 
@@ -27,8 +29,7 @@ OWNER = re.compile(rf"{REGION_PREFIX}_(\d+)_")
 
 def is_alive(pid: int) -> bool:
     """Whether there is a process of this id that has not ended."""
-    stat = stat_of(pid)
-    return stat is not None and stat.state != ZOMBIE
+    return not has_ended(pid)
 
 
 def command(repository: Path, endpoints: Endpoints) -> list[str]:
@@ -48,9 +49,15 @@ def regions() -> set[str]:
     return names - {name for name, pid in owners.items() if is_alive(pid) and not is_ours(pid)}
 
 
+def running(words: str, most: int | None = None) -> set[int]:
+    """Ids of processes with these words in their command line, or in its first ``most`` words."""
+    each = psutil.process_iter(["cmdline"])
+    return {process.pid for process in each if words in " ".join((process.info["cmdline"] or [])[:most])}
+
+
 def tritons() -> set[int]:
     """Process ids of every tritonserver that this run of the tests has started."""
-    return {pid for pid in all_pids() if "tritonserver" in "".join(arguments_of(pid)[:1]) and is_ours(pid)}
+    return {pid for pid in running("tritonserver", 1) if is_ours(pid)}
 
 
 def is_ours(pid: int) -> bool:

@@ -13,8 +13,8 @@ import tritonclient.grpc
 from prometheus_client.parser import text_string_to_metric_families
 
 import goldens
+from commands import running
 from reference_server import Served
-from rfm.launch.process_table import all_pids, arguments_of
 from rfm_client import (
     PreferenceSample,
     ProgressSample,
@@ -68,8 +68,7 @@ def wait_until_at_work(model: str) -> None:
     """Returns when a process of the model computes."""
 
     def cpu_s() -> float:
-        ours = [pid for pid in all_pids() if any(f"/{model}/" in word for word in arguments_of(pid)[:2])]
-        return sum(sum(psutil.Process(pid).cpu_times()[:2]) for pid in ours)
+        return sum(sum(psutil.Process(pid).cpu_times()[:2]) for pid in running(f"/{model}/", 2))
 
     before_s = cpu_s()
     wait_for(lambda: cpu_s() > before_s + 0.05)

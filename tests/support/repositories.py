@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
-from rfm.launch.process_table import all_pids, arguments_of
+from commands import running
 from rfm_export.layout import CONFIG_FILE
 from rfm_export.pbtxt import parse, render
 
@@ -56,7 +56,7 @@ def bound_queue(model: Path, *, max_queue_size: int = 0, timeout_ms: int = 0) ->
 def kill_model(repository: Path, model: str = "rfm") -> None:
     """Kills each process of a model that a server of ``repository`` runs."""
     model_file = f"{repository}/{model}/1/model.py"
-    killed = [pid for pid in all_pids() if model_file in " ".join(arguments_of(pid))]
+    killed = running(model_file)
     assert killed
     for pid in killed:
         with suppress(ProcessLookupError):  # it has ended meanwhile

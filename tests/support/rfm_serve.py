@@ -8,19 +8,20 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx
+import psutil
 from prometheus_client.parser import text_string_to_metric_families
 
-from commands import RFM
+from commands import RFM, running
 from one_model import CRASHES
 from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.launch.endpoints import Endpoints
-from rfm.launch.process_table import arguments_of, children_of, stat_of
+from rfm.launch.model_processes import children_of
 from rfm.launch.repository_api import RepositoryApi
 from rfm_client import RewardClient
 
@@ -41,13 +42,16 @@ def wait_for(is_so: Callable[[], Any], within_s: float = PATIENCE_S) -> float:
 
 def children(pid: int, program: str = "") -> list[int]:
     """Processes that the process has started. program: part of their name"""
-    return [child for child in children_of(pid) if (stat := stat_of(child)) is not None and program in stat.name]
+    found = []
+    for child in children_of(pid):
+        with suppress(psutil.NoSuchProcess):  # it has ended
+            found += [child] if program in psutil.Process(child).name() else []
+    return found
 
 
 def model_processes(triton: int, model: str = MODEL) -> list[int]:
     """The processes of a model that live, of the tritonserver ``triton``; a zombie has no arguments."""
-    found = children(triton, "triton_python")
-    return sorted(pid for pid in found if any(f"/{model}/" in word for word in arguments_of(pid)[1:2]))
+    return sorted(running(f"/{model}/", 2) & set(children(triton, "triton_python")))
 
 
 @dataclass
