@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import socket
 import subprocess
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,8 +21,12 @@ import rfm_export
 from callers import Callers, Exam, direct, through_gateway
 from paths import ROOT
 from rfm.config import ExportConfig
+from rfm.launch.model_processes import has_ended
+from rfm.launch.repository_folder import MODEL_FILE
 from rfm.launch.triton_server import Endpoints
+from rfm.supervise.supervisor import GATEWAY
 from rfm_client import RewardClient
+from rfm_client.contract import descriptors
 from rfm_serve import MODEL, RFM, Serving, children, serving, wait_for
 
 CHECKPOINT = ROOT / "model_repository" / "rfm" / "1" / "checkpoint"
@@ -28,6 +35,9 @@ HEALED_S = 10.0  # from a fault to readiness, without the time of a start and th
 CALLERS = 16
 HANG_S = 10
 SILENT_S = 10.0  # the default of rfm serve
+GONE_S = 5.0  # until all processes of a killed rfm serve have ended
+IDLE = 1300  # connections; more than the usual limit of descriptors, 1024
+DIES = "import os\n\nos._exit(1)\n"
 LOOP_S = 120.0  # six or more starts of Triton, with back-off
 MODEL_FAULTS = """
 
@@ -144,7 +154,7 @@ class Site:
 
     @property
     def gateway(self) -> psutil.Process:
-        (pid,) = [pid for pid in children(self.served.process.pid) if pid != self.served.triton]
+        (pid,) = children(self.served.process.pid, "python")
         return psutil.Process(pid)
 
     def wait_healthy(self) -> float:
@@ -159,8 +169,11 @@ class Site:
 
 
 @contextmanager
-def site(folder: Path, export: Callable[[Path], object] | None = None) -> Iterator[Site]:
-    """Start a server for one fault. A server for all faults would reach six restarts in a row, a crash loop."""
+def site(folder: Path, export: Callable[[Path], object] | None = None, *, to: Path | None = None) -> Iterator[Site]:
+    """Start a server for one fault. A server for all faults would reach six restarts in a row, a crash loop.
+
+    to: as of ``serving``
+    """
     folder.mkdir()
     repository, key_file, config = folder / "model_repository", folder / "key", folder / "serve.yaml"
     (export or (lambda repository: export_faulty(repository, folder)))(repository)
@@ -168,7 +181,8 @@ def site(folder: Path, export: Callable[[Path], object] | None = None) -> Iterat
     key_file.write_text("the-key-of-this-run")
     config.write_text(f"serve: {{hang_s: {HANG_S}}}\n")
     port = Endpoints.free().http_port
-    with serving(repository, f"--gateway-port={port}", f"--admin-key-file={key_file}", f"--config={config}") as served:
+    options = f"--gateway-port={port}", f"--admin-key-file={key_file}", f"--config={config}"
+    with serving(repository, *options, to=to) as served:
         start_s = served.wait_ready()
         exams = [Exam.of(CHECKPOINT, mixed=mixed) for mixed in (True, False)]
         made = Site(served, f"http://127.0.0.1:{port}", folder, start_s, *exams)
@@ -239,6 +253,66 @@ def kill_gateway(site: Site) -> list[Row]:
     return [row, Row("  callers beside it, over gRPC", beside)]
 
 
+def kill_serve(site: Site) -> list[Row]:
+    """Kill ``rfm serve`` itself. All that it started ends at once, and the next start removes what is left."""
+    processes = psutil.Process(site.served.process.pid).children(recursive=True)
+    site.served.process.kill()
+    healed_s = wait_for(lambda: all(has_ended(process.pid) for process in processes))
+    with serving(site.folder / "model_repository") as again:
+        start_s = again.wait_ready()
+    row = Row("kill -9 of rfm serve", None, healed_s, f"{len(processes)} processes ended; started in {start_s:.1f} s")
+    row.expect(healed_s <= GONE_S, f"processes stayed for {healed_s:.1f} s; allowed: {GONE_S:g} s")
+    return [row]
+
+
+def full_disk(healthy: Site) -> list[Row]:
+    """Kill Triton while nothing that ``rfm serve`` writes finds room."""
+    kill = signalled(TRITON, signal.SIGKILL)
+    with site(healthy.folder / "full_disk", to=Path("/dev/full")) as without_room:
+        return healed("kill -9 of Triton, no room for the log", kill, TRITON)(without_room)
+
+
+def dead_load(site: Site) -> list[Row]:
+    """Roll out a half-copied version, and one whose process dies before its handshake with Triton."""
+    rows, version = [], site.folder / "model_repository" / MODEL / "2"
+    for name, program in {"a version without model.py": None, "a process that dies as it loads": DIES}.items():
+        rfm_export.export(CHECKPOINT, version.parent.parent, ExportConfig(num_gpus=0, torch_threads=1))
+        file = version / MODEL_FILE
+        file.unlink() if program is None else file.write_text(program)
+        before, began_s = site.restarts(MODEL), time.monotonic()
+        with site.callers() as callers:
+            with suppress(RuntimeError):
+                site.models("rollout", MODEL, "2")
+                raise AssertionError(f"{name}: expected the rollout to fail")
+            took_s = time.monotonic() - began_s
+            site.served.wait_ready()
+            callers.wait_for_all()
+        told = f"the rollout failed after {took_s:.1f} s; {site.restarts(MODEL) - before:.0f} restarts"
+        row = Row(f"rollout of {name}", callers, took_s, told)
+        row.expect(took_s <= HEALED_S + 2 * site.start_s, f"the rollout took {took_s:.1f} s")
+        rows.append(row)
+        shutil.rmtree(version)
+    return rows
+
+
+def idle_connections(site: Site) -> list[Row]:
+    """Open IDLE connections to the gateway and to each port of Triton, and leave them idle."""
+    descriptors.raise_limit()
+    ends, gateway = site.served.endpoints, httpx.URL(site.gateway_url)
+    ports = [gateway.port, ends.http_port, ends.grpc_port, ends.metrics_port]
+    with ExitStack() as idle, site.callers(CALLERS // 2) as callers, site.gateway_callers() as beside:
+        for port in ports:
+            for _ in range(IDLE):
+                idle.enter_context(socket.create_connection((gateway.host, port)))
+        time.sleep(2 * SILENT_S)  # long enough for a restart
+        callers.wait_for_all()
+        beside.wait_for_all()
+    row = Row(f"{IDLE} idle connections to each of {len(ports)} ports", callers)
+    restarts = sum(map(site.restarts, (TRITON, MODEL, OTHER, GATEWAY)))
+    row.expect(not restarts, f"{restarts:.0f} restarts")
+    return [row, Row("  callers through the gateway", beside)]
+
+
 def signalled(what: str, number: signal.Signals) -> Callable[[Site], None]:
     def send(site: Site) -> None:
         os.kill(site.served.triton if what == TRITON else site.served.model_processes()[0], number)
@@ -255,5 +329,9 @@ FAULTS: tuple[Callable[[Site], list[Row]], ...] = (
     # Three failed batches in a row end the model process; callers of the first two get errors.
     healed("a broken context (simulated)", lambda site: site.trigger("break"), MODEL, may_lose=2 * CALLERS),
     kill_gateway,
+    kill_serve,
+    full_disk,
+    dead_load,
+    idle_connections,
     crash_loop,
 )

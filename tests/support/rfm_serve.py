@@ -116,13 +116,13 @@ class Serving:
 
 
 @contextmanager
-def serving(repository: Path, *more: str) -> Iterator[Serving]:
-    """Within it, the repository is served. Nothing of it may be left behind."""
+def serving(repository: Path, *more: str, to: Path | None = None) -> Iterator[Serving]:
+    """Within it, the repository is served. Nothing of it may be left behind. to: what takes its lines; None: a file"""
     endpoints, status_port = Endpoints.free(), Endpoints.free().http_port
     ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
     options = [f"--{name}-port={port}" for name, port in (ports | {"status": status_port}).items()]
     log = repository.parent / "rfm.log"
-    with log.open("wb") as lines:
+    with (to or log).open("wb") as lines:
         process = subprocess.Popen(
             [RFM, "serve", "--repository", repository, *options, *more], stdout=lines, stderr=lines
         )
