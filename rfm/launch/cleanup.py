@@ -32,7 +32,7 @@ class Claim:
         name = f"{os.getpid()}_{secrets.token_hex(4)}"
         self.region_prefix = f"{REGION_PREFIX}_{name}_"
         self.backends = SHARED_MEMORY / f"{self.region_prefix}backends"
-        self.requests = SHARED_MEMORY / f"{self.region_prefix}requests_"  # and the id of a model process: its notes
+        self.requests = self.backends / "requests_"  # and the id of a model process: its notes
         self._lock = SHARED_MEMORY / f"{self.region_prefix}{_LOCK}"
         new_lock = SHARED_MEMORY / f"rfm-new-{name}"
         try:
@@ -47,10 +47,11 @@ class Claim:
 
     def requests_inside(self) -> list[str]:
         """Return the requests that model processes which have ended had noted; if none has ended, those of all."""
-        files = SHARED_MEMORY.glob(f"{self.requests.name}*")
-        notes = {int(file.name.rpartition("_")[2]): file.read_text(errors="replace") for file in files}
-        ended = [pid for pid in notes if has_ended(pid)]
-        return [each for pid in ended or notes for each in notes[pid].partition("\0\0")[0].split("\0") if each]
+        inside: dict[bool, list[str]] = {True: [], False: []}  # by whether the process has ended
+        for file in self.backends.glob(f"{self.requests.name}*"):
+            noted = file.read_text(errors="replace").partition("\0\0")[0]
+            inside[has_ended(int(file.name.rpartition("_")[2]))] += filter(None, noted.split("\0"))
+        return inside[True] or inside[False]
 
     def release(self) -> None:
         """Remove the regions, the folder and the lock."""

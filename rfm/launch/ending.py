@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -14,6 +15,7 @@ from typing import Any
 
 EXIT_TIMEOUT_S = 10  # for requests in flight; Triton also waits this long for a dead model process
 KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
+REAP_S, POLL_S = 5.0, 0.02  # a driver or a disk may keep a killed process for longer
 
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SIGNALS = {each.value: each.name for each in signal.Signals}
@@ -50,7 +52,7 @@ class ProcessGroup:
                 restore_signals=False,  # SIGPIPE stays ignored: a log that nobody reads ends no process
                 **options,
             )
-        except OSError:
+        except BaseException:
             self._sentinel.communicate()
             raise
 
@@ -68,9 +70,11 @@ class ProcessGroup:
             self.process.wait(KILL_AFTER_S)
         self.kill()
         self.process.wait()
+        ends_s = time.monotonic() + REAP_S
         with suppress(ChildProcessError):
-            while True:  # orphans, too: this process inherits them if it is the first of a container
-                os.waitpid(-self.id, 0)
+            while time.monotonic() < ends_s:  # orphans, too: the first process of a container inherits them
+                if os.waitpid(-self.id, os.WNOHANG) == (0, 0):
+                    time.sleep(POLL_S)
         self._sentinel.communicate()  # closes the pipe, and notes the end
 
 

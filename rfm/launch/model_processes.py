@@ -14,7 +14,6 @@ UNKNOWN = ""  # the model of a process that died before the first look
 LOADING_DEAD_S = 5.0  # Triton ends a failed load within about 1 s, unless the process died before its handshake
 
 _PROGRAM = "triton_python_backend_stub"
-_PROGRAM_IN_KERNEL = _PROGRAM[:15]
 _STATES = {psutil.STATUS_ZOMBIE: "a process of it is dead", psutil.STATUS_STOPPED: "a process of it is stopped"}
 
 
@@ -53,7 +52,7 @@ class ModelProcesses:
                 words = [] if state == psutil.STATUS_ZOMBIE else process.cmdline()
                 if len(words) > 1 and words[0].endswith(_PROGRAM):  # then .../MODEL/VERSION/model.py
                     self._models[pid] = Path(words[1]).parent.parent.name
-                elif process.name().startswith(_PROGRAM_IN_KERNEL):
+                elif state == psutil.STATUS_ZOMBIE:  # also if it died before it was the program
                     self._models.setdefault(pid, UNKNOWN)
                 if pid in self._models:
                     states[pid] = state

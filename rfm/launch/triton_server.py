@@ -147,12 +147,15 @@ class TritonServer:
         Raises ServerStartError.
         """
         try:
-            self._start_ready(served)
-        except SpoiltStartError:
-            if self._signal is not None:  # it is to end
-                raise
-            self.stop()
-            self._start_ready(served)
+            try:
+                self._start_ready(served)
+            except SpoiltStartError:
+                if self._signal is not None:  # it is to end
+                    raise
+                self.stop()
+                self._start_ready(served)
+        except OSError as error:
+            raise ServerStartError(f"{error.filename}: expected to be readable, got: {error.strerror}") from error
 
     def stop(self) -> None:
         """End the server gracefully, by force after KILL_AFTER_S."""
@@ -192,7 +195,8 @@ class TritonServer:
             as_in_file = [name for name in served if _names_the_same_versions(self.repository, name, served[name])]
             if len(as_in_file) < len(served):  # an ensemble would load its parts from their files
                 as_in_file = []
-        check_models(self.repository, sorted(as_in_file))
+        if served is None:  # later, a file that cannot be read for a moment must not cost a model
+            check_models(self.repository, there)
         self._start(sorted(as_in_file))
         self._wait_ready(as_in_file)
         others = {name: served[name] for name in served.keys() - set(as_in_file)} if served else {}
@@ -242,8 +246,7 @@ class TritonServer:
             failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in models]
             if failed:
                 reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
-                kind = SpoiltStartError if re.search(_DIED, reasons) else ServerStartError
-                raise kind(f"models: expected all to be ready, got {reasons}{_remedy(reasons)}", failed[0].name)
+                raise _failed(f"models: expected all to be ready, got {reasons}{_remedy(reasons)}", failed[0].name)
             check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
             return
         kind = SpoiltStartError if status == -signal.SIGABRT else ServerStartError
@@ -261,10 +264,10 @@ class TritonServer:
         try:
             status, text = answer.result()
         except NO_ANSWER as error:
-            raise ServerStartError(f"models: expected {name} to load, got: {error}", name) from error
+            model = name if self.exit_status is None else None  # else Triton itself has ended
+            raise ServerStartError(f"models: expected {name} to load, got: {error}", model) from error
         if status != HTTPStatus.OK:
-            kind = SpoiltStartError if re.search(_DIED, text) else ServerStartError
-            raise kind(f"models: expected {name} to load, got: {text}", name)
+            raise _failed(f"models: expected {name} to load, got: {text}", name)
 
     def _pause(self, processes: ModelProcesses, ends_s: float) -> None:
         """Wait for POLL_S. Kill Triton and raise SpoiltStartError if a model process is dead, or after ``ends_s``."""
@@ -294,6 +297,10 @@ class TritonServer:
         own = {name: value for name, value in os.environ.items() if name not in SECRETS}
         of_models = {HANG_VARIABLE: str(self._hang_s), INSIDE_VARIABLE: str(claim.requests)}
         return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE, **of_models}
+
+
+def _failed(reason: str, model: str) -> ServerStartError:
+    return (SpoiltStartError if re.search(_DIED, reason) else ServerStartError)(reason, model)
 
 
 def _remedy(reasons: str) -> str:

@@ -9,7 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing, nullcontext, suppress
 from functools import partial
 from types import FrameType
 
@@ -28,6 +28,7 @@ MOST_OF_A_MODEL = 3  # of them; a call ends a process twice at most, so one call
 ASK_S = 1.0  # between the requests to the gateway
 TRIES = 2  # requests in a row without an answer; one alone may be due to a machine that stood still
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
+GATEWAY_PAUSE_S = 5.0  # between its starts
 
 logger = logging.getLogger(__name__)
 
@@ -37,13 +38,13 @@ class CrashLoopError(ServerStartError):
 
 
 class BackOff:
-    """Growing pauses between the restarts of one process; none before the first.
+    """Growing pauses between the restarts of Triton; none before the first.
 
     row: what had each of the faults in a row
     """
 
-    def __init__(self, what: str, steady_s: float = STEADY_S) -> None:
-        self._what, self._steady_s = what, steady_s
+    def __init__(self, steady_s: float = STEADY_S) -> None:
+        self._steady_s = steady_s
         self.row: list[str] = []
         self._running_since_s: float | None = None  # None: not running
 
@@ -63,12 +64,12 @@ class BackOff:
         """Return the seconds to wait before the next start. Raises CrashLoopError. reason: that of the last fault"""
         if len(self.row) > MOST:
             got = f"{len(self.row)} faults in a row; the last: {reason}"
-            raise CrashLoopError(f"{self._what}: expected to run, got {got}")
+            raise CrashLoopError(f"{TRITON}: expected to run, got {got}")
         return 0.0 if len(self.row) == 1 else min(FIRST_PAUSE_S * 2.0 ** (len(self.row) - 2), LONGEST_PAUSE_S)
 
 
 class GatewayProcess:
-    """The gateway as a child process. Call ``look`` often: it restarts a gateway that has ended.
+    """The gateway as a child process. Call ``look`` often: it restarts a gateway that has ended, however often it ends.
 
     A thread kills a gateway that listens but is silent.
 
@@ -78,15 +79,14 @@ class GatewayProcess:
 
     def __init__(self, command: Sequence[str], address: tuple[str, int], silent_s: float) -> None:
         self._command, self._address, self._silent_s = command, address, silent_s
-        self._back_off = BackOff(GATEWAY)
         self._group: ProcessGroup | None = None
-        self._due_s: float | None = None
+        self._started_s = 0.0
         self._fault: str | None = None
 
     def start(self) -> None:
         """Start the gateway as a child process."""
+        self._started_s = time.monotonic()
         self._group = ProcessGroup(self._command)
-        self._back_off.started()
         self._fault = None
         threading.Thread(target=self._listen, args=(self._group,), name="rfm-gateway", daemon=True).start()
 
@@ -99,7 +99,7 @@ class GatewayProcess:
             except TimeoutError:
                 num_missed += 1
             except OSError:  # it does not listen yet, or has ended
-                pass
+                num_missed = 0
             if num_missed == TRIES:
                 self._fault = f"no answer for {self._silent_s:g} s"
                 group.kill()
@@ -112,16 +112,12 @@ class GatewayProcess:
             connection.recv(1)
 
     def look(self) -> str | None:
-        """Restart an ended gateway. Return why it ended; None: no restart. Raises CrashLoopError."""
+        """Restart an ended gateway, GATEWAY_PAUSE_S after its start or later. Return why it ended; None: no restart."""
         if self._group is None or (status := self._group.process.poll()) is None:
             return None
-        why = self._fault or how_it_ended(status)
-        if self._due_s is None:
-            self._back_off.failed(GATEWAY)
-            self._due_s = time.monotonic() + self._back_off.pause_s(why)
-        if time.monotonic() < self._due_s:
+        if time.monotonic() - self._started_s < GATEWAY_PAUSE_S:
             return None
-        self._due_s = None
+        why = self._fault or how_it_ended(status)
         self._group.end()
         self.start()
         return why
@@ -158,7 +154,7 @@ class Supervisor:
             TritonWatch, server, self._status, probe_s=probe_s, hang_s=hang_s, silent_s=triton_silent_s
         )
         self._is_to_stop = threading.Event()
-        self._new_back_off = partial(BackOff, TRITON, STEADY_S + hang_s)
+        self._new_back_off = partial(BackOff, STEADY_S + hang_s)
         self._back_off = self._new_back_off()
         self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
@@ -219,20 +215,22 @@ class Supervisor:
         if self._server.exit_status is not None:
             self._start_again(TRITON, how_it_ended(self._server.exit_status))
         elif self._watch.fault is not None:
-            self._start_again(*self._watch.fault)
+            self._start_again(*self._watch.fault, counts=not self._watch.is_of_load)
         if self._gateway is not None and (why := self._gateway.look()):
             self._count(GATEWAY, why)
         if self._watch is not None and self._watch.reasons:
             reasons = self._watch.reasons
             if self._left_out:
-                lasting = set(self._server.models) - reasons.keys()  # neither deleted nor loaded again
-                self._left_out = {model: why for model, why in self._left_out.items() if model in lasting}
+                with suppress(OSError):  # the folder may be readable again at the next look
+                    lasting = set(self._server.models) - reasons.keys()  # neither deleted nor loaded again
+                    self._left_out = {model: why for model, why in self._left_out.items() if model in lasting}
             self._status.record({**self._left_out, **reasons}, self._left_out)
 
-    def _start_again(self, what: str, why: str) -> None:
+    def _start_again(self, what: str, why: str, *, counts: bool = True) -> None:
         """Restart Triton; return when it is ready, or after a stop signal. Raises CrashLoopError.
 
         what: the model with the fault, or TRITON
+        counts: False: the fault is not part of a crash loop
         """
         began_s = time.monotonic()
         if inside := self._server.requests_inside():
@@ -244,9 +242,11 @@ class Supervisor:
             self._status.record_down(f"{TRITON} is started again: {reason}")
             self._server.kill()
             self._server.stop()
-            is_left_out = self._back_off.failed(what) > MOST_OF_A_MODEL and self._leaves_out(what, why)
-            if not is_left_out and self._is_to_stop.wait(self._back_off.pause_s(reason)):
-                return
+            if counts:
+                is_left_out = self._back_off.failed(what) > MOST_OF_A_MODEL and self._leaves_out(what, why)
+                if not is_left_out and self._is_to_stop.wait(self._back_off.pause_s(reason)):
+                    return
+            counts = True
             self._count(what, why)
             try:
                 self._start()

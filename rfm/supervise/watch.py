@@ -79,6 +79,7 @@ class TritonWatch:
         self.served = dict(served)
         self.reasons: dict[str, str] = dict.fromkeys(served, "it is loading")
         self.fault: tuple[str, str] | None = None  # the model, or TRITON, and the reason
+        self.is_of_load = False  # True: the fault is that of a load, which somebody asked for
         self._closed = threading.Event()
         threading.Thread(target=self._run, name="rfm-watch", daemon=True).start()
 
@@ -124,8 +125,11 @@ class TritonWatch:
     def _dead(self) -> tuple[str, str] | None:
         settled = self._ready.keys() - self._going
         found = self._processes.fault(settled if self._going else {*settled, UNKNOWN})
-        loading = next(iter(self._going), TRITON) if len(self._going) <= 1 else TRITON
-        return found and (found[0] or loading, found[1])
+        if found is None:
+            return None
+        loading = next(iter(self._going)) if len(self._going) == 1 else TRITON
+        self.is_of_load = (found[0] or loading) in self._going
+        return found[0] or loading, found[1]
 
     def _probed(self) -> tuple[str, str] | None:
         probed = {name: probe.fault(self._progress_s.get(name, 0.0)) for name, probe in self._probes.items()}

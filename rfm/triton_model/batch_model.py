@@ -103,6 +103,7 @@ class BatchModel(Generic[Question, Answer]):
             self._pipeline.close()
         self._metrics.close()
         self._watchdog.close()
+        self._inside.close()
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         """Load the weights in the folder ``version`` onto ``device``."""

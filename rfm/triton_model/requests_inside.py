@@ -8,6 +8,7 @@ import os
 import threading
 from collections.abc import Iterable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from rfm.triton_model.request import Request
@@ -26,12 +27,18 @@ class RequestsInside:
         self._lock = threading.Lock()
         self._ids: dict[int, str] = {}
         self._notes: mmap.mmap | None = None
+        self._path = Path(f"{prefix}{os.getpid()}")
         if prefix:
             with suppress(OSError):  # no room
-                file = os.open(f"{prefix}{os.getpid()}", os.O_CREAT | os.O_RDWR, 0o600)
+                file = os.open(self._path, os.O_CREAT | os.O_RDWR, 0o600)
                 os.posix_fallocate(file, 0, SIZE)
                 self._notes = mmap.mmap(file, SIZE)
                 os.close(file)
+
+    def close(self) -> None:
+        """Remove the file."""
+        if self._notes is not None:
+            self._path.unlink(missing_ok=True)
 
     def add(self, requests: Iterable[Request[Any]]) -> None:
         """Note requests before any work on them."""

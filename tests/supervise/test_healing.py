@@ -278,7 +278,7 @@ def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the
 
 
 def test_the_row_names_what_had_each_fault() -> None:
-    ends = BackOff("triton")
+    ends = BackOff()
     for cause in ("rfm", "", "rfm"):
         ends.pause_s("why", cause)
     assert ends.row == ["rfm", "triton", "rfm"]
@@ -293,17 +293,17 @@ def test_a_crash_loop_is_many_faults_each_soon_after_a_start(monkeypatch: pytest
         nonlocal now_s
         ends.started()
         now_s += duration_s
-        ends.failed("gateway")
+        ends.failed("triton")
         return ends.pause_s("why")
 
-    ends = BackOff("gateway")
+    ends = BackOff()
     assert [run_for(1.0) for _ in range(MOST)] == [0, 0.5, 1, 2, 4]
     assert run_for(STEADY_S) == 0
     assert [run_for(1.0) for _ in range(MOST - 1)] == [0.5, 1, 2, 4]
-    wanted = r"^gateway: expected to run, got 6 faults in a row; the last: why$"
+    wanted = r"^triton: expected to run, got 6 faults in a row; the last: why$"
     with pytest.raises(CrashLoopError, match=wanted):
         run_for(1.0)
-    ends = BackOff("triton")
+    ends = BackOff()
     run_for(5 * STEADY_S)
     for _ in range(MOST - 1):
         now_s += 2 * STEADY_S

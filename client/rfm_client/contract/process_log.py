@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from datetime import datetime, timezone
+from itertools import islice
 from urllib.parse import quote
 
 from rfm_client.contract.settings import ConfigError
@@ -22,6 +23,7 @@ LEVEL_VARIABLE = "RFM_LOG_LEVEL"
 _LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 _OURS = ("rfm", "rfm_client", "rfm_gateway")  # loggers that the level is for: at DEBUG, libraries would log too much
 _IN_IDS = "._:/+=@-"  # besides letters and digits
+_MOST_IDS, _MOST_LETTERS = 64, 64  # in a line
 
 _requests: ContextVar[str] = ContextVar("requests", default="")
 
@@ -60,8 +62,8 @@ def about(ids: Iterable[str]) -> Iterator[None]:
 
 
 def _in_log(ids: Iterable[str]) -> str:
-    """Return ids without spaces, separated by commas."""
-    return ",".join(quote(each, safe=_IN_IDS) for each in ids)
+    """Return ids without spaces, separated by commas: the beginnings of the first ones."""
+    return ",".join(quote(each[:_MOST_LETTERS], safe=_IN_IDS) for each in islice(ids, _MOST_IDS))
 
 
 class _StandardError(logging.Handler):
