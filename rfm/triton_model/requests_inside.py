@@ -36,7 +36,7 @@ class RequestsInside:
                 os.close(file)
 
     def close(self) -> None:
-        """Remove the file."""
+        """Remove the file of this process."""
         if self._notes is not None:
             self._path.unlink(missing_ok=True)
 
