@@ -12,7 +12,7 @@ SAMPLE_TOKENS_PARAMETER = "max_sample_tokens"
 FAMILY_PARAMETER = "family"  # the package of the checkpoint's family
 DTYPE_PARAMETER = "dtype"  # empty: as checkpoint and device decide
 FEATURE_CACHE_PARAMETER = "feature_cache_mib"  # 0: no cache
-PYTHON_PARAMETERS = (THREADS_PARAMETER, BUDGET_PARAMETER, SAMPLE_TOKENS_PARAMETER, FAMILY_PARAMETER, DTYPE_PARAMETER)
+PYTHON_PARAMETERS = (THREADS_PARAMETER, BUDGET_PARAMETER, SAMPLE_TOKENS_PARAMETER, DTYPE_PARAMETER)
 GRAPHS_PARAMETER = "cuda_graphs"  # present only if it is on
 OLD_QUEUE_PARAMETERS = ("max_queue_size", "queue_timeout_ms")  # of old exports; today's bound Triton's own queue
 

@@ -73,12 +73,13 @@ class GatewayProcess:
 
     A thread kills a gateway that listens but is silent.
 
+    command: command line of the gateway
     address: host and port of the gateway
     silent_s: seconds without an answer after which the gateway counts as silent
     """
 
     def __init__(self, command: Sequence[str], address: tuple[str, int], silent_s: float) -> None:
-        self._command, self._address, self._silent_s = command, address, silent_s
+        self.command, self._address, self._silent_s = command, address, silent_s
         self._group: ProcessGroup | None = None
         self._started_s = 0.0
         self._fault: str | None = None
@@ -86,7 +87,7 @@ class GatewayProcess:
     def start(self) -> None:
         """Start the gateway as a child process."""
         self._started_s = time.monotonic()
-        self._group = ProcessGroup(self._command)
+        self._group = ProcessGroup(self.command)
         self._fault = None
         threading.Thread(target=self._listen, args=(self._group,), name="rfm-gateway", daemon=True).start()
 

@@ -34,6 +34,7 @@ from client_commands import (
     web_server,
 )
 from reference_server import Served
+from rfm.launch.repository_api import RepositoryApi
 from rfm_client import (
     FrameScores,
     ProgressResult,
@@ -71,7 +72,8 @@ def test_status_tells_what_triton_counts(served: Served) -> None:
     wait_for(lambda: (shown()[1][MODEL]["batches"] or {"count": 0})["count"])  # the model tells once a second
     server, models = shown()
     assert (server["ready"], server["version"], server["metrics_error"]) == (True, "2.51.0", None)
-    assert models.keys() == {file.parent.name for file in served.repository.glob("*/config.pbtxt")}
+    with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
+        assert models.keys() == {entry.name for entry in api.index() if entry.is_ready}
     with tritonclient.http.InferenceServerClient(served.url("http").removeprefix("http://")) as triton:
         (counted,) = triton.get_inference_statistics(MODEL)["model_stats"]
     model, stats = models[MODEL], counted["inference_stats"]

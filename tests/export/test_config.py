@@ -16,7 +16,7 @@ from labelling import LEROBOT
 from paths import ROOT
 from rfm.config import ExportConfig, ServeConfig
 from rfm.launch.triton_server import Endpoints
-from rfm.supervise.supervisor import Supervisor
+from rfm.supervise.supervisor import GatewayProcess, Supervisor
 from rfm_client.contract.settings import ConfigError, settings_of
 from rfm_commands import cli
 from rfm_commands.config import SECTIONS, Config
@@ -142,8 +142,8 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Any:
     class RanError(Exception):
         pass
 
-    def supervised(*_: Any, gateway: list[str], **__: Any) -> Supervisor:
-        found["gateway"] = gateway
+    def supervised(*_: Any, gateway: GatewayProcess, **__: Any) -> Supervisor:
+        found["gateway"] = gateway.command
         raise RanError
 
     monkeypatch.setattr(cli, "Supervisor", supervised)

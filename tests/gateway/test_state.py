@@ -176,8 +176,9 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_si
         poll(lambda: not answers(url))
         poll(lambda: answers(url))
         assert answered(ask_json(gateway, [progress(FIRST)])) == expected(gateway, [progress(FIRST)])
-        started += psutil.Process(process.pid).children(recursive=True)
-        (stopped,) = (child for child in set(started) - {own} if "rfm_gateway" in child.cmdline())
+        running = psutil.Process(process.pid).children(recursive=True)
+        started += running
+        (stopped,) = (child for child in running if "rfm_gateway" in child.cmdline())
         stopped.suspend()
         poll(lambda: not stopped.is_running())
         poll(lambda: answers(url))
