@@ -23,6 +23,7 @@ class LoopThread:
         self._process_id = os.getpid()
         self._starting = threading.Lock()  # _is_stopped must not change between check and use
         self._is_stopped = False
+        self._cancelled: set[asyncio.Task[Any]] = set()  # by ``stop``
         self._thread = threading.Thread(target=self._loop.run_forever, name=name, daemon=True)
         self._thread.start()
 
@@ -75,16 +76,16 @@ class LoopThread:
         try:
             return await coroutine
         except asyncio.CancelledError:
-            if not self._is_stopped:
+            if asyncio.current_task() not in self._cancelled:
                 raise
             raise ClientClosedError("this RewardClient was closed during the call") from None
 
     async def _end(self, last: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        others = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in others:
+        self._cancelled = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in self._cancelled:
             task.cancel()
         try:
-            await asyncio.gather(*others, return_exceptions=True)
+            await asyncio.gather(*self._cancelled, return_exceptions=True)
             await last()
             await self._loop.shutdown_default_executor()
         finally:
