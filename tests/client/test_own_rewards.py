@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
 from gymnasium.wrappers import RecordEpisodeStatistics
 from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
 
@@ -220,3 +221,25 @@ def test_statistics_inside_a_vector_show_the_reward_model_s_rewards(
             assert told["episode"]["l"][index] == 3 + index
             returns[index], num_ended = 0, num_ended + 1
     assert num_ended >= 5
+
+
+SILENT: dict[str, Callable[[], Any]] = {
+    "the vector": lambda: VectorWrapper(INSIDE["the vector"](AutoresetMode.DISABLED)),
+    "each environment": lambda: INSIDE["each environment"](AutoresetMode.DISABLED),
+    "each environment, in a process": lambda: AsyncVectorEnv(
+        [lambda: RecordEpisodeStatistics(CodedEnv())], autoreset_mode=AutoresetMode.DISABLED
+    ),
+}
+
+
+@pytest.mark.parametrize("inside", SILENT.values(), ids=SILENT)
+def test_statistics_inside_a_vector_that_would_miss_an_end_by_success_are_refused(
+    recorder: Recorder, inside: Callable[[], Any]
+) -> None:
+    options = RewardOptions(frames_from="pixels", terminate_on_success=SuccessRule())
+    remedy = r"wrap in the other order: RecordEpisodeStatistics\(RewardModelVectorWrapper\(...\)\)$"
+    with (
+        closing(inside()) as env,
+        pytest.raises(ValueError, match=rf"^terminate_on_success: expected None .*; {remedy}"),
+    ):
+        RewardModelVectorWrapper(env, recorder, TASK, options)

@@ -111,6 +111,30 @@ def test_tensors_are_paid_as_arrays_would_be(mode: AutoresetMode, source: str | 
         np.testing.assert_array_equal(of_model["reward_model"]["progress"], wanted_of_model["reward_model"]["progress"])
 
 
+class IntegerEnds(gym.vector.VectorWrapper):
+    """Says 0 and 1 of an episode's end."""
+
+    def step(self, actions: Any) -> Any:
+        observations, rewards, terminations, truncations, infos = super().step(actions)
+        return observations, rewards, terminations.astype(int), truncations.astype(int), infos
+
+
+@pytest.mark.parametrize("mode", [NEXT_STEP, SAME_STEP, DISABLED])
+def test_ends_that_are_integers_are_paid_as_booleans_would_be(mode: AutoresetMode) -> None:
+    def told(*wrappers: Any) -> Any:
+        env: Any = SyncVectorEnv([partial(CodedEnv, *each) for each in enumerate(LENGTHS)], autoreset_mode=mode)
+        for wrapper in wrappers:
+            env = wrapper(env)
+        with Recorder() as client:
+            env = RewardModelVectorWrapper(env, client, TASKS, RewardOptions(sampling="all", frames_from="pixels"))
+            return [step[1:4] for step in rolled(env, mode, np.zeros(2, int))], client.calls
+
+    (steps, calls), (expected, expected_calls) = told(IntegerEnds), told()
+    assert calls == expected_calls
+    np.testing.assert_array_equal(steps, expected)
+    assert {step[1].dtype for step in steps} == {np.dtype(bool)}
+
+
 def test_a_success_ends_an_episode_of_a_tensor_vector(recorder: Recorder) -> None:
     options = RewardOptions(frames_from="pixels", terminate_on_success=SuccessRule(threshold=0.0))
     env = RewardModelVectorWrapper(TensorVector(DISABLED), recorder, TASKS, options)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -144,31 +145,74 @@ def test_an_error_at_the_last_step_is_an_end(told: Any) -> None:
     assert told() == []
 
 
+def test_final_allows_a_reset_after_each_error(recorder: Recorder) -> None:
+    env = RewardModelWrapper(CodedEnv(), recorder, TASK, replace(FINAL, success_bonus=1.0))
+    for _ in range(3):
+        env.reset()
+        recorder.failing = len(recorder.calls)
+        with pytest.raises(ServerUnavailableError):
+            env.step(0)
+
+
+def vector(recorder: Recorder, lengths: tuple[int, int], mode: AutoresetMode) -> RewardModelVectorWrapper:
+    makers = [partial(CodedEnv, number, (length,)) for number, length in enumerate(lengths)]
+    return RewardModelVectorWrapper(SyncVectorEnv(makers, autoreset_mode=mode), recorder, TASKS, FINAL)
+
+
+def cut(env: RewardModelVectorWrapper) -> None:
+    env.reset()
+    for _ in range(2):
+        env.step(np.zeros(2, int))
+
+
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
 def test_final_refuses_a_vector_that_is_reset_before_its_episodes_end(
     recorder: Recorder, told: Any, mode: AutoresetMode
 ) -> None:
-    """The second environment ends in time; the first never does."""
-    makers = [partial(CodedEnv, number, (length,)) for number, length in enumerate((3, 2))]
-    env = RewardModelVectorWrapper(SyncVectorEnv(makers, autoreset_mode=mode), recorder, TASKS, FINAL)
-
-    def cut() -> None:
-        env.reset()
-        for _ in range(2):
-            env.step(np.zeros(2, int))
-
+    env = vector(recorder, (3, 3), mode)
     for _ in range(2):
-        cut()
+        cut(env)
     assert told() == [f"envs[0]: {WARNED}"]
     with pytest.raises(ValueError, match=rf"^envs\[0\]: {REFUSED}"):
-        cut()
+        cut(env)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
+def test_final_allows_resets_of_a_vector_in_which_an_episode_has_ended(
+    recorder: Recorder, told: Any, mode: AutoresetMode
+) -> None:
+    """The second environment ends in time; the first never does."""
+    env = vector(recorder, (3, 2), mode)
+    for _ in range(4):
+        cut(env)
+    assert told() == [f"envs[0]: {WARNED}"]
+
+
+class Still:
+    """A policy that always takes the first action."""
+
+    def predict(self, observations: Any, *_args: Any, **_options: Any) -> tuple[Any, None]:
+        return np.zeros(len(observations["pixels"]), int), None
+
+
+def test_final_allows_evaluations_that_end_with_the_shortest_episode(recorder: Recorder, told: Any) -> None:
+    """``evaluate_policy`` takes a single episode from the last environment, and cuts those of the others."""
+    vectors = pytest.importorskip("stable_baselines3.common.vec_env", reason="the extra sb3 is not installed")
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    from rfm_client.sb3 import RewardModelVecEnv
+
+    makers = [partial(CodedEnv, number, (length,)) for number, length in enumerate((9, 9, 9, 2))]
+    env = vectors.VecMonitor(RewardModelVecEnv(vectors.DummyVecEnv(makers), recorder, TASK, FINAL))
+    assert [evaluate_policy(Still(), env, n_eval_episodes=1)[0] > 0 for _ in range(4)] == [True] * 4
+    assert told() == [f"envs[0]: {WARNED}"]
 
 
 def test_final_refuses_a_vecenv_that_is_reset_before_its_episodes_end(recorder: Recorder, told: Any) -> None:
     vectors = pytest.importorskip("stable_baselines3.common.vec_env", reason="the extra sb3 is not installed")
     from rfm_client.sb3 import RewardModelVecEnv
 
-    makers = [partial(CodedEnv, number, (length,)) for number, length in enumerate((3, 2))]
+    makers = [partial(CodedEnv, number) for number in range(2)]
     env = RewardModelVecEnv(vectors.DummyVecEnv(makers), recorder, TASKS, FINAL)
     with pytest.raises(ValueError, match=rf"^envs\[0\]: {REFUSED}"):
         for _ in range(3):

@@ -19,12 +19,13 @@ does not predict it), its ``step``, its ``lag`` in steps, and the steps ``skippe
 frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
 ResetNeeded. A step after an episode's end does, too, unless the environment resets in that step.
 
-``compute_reward`` raises NotImplementedError: hindsight relabelling would mix the environment's rewards with the
-model's. If a Monitor or RecordEpisodeStatistics inside the wrapper reports an episode, the wrapper puts the sum of the
-model's rewards into ``info["episode"]``.
+``compute_reward`` of RewardModelWrapper raises NotImplementedError: hindsight relabelling would mix the environment's
+rewards with the model's. If a Monitor or RecordEpisodeStatistics inside the wrapper reports an episode, the wrapper
+puts the sum of the model's rewards into ``info["episode"]``.
 
 A time limit belongs inside the wrapper, as ``gymnasium.make`` puts it. A reset of an unended episode that drops a
-reward logs a warning, once. In mode ``final``, a second such reset in a row raises ValueError.
+reward logs a warning, once. In mode ``final``, a second such reset in a row, with no end of an episode and no error in
+between, raises ValueError.
 """
 
 from __future__ import annotations
@@ -34,7 +35,14 @@ from typing import Any
 
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.integrations.own_rewards import WritingMonitor, refuse_relabelling, warn_of_file, with_statistics
+from rfm_client.integrations.own_rewards import (
+    RETURNS,
+    WritingMonitor,
+    refuse_relabelling,
+    refuse_statistics,
+    warn_of_file,
+    with_statistics,
+)
 from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
 try:
@@ -197,15 +205,11 @@ def _check_shows_its_end(info: Info) -> None:
 
 def _check_statistics(env: gymnasium.Env[Any, Any], options: RewardOptions) -> None:
     """Raise ValueError for statistics that would miss episodes; warn of a file with the environment's rewards."""
-    ends = options.terminate_on_success
-    is_counted = ends is not None and env.has_wrapper_attr("episode_returns")
-    expected = "None with a Monitor or RecordEpisodeStatistics inside, which does not see this end"
-    remedy = "wrap in the other order: Monitor(RewardModelWrapper(...)); call make_vec_env with a function that makes "
-    require("terminate_on_success", not is_counted, expected, f"{ends}; {remedy}RewardModelWrapper(...)")
-    while isinstance(env, gymnasium.Wrapper):
-        if isinstance(env, WritingMonitor):
-            warn_of_file("env", "Monitor(RewardModelWrapper(...), filename)")
-        env = env.env
+    if options.terminate_on_success is not None and env.has_wrapper_attr(RETURNS):
+        make = "call make_vec_env with a function that makes RewardModelWrapper(...)"
+        refuse_statistics(options.terminate_on_success, f"Monitor(RewardModelWrapper(...)); {make}")
+    if any(isinstance(layer, WritingMonitor) for layer in _layers(env)):
+        warn_of_file("env", "Monitor(RewardModelWrapper(...), filename)")
 
 
 def tasks_of(task: str | Sequence[str], num_envs: int) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 
 from rfm_client.contract.checks import require
@@ -20,7 +20,7 @@ from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import as_array, checked_mask
 from rfm_client.episodes.steps import copied
 from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind, tasks_of
-from rfm_client.integrations.own_rewards import correct_statistics
+from rfm_client.integrations.own_rewards import RETURNS, correct_statistics, refuse_statistics
 from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
 OfEnvs: TypeAlias = dict[int, RewardedEpisode]  # by number of the environment
@@ -51,7 +51,8 @@ class RewardModelVectorWrapper(VectorWrapper):
     Raises ValueError if ``options`` names a source of frames that ``env`` lacks; for SAME_STEP with frames from
     ``render()``, which never shows an episode's last frame; and for ``terminate_on_success`` unless DISABLED, because
     an environment that resets by itself does not know of the success. In these two cases, wrap each sub-environment in
-    RewardModelWrapper instead. Raises TypeError if ``env`` is no ``gymnasium.vector.VectorEnv``.
+    RewardModelWrapper instead. Raises ValueError, too, for ``terminate_on_success`` with a RecordEpisodeStatistics
+    inside, which would miss that end; TypeError if ``env`` is no ``gymnasium.vector.VectorEnv``.
     """
 
     def __init__(
@@ -64,6 +65,8 @@ class RewardModelVectorWrapper(VectorWrapper):
         check_kind(env, VectorEnv)
         check_frame_source(options, env.render_mode, env.single_observation_space)
         autoreset_mode = _checked_autoreset_mode(env, options)
+        if options.terminate_on_success is not None and _has_statistics(env):
+            refuse_statistics(options.terminate_on_success, "RecordEpisodeStatistics(RewardModelVectorWrapper(...))")
         tasks = tasks_of(task, env.num_envs)
         super().__init__(env)  # after the checks: a refused wrapper must not close the environments when collected
         self._rewarder = EpisodeRewarder(client, options)
@@ -103,7 +106,8 @@ class RewardModelVectorWrapper(VectorWrapper):
         resetting = self._resetting
         self._whole = np.zeros_like(self._whole)  # until each frame is kept
         observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
-        terminated, truncated, paid = map(as_array, (terminations, truncations, env_rewards))
+        terminated, truncated = (as_array(each).astype(np.bool_) for each in (terminations, truncations))
+        paid = as_array(env_rewards)
         self._ended = ended = terminated | truncated
         stepped, fresh, final = self._added(self._shown(observations), infos, resetting)
         self._rewarder.score(
@@ -250,6 +254,13 @@ def check_differ(where: str, last: Any, first: Any, instead: str) -> None:
         got = "the first frame of the next one: the environment seems to draw into the array that it has returned"
         remedy = f"let it return a copy of its observation, or {instead}"
         raise InvalidSampleError.at(where, "the last frame of the ended episode", f"{got}; {remedy}")
+
+
+def _has_statistics(env: VectorEnv) -> bool:
+    """True with a RecordEpisodeStatistics around the vector or around environments in it."""
+    if isinstance(env, VectorWrapper):
+        return hasattr(env, RETURNS) or _has_statistics(env.env)
+    return isinstance(env, (AsyncVectorEnv, SyncVectorEnv)) and any(env.call("has_wrapper_attr", RETURNS))
 
 
 def _checked_autoreset_mode(env: VectorEnv, options: RewardOptions) -> AutoresetMode:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Places where an environment's own reward would stay in use beside the reward model's: refused or corrected."""
+"""Refuse or correct every use of the environment's own reward."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
+from rfm_client.episodes.steps import SuccessRule
 from rfm_client.integrations.rewards import Info, RewardedEpisode
 
 RELABELS = "compute_reward"  # method of an environment that rewards a step for another goal
+RETURNS = "episode_returns"  # attribute of Monitor and RecordEpisodeStatistics
 _STATISTICS = "episode"  # key in info, of Monitor and RecordEpisodeStatistics
 
 
@@ -18,6 +20,15 @@ def refuse_relabelling(*_args: object, **_kwargs: object) -> NoReturn:
     expected = "no rewards for other goals, since the reward model scores frames and a task sentence"
     remedy = "turn off hindsight relabelling (HerReplayBuffer); other replay buffers keep the model's rewards"
     raise NotImplementedError(f"{RELABELS}: expected {expected}, got a call; {remedy}")
+
+
+def refuse_statistics(rule: SuccessRule, instead: str) -> NoReturn:
+    """Raise ValueError for statistics inside, which would miss the ends by ``terminate_on_success``.
+
+    instead: what to make instead
+    """
+    expected = "None with a Monitor or RecordEpisodeStatistics inside, which does not see this end"
+    raise ValueError(f"terminate_on_success: expected {expected}, got {rule}; wrap in the other order: {instead}")
 
 
 def with_statistics(info: Info, episode: RewardedEpisode) -> Info:
@@ -47,7 +58,7 @@ class _HasFile(type):
 
 
 class WritingMonitor(metaclass=_HasFile):
-    """The kind of a Monitor that writes a file, for ``isinstance``. A ``VecEnv`` can look for it in its processes."""
+    """Matches, in ``isinstance``, a Monitor that writes a file. A ``VecEnv`` can look for it in its processes."""
 
 
 def warn_of_file(where: str, outside: str) -> None:

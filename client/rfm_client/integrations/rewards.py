@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
@@ -24,7 +25,6 @@ from rfm_client.data.orientation import ChannelOrder, Orientation
 from rfm_client.data.sampling import Rule
 from rfm_client.episodes.live import LiveView
 from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, SuccessRule
-from rfm_client.integrations.unpaid import UnpaidResets
 
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
@@ -36,6 +36,13 @@ _PAID: dict[Mode, Callable[[float, float, float, bool], float]] = {  # of progre
     "shaping": lambda now, before, gamma, is_end: gamma * now - before,
     "final": lambda now, before, gamma, is_end: now if is_end else 0.0,
 }
+
+_INSIDE = (
+    "put the time limit inside the wrapper: RewardModelWrapper(TimeLimit(env, steps), ...), "
+    "or gymnasium.make(..., max_episode_steps=steps)"
+)
+
+logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,15 +201,10 @@ class RewardedEpisode:
         self._has_succeeded = self._has_bonus = self._has_ended = False
 
     @property
-    def num_steps(self) -> int:
-        """Number of steps since the reset."""
-        return self.frames.step
-
-    @property
     def is_unpaid(self) -> bool:
         """True if the episode goes on, and a step of it is not yet paid."""
         paid = 0 if self.known is None or self._options.mode == "final" else self.known.step
-        return not self._has_ended and self.num_steps > paid
+        return not self._has_ended and self.frames.step > paid
 
     def add(self, frame: Any) -> None:
         """Add a copy of a frame, uint8 [H, W, 3], or of a dict of these by camera. Raises InvalidSampleError."""
@@ -289,14 +291,27 @@ class EpisodeRewarder:
         self._source = client
         self._options = options
         self._made: RewardClient | None = None
-        self._unpaid_resets = UnpaidResets(refuses=options.mode == "final")
+        self._has_dropped = False  # the last reset has, and no episode has ended since
+        self._has_warned = False
 
     def check_reset(self, episodes: Iterable[RewardedEpisode]) -> None:
         """Warn once of a reset that drops the reward of unended episodes. Call it before the reset.
 
-        Raises ValueError for the second such reset of an environment in a row, in mode ``final``.
+        Raises ValueError in mode ``final`` for the second such reset in a row: episodes that end outside the wrapper
+        would never be paid. An end or an error between the resets allows the second.
         """
-        self._unpaid_resets.check(episodes)
+        unpaid = next((episode for episode in episodes if episode.is_unpaid), None)
+        if unpaid is None:
+            return
+        where = "reset" if unpaid.index is None else f"envs[{unpaid.index}]: reset"
+        got = f"one after {unpaid.frames.step} steps, whose reward is lost"
+        self._has_dropped = not self._has_dropped  # a third reset may go on
+        if not self._has_dropped and self._options.mode == "final":
+            expected = "the end of an episode before it, where mode 'final' pays"
+            raise ValueError(f"{where}: expected {expected}, got {got}, for the second time in a row; {_INSIDE}")
+        if not self._has_warned:
+            self._has_warned = True
+            logger.warning("%s: expected the end of the episode before it, got %s; %s", where, got, _INSIDE)
 
     def begin(self, task: str, frame: Any, index: int | None = None) -> RewardedEpisode:
         """Return a new episode with its first frame. Raises RewardError.
@@ -313,12 +328,14 @@ class EpisodeRewarder:
 
         episodes: to each, True if its newest frame is its last
         """
+        has_dropped, self._has_dropped = self._has_dropped, False  # after an error, a reset may drop a reward
         try:
             self._score(episodes)
+            self._has_dropped = has_dropped
         finally:
             for episode in (episode for episode, ends in episodes.items() if ends or episode.succeeded):
                 episode.end()
-                self._unpaid_resets.ended(episode)
+                self._has_dropped = False
 
     def close(self) -> None:
         """Close the client if it was made here."""
