@@ -63,7 +63,7 @@ class Connection(HttpToolsProtocol):
         super().on_headers_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the timers."""
+        """Forget the timers of head and answer."""
         self._forget_head()
         super().connection_lost(exc)
         self.resume_writing()
