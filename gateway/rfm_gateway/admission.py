@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Limit concurrent evaluations, and let the body of a request arrive before the request takes the place of others."""
+"""Limit concurrent evaluations; a request takes a place only when its body has arrived."""
 
 from __future__ import annotations
 

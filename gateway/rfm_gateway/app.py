@@ -86,6 +86,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
     app = FastAPI(
         title=title, summary=summary, lifespan=lifespan, docs_url=None, redoc_url=None, exception_handlers=_handlers()
     )
+    app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # the innermost
     app.add_middleware(RequestMiddleware, metrics=metrics, config=config)
     if config.cors_origin:
         app.add_middleware(
@@ -95,7 +96,6 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
             allow_headers=["*"],
             expose_headers=[REQUEST_ID_HEADER],
         )
-    app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # the outermost
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
     max_decoded_bytes = DECODED_PER_BODY * limits.max_bytes
     state = TritonState(client, config.triton_url, config.metrics_url, model, credentials)

@@ -25,7 +25,7 @@ from rfm_client.transport.off_loop import off_loop
 from rfm_gateway import schema
 from rfm_gateway.admission import Turn, arriving
 
-MAX_PARTS = 1000  # of one multipart request: each takes memory, also if it is empty
+MAX_PARTS = 2000  # of one multipart request: each takes memory, also if it is empty
 IN_MEMORY_BYTES = 32 * 2**20  # of a file; larger files lie on disk
 MAX_SAMPLES = 10_000  # of one request
 MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 MIB = 2**20
 _HOST_NAME = re.compile(r"[\w.-]+", re.ASCII)
+_ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/A-Z]+")  # as browsers send it
 _SHORTEST_S, _LONGEST_S = 0.001, 86_400.0  # a day
 
 
@@ -70,6 +71,10 @@ class GatewayConfig(Settings):
         for name in self.allow_host:
             if not _HOST_NAME.fullmatch(name):
                 raise ConfigError("allow_host", f"expected a host name without scheme and port, got {name!r}")
+        for origin in self.cors_origin:
+            if not _ORIGIN.fullmatch(origin):
+                expected = "expected * or an origin in lower case without a path, such as http://lab.example:3000"
+                raise ConfigError("cors_origin", f"{expected}, got {origin!r}")
 
     @property
     def triton_url(self) -> str:

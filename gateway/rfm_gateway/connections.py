@@ -9,7 +9,7 @@ from typing import Any
 from starlette.responses import JSONResponse
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from rfm_gateway.admission import RETRY_AFTER
+from rfm_gateway.admission import PACE_BYTES, RETRY_AFTER
 
 _refusal = JSONResponse(
     {"detail": "expected fewer connections at a time, got more"}, 503, {**RETRY_AFTER, "Connection": "close"}
@@ -25,26 +25,34 @@ class Connection(HttpToolsProtocol):
     """A connection that is closed if the head of its next request does not arrive within ``head_s``.
 
     The time begins when the connection opens, and later with the first byte after an answer; until then uvicorn's
-    timeout_keep_alive counts. Beyond uvicorn's limit_concurrency, requests get JSON and Retry-After.
+    timeout_keep_alive counts. The rest of a body that has its answer may take ``rest_s``, since many callers read an
+    answer only after it. So may each PACE_BYTES of an answer: the kernel passes on large pieces.
+
+    Beyond uvicorn's limit_concurrency, requests get JSON and Retry-After. Beyond half of the descriptors above that,
+    connections are closed at once.
     """
 
-    head_s = 10.0
+    head_s, rest_s = 10.0, 120.0
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._most, self.limit_concurrency = self.limit_concurrency, None
         self._head_due: asyncio.TimerHandle | None = None
+        self._read_due: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
         """Wait for the first head."""
         super().connection_made(transport)
-        self._await_head()
+        if self._most is not None and len(self.connections) > self._most + self._most // 14 + 1:
+            transport.abort()
+        self._await_head(self.head_s)
 
     def data_received(self, data: bytes) -> None:
         """Wait for the next head, from its first byte on, also while the rest of a refused body arrives."""
         is_between_requests = self.cycle is None or self.cycle.response_complete
         if is_between_requests and self._head_due is None:
-            self._await_head()
+            has_rest = self.cycle is not None and self.cycle.more_body
+            self._await_head(self.rest_s if has_rest else self.head_s)
         super().data_received(data)
 
     def on_headers_complete(self) -> None:
@@ -55,12 +63,34 @@ class Connection(HttpToolsProtocol):
         super().on_headers_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the timer of the head."""
+        """Forget the timers of head and answer."""
         self._forget_head()
         super().connection_lost(exc)
+        self.resume_writing()
 
-    def _await_head(self) -> None:
-        self._head_due = self.loop.call_later(self.head_s, self.transport.close)
+    def pause_writing(self) -> None:
+        """Wait for the peer to read."""
+        super().pause_writing()
+        self._await_read(self.transport.get_write_buffer_size())
+
+    def resume_writing(self) -> None:
+        """Forget the timer of the peer's reading."""
+        super().resume_writing()
+        if self._read_due is not None:
+            self._read_due.cancel()
+
+    def _await_read(self, unread_bytes: int) -> None:
+        self._read_due = self.loop.call_later(self.rest_s, self._check_read, unread_bytes)
+
+    def _check_read(self, unread_before_bytes: int) -> None:
+        unread_bytes = self.transport.get_write_buffer_size()
+        if unread_before_bytes - unread_bytes < PACE_BYTES:
+            self.transport.abort()
+        else:
+            self._await_read(unread_bytes)
+
+    def _await_head(self, within_s: float) -> None:
+        self._head_due = self.loop.call_later(within_s, self.transport.close)
 
     def _forget_head(self) -> None:
         if self._head_due is not None:

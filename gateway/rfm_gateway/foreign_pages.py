@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Refuse requests of web pages that the gateway did not serve.
 
-A page of another site can send requests to addresses that only its visitor reaches, such as 127.0.0.1. Browsers say so
-in ``Origin`` and ``Sec-Fetch-Site``, which no page can change. With DNS rebinding, the page's own name leads to such an
-address, and browsers take both servers for one. Then ``Host`` has the page's name.
+A page of another site can send requests to addresses that only its visitor can reach, such as 127.0.0.1. Browsers say
+so in ``Origin`` and ``Sec-Fetch-Site``, which no page can change. With DNS rebinding, the page's own name leads to such
+an address, and browsers take both servers for one. Then ``Host`` has the page's name.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rfm_gateway.config import GatewayConfig
 
 EMBEDDED_HERE_ALONE = {"Cross-Origin-Resource-Policy": "same-origin"}  # for old browsers, and HTTP without TLS
 _ANY_ORIGIN = "*"
-_NEVER_PUBLIC = ("local", "internal")  # top-level domains that the public DNS does not have
+_NEVER_PUBLIC = ("local", "internal", "lan", "svc")  # top-level domains that the public DNS does not have
 _MOST_LETTERS = 100  # of a header in an answer
 
 
@@ -37,7 +37,7 @@ class ForeignPageMiddleware:
         self._has_key = has_key
         self._is_local = config.host is None or is_loopback(config.host)
         own = () if self._is_local else (config.host or "", socket.gethostname())
-        self._names = {name.lower() for name in (*config.allow_host, *own)}
+        self._names = {name.lower().removesuffix(".") for name in (*config.allow_host, *own)}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
@@ -80,7 +80,7 @@ class ForeignPageMiddleware:
 
 
 def _name_in(host: str) -> str:
-    """Return the name or address in a ``Host``, in small letters; empty if it is malformed."""
+    """Return the name or address in a ``Host``, in lower case; empty if it is malformed."""
     try:
         return (urlsplit(f"//{host}").hostname or "").removesuffix(".")
     except ValueError:

@@ -27,9 +27,11 @@ ENDPOINTS = (*EVALUATIONS, "/gpu_status", "/health", "/model_info", "/metrics")
 CALLER_LEFT = 499  # as nginx logs it
 REJECTIONS = {
     401: "key",
+    403: "origin",
     408: "slow",
     413: "size",
     415: "format",
+    421: "host",
     422: "invalid",
     CALLER_LEFT: "hung_up",
     503: "unavailable",

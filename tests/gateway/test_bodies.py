@@ -132,9 +132,9 @@ def test_too_large_a_body_is_a_413(gateway: TestClient, path: str, content: Any)
 
 
 def test_too_many_parts_are_a_413(gateway: TestClient) -> None:
-    files = [ZERO, *((f"array_{number}", (f"{number}.npy", b"")) for number in range(1000))]
+    files = [ZERO, *((f"array_{number}", (f"{number}.npy", b"")) for number in range(2000))]
     response = gateway.post(NPY, files=files)
-    expected = "body: expected at most 1000 parts, fields and files together, got more"
+    expected = "body: expected at most 2000 parts, fields and files together, got more"
     assert failure(response, 413) == f"{expected}; send the samples in several requests"
     assert gateway.post(NPY, files=files[:-1]).status_code == 503  # there is no Triton
 

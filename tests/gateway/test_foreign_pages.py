@@ -33,10 +33,14 @@ def gateway() -> Iterator[TestClient]:
 
 HOSTS_OF_LOOPBACK = ("localhost", "LOCALHOST:8100", "localhost.", "page.localhost", "127.0.0.1:8100", "[::1]:8100")
 ADDRESSES = ("10.0.0.5:8100", "192.168.1.7", "[fe80::1]:8100")  # which no DNS can change
-HOSTS_OF_NETWORK = ("robot:8100", "gateway", "robot.local", "rfm.prod.svc.cluster.local:80", "host.docker.internal")
+HOSTS_OF_NETWORK = (
+    *("robot:8100", "gateway", "robot.local", "robot.lan", "host.docker.internal"),
+    *("rfm.robots.svc", "rfm.robots.svc.cluster.local:80"),
+)
 FOREIGN_HOSTS = (
     "evil.example.com",
     "evil.example.com:8100",
+    "rfm.robots",
     "127.0.0.1.evil.example",
     "localhost.evil.example",
     "[::1",
@@ -56,8 +60,8 @@ def test_a_name_that_anybody_could_own_gets_nothing_without_a_key(gateway: TestC
 
 
 def test_on_other_addresses_names_of_the_local_network_are_answered_too() -> None:
-    with inside(host="0.0.0.0", allow_host=("GPU.lab.example",)) as client:
-        for host in (*HOSTS_OF_LOOPBACK, *ADDRESSES, *HOSTS_OF_NETWORK, "gpu.lab.example:8100"):
+    with inside(host="0.0.0.0", allow_host=("GPU.lab.example", "box.lab.example.")) as client:
+        for host in (*HOSTS_OF_LOOPBACK, *ADDRESSES, *HOSTS_OF_NETWORK, "gpu.lab.example:8100", "box.lab.example"):
             assert client.get("/viewer/live", headers={"Host": host}).status_code == 200, host
         for host in (*FOREIGN_HOSTS, "other.lab.example", ""):
             told = failure(client.get("/viewer/live", headers={"Host": host}), 421)
@@ -77,6 +81,12 @@ def test_with_a_key_every_host_is_answered_and_the_key_alone_opens() -> None:
 def test_a_host_to_allow_is_a_name(name: str) -> None:
     with pytest.raises(ConfigError, match=f"expected a host name without scheme and port, got {name!r}"):
         GatewayConfig(allow_host=("robot", name))
+
+
+@pytest.mark.parametrize("origin", ["http://lab.example/", "https://Lab.example", "lab.example", "null", ""])
+def test_an_origin_to_allow_is_one_that_browsers_send(origin: str) -> None:
+    with pytest.raises(ConfigError, match=f"cors_origin: expected .* without a path, .*, got {origin!r}"):
+        GatewayConfig(cors_origin=(LAB, origin))
 
 
 OF_OTHERS = {
@@ -112,6 +122,16 @@ def test_a_page_of_another_origin_gets_nothing(gateway: TestClient, headers: dic
     with inside(KEY) as client:
         told = failure(client.post("/evaluate_batch", content=SAMPLE, headers={"X-API-Key": KEY, **headers}), 403)
         assert repr(headers.get("Origin", "none, of another site")) in told
+
+
+@pytest.mark.parametrize(
+    ("reason", "headers"), [("origin", {"Origin": "http://evil.example.com"}), ("host", {"Host": "evil.example.com"})]
+)
+def test_refused_evaluations_are_counted_and_have_their_id(reason: str, headers: dict[str, str]) -> None:
+    with inside() as client:
+        response = client.post("/evaluate_batch", content=SAMPLE, headers={"X-Request-ID": "mine", **headers})
+        assert response.headers["X-Request-ID"] == "mine"
+        assert f'rfm_gateway_rejections_total{{reason="{reason}"}} 1.0' in client.get("/metrics").text
 
 
 @pytest.mark.parametrize("headers", OF_OURS.values(), ids=OF_OURS)

@@ -11,12 +11,15 @@ import threading
 from collections.abc import AsyncGenerator, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import requests
 import uvicorn
 from fastapi import HTTPException, Request
+from fastapi.responses import StreamingResponse
 from prometheus_client import Gauge
+from uvicorn.server import ServerState
 
 from gateway_requests import FIRST, TINY, Triton, ask_json, failure, paused, post_body, progress
 from gateways import WITHIN_S, answers, free_port, poll, running
@@ -30,15 +33,17 @@ KEY = "open sesame"
 SETTINGS = GatewayConfig(triton="grpc://127.0.0.1:1", max_in_flight=1, max_waiting=0)
 
 
-class Hasty(Connection):
-    head_s = 0.2
+HEAD_OF_BODY = b"POST /evaluate_batch HTTP/1.1\r\nHost: gateway\r\nContent-Length: 1000\r\n\r\n"
+LONG_S = 10 * WITHIN_S
 
 
 @contextmanager
-def listening(limit_concurrency: int | None = None, api_key: str | None = None) -> Iterator[int]:
-    """The port of a gateway inside this process, before no Triton."""
+def listening(limit_concurrency: int | None = None, api_key: str | None = None, **bounds_s: float) -> Iterator[int]:
+    """The port of a gateway inside this process, before no Triton. Its bounds are short; one answer is large."""
     app, port = create_app(SETTINGS, api_key), free_port()
-    config = uvicorn.Config(app, port=port, http=Hasty, limit_concurrency=limit_concurrency, log_config=None)
+    app.add_api_route("/large", lambda: StreamingResponse([bytes(2**20)] * 32))
+    hasty = type("Hasty", (Connection,), {"head_s": 0.2, "rest_s": 0.2, **bounds_s})
+    config = uvicorn.Config(app, port=port, http=hasty, limit_concurrency=limit_concurrency, log_config=None)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
     thread.start()
@@ -75,12 +80,61 @@ def test_a_connection_without_a_whole_head_is_closed_and_one_with_it_is_not(sent
 
 
 def test_a_refused_body_that_does_not_end_is_no_reason_to_stay() -> None:
-    head = b"POST /evaluate_batch HTTP/1.1\r\nHost: gateway\r\nContent-Length: 1000\r\n\r\n"
     with listening(api_key=KEY) as port, socket.create_connection(("127.0.0.1", port), WITHIN_S) as slow:
-        slow.sendall(head)
+        slow.sendall(HEAD_OF_BODY)
         assert slow.recv(65536).startswith(b"HTTP/1.1 401 ")
         slow.sendall(b"[")
         assert closed_by_peer(slow)
+
+
+def test_a_refused_body_may_take_longer_than_a_head_so_that_its_sender_gets_the_answer() -> None:
+    with (
+        listening(api_key=KEY, rest_s=LONG_S) as port,
+        socket.create_connection(("127.0.0.1", port), WITHIN_S) as slow,
+    ):
+        slow.sendall(HEAD_OF_BODY)
+        assert slow.recv(65536).startswith(b"HTTP/1.1 401 ")
+        slow.sendall(b"[")
+        for _ in range(2):
+            with socket.create_connection(("127.0.0.1", port)) as silent:
+                assert closed_by_peer(silent)
+        slow.sendall(b" " * 999 + b"GET /docs HTTP/1.1\r\nHost: gateway\r\n\r\n")
+        assert slow.recv(65536).startswith(b"HTTP/1.1 200 ")
+
+
+def test_a_caller_that_reads_no_answer_is_cut_off() -> None:
+    with listening(limit_concurrency=1) as port, socket.create_connection(("127.0.0.1", port), WITHIN_S) as stuck:
+        stuck.sendall(b"GET /large HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert stuck.recv(1)
+        poll(lambda: requests.get(f"http://127.0.0.1:{port}/openapi.json").ok)
+
+
+def test_a_caller_that_reads_an_answer_slowly_is_cut_off_only_when_it_stops() -> None:
+    async def serve() -> None:
+        unread_bytes = [3 * PACE_BYTES, 2 * PACE_BYTES, PACE_BYTES, 1]
+        transport, is_cut_off = Mock(asyncio.Transport), asyncio.Event()
+        transport.get_extra_info.return_value = None
+        transport.get_write_buffer_size.side_effect = unread_bytes
+        transport.abort.side_effect = is_cut_off.set
+        connection = Connection(uvicorn.Config(create_app(SETTINGS)), ServerState(), {})
+        connection.rest_s = 0.01
+        connection.connection_made(transport)
+        connection.pause_writing()
+        await asyncio.wait_for(is_cut_off.wait(), WITHIN_S)
+        assert transport.get_write_buffer_size.call_count == len(unread_bytes)
+
+    asyncio.run(serve())
+
+
+def test_many_connections_without_a_request_leave_descriptors() -> None:
+    """Beyond those that get a 503, connections are closed at once."""
+    with listening(limit_concurrency=2, head_s=LONG_S) as port, ExitStack() as stack:
+        first, *_, late = (
+            stack.enter_context(socket.create_connection(("127.0.0.1", port), WITHIN_S)) for _ in range(4)
+        )
+        assert closed_by_peer(late)
+        first.sendall(HEAD_OF_BODY)
+        assert first.recv(65536).startswith(b"HTTP/1.1 503 ")
 
 
 def test_more_connections_than_allowed_are_a_503() -> None:

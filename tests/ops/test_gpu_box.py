@@ -305,6 +305,16 @@ def test_the_page_s_files_need_no_key_and_all_else_does(box: Box) -> None:
 
 
 @pytest.mark.triton
+def test_the_gateway_answers_by_any_name_of_the_box_also_its_page(box: Box) -> None:
+    """Browsers send this ``Host`` and, as they post, this ``Origin``."""
+    name = f"gpu-box.lan:{PORTS['proxy']}"
+    with box.http(host=name, origin=f"https://{name}", **{"X-API-Key": box.key()}) as caller:
+        caller.headers["Sec-Fetch-Site"] = "same-origin"
+        assert [caller.get(path).status_code for path in ("/health", "/", "/model_info")] == [200] * 3
+        assert caller.post("/evaluate_batch", content=b"").status_code == 422  # as a wrong body is
+
+
+@pytest.mark.triton
 def test_the_log_names_the_caller_and_no_key(box: Box) -> None:
     with box.client(box.grpc_url, api_key=box.key(LATER)) as asked:
         asked.progress(FILMED)
