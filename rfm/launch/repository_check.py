@@ -56,7 +56,7 @@ def _outdated(config: ModelConfig) -> str | None:
     stamp = config.parameters[EXPORT_PARAMETER].string_value
     if stamp != EXPORT_VERSION:
         is_newer = stamp.isdecimal() and int(stamp) > int(EXPORT_VERSION)
-        return f"expected an export by this version of rfm, got one by {'a newer' if is_newer else 'an older'} version"
+        return f"expected an export by this version of rfm, got one of {'a newer' if is_newer else 'an older'} version"
     needed = () if config.backend != "python" else PYTHON_PARAMETERS
     missing = [name for name in needed if name not in config.parameters]
     return f"expected the parameter {missing[0]}, got none" if missing else None
