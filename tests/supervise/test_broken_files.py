@@ -52,7 +52,7 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "empty": ("rfm", write_config(""), "/rfm/config.pbtxt: expected a model's configuration, got an empty file; "),
     "of no version": ("rfm", forget(EXPORT_PARAMETER), "/rfm/config.pbtxt: .* got one of an older version; "),
     "of an older version": ("rfm_frames", change_stamp("0"), "/rfm_frames/config.pbtxt: .* of an older version; "),
-    "of a newer version": ("rfm_encoder", change_stamp("999"), "/rfm_encoder/config.pbtxt: .* by a newer version; "),
+    "of a newer version": ("rfm_encoder", change_stamp("999"), "/rfm_encoder/config.pbtxt: .* of a newer version; "),
     "no program": ("rfm", lambda model: (model / "1/model.py").unlink(), "/rfm/1/model.py: expected the model's pro"),
     "no version": ("rfm", lambda model: shutil.rmtree(model / "1"), "/rfm/1: expected the folder of a version, got no"),
     "no version of an ensemble": ("rfm_frames", lambda model: shutil.rmtree(model / "1"), "/rfm_frames/1: expected "),
