@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -274,15 +273,15 @@ def full_disk(healthy: Site) -> list[Row]:
 
 def dead_load(site: Site) -> list[Row]:
     """Roll out a half-copied version, and one whose process dies before its handshake with Triton."""
-    rows, version = [], site.folder / "model_repository" / MODEL / "2"
+    rows, repository = [], site.folder / "model_repository"
     for name, program in {"a version without model.py": None, "a process that dies as it loads": DIES}.items():
-        rfm_export.export(CHECKPOINT, version.parent.parent, ExportConfig(num_gpus=0, torch_threads=1))
-        file = version / MODEL_FILE
+        version = str(rfm_export.export(CHECKPOINT, repository, ExportConfig(num_gpus=0, torch_threads=1)))
+        file = repository / MODEL / version / MODEL_FILE
         file.unlink() if program is None else file.write_text(program)
         before, began_s = site.restarts(MODEL), time.monotonic()
         with site.callers() as callers:
             with suppress(RuntimeError):
-                site.models("rollout", MODEL, "2")
+                site.models("rollout", MODEL, version)
                 raise AssertionError(f"{name}: expected the rollout to fail")
             took_s = time.monotonic() - began_s
             site.served.wait_ready()
@@ -291,7 +290,6 @@ def dead_load(site: Site) -> list[Row]:
         row = Row(f"rollout of {name}", callers, took_s, told)
         row.expect(took_s <= HEALED_S + 2 * site.start_s, f"the rollout took {took_s:.1f} s")
         rows.append(row)
-        shutil.rmtree(version)
     return rows
 
 
