@@ -4,12 +4,19 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import Any
 
+import httptools
 from starlette.responses import JSONResponse
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from rfm_gateway.admission import PACE_BYTES, RETRY_AFTER
+
+MAX_HEAD_BYTES = 64 * 2**10  # as of most servers
+
+logger = logging.getLogger("rfm_gateway.connections")
+logger.setLevel(logging.ERROR)  # so that malformed requests cannot fill the log
 
 _refusal = JSONResponse(
     {"detail": "expected fewer connections at a time, got more"}, 503, {**RETRY_AFTER, "Connection": "close"}
@@ -22,14 +29,15 @@ def most_connections(num_descriptors: int) -> int:
 
 
 class Connection(HttpToolsProtocol):
-    """A connection that is closed if the head of its next request does not arrive within ``head_s``.
+    """A connection that is closed if the head of its next request is large or does not arrive within ``head_s``.
 
     The time begins when the connection opens, and later with the first byte after an answer; until then uvicorn's
     timeout_keep_alive counts. The rest of a body that has its answer may take ``rest_s``, since many callers read an
     answer only after it. So may each PACE_BYTES of an answer: the kernel passes on large pieces.
 
     Beyond uvicorn's limit_concurrency, requests get JSON and Retry-After. Beyond half of the descriptors above that,
-    connections are closed at once.
+    connections are closed at once. A request before the end of the answer to another is malformed. There are no
+    WebSockets.
     """
 
     head_s, rest_s = 10.0, 120.0
@@ -39,6 +47,8 @@ class Connection(HttpToolsProtocol):
         self._most, self.limit_concurrency = self.limit_concurrency, None
         self._head_due: asyncio.TimerHandle | None = None
         self._read_due: asyncio.TimerHandle | None = None
+        self._is_in_head, self._head_bytes = False, 0
+        self.logger, self.ws_protocol_class = logger, None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
         """Wait for the first head."""
@@ -54,13 +64,31 @@ class Connection(HttpToolsProtocol):
             has_rest = self.cycle is not None and self.cycle.more_body
             self._await_head(self.rest_s if has_rest else self.head_s)
         super().data_received(data)
+        self._head_bytes += len(data)
+        if self._is_in_head and self._head_bytes > MAX_HEAD_BYTES:
+            self.transport.abort()
+
+    def on_message_begin(self) -> None:
+        """Count the bytes of a head."""
+        super().on_message_begin()
+        self._is_in_head, self._head_bytes = True, 0
 
     def on_headers_complete(self) -> None:
-        """Hand the request to the application, or refuse it."""
+        """Hand the request to the application, or refuse it. Raises HttpParserError for a second one at a time."""
         self._forget_head()
+        self._is_in_head = False
+        if self.cycle is not None and not self.cycle.response_complete:
+            raise httptools.HttpParserError("expected one request at a time, got another")
         is_full = self._most is not None and len(self.connections) > self._most
         self.app = _refusal if is_full else self.config.loaded_app
         super().on_headers_complete()
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse malformed requests, and end the answer under way."""
+        if self.cycle is not None:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        super().send_400_response(msg)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the timers of head and answer."""

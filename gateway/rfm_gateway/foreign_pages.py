@@ -12,14 +12,14 @@ import ipaddress
 import socket
 from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rfm_client.contract.addresses import is_loopback
 from rfm_gateway.config import GatewayConfig
 
-EMBEDDED_HERE_ALONE = {"Cross-Origin-Resource-Policy": "same-origin"}  # for old browsers, and HTTP without TLS
+EMBEDDED_HERE_ALONE = {"Cross-Origin-Resource-Policy": "same-origin"}  # without TLS, browsers do not say who asks
 _ANY_ORIGIN = "*"
 _NEVER_PUBLIC = ("local", "internal", "lan", "svc")  # top-level domains that the public DNS does not have
 _MOST_LETTERS = 100  # of a header in an answer
@@ -41,10 +41,16 @@ class ForeignPageMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
+
+        async def send_embedded_here_alone(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(EMBEDDED_HERE_ALONE)
+            await send(message)
+
         refusal = None
         if scope["type"] == "http":
             refusal = self._refusal(Headers(scope=scope), scope["method"])
-        await (refusal or self._app)(scope, receive, send)
+        await (refusal or self._app)(scope, receive, send_embedded_here_alone)
 
     def _refusal(self, headers: Headers, method: str) -> JSONResponse | None:
         host = headers.get("host")  # only HTTP/1.0 may leave it out, and browsers never do

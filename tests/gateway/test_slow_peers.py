@@ -9,7 +9,7 @@ import resource
 import socket
 import threading
 from collections.abc import AsyncGenerator, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -61,6 +61,47 @@ def closed_by_peer(connection: socket.socket) -> bool:
     while connection.recv(65536):
         pass
     return True
+
+
+ENDLESS = {
+    "a header": b"GET / HTTP/1.1\r\nHost: localhost\r\nx: " + b"a" * 2**20,
+    "headers": b"GET / HTTP/1.1\r\nHost: localhost\r\n" + b"a: b\r\n" * 2**17,
+    "a head behind a body that is refused": HEAD_OF_BODY[:-2] + b"\r\n" + b"0" * 1000 + b"GET /" + b"a" * 2**20,
+}
+
+
+@pytest.mark.parametrize("sent", ENDLESS.values(), ids=ENDLESS)
+def test_a_head_without_an_end_is_cut_off(sent: bytes, caplog: pytest.LogCaptureFixture) -> None:
+    with listening(head_s=LONG_S, rest_s=LONG_S) as port, socket.create_connection(("127.0.0.1", port)) as peer:
+        with suppress(ConnectionError):
+            peer.sendall(sent)
+            closed_by_peer(peer)
+        with pytest.raises(ConnectionError):
+            for _ in range(100):
+                peer.sendall(sent)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("length", [1, 9000])
+def test_a_request_for_a_websocket_is_an_ordinary_request(length: int, caplog: pytest.LogCaptureFixture) -> None:
+    upgrade = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nContent-Length: 5\r\n\r\n"
+    with listening() as port, socket.create_connection(("127.0.0.1", port)) as peer:
+        peer.sendall(b"GET /" + b"a" * length + b" HTTP/1.1\r\nHost: localhost\r\n" + upgrade)
+        assert peer.recv(12) == b"HTTP/1.1 404"
+        assert closed_by_peer(peer)
+    assert not caplog.records
+
+
+def test_a_peer_that_sends_many_requests_at_a_time_is_cut_off(caplog: pytest.LogCaptureFixture) -> None:
+    with listening(head_s=LONG_S) as port, socket.create_connection(("127.0.0.1", port)) as peer:
+        peer.sendall(b"GET /docs HTTP/1.1\r\nHost: localhost\r\n\r\n" * 100)
+        peer.settimeout(WITHIN_S)
+        got = b""
+        with suppress(ConnectionError):
+            while chunk := peer.recv(65536):
+                got += chunk
+    assert got.count(b"HTTP/1.1 200") <= 1
+    assert not caplog.records
 
 
 HEADS = {"nothing": b"", "half a head": b"POST /evaluate_batch HTTP/1.1\r\nHos"}

@@ -250,6 +250,16 @@ def test_a_folder_that_hides_its_links_is_refused(tmp_path: Path, monkeypatch: p
         GatewayConfig(dataset=(str(root),)).shown_datasets()
 
 
+def test_a_pipe_in_a_dataset_is_not_read(tmp_path: Path) -> None:
+    """Whoever opened it would wait for somebody to write."""
+    root = copied("toy_v30_many", tmp_path)
+    with serving(root) as get:
+        (root / VIDEO).unlink()
+        os.mkfifo(root / VIDEO)
+        expected = f"{VIDEO}: expected a file or a folder, got a pipe, a socket or a device"
+        assert failure(get("/0/episodes/0/videos/0"), 500).endswith(expected)
+
+
 def test_links_inside_a_dataset_are_followed(tmp_path: Path) -> None:
     root = copied("toy_v30_many", tmp_path)
     (root / "videos").rename(root / "elsewhere")

@@ -16,7 +16,6 @@ from fastapi.responses import JSONResponse
 
 from rfm_client.data.datasets.protocol import DatasetError
 from rfm_gateway.body import Decoded
-from rfm_gateway.foreign_pages import EMBEDDED_HERE_ALONE
 from rfm_gateway.observe import while_connected
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 
 Read = TypeVar("Read")
 
-_HEADERS = {"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff", **EMBEDDED_HERE_ALONE}
+_HEADERS = {"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
 
 
 def dataset_routes(datasets: Sequence[ShownDataset], timeout_s: float, max_video_bytes: int) -> APIRouter:

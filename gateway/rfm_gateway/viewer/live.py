@@ -27,7 +27,6 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, St
 
 from rfm_client.transport.off_loop import off_loop
 from rfm_gateway.body import BodyLimits, field_errors
-from rfm_gateway.foreign_pages import EMBEDDED_HERE_ALONE
 
 MOST_BODY_BYTES = 4 * 2**20
 MOST_EPISODES = 128  # ended episodes are forgotten first, then the longest silent
@@ -40,7 +39,7 @@ _MOST_STEPS = 2000  # of a report by our client
 _MOST_LETTERS = 2000
 _MOST_NUMBER = 10**9  # the limit of a step's number
 _MOST_DIGITS = 15  # of a cursor's number
-_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", **EMBEDDED_HERE_ALONE}
+_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 
 
 def _jpeg(text: Any) -> bytes:
