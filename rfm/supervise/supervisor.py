@@ -244,7 +244,9 @@ class Supervisor:
             self._server.kill()
             self._server.stop()
             if counts:
-                is_left_out = self._back_off.failed(what) > MOST_OF_A_MODEL and self._leaves_out(what, why)
+                num_faults, row = self._back_off.failed(what), self._back_off.row
+                is_too_often = num_faults > MOST_OF_A_MODEL or len(row) > MOST
+                is_left_out = is_too_often and self._leaves_out(what, why)
                 if not is_left_out and self._is_to_stop.wait(self._back_off.pause_s(reason)):
                     return
             counts = True

@@ -199,7 +199,7 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
             api.load(OTHER)
         wait_for(lambda: served.reasons() == {MODEL: NO_REASON, OTHER: NO_REASON})
     assert served.process.returncode == 0
-    told = f"rfm: {OTHER} is left out, since it had 4 of [4-6] faults in a row; the last: "  # after others' faults
+    told = f"rfm: {OTHER} is left out, since it had (4 of [4-6]|[1-3] of 6) faults in a row; the last: "  # after others' faults
     assert any(re.match(told, line) for line in served.said)
 
 
@@ -279,8 +279,7 @@ def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the
 
 def test_the_row_names_what_had_each_fault() -> None:
     ends = BackOff()
-    for cause in ("rfm", "", "rfm"):
-        ends.pause_s("why", cause)
+    assert [ends.failed(cause) for cause in ("rfm", "triton", "rfm")] == [1, 1, 2]
     assert ends.row == ["rfm", "triton", "rfm"]
 
 
