@@ -7,6 +7,7 @@ import fcntl
 import os
 import secrets
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 from rfm.launch.installation import ServerStartError
@@ -49,8 +50,9 @@ class Claim:
         """Return the requests that model processes which have ended had noted; if none has ended, those of all."""
         inside: dict[bool, list[str]] = {True: [], False: []}  # by whether the process has ended
         for file in self.backends.glob(f"{self.requests.name}*"):
-            noted = file.read_text(errors="replace").partition("\0\0")[0]
-            inside[has_ended(int(file.name.rpartition("_")[2]))] += filter(None, noted.split("\0"))
+            with suppress(FileNotFoundError):  # its process has unloaded the model meanwhile
+                noted = file.read_text(errors="replace").partition("\0\0")[0]
+                inside[has_ended(int(file.name.rpartition("_")[2]))] += filter(None, noted.split("\0"))
         return inside[True] or inside[False]
 
     def release(self) -> None:
