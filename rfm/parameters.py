@@ -14,7 +14,6 @@ DTYPE_PARAMETER = "dtype"  # empty: as checkpoint and device decide
 FEATURE_CACHE_PARAMETER = "feature_cache_mib"  # 0: no cache
 PYTHON_PARAMETERS = (THREADS_PARAMETER, BUDGET_PARAMETER, SAMPLE_TOKENS_PARAMETER, DTYPE_PARAMETER)
 GRAPHS_PARAMETER = "cuda_graphs"  # present only if it is on
-OLD_QUEUE_PARAMETERS = ("max_queue_size", "queue_timeout_ms")  # of old exports; today's bound Triton's own queue
 
 INSIDE_VARIABLE = "RFM_REQUESTS_INSIDE"  # beginning of the path where a process notes the requests inside it
 HANG_VARIABLE = "RFM_HANG_S"  # seconds without progress of a batch after which the process ends

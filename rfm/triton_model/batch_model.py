@@ -17,7 +17,7 @@ import torch
 
 from rfm.engine.computation import is_by_this_torch
 from rfm.engine.execution import Execution
-from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, INSIDE_VARIABLE, OLD_QUEUE_PARAMETERS
+from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, INSIDE_VARIABLE
 from rfm.probe_request import probe_request
 from rfm.triton_model import request_log
 from rfm.triton_model.metrics import InstanceMetrics
@@ -82,8 +82,6 @@ class BatchModel(Generic[Question, Answer]):
         self._metrics = InstanceMetrics(labels, _checkpoint(settings), sample_types, lambda: self._watchdog.num_steps)
         self._blank_tensors = probe_request(config)
         self._num_warmups = sum(warmup.get("count") or 1 for warmup in config.get("model_warmup", []))
-        if any(settings.get(name) for name in OLD_QUEUE_PARAMETERS):
-            logger.warning("%s of an older export have no effect: export again", ", ".join(OLD_QUEUE_PARAMETERS))
         told = settings.get(COMPUTATION_PARAMETER)
         if told and not is_by_this_torch(told):
             here = f"torch {torch.__version__}"

@@ -327,12 +327,6 @@ def test_an_instance_notes_that_labels_name_another_pytorch(tmp_path: Path, told
     assert all(f"export with torch {torch.__version__}" in note for note in noted)
 
 
-def test_an_older_export_s_bound_of_the_queue_is_ignored_with_a_note(tmp_path: Path) -> None:
-    model = Model(tmp_path, settings={"queue_timeout_ms": "1"})
-    assert LOGGED[0].endswith("of an older export have no effect: export again")
-    assert [response.error for response in model.respond(request(1), request(5))] == [None, None]
-
-
 @pytest.mark.parametrize(("kind", "gpus"), [("CPU", []), ("GPU", [0, 1, 2, 3])])
 def test_the_cores_of_a_machine_are_shared_among_the_instances(
     kind: str, gpus: list[int], monkeypatch: pytest.MonkeyPatch
