@@ -19,6 +19,7 @@ from paths import ROOT
 from patients import references  # noqa: F401  a fixture
 from reference_server import Served
 from rfm.engine import Engine
+from rfm.launch import endpoints
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import Endpoints
 
@@ -29,6 +30,8 @@ torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start, which share the cores with other tests
 os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test asks the network
+worker, workers = os.getenv("PYTEST_XDIST_WORKER", "gw0"), os.getenv("PYTEST_XDIST_WORKER_COUNT", "1")
+endpoints.PORTS = endpoints.PORTS[int(worker.removeprefix("gw")) :: int(workers)]  # no two workers choose the same port
 os.environ["ONEDNN_MAX_CPU_ISA"] = "AVX512_CORE"  # as the references were computed: AMX rounds bfloat16 elsewhere
 
 
