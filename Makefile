@@ -71,7 +71,7 @@ bench-full: $(INSTALLED)
 GPU_PYTHON = $(if $(wildcard build/gpu.tar.xz),$(PYTHON),$(BIN)/python)
 EMPTY :=
 SPACE := $(EMPTY) $(EMPTY)
-GPU_PATH = $(subst $(SPACE),:,$(addprefix $(CURDIR)/,. client gateway export commands build/gpu/site))
+GPU_PATH = $(subst $(SPACE),:,$(addprefix $(CURDIR)/,. client apps/gateway apps/labels export commands build/gpu/site))
 
 # Measure on a GPU: GPU tests, the bare engine, served checkpoints. Nine minutes.
 # Writes benchmarks/results/gpu.md. ARGUMENTS="--checkout build/gpu/before" measures the commit of make gpu-packages.
@@ -170,12 +170,13 @@ lock:
 	{ echo '# What the image installs beside torch, in the versions of constraints.txt, with the hashes of all files.'; \
 	  echo '# Made by: make lock'; \
 	  echo '# Not here: torch, whose build and so whose hash depends on TORCH_INDEX, and what only torch needs.'; \
-	  printf 'torch\nrfm-client\nrfm-gateway\n' | $(VENV)/lock/bin/uv pip compile --quiet --no-python-downloads --no-header \
+	  printf 'torch\nrfm-client\nrfm-gateway\nrfm-page\n' | $(VENV)/lock/bin/uv pip compile --quiet --no-python-downloads --no-header \
 	  --no-annotate --universal --python-version 3.10 --generate-hashes --constraints constraints.txt --excludes - \
-	  --extra encoders --extra vlm --extra quantized client/pyproject.toml gateway/pyproject.toml pyproject.toml; } > $(VENV)/lock/requirements.txt
+	  --extra encoders --extra vlm --extra quantized client/pyproject.toml apps/gateway/pyproject.toml apps/page/pyproject.toml pyproject.toml; } > $(VENV)/lock/requirements.txt
 	mv $(VENV)/lock/requirements.txt docker/requirements.txt
 
-VERSIONED := pyproject.toml client/pyproject.toml gateway/pyproject.toml CITATION.cff docker/.env.example docker/compose.yaml \
+PROJECTS := pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.toml)
+VERSIONED := $(PROJECTS) CITATION.cff docker/.env.example docker/compose.yaml \
   docker/kubernetes/kserve/kustomization.yaml $(wildcard docker/kubernetes/overlays/*/kustomization.yaml) docs/guides/deploy.md \
   docs/guides/gpu_box.md
 
@@ -200,13 +201,14 @@ model_repository: $(INSTALLED)
 $(VENV):
 	mkdir -p $@
 
-$(INSTALLED): pyproject.toml client/pyproject.toml gateway/pyproject.toml constraints.txt | $(VENV)
+$(INSTALLED): pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.toml) constraints.txt | $(VENV)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	  --editable "client[gym,hdf5,label,ray,rerun]" --editable gateway --editable ".[encoders,vlm,quantized,triton,demo,dev]"
+	  --editable "client[cli,rerun]" --editable apps/gateway --editable "apps/labels[hdf5,ray,rerun]" \
+	  --editable apps/page --editable "apps/rl[sb3]" --editable ".[encoders,vlm,quantized,triton,demo,dev]"
 	touch $@
 
 # Remove what make has made.
 clean:
-	rm -rf $(VENV) build client/build gateway/build demo_output
+	rm -rf $(VENV) build client/build apps/*/build demo_output

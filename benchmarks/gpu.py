@@ -40,7 +40,7 @@ from rfm.config import ExportConfig
 NAME = "gpu"
 LIMIT_S = 510  # the rest of nine minutes is for servers that end
 TESTS_S = 150
-SOURCES = ("", "client", "gateway", "export", "commands")  # folders of a checkout with packages
+SOURCES = ("", "client", "apps/gateway", "apps/labels", "export", "commands")  # folders of a checkout with packages
 NOW, BEFORE = "now", "before"  # names of runs
 KEY = ("what", "way", "graphs", "frames", "size", "callers", "repeated")
 FIGURES = ("samples_per_s", "failed", "p50_ms", "p99_ms", "tokens", "peak_gib")

@@ -4,7 +4,7 @@
 # names must also have one of its hashes; torch's own would depend on TORCH_INDEX. The image is built with it, and a test
 # runs it.
 #
-#   install.sh wheels FOLDER                   builds this checkout's wheels, of the client, the gateway and the server
+#   install.sh wheels FOLDER                   builds this checkout's wheels, of the client, the gateway, its page and the server
 #   install.sh torch ENVIRONMENT               makes the environment and puts PyTorch into it
 #   install.sh packages ENVIRONMENT FOLDER     puts FOLDER's wheels and what they need into it
 #
@@ -29,7 +29,7 @@ build_wheels() {
     make_environment "$builder"
     install_into "$builder" setuptools
     python3 -m pip --python "$builder/bin/python" wheel --disable-pip-version-check --quiet --no-deps \
-        --no-build-isolation --wheel-dir "$1" "$root/client" "$root/gateway" "$root"
+        --no-build-isolation --wheel-dir "$1" "$root/client" "$root/apps/gateway" "$root/apps/page" "$root"
     rm -rf "$builder"
 }
 
@@ -44,7 +44,7 @@ install_torch() {
 install_packages() { # by file: a wheel of this name on an index would not be ours
     # Anew what came with torch: of what is installed already pip compares no hash.
     install_into "$1" --no-deps --require-hashes --force-reinstall --requirement "$root/docker/requirements.txt"
-    install_into "$1" --no-deps "$2"/rfm_client-*.whl "$2"/rfm_gateway-*.whl "$2"/rfm_triton-*.whl
+    install_into "$1" --no-deps "$2"/rfm_client-*.whl "$2"/rfm_gateway-*.whl "$2"/rfm_page-*.whl "$2"/rfm_triton-*.whl
     python3 -m pip --python "$1/bin/python" check --disable-pip-version-check
 }
 

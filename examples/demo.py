@@ -18,7 +18,7 @@ from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.show import scores_table
-from rfm_client.data.inputs import load_trajectory
+from rfm_client.frames.inputs import load_trajectory
 from rfm_commands.demo import show_metrics
 from toy_world import Clip, Task, make_clip
 from toy_world.video import write_video

@@ -22,7 +22,8 @@ import numpy as np
 import typer
 
 from rfm.launch.temporary import stopped_by_signals, temporary_server
-from rfm_client import LiveView, RewardClient
+from rfm_client import RewardClient
+from rfm_rl import LiveView
 from toy_world import Task, forward, pick_and_place, random_scene, render, resting
 
 TASK = Task("red", "plate")

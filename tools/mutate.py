@@ -63,7 +63,10 @@ def start(pattern: str, folder: Path) -> Path:
 
 def run(folder: Path, program: str, *words: str) -> str:
     """Run a program of cosmic-ray, and return its output. Tests import the packages of the clone."""
-    imported = [folder / name for name in (".", "client", "gateway", "export", "commands")]
+    imported = [
+        folder / name
+        for name in (".", "client", "apps/gateway", "apps/labels", "apps/page", "apps/rl", "export", "commands")
+    ]
     own = {"PYTHONPATH": os.pathsep.join(map(str, imported)), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
     words = (str(BIN / program), *words)
     return subprocess.run(

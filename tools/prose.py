@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PRODUCT = ("client", "commands", "export", "gateway", "model_repository", "rfm")
+PRODUCT = ("apps", "client", "commands", "export", "model_repository", "rfm")
 WORDS = {"what": r"what", "one": r"ones?", "that": r"that", "nobody, somebody": r"(no|some|who(ever)?)(body|ever)"}
 
 

@@ -36,8 +36,7 @@ from rfm_client.contract import (
     Trajectory,
     float_frames_to_uint8,
 )
-from rfm_client.data.inputs import as_trajectory, load_trajectory
-from rfm_client.episodes.live import LiveView
+from rfm_client.frames.inputs import as_trajectory, load_trajectory
 
 __all__ = [
     "AccessDeniedError",
@@ -49,7 +48,6 @@ __all__ = [
     "FrameSize",
     "InferenceFailedError",
     "InvalidSampleError",
-    "LiveView",
     "ModelInfo",
     "ModelNotFoundError",
     "PreferenceResult",

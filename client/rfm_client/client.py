@@ -15,10 +15,10 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import DEFAULT_MODEL, Part
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
-from rfm_client.data.fit_to_checkpoint import snapshot
 from rfm_client.episodes.episodes import Episode, Episodes
 from rfm_client.episodes.steps import EpisodeSettings
 from rfm_client.episodes.windows import Window
+from rfm_client.frames.fit_to_checkpoint import snapshot
 from rfm_client.scoring.call import CallOptions
 from rfm_client.transport.calls import Transport
 from rfm_client.transport.lifetime import Closing, OneProcess

@@ -20,23 +20,20 @@ from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import TritonServer, short_spin
 from rfm.supervise.supervisor import CrashLoopError, GatewayProcess, Supervisor
-from rfm_client.cli.command import Given, OptionsOf, with_options
+from rfm_client.cli.command import Given, OptionsOf, add_missing, with_options
 from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import from_here
 from rfm_client.contract.process_log import write_log
 
 try:
-    import rfm_gateway  # noqa: F401  before the modules below, which import parts of it
+    from rfm_gateway import GatewayConfig, gateway, gateway_command  # before the modules below, which import it
 except ModuleNotFoundError:
-    raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./gateway .") from None
+    raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./apps/gateway .") from None
 from rfm_commands.command import AdminKeyFile, RfmCommand, TritonPath, fail, say
 from rfm_commands.config import Config
 from rfm_commands.demo import demo
-from rfm_commands.label import label
 from rfm_commands.models import app as models_app
 from rfm_commands.rollout import names_of
-from rfm_gateway.command import gateway, gateway_command
-from rfm_gateway.config import GatewayConfig
 
 ACCEPTED_WARNING = "a Triton with known remote vulnerabilities is accepted: use NVIDIA's container 26.07 or newer"
 EXPORT_EXAMPLE = "\b\nExample:\n  rfm export org/name --repository my_models --config serve.yaml"
@@ -189,7 +186,12 @@ def serve(
 
 
 app.command(cls=RfmCommand)(gateway)
-app.command(cls=RfmCommand)(label)
+try:
+    from rfm_commands.label import label
+
+    app.command(cls=RfmCommand)(label)
+except ModuleNotFoundError as error:
+    add_missing(app, "label", f"{error.name} is not installed", "labels", "rfm")
 app.command(cls=RfmCommand)(demo)
 app.add_typer(models_app, name="models")
 

@@ -12,7 +12,7 @@ from typing import Any
 from rfm.config import ExportConfig, ServeConfig
 from rfm.plain_yaml import read_yaml
 from rfm_client.contract.settings import ConfigError, Settings, settings_of
-from rfm_gateway.config import GatewayConfig
+from rfm_gateway import GatewayConfig
 
 SECTIONS: dict[str, type[Settings]] = {"export": ExportConfig, "serve": ServeConfig, "gateway": GatewayConfig}
 

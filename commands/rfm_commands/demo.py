@@ -41,7 +41,7 @@ def demo(
         import av  # noqa: F401  ``read_video`` needs it
         from rich.console import Console
 
-        from rfm_client.data.video import read_video
+        from rfm_client.frames.video import read_video
     except ImportError as error:
         fail(f'the demo needs {error.name}: pip install ".[demo,encoders,triton]"')
     console, settings = Console(), ExportConfig(**given)
@@ -66,7 +66,7 @@ def score_video(
     frames: uint8 [T, H, W, 3], T frames of H x W pixels, evenly thinned if the checkpoint takes fewer
     """
     from rfm_client.cli.pictures import Panel, plot
-    from rfm_client.data.video import frame_times_s
+    from rfm_client.frames.video import frame_times_s
 
     with RewardClient(endpoints.grpc_url) as client:
         result = client.progress(Trajectory(frames=frames, task=task), subsample=True)

@@ -13,8 +13,8 @@ from PIL import Image
 
 from encoding import encode
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.blank_frames import BlankFrames, is_blank
-from rfm_client.data.video import read_video
+from rfm_client.frames.blank_frames import BlankFrames, is_blank
+from rfm_client.frames.video import read_video
 
 VIDEOS = Path(__file__).parents[1] / "videos"
 SIZE = (48, 64, 3)

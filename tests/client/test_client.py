@@ -32,7 +32,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.data.resize import resize_frames
+from rfm_client.frames.resize import resize_frames
 from rfm_client.transport.calls import Answer, GrpcTransport
 from rfm_client.transport.concurrency import MAX_BYTES, ConcurrencyLimiter
 from rfm_client.transport.credentials import Credentials

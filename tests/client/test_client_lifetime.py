@@ -36,7 +36,7 @@ from rfm_client import (
     RewardClient,
     RewardError,
 )
-from rfm_client.gym import RewardModelWrapper
+from rfm_rl import RewardModelWrapper
 from trajectories import random_trajectory
 
 

@@ -13,7 +13,7 @@ from rfm.rewind.encoders import ImagePreprocessor
 from rfm.vlm.images import QwenImages, SmolImages, fitted_size
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.resize import resize_frames
+from rfm_client.frames.resize import resize_frames
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,12 @@ import pytest
 
 from rfm_client import RewardClient
 from rfm_client.contract.results import FrameScores
-from rfm_client.data.inputs import load_trajectory
-from rfm_client.data.sampling import Sampling
-from rfm_client.data.video import read_video
 from rfm_client.episodes.steps import EpisodeOptions, SuccessRule
-from rfm_client.gym import RewardOptions
-from rfm_client.labelling.options import LabelOptions, RayOptions
+from rfm_client.frames.inputs import load_trajectory
+from rfm_client.frames.sampling import Sampling
+from rfm_client.frames.video import read_video
+from rfm_labels.options import LabelOptions, RayOptions
+from rfm_rl import RewardOptions
 
 URL = "grpc://127.0.0.1:1"
 SCORES = FrameScores(progress=np.full(4, 0.5, np.float32), success=np.full(4, 0.5, np.float32))

@@ -11,7 +11,7 @@ import pytest
 from coded_env import CodedEnv
 from rfm_client import InvalidSampleError, RewardClient
 from rfm_client.contract import FrameSize
-from rfm_client.gym import RewardModelWrapper, RewardOptions
+from rfm_rl import RewardModelWrapper, RewardOptions
 from shelves import V1, V2, Shelf
 
 SHORT, LONG = replace(V1, max_frames=4), replace(V2, max_frames=8)

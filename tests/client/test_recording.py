@@ -19,9 +19,9 @@ from client_commands import TASK, invoke
 from rfm.launch.triton_server import Endpoints
 from rfm_client import FrameScores
 from rfm_client.cli.command import ExitCode
-from rfm_client.data.inputs import load_trajectory
-from rfm_client.data.video import frame_times_s
-from rfm_client.integrations.recording import FRAME, TIME, Recording
+from rfm_client.frames.inputs import load_trajectory
+from rfm_client.frames.video import frame_times_s
+from rfm_client.recording import FRAME, TIME, Recording
 
 JPEG_ERROR = 30  # of a pixel, by which the compressed picture may differ
 NS_PER_S = 1e9

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from paths import VIDEOS
-from rfm_client.data.video import read_video
-from rfm_client.data.video_decoding import Upright
+from rfm_client.frames.video import read_video
+from rfm_client.frames.video_decoding import Upright
 
 WIDTH, HEIGHT = 128, 96
 

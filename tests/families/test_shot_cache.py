@@ -18,7 +18,7 @@ from rfm.vlm.predictor import VlmPredictor
 from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs, frame_digest
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.sampling import RULES, Rule, Sampling
+from rfm_client.frames.sampling import RULES, Rule, Sampling
 from vlm import assert_close, load, video
 
 TASK = "stack the blocks"

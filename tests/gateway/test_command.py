@@ -67,8 +67,8 @@ def test_wrong_options_are_refused(options: str, message: str) -> None:
 
 WITHOUT_GATEWAY = "import sys; sys.modules['rfm_gateway'] = None; sys.argv = {words}; from {module} import main; main()"
 COMMANDS = {
-    "rfm_client.cli": ("rfm-client gateway --triton grpc://localhost:1", "pip install ./client ./gateway"),
-    "rfm_commands.cli": ("rfm serve --gateway-port 8100", "pip install ./client ./gateway ."),
+    "rfm_client.cli": ("rfm-client gateway --triton grpc://localhost:1", "pip install ./client ./apps/gateway"),
+    "rfm_commands.cli": ("rfm serve --gateway-port 8100", "pip install ./client ./apps/gateway ."),
 }
 
 

@@ -18,8 +18,8 @@ from browsers import REBOUND, Browser
 from gateway_requests import Json
 from gateways import Gateway, poll, running
 from rfm.launch.triton_server import Endpoints
-from rfm_client import LiveView
 from rfm_client.episodes import StepScore
+from rfm_rl import LiveView
 from shown_datasets import copied
 
 pytestmark = pytest.mark.slow

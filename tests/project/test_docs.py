@@ -32,9 +32,9 @@ from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajector
 from rfm_client.cli.commands import app
 from rfm_client.contract import wire
 from rfm_client.contract.settings import Setting, settings_of
-from rfm_client.labelling import ClientScorer, LabelOptions, label, open_dataset
 from rfm_commands.cli import app as rfm
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
+from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
 
 pytestmark = pytest.mark.triton
 

@@ -15,7 +15,7 @@ import pytest
 from paths import ROOT
 from rfm.launch.endpoints import Endpoints
 
-DISTRIBUTIONS = {"rfm_client": ROOT / "client", "rfm_gateway": ROOT / "gateway", "rfm_triton": ROOT}
+DISTRIBUTIONS = (ROOT / "client", *(file.parent for file in ROOT.glob("apps/*/pyproject.toml")), ROOT)
 
 
 def version() -> str:
@@ -42,7 +42,7 @@ def test_wheels_serve_and_score_without_the_source_tree(tmp_path: Path) -> None:
     copy, wheels, environment = tmp_path / "source", tmp_path / "wheels", tmp_path / "environment"
     subprocess.run(["git", "clone", "--quiet", ROOT, copy], check=True)
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    for folder in DISTRIBUTIONS.values():
+    for folder in DISTRIBUTIONS:
         source = copy / folder.relative_to(ROOT)
         words = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", wheels, source]
         subprocess.run([*pip, *words], check=True, timeout=300)

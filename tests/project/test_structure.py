@@ -26,17 +26,19 @@ FOLDERS = {
     "rfm_client": "client",
     "rfm_commands": "commands",
     "rfm_export": "export",
-    "rfm_gateway": "gateway",
+    **{f"rfm_{name}": f"apps/{name}" for name in ("gateway", "labels", "page", "rl")},
 }
 # Package, module, or folder of programs -> what of ours it may import besides itself; "!": what of that it may not.
 MAY_IMPORT = {
     "rfm_client.contract": set(),
     "rfm_client.transport": {"rfm_client.contract"},
-    "rfm_client.data": {"rfm_client.contract"},
-    "rfm_client.episodes": {"rfm_client", "!rfm_client.labelling", "!rfm_client.cli"},
-    "rfm_client.labelling": {"rfm_client", "!rfm_client.cli"},
+    "rfm_client.frames": {"rfm_client.contract"},
+    "rfm_client.episodes": {"rfm_client", "!rfm_client.cli"},
     "rfm_client": set(),
     "rfm_gateway": {"rfm_client"},
+    "rfm_labels": {"rfm_client"},
+    "rfm_page": {"rfm_client", "rfm_gateway.mounting", "rfm_labels"},
+    "rfm_rl": {"rfm_client"},
     "rfm.checkpoint": {"rfm.plain_yaml", "rfm_client.contract"},
     **{f"rfm.{family}": {*SHARED, *extended} for family, extended in FAMILIES.items()},
     "rfm.triton_model": {*SHARED, "rfm.parameters", "rfm.probe_request"},
@@ -45,10 +47,10 @@ MAY_IMPORT = {
     "rfm.engine": {"rfm", "!rfm.launch", "!rfm.supervise", "!rfm.triton_model", "rfm_client.contract"},
     "rfm": {"rfm_client.contract"},
     "rfm_export": {"rfm", "rfm_client.contract"},
-    "rfm_commands": {"rfm", "rfm_client", "rfm_export", "rfm_gateway"},
+    "rfm_commands": {"rfm", "rfm_client", "rfm_export", "rfm_gateway", "rfm_labels"},
     "model_repository": {"rfm", "rfm_client.contract"},
-    "examples": {"rfm_client"},
-    "benchmarks": {"rfm_client", "rfm_gateway"},
+    "examples": {"rfm_client", "rfm_labels", "rfm_rl"},
+    "benchmarks": {"rfm_client", "rfm_gateway", "rfm_labels", "rfm_rl"},
 }
 EXCEPTIONS = {
     "commands/rfm_commands/cli.py": {"rfm_export"},  # the command, where all packages meet
@@ -79,16 +81,10 @@ EXTRAS = {
     "av": {"video_decoding.py"},
     "async_timeout": {"deadline.py"},  # Python 3.10 only
     "PIL": {"pictures.py", "resize.py"},
-    "gymnasium": {"gym.py", "gym_vector.py", "sb3.py"},
-    "stable_baselines3": {"sb3.py"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"cli", "plot.py"},
-    "pyarrow": {"label_files.py", "hdf5_tables.py", "lerobot_rows.py", "finished_episodes.py"},
-    "fsspec": {"finished_episodes.py"},
-    "huggingface_hub": {"hub_access.py", "opening.py"},
-    "h5py": {"hdf5_contents.py", "hdf5_layouts.py", "hdf5_labels.py", "hdf5_sources.py"},
-    "ray": {"ray_engine.py"},
+    "huggingface_hub": {"hub_access.py"},
     "rerun": {"recording.py"},
     "prometheus_client": {"status.py"},
 }
@@ -139,7 +135,7 @@ def test_no_extra_of_the_client_names_a_distribution_of_ours() -> None:
 
 LOADS = {  # modules: what must not be loaded with them
     "rfm.engine": {"transformers", "PIL", "av", "matplotlib"},
-    "rfm_client.labelling": {*EXTRAS, "torch"} - {"async_timeout"},
+    "rfm_labels": {*EXTRAS, "h5py", "pyarrow", "fsspec", "ray", "torch"} - {"async_timeout"},
     "rfm_commands.cli, rfm_commands.rollout, rfm.supervise.supervisor": {"torch"},  # two seconds and 200 MB
 }
 
@@ -182,7 +178,7 @@ def test_every_ignored_type_error_has_a_code_and_a_reason(package: str) -> None:
 
 @pytest.mark.parametrize(
     "package",
-    ["rfm_client", "rfm_client.contract", "rfm_client.gym", "rfm_client.labelling", "rfm_client.data.datasets"],
+    ["rfm_client", "rfm_client.contract", "rfm_rl", "rfm_labels", "rfm_labels.datasets"],
 )
 def test_a_package_exports_all_that_it_imports_for_its_users(package: str) -> None:
     module = importlib.import_module(package)
@@ -195,7 +191,7 @@ def test_a_package_exports_all_that_it_imports_for_its_users(package: str) -> No
 def test_files_say_their_licence() -> None:
     files = [
         file
-        for part in ("client", "gateway", "rfm", "export", "commands", "examples", "benchmarks", "tests", "tools")
+        for part in ("client", "apps", "rfm", "export", "commands", "examples", "benchmarks", "tests", "tools")
         for file in (ROOT / part).rglob("*.py")
     ]
     assert files

@@ -21,7 +21,7 @@ from gateways import poll
 from rfm_client.contract.samples import UInt8Array
 
 IMAGES_VARIABLE = "RFM_IMAGES"  # a folder for new pictures of the documents
-AXE = Path(__file__).parents[1] / "gateway" / "vendored" / "axe-core" / "axe.min.js"
+AXE = Path(__file__).parents[1] / "page" / "vendored" / "axe-core" / "axe.min.js"
 WINDOW_PX = (1280, 1400)
 PICTURE_PX = (1440, 900)
 REBOUND = "rebound.example"  # a name of elsewhere that leads here, as with DNS rebinding

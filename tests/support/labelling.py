@@ -21,7 +21,7 @@ from pyarrow import parquet
 
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.labelling import CheckpointFacts, DatasetEpisode, LabelOptions, Scorer, Watch, label, open_dataset
+from rfm_labels import CheckpointFacts, DatasetEpisode, LabelOptions, Scorer, Watch, label, open_dataset
 
 LEROBOT = Path(__file__).parents[1] / "lerobot"
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.resize import as_jpeg
+from rfm_client.frames.resize import as_jpeg
 
 Json = dict[str, Any]
 

@@ -21,7 +21,6 @@ from rfm_client.contract import errors
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of, settings_of
 
 STANDARD_OUTPUT = "-"
-LABEL_PACKAGES = ("fsspec", "huggingface_hub", "pyarrow")  # of the extra "label"
 
 Given: TypeAlias = dict[str, Any]  # values of the given options, by setting
 
@@ -263,8 +262,7 @@ def missing_package(error: ImportError) -> str:
     """Return the error's message with the command that installs the package."""
     if "pip install" in str(error):
         return str(error)
-    package = (error.name or "").partition(".")[0]
-    return f'{error}: pip install "./client[{"label" if package in LABEL_PACKAGES else "cli"}]"'
+    return f'{error}: pip install "./client[cli]"'
 
 
 def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:
@@ -304,3 +302,15 @@ def _shown(default: Any) -> str:
     if isinstance(default, tuple):
         return " ".join(map(str, default))
     return f"{default:g}" if isinstance(default, float) else str(default)
+
+
+def add_missing(app: typer.Typer, name: str, reason: str, package: str, program: str = "rfm-client") -> None:
+    """Add a command that says how to install the application that has it."""
+
+    @app.command(
+        name,
+        help=f"Needs rfm-{package}, which is not installed.",
+        context_settings={"ignore_unknown_options": True, "allow_extra_args": True},
+    )
+    def missing() -> None:
+        fail(f"{name}: {reason}: pip install ./client ./apps/{package}", program)

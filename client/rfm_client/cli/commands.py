@@ -18,14 +18,12 @@ from rfm_client.cli.command import (
     EXIT_CODES,
     Command,
     OptionsOf,
+    add_missing,
     exit_code_of,
-    fail,
     report,
     usage_errors,
     with_options,
 )
-from rfm_client.cli.evaluate import evaluate
-from rfm_client.cli.label import label
 from rfm_client.cli.options import (
     CredentialFiles,
     CredentialsGiven,
@@ -55,6 +53,8 @@ app = typer.Typer(
     rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+_APPLICATIONS = {"evaluate": "labels", "gateway": "gateway", "label": "labels"}  # the packages of commands
 
 VIDEOS = "Videos, .npy or .npz files, or URLs of videos."
 
@@ -258,10 +258,6 @@ def bench_input(
     typer.echo(shlex.join([*words, "--async", "--concurrency-range", "1:16:5"]))
 
 
-app.command(cls=Command, epilog=EXIT_CODES)(label)
-app.command(cls=Command, epilog=EXIT_CODES)(evaluate)
-
-
 def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:
     if num_scored < num_frames:
         report(f"note: {name}: {num_scored} of {num_frames} frames were scored, evenly spaced")
@@ -272,20 +268,17 @@ def _report_blank(name: str, blank: str) -> None:
         report(f"note: {name}: {blank}: its scores mean nothing")
 
 
-def _add_gateway() -> None:
-    """Add rfm-gateway's command; without the package, a command that says how to install it."""
-    try:
-        for found in entry_points(group="rfm_client.commands", name="gateway"):
-            app.command(found.name, cls=Command)(found.load())
-            return
-        reason = "rfm-gateway is not installed"
-    except ImportError as error:
-        reason = str(error)
-
-    @app.command("gateway", context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
-    def gateway() -> None:
-        """Serve the FastAPI server's endpoints before a Triton server; needs rfm-gateway."""
-        fail(f"gateway: {reason}: pip install ./client ./gateway")
+def _add_applications() -> None:
+    """Add the commands of installed applications; for the others, commands that say how to install them."""
+    reasons = {name: f"rfm-{_APPLICATIONS[name]} is not installed" for name in _APPLICATIONS}
+    for found in sorted(entry_points(group="rfm_client.commands"), key=lambda each: each.name):
+        try:
+            app.command(found.name, cls=Command, epilog=EXIT_CODES)(found.load())
+            reasons.pop(found.name, None)
+        except ImportError as error:
+            reasons[found.name] = str(error)
+    for name, reason in reasons.items():
+        add_missing(app, name, reason, _APPLICATIONS.get(name, name))
 
 
-_add_gateway()
+_add_applications()

@@ -23,7 +23,7 @@ from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
 from rfm_client.contract.results import FrameScores, PreferenceResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Trajectory
-from rfm_client.data.fit_to_checkpoint import with_frame_indices
+from rfm_client.frames.fit_to_checkpoint import with_frame_indices
 
 if TYPE_CHECKING:
     from rich.table import Table

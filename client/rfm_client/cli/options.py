@@ -19,8 +19,8 @@ from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
-from rfm_client.data.orientation import ChannelOrder, Orientation
-from rfm_client.data.sampling import RULES, Rule, Sampling
+from rfm_client.frames.orientation import ChannelOrder, Orientation
+from rfm_client.frames.sampling import RULES, Rule, Sampling
 from rfm_client.plot import MAX_CURVES
 from rfm_client.transport.credentials import Credentials
 

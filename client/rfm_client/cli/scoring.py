@@ -32,10 +32,10 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.contract.results import FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory
-from rfm_client.data.blank_frames import BlankFrames
-from rfm_client.data.datasets.sentences import is_blank
-from rfm_client.data.fit_to_checkpoint import FittedSample, fitted, with_frame_indices
-from rfm_client.data.sampling import Sampling, of_prefixes, prefix_samples
+from rfm_client.contract.tasks import is_blank
+from rfm_client.frames.blank_frames import BlankFrames
+from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, with_frame_indices
+from rfm_client.frames.sampling import Sampling, of_prefixes, prefix_samples
 from rfm_client.plot import plot_scores
 
 if TYPE_CHECKING:
@@ -64,8 +64,8 @@ class Source:
     @classmethod
     def read(cls, name: str, video: VideoOptions) -> Source:
         """Read the source from a file or URL. Raises InvalidSampleError."""
-        from rfm_client.data.inputs import ARRAY_SUFFIXES, load_trajectory
-        from rfm_client.data.video import frame_times_s, is_url
+        from rfm_client.frames.inputs import ARRAY_SUFFIXES, load_trajectory
+        from rfm_client.frames.video import frame_times_s, is_url
 
         are_arrays = not is_url(name) and PurePath(name).suffix.lower() in ARRAY_SUFFIXES
         fps = None if are_arrays else video.fps
@@ -284,7 +284,7 @@ def recorder(file: Path | None, names: Sequence[str]) -> Iterator[Record | None]
     if file is None:
         yield None
         return
-    from rfm_client.integrations.recording import Recording
+    from rfm_client.recording import Recording
 
     stems = unique_stems(names)
     with Recording(file) as recording:

@@ -2,7 +2,6 @@
 """Episodes that grow: each step sends only its new frames, and returns the score of the episode so far."""
 
 from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes, Episode, Episodes
-from rfm_client.episodes.live import LiveView
 from rfm_client.episodes.steps import EpisodeOptions, StepScore, StepScores, SuccessRule
 
 __all__ = [
@@ -11,7 +10,6 @@ __all__ = [
     "Episode",
     "EpisodeOptions",
     "Episodes",
-    "LiveView",
     "StepScore",
     "StepScores",
     "SuccessRule",

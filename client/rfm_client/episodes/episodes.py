@@ -17,9 +17,9 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import checked_mask
-from rfm_client.data.sampling import Sampling
 from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, StepScores, copied
 from rfm_client.episodes.windows import EpisodeFrame
+from rfm_client.frames.sampling import Sampling
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.lifetime import AsyncClosing, Closing, OneProcess
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Any, TypedDict, cast
+from typing import Any, Protocol, TypedDict, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -23,15 +23,12 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.results import SUCCESS_THRESHOLD, FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
-from rfm_client.data.blank_frames import FRAMES_IN_A_ROW, BlankFrames, is_black, is_blank
-from rfm_client.data.camera_fusion import FUSES, Fuse
-from rfm_client.data.orientation import ChannelOrder, Channels, Correction, Corrections, Orient, Orientation
-from rfm_client.data.resize import resize_frames
-from rfm_client.data.sampling import Prefix, Rule, Sampling, of_frames
 from rfm_client.episodes.windows import EpisodeFrame, Window
-
-if TYPE_CHECKING:
-    from rfm_client.episodes.live import LiveEpisode, LiveView
+from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW, BlankFrames, is_black, is_blank
+from rfm_client.frames.camera_fusion import FUSES, Fuse
+from rfm_client.frames.orientation import ChannelOrder, Channels, Correction, Corrections, Orient, Orientation
+from rfm_client.frames.resize import resize_frames
+from rfm_client.frames.sampling import Prefix, Rule, Sampling, of_frames
 
 _BLACK = (
     "black ones in a row: simulators in one process can blacken each other's pictures; give each a process of its own"
@@ -59,6 +56,23 @@ class SuccessRule:
         checked_count("last", self.last)
 
 
+class EpisodeReport(Protocol):
+    """One episode in a view."""
+
+    def add(self, frame: UInt8Array, score: StepScore) -> None:
+        """Take a step. Return at once, and raise nothing. frame: uint8 [H, W, 3], which will not change any more."""
+
+    def end(self) -> None:
+        """Take the end of the episode. Return at once, and raise nothing."""
+
+
+class EpisodeView(Protocol):
+    """A view to which episodes report each step, such as ``rfm_rl.LiveView``."""
+
+    def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> EpisodeReport:
+        """Return a new episode. env: its number among those that grow together, from 0; threshold: of success"""
+
+
 class EpisodeSettings(TypedDict, total=False):
     """Fields of EpisodeOptions, as keyword arguments."""
 
@@ -70,14 +84,14 @@ class EpisodeSettings(TypedDict, total=False):
     channels: ChannelOrder | Mapping[str, ChannelOrder]
     resize: bool
     success: SuccessRule
-    live: LiveView | None
+    live: EpisodeView | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeOptions:
     """How each step of an episode is scored. Raises ValueError for contradictory options.
 
-    sampling: a rule of ``rfm_client.data.sampling``; None: the rule of the checkpoint's training
+    sampling: a rule of ``rfm_client.frames.sampling``; None: the rule of the checkpoint's training
     frames: the rule's number of frames; None: the rule's own if fixed, else ``ModelInfo.max_frames``. If the rule needs
         a number and the checkpoint has none, the first step raises ValueError
     cameras: names of the cameras with a frame in each step; empty: a single camera without a name
@@ -99,7 +113,7 @@ class EpisodeOptions:
     channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
     resize: bool = False
     success: SuccessRule = SuccessRule()
-    live: LiveView | None = None
+    live: EpisodeView | None = None
 
     def __post_init__(self) -> None:
         require("cameras", not isinstance(self.cameras, str), "a sequence of names", repr(self.cameras))
@@ -189,7 +203,7 @@ class EpisodeFrames:
         self._options, self._index, self._where = options, index, where
         self._corrections = options.corrections
         self._frames: list[tuple[EpisodeFrame, ...]] = []  # by step and camera
-        self._live: LiveEpisode | None = None
+        self._live: EpisodeReport | None = None
         self._has_warned = False
 
     @property

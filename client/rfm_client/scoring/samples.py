@@ -17,7 +17,7 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import encoder_name
 from rfm_client.contract.results import Result
 from rfm_client.contract.samples import ProgressSample, Sample, Trajectory
-from rfm_client.data.fit_to_checkpoint import FittedSample, fitted, whole, with_frame_indices
+from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, whole, with_frame_indices
 from rfm_client.scoring.batching import groups, model_of, padded_bytes, parts
 from rfm_client.scoring.call import Call
 from rfm_client.transport.calls import Answer

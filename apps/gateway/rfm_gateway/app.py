@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: MIT
+"""The gateway as a FastAPI application."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
+from fastapi.middleware.cors import CORSMiddleware
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import JSONResponse
+from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
+from pydantic.json_schema import models_json_schema
+from starlette.requests import ClientDisconnect
+
+from rfm_client.async_client import AsyncRewardClient
+from rfm_client.contract import errors
+from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_gateway import pages, schema
+from rfm_gateway.admission import RETRY_AFTER
+from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
+from rfm_gateway.config import MIB, GatewayConfig
+from rfm_gateway.foreign_pages import ForeignPageMiddleware
+from rfm_gateway.installed_page import page_of
+from rfm_gateway.mounting import Surroundings
+from rfm_gateway.observe import (
+    CALLER_LEFT,
+    REQUEST_ID_HEADER,
+    CallerLeftError,
+    GatewayMetrics,
+    RequestMiddleware,
+    while_connected,
+)
+from rfm_gateway.scoring import Evaluator
+from rfm_gateway.state import TritonState
+
+DECODED_PER_BODY = 2  # limit of decoded files, as a multiple of the body's limit
+
+_KEY_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # at module level, where FastAPI resolves annotations
+_KEY_BEARER = HTTPBearer(auto_error=False)
+
+_REFERENCE = "#/components/schemas/{model}"
+_MODELS = (schema.EvaluateBatchRequest, schema.InvalidRequest, schema.Failure)
+_STATUS_OF = {  # HTTP status, by the client's error
+    errors.ServerUnavailableError: 503,
+    errors.ModelNotFoundError: 503,
+    errors.DeadlineExceededError: 504,
+    errors.InferenceFailedError: 502,
+    errors.AccessDeniedError: 502,  # the gateway's own credentials, not the caller's
+}
+
+logger = logging.getLogger("rfm_gateway")
+
+
+def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
+    """Return the application.
+
+    api_key: key that requests must show, except for health and documentation; None: no key
+
+    Raises OSError for a missing folder, ValueError for a malformed URL or an unusable file.
+    """
+    folder = None if config.allow_folder is None else config.allow_folder.resolve(strict=True)
+    model, credentials, metrics = config.model or DEFAULT_MODEL, config.credentials, GatewayMetrics()
+    new_client = partial(
+        AsyncRewardClient,
+        config.triton_url,
+        timeout_s=config.timeout_s,
+        retry=False,  # the caller gets the error at once, and may retry
+        max_in_flight=config.max_in_flight,
+        **credentials.options,
+    )
+    client = new_client(model=model)
+
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        async with client:
+            yield
+
+    title, summary = "RFM evaluation gateway", "Rewards for robot trajectories."
+    app = FastAPI(
+        title=title, summary=summary, lifespan=lifespan, docs_url=None, redoc_url=None, exception_handlers=_handlers()
+    )
+    app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # the innermost
+    app.add_middleware(RequestMiddleware, metrics=metrics, config=config)
+    if config.cors_origin:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=config.cors_origin,
+            allow_methods=["GET", "POST"],
+            allow_headers=["*"],
+            expose_headers=[REQUEST_ID_HEADER],
+        )
+    limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
+    max_decoded_bytes = DECODED_PER_BODY * limits.max_bytes
+    state = TritonState(client, config.triton_url, config.metrics_url, model, credentials)
+    guards = [] if api_key is None else [Depends(_key_check(api_key))]
+    guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
+    _add_evaluations(guarded, limits, Evaluator(client, config.timeout_s, folder, max_decoded_bytes), metrics)
+    _add_reports(guarded, state, metrics)
+    page = page_of(config)
+    if page is not None:
+        guarded.include_router(page.routes(Surroundings(config, new_client, limits, max_decoded_bytes, metrics)))
+    app.include_router(guarded)
+
+    @app.get("/health", responses=_failures(502, 503, 504))
+    async def health() -> schema.Health:
+        """Healthy if every model answers a probe or is busy."""
+        return await state.health()
+
+    pages.add_docs(app)
+    if page is not None:
+        page.add_files(app)
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
+    return app
+
+
+def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator, metrics: GatewayMetrics) -> None:
+    async def answer(request: Request, reading: Awaitable[Batch]) -> Response:
+        batch = await reading
+        found = await while_connected(request, evaluator.evaluate(batch, request.state.request_id))
+        for sample in batch.samples:
+            metrics.samples.labels(sample.sample_type).inc()
+        return Response(found.model_dump_json(), media_type="application/json")
+
+    @router.post(
+        "/evaluate_batch",
+        response_model=schema.EvaluateBatchAnswer,
+        responses={422: {"model": schema.InvalidRequest}, **_failures(408, 413, 502, 503, 504)},
+        openapi_extra=_body("application/json", {"$ref": _REFERENCE.format(model="EvaluateBatchRequest")}),
+    )
+    async def evaluate_batch(request: Request) -> Response:
+        """Score samples in JSON."""
+        return await answer(request, read_json(limits, request))
+
+    @router.post(
+        "/evaluate_batch_npy",
+        response_model=schema.EvaluateBatchAnswer,
+        responses={422: {"model": schema.InvalidRequest}, **_failures(400, 408, 413, 415, 502, 503, 504)},
+        openapi_extra=_body("multipart/form-data", _MULTIPART),
+    )
+    async def evaluate_batch_npy(request: Request) -> Response:
+        """Score samples whose arrays are .npy files.
+
+        The fields `sample_0`, `sample_1`, ... hold a sample each, as JSON. In it `{"__numpy_file__": name}` stands for
+        the array in the part of that name.
+        """
+        return await answer(request, read_multipart(limits, request))
+
+
+def _add_reports(router: APIRouter, state: TritonState, metrics: GatewayMetrics) -> None:
+    @router.get("/gpu_status", responses=_failures(502, 503, 504))
+    async def gpu_status() -> schema.GpuStatus:
+        """State of the devices that models run on."""
+        return await state.gpu_status()
+
+    @router.get("/model_info", responses=_failures(502, 503, 504))
+    async def model_info() -> schema.ModelInformation:
+        """Facts about the served checkpoint."""
+        return await state.model_info()
+
+    @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+    async def metrics_text() -> Response:
+        """The gateway's own metrics, for Prometheus."""
+        return Response(metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+_MULTIPART = {
+    "type": "object",
+    "required": ["sample_0"],
+    "properties": {
+        "sample_0": {"type": "string", "description": "A sample as JSON; sample_1 and so on hold the others."},
+        "use_frame_steps": {"type": "string", "enum": ["true", "false"]},
+    },
+    "additionalProperties": {"type": "string", "format": "binary", "description": "An array as a .npy file."},
+}
+
+
+def _body(media_type: str, content: dict[str, Any]) -> dict[str, Any]:
+    return {"requestBody": {"required": True, "content": {media_type: {"schema": content}}}}
+
+
+def _failures(*codes: int) -> dict[int | str, dict[str, Any]]:
+    return {code: {"model": schema.Failure} for code in codes}
+
+
+def _key_check(key: str) -> Callable[..., None]:
+    """Return a dependency that refuses requests without the key."""
+    expected = key.encode()
+
+    def check(
+        in_header: Annotated[str | None, Depends(_KEY_HEADER)],
+        in_bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_KEY_BEARER)],
+    ) -> None:
+        given = (in_header or "", in_bearer.credentials if in_bearer is not None else "")
+        matches = [secrets.compare_digest(each.encode(), expected) for each in given]  # both, in constant time
+        if not any(matches):
+            raise HTTPException(
+                401,
+                "key: expected X-API-Key or Authorization: Bearer, got another or none",
+                {"WWW-Authenticate": "Bearer"},
+            )
+
+    return check
+
+
+def _handlers() -> dict[Any, Any]:
+    """Return handlers that answer every error as JSON, and never answer bad input with 500."""
+
+    def fixed(code: int, detail: str, **headers: str) -> Callable[..., Awaitable[JSONResponse]]:
+        async def handler(_request: Request, _error: Exception) -> JSONResponse:
+            return JSONResponse({"detail": detail}, code, headers)
+
+        return handler
+
+    async def failed(_request: Request, error: errors.RewardError) -> JSONResponse:
+        code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
+        return JSONResponse({"detail": str(error)}, code, RETRY_AFTER if code == 503 else None)
+
+    async def unexpected(_request: Request, error: Exception) -> JSONResponse:
+        logger.error("unexpected", exc_info=error)
+        return JSONResponse({"detail": "the gateway failed; its log has the reason"}, 500)
+
+    return {
+        TimeoutError: fixed(408, "body: expected all of it in time, got a part", Connection="close"),
+        ClientDisconnect: fixed(400, "body: expected all of it, got a part"),  # the caller is gone
+        CallerLeftError: fixed(CALLER_LEFT, "the caller has hung up"),  # for the log and the metrics
+        errors.RewardError: failed,
+        Exception: unexpected,
+    }
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """Return the OpenAPI document, with the schemas of bodies: endpoints read those from the stream, undeclared."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+        _, models = models_json_schema([(model, "validation") for model in _MODELS], ref_template=_REFERENCE)
+        document["components"]["schemas"].update(models["$defs"])
+        app.openapi_schema = document
+    return app.openapi_schema

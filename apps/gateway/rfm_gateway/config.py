@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: MIT
+"""Settings of a gateway: section ``gateway`` of ``rfm serve``'s YAML file, and options of ``rfm gateway``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from rfm_client.contract.addresses import MAX_PORT, check_certificate, split_url
+from rfm_client.contract.listening import check_free
+from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
+from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
+from rfm_client.transport.credentials import Credentials
+from rfm_gateway.installed_page import page_of
+
+MIB = 2**20
+_HOST_NAME = re.compile(r"[\w.-]+", re.ASCII)
+_ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/A-Z]+")  # as browsers send it
+_SHORTEST_S, _LONGEST_S = 0.001, 86_400.0  # a day
+
+
+@dataclass(frozen=True)
+class GatewayConfig(Settings):
+    """Settings of a gateway: addresses, credentials, limits. docs/reference/gateway.md explains them.
+
+    Addresses may be None, because ``rfm serve`` and ``rfm gateway`` have different defaults for them.
+    """
+
+    TITLE: ClassVar[str] = "Gateway (section gateway of the file)"
+
+    port: int | None = setting(None, "Port to listen on; else there is no gateway.", least=1, most=MAX_PORT)
+    host: str | None = setting(None, "Address to listen on; else that of Triton.")
+    triton: str | None = setting(
+        None, "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://; else the one beside it."
+    )
+    metrics_url: str | None = setting(None, "Triton's metrics; else those of the Triton beside it.")
+    model: str | None = setting(None, "Name under which the checkpoint was exported; else rfm, or export.name.")
+    api_key_file: Path | None = setting(
+        None, f"File with the key that requests must show; else {GATEWAY_KEY_VARIABLE}."
+    )
+    certificate: Path | None = setting(None, "Serve HTTPS with this certificate (PEM), and its key.")
+    key: Path | None = setting(None, "The certificate's key (PEM).")
+    triton_ca_file: Path | None = setting(None, "Authorities (PEM) that Triton is trusted by; else the system's.")
+    triton_certificate: Path | None = setting(None, "By which Triton knows the gateway (PEM).")
+    triton_key: Path | None = setting(None, "That certificate's key (PEM).")
+    cors_origin: Texts = setting((), "Origin from which browsers may ask. Repeat for more.")
+    allow_host: Texts = setting((), "Host name by which callers may ask without a key. Repeat for more.")
+    allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
+    timeout_s: float = setting(
+        120.0,
+        "Seconds that a request may take to arrive, then wait, then take to be scored.",
+        least=_SHORTEST_S,
+        most=_LONGEST_S,
+        flag="--timeout",
+    )
+    max_body_mib: int = setting(512, "Largest request.", least=1)
+    max_in_flight: int = setting(256, "Evaluations at a time; others wait.", least=1)
+    max_waiting: int = setting(1024, "Evaluations that wait for their turn; more are refused with 503.", least=0)
+    viewer: bool = setting(True, "Serve the page in the browser, at /.")
+    dataset: Texts = setting((), "LeRobot folder or HDF5 file to show on the page. Repeat for more.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.certificate is None) != (self.key is None):
+            raise ConfigError("certificate, key", "expected both or none, got one")
+        for name in self.allow_host:
+            if not _HOST_NAME.fullmatch(name):
+                raise ConfigError("allow_host", f"expected a host name without scheme and port, got {name!r}")
+        for origin in self.cors_origin:
+            if not _ORIGIN.fullmatch(origin):
+                expected = "expected * or an origin in lower case without a path, such as http://lab.example:3000"
+                raise ConfigError("cors_origin", f"{expected}, got {origin!r}")
+
+    @property
+    def triton_url(self) -> str:
+        """URL of Triton. Raises ConfigError if there is none."""
+        if self.triton is None:
+            raise ConfigError("triton", "expected the URL of a Triton, got none")
+        return self.triton
+
+    @property
+    def credentials(self) -> Credentials:
+        """Credentials for Triton. Raises ValueError for unusable files."""
+        return Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key)
+
+    @property
+    def tls(self) -> dict[str, Any]:
+        """Arguments of uvicorn for TLS. Raises ValueError for unusable files."""
+        if self.certificate is None or self.key is None:
+            return {}
+        check_certificate(self.certificate, self.key, "certificate, key")
+        return {"ssl_certfile": self.certificate, "ssl_keyfile": self.key}
+
+    def api_key(self, environment: Mapping[str, str]) -> str | None:
+        """Return the key that requests must show, or None. Raises ConfigError."""
+        try:
+            key = environment.get(GATEWAY_KEY_VARIABLE) if self.api_key_file is None else self.api_key_file.read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError("api_key_file", f"expected a text file, got {error}") from None
+        if key is not None and not key.strip():
+            raise ConfigError("api_key_file", f"expected a key, here or in {GATEWAY_KEY_VARIABLE}, got no character")
+        return None if key is None else key.strip()
+
+    def check(self, environment: Mapping[str, str]) -> None:
+        """Raise ValueError or OSError for settings with which a gateway would not start."""
+        split_url(self.triton_url)
+        if self.host is not None and self.port is not None:
+            options = {"port_option": "--gateway-port", "host_option": "--gateway-host"}
+            check_free(self.host, self.port, "port", **options)
+        if self.allow_folder is not None:
+            self.allow_folder.resolve(strict=True)
+        _ = self.credentials, self.tls, self.api_key(environment)
+        page = page_of(self)
+        if page is not None:
+            page.check(self)

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: MIT
+"""Label every frame of a dataset, in files that training reads. Needs ``pip install ./client ./apps/labels``.
+
+from rfm_client import RewardClient
+from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
+
+with RewardClient("grpc://localhost:8001") as client:
+    report = label(open_dataset("my_dataset"), ClientScorer(client), LabelOptions(cameras=("top",)))
+"""
+
+from rfm_labels.datasets import (
+    Channels,
+    Dataset,
+    DatasetEpisode,
+    DatasetError,
+    Orient,
+    iter_episodes,
+    open_dataset,
+)
+from rfm_labels.evaluation import Evaluation, LabelComparison, evaluate_labels, read_outcomes
+from rfm_labels.label import Report, label, label_with_ray
+from rfm_labels.label_files import EpisodeLabels, find_label_files, read_episode_labels
+from rfm_labels.options import LabelOptions, RayOptions, parse_episodes
+from rfm_labels.run import Watch
+from rfm_labels.scorer import CheckpointFacts, ClientScorer, Scorer
+from rfm_labels.summary import Summary, summarise
+
+__all__ = [
+    "Channels",
+    "CheckpointFacts",
+    "ClientScorer",
+    "Dataset",
+    "DatasetEpisode",
+    "DatasetError",
+    "EpisodeLabels",
+    "Evaluation",
+    "LabelComparison",
+    "LabelOptions",
+    "Orient",
+    "RayOptions",
+    "Report",
+    "Scorer",
+    "Summary",
+    "Watch",
+    "evaluate_labels",
+    "find_label_files",
+    "iter_episodes",
+    "label",
+    "label_with_ray",
+    "open_dataset",
+    "parse_episodes",
+    "read_episode_labels",
+    "read_outcomes",
+    "summarise",
+]

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The commands ``rfm-client label`` and ``rfm-client evaluate``."""

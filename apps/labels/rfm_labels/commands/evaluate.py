@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""``rfm-client evaluate``: which of several reward models suits a dataset, from their label files."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rfm_client.cli.command import OptionsOf, with_options
+from rfm_client.cli.options import OutputOptions
+from rfm_client.cli.show import number, print_tables, table
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from rfm_labels import LabelComparison
+
+HELPS = {"plot": "Draw histograms of progress at the last frame: .png, .pdf or .svg."}
+LEGEND = (
+    "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, and of progress, at the last frame; "
+    "0.5 is chance. Threshold: of success at the last frame, with the best balanced accuracy. Falls: steps on which "
+    "progress falls by more than 0.01. Frames/s: of the run that labelled, with decoding."
+)
+
+
+@with_options
+def evaluate(
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder or HDF5 file of the labelled dataset.")],
+    output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json", "plot"), helps=HELPS)],
+    labels: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Label file: Parquet, or HDF5 (demos.hdf5/NAME in place). Repeat for more. Default: all in DATASET.",
+            show_default=False,
+        ),
+    ] = None,
+    outcome: Annotated[
+        str | None,
+        typer.Option(
+            help="Outcomes of the episodes: a CSV file (episode, success), or a column of a LeRobot dataset.",
+            metavar="COLUMN|FILE.csv",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Compare reward models by their labels of one dataset.
+
+    With outcomes, successes and failures are told apart. Labels are those of `rfm-client label --name NAME`.
+    """
+    from rfm_labels import DatasetError, evaluate_labels, find_label_files, read_outcomes
+
+    output.make_folders()
+    files = labels or find_label_files(dataset)
+    if not files:
+        expected = "label files, NAME_progress.parquet or in HDF5 (rfm-client label), or --labels"
+        raise DatasetError.at(dataset, expected, "none")
+    comparison = evaluate_labels(files, None if outcome is None else read_outcomes(outcome, dataset))
+    if output.prints_tables:
+        print_tables(*tables(comparison))
+        print(LEGEND.format("successes" if comparison.is_success is not None else "all episodes"))
+    output.write_json(document(comparison))
+    if output.plot is not None:
+        from rfm_labels.pictures import draw_evaluation
+
+        draw_evaluation(output.plot, comparison)
+
+
+def tables(comparison: LabelComparison) -> list[Table]:
+    """Return a table of the models, and a table of each pair's agreement."""
+    known, rows = comparison.is_success, []
+    columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls", "frames/s"]
+    if known is not None:
+        columns[5:5] = ["of successes", "of failures", "AUROC success", "AUROC progress", "threshold", "accuracy"]
+    for each in comparison.evaluations:
+        cells = [each.name, number(each.spearman, 3), number(each.kendall, 3), str(each.num_constant)]
+        cells.append(number(each.final, 3))
+        if known is not None:
+            success, progress = each.by_success, each.by_progress
+            cells += [number(each.final_of_successes, 3), number(each.final_of_failures, 3)]
+            cells += [number(ranking.auroc if ranking else None, 3) for ranking in (success, progress)]
+            cells.append(number(success.threshold if success else None, 3))
+            cells.append(number(success.balanced_accuracy if success else None, 3))
+        rows.append([*cells, f"{each.backwards:.1%}", number(each.frames_per_s, 1)])
+    counts = f"{len(comparison.episodes)} episodes"
+    if known is not None:
+        counts += f": {int(known.sum())} successes, {int((~known).sum())} failures"
+    if comparison.num_left_out:
+        counts += f"; {comparison.num_left_out} left out, which not all files have"
+    shown = [table(counts, columns, rows)]
+    if comparison.agreements:
+        pairs = [
+            [each.first, each.second, number(each.spearman, 3), number(each.distance, 3)]
+            for each in comparison.agreements
+        ]
+        shown.append(table("agreement on progress", ["labels", "and", "rho", "distance"], pairs, names=2))
+    return shown
+
+
+def document(comparison: LabelComparison) -> dict[str, Any]:
+    """Return the document of ``evaluate --json``."""
+    evaluations = []
+    for each in comparison.evaluations:
+        fields = asdict(each)
+        evaluations.append({**fields, "final_progress": each.final_progress.tolist()})
+    return {
+        "episodes": list(comparison.episodes),
+        "is_success": None if comparison.is_success is None else comparison.is_success.tolist(),
+        "num_left_out": comparison.num_left_out,
+        "evaluations": evaluations,
+        "agreements": [asdict(each) for each in comparison.agreements],
+    }

@@ -1,0 +1,372 @@
+# SPDX-License-Identifier: MIT
+"""``rfm-client label``: label every frame of a dataset. ``rfm label`` shares its parts."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import typer
+
+from rfm_client.cli.command import ExitCode, report, with_options
+from rfm_client.cli.options import CredentialsGiven, ServerOptions, credentials_of
+from rfm_client.cli.show import print_tables, table
+from rfm_client.contract.errors import RewardError
+from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
+from rfm_client.frames.orientation import CHANNEL_ORDERS, ORIENTATIONS, Channels, Orient
+from rfm_labels import blank_cameras
+from rfm_labels.commands.progress_bar import ProgressBar, Say
+from rfm_labels.datasets.faults import listed
+from rfm_labels.datasets.hdf5 import SUFFIXES
+from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
+from rfm_labels.datasets.opening import hdf5_files, open_dataset
+from rfm_labels.datasets.protocol import (
+    Dataset,
+    FaultsError,
+    SeveralTasks,
+    UnusedTaskError,
+    require,
+)
+from rfm_labels.episode_scores import FrameMemory, episode_scores
+from rfm_labels.finished_episodes import Parts
+from rfm_labels.hdf5_tables import dataset_stem, labels_in, own_file, stored_in
+from rfm_labels.label import Outputs, Report, check, label_with_ray, plan_labels
+from rfm_labels.label import label as label_dataset
+from rfm_labels.label_files import read_blank
+from rfm_labels.options import LabelOptions, RayOptions
+from rfm_labels.plan import Item, Plan, selected
+from rfm_labels.ray_engine import Connect
+from rfm_labels.run import Watch
+from rfm_labels.scorer import ClientScorer, Scorer
+from rfm_labels.summary import Summary, summarise
+from rfm_labels.survey import check_episodes
+
+_MIB = 2**20
+_OF_CAMERAS = (Orient, Channels)  # options with a value for each camera
+
+DatasetArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="DATASET",
+        help="LeRobot folder or Hub id org/name@revision; HDF5 file, or a folder of them; folder of videos, of folders "
+        "of pictures, or of .npy and .npz files, with tasks.csv or tasks.json.",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class EpisodeTexts(Settings):
+    """Task, orientation and channels of a dataset's episodes. Raises ConfigError."""
+
+    TITLE: ClassVar[str] = "Dataset"
+
+    task: str | None = setting(None, "Task sentence of the episodes that have none.")
+    override_task: bool = setting(False, "Put --task in the place of the tasks that episodes have.")
+    several_tasks: SeveralTasks = setting(
+        "each",
+        "LeRobot episodes with several tasks. each: each stretch of frames with one task is scored by itself. "
+        "first: all frames by the first frame's task.",
+    )
+    task_column: str | None = setting(
+        None,
+        "LeRobot column with the tasks: sentences, or numbers of sentences. Default: task_index, checked against the "
+        "metadata.",
+        metavar="NAME",
+    )
+    orient: Texts = setting(
+        (),
+        "Turn stored pictures upright, of all cameras or of one; may be repeated. Else as stored; LIBERO's HDF5 files "
+        "flip-vertical.",
+        metavar="[CAMERA=]" + "|".join(ORIENTATIONS),
+    )
+    channels: Texts = setting(
+        (),
+        "Channel order of stored pictures, for all cameras or one; may be repeated. Default: rgb.",
+        metavar="[CAMERA=]" + "|".join(CHANNEL_ORDERS),
+    )
+    tolerance_s: float = setting(
+        TOLERANCE_S,
+        "LeRobot videos: most seconds between a row and its frame, as LeRobot's tolerance_s. A larger value accepts "
+        "rows with times from a clock.",
+        least=0,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for option in _OF_CAMERAS:
+            try:
+                option.parse(getattr(self, option.NAME))
+            except ValueError as error:
+                raise ConfigError(option.NAME, str(error)) from None
+
+    @property
+    def opening(self) -> dict[str, Any]:
+        """Arguments of ``open_dataset`` after the source."""
+        given = {each.name: getattr(self, each.name) for each in fields(self)}
+        return given | {option.NAME: option.parse(given[option.NAME]) for option in _OF_CAMERAS}
+
+
+@dataclass(frozen=True)
+class RunOptions(Settings):
+    """Engine, trial run and summary of a labelling command."""
+
+    TITLE: ClassVar[str] = "Run"
+
+    engine: Literal["threads", "ray"] = setting("threads", "threads: in this process. ray: by actors of a Ray cluster.")
+    dry_run: bool = setting(False, "Check everything, measure a few episodes, write nothing.")
+    report: bool = setting(False, "Only show the summary of labels that are there.")
+    picture: bool = setting(True, "Draw the summary: NAME_summary.png in the output.")
+    rrd: Path | None = setting(
+        None,
+        "Record frames and scores of each labelled episode for Rerun's viewer: a .rrd file each.",
+        metavar="FOLDER",
+    )
+
+
+@with_options
+def label(
+    context: typer.Context,
+    dataset: DatasetArgument,
+    server: ServerOptions,
+    files: CredentialsGiven,
+    texts: EpisodeTexts,
+    labels: LabelOptions,
+    run: RunOptions,
+    ray: RayOptions,
+) -> None:
+    """Label every frame of a dataset by asking running servers.
+
+    `rfm label` writes the same files with a checkpoint in its own process, without a server.
+
+    The label files have the forms that training code reads, such as LeRobot's.
+
+    Run the same command again to label the missing episodes.
+    """
+    credentials = credentials_of(context, files)  # Ray cannot send the context to other machines
+
+    @contextmanager
+    def connect() -> Iterator[Scorer]:
+        with server.connected(credentials) as client:
+            yield ClientScorer(client)
+
+    raise typer.Exit(LabelCommand(dataset, texts, labels, run, ray, connect, report).run())
+
+
+@dataclass(frozen=True)
+class LabelCommand:
+    """A labelling command's run: label, try, or only show the summary.
+
+    source: as in ``open_dataset``
+    connect: returns a context with a scorer
+    say: takes a line for the user
+    """
+
+    source: str
+    texts: EpisodeTexts
+    labels: LabelOptions
+    options: RunOptions
+    ray: RayOptions
+    connect: Connect
+    say: Say
+
+    def run(self) -> ExitCode:
+        """Run as the options say. Raises RewardError, OSError and ImportError."""
+        if files := hdf5_files(self.source):
+            return self._run_each(files)
+        if self.options.report:
+            self._report()
+            return ExitCode.OK
+        if self.options.dry_run:
+            self._try()
+            return ExitCode.OK
+        if self.options.rrd is not None:
+            from rfm_client.recording import load_rerun
+
+            load_rerun()  # a missing package must not fail after the labelling
+            self.options.rrd.mkdir(parents=True, exist_ok=True)
+        report = self._label()
+        status = self._tell(report)
+        if self.options.rrd is not None:
+            self._record(self.options.rrd, report)
+        return status
+
+    def _run_each(self, files: Sequence[Path]) -> ExitCode:
+        """Run for each HDF5 file of a folder, once all can be opened. Raises DatasetError for a file that cannot."""
+        formats = ", ".join(self.labels.formats)
+        require(
+            "format", formats in ("", "hdf5"), "hdf5 for a folder of HDF5 files, each with labels of its own", formats
+        )
+        stems = [file.stem for file in files]
+        twice = [str(file) for file in files if stems.count(file.stem) > 1]
+        got = f"{', '.join(twice)}: leave out --output, and labels lie beside their files"
+        has_room = self.labels.output is None or not twice
+        require("output", has_room, "a folder for files whose names differ", got)
+        commands = []
+        for file in files:
+            rrd = self.options.rrd and self.options.rrd / file.stem
+            commands.append(replace(self, source=str(file), options=replace(self.options, rrd=rrd)))
+        codes = []
+        for command in commands if self.options.report else self._checked(commands):
+            self.say(f"{command.source}")
+            codes.append(command.run())
+        return next((code for code in codes if code is not ExitCode.OK), ExitCode.OK)
+
+    def _checked(self, commands: Sequence[LabelCommand]) -> list[LabelCommand]:
+        """Return the commands, with --task for the files that need it alone.
+
+        Raises FaultsError with the faults of all files, UnusedTaskError if no file needs --task.
+        """
+        lines, unused, checked = [], [], []
+        for command in commands:
+            try:
+                dataset = command._dataset()
+                check_episodes(dataset, self.labels)
+                selected(dataset, self.labels)
+            except UnusedTaskError as error:
+                unused.append(error)
+                command = replace(command, texts=replace(command.texts, task=None))
+            except RewardError as error:
+                told = str(error).split("\n")
+                lines += [line if command.source in line else f"{command.source}: {line}" for line in told]
+            checked.append(command)
+        if lines:
+            raise FaultsError("\n".join(lines))
+        if len(unused) == len(commands):
+            raise unused[0]
+        return checked
+
+    def _label(self) -> Report:
+        watch = ProgressBar(self.say)
+        try:
+            with watch:
+                if self.options.engine == "ray":
+                    opening = self.texts.opening
+                    return label_with_ray(self.source, self.connect, self.labels, watch, ray=self.ray, **opening)
+                dataset = self._dataset()
+                with self.connect() as scorer:
+                    return label_dataset(dataset, scorer, self.labels, watch)
+        except (RewardError, OSError, KeyboardInterrupt):
+            if watch.num_begun:
+                self.say("finished episodes stay: run the same command again for the rest")
+            raise
+
+    def _try(self) -> None:
+        """Check everything, measure a few episodes, write nothing."""
+        dataset = self._dataset()
+        outputs = Outputs(self.labels.output or dataset.root, self.labels, dataset)
+        with self.connect() as scorer, ProgressBar(self.say) as watch:
+            plan = plan_labels(dataset, scorer, self.labels, watch)
+            checked = check(plan, outputs, watch)
+            num_bytes = sum(checked.num_bytes[item.episode.index] for item in plan.items)
+            took_s = _measured_s(plan, dataset, scorer, self.labels.workers, watch)
+        _print(_plan_rows(plan, dataset, num_bytes, took_s))
+
+    def _tell(self, report: Report) -> ExitCode:
+        if report.failures:
+            failed = f"{len(report.failures)} episodes failed"
+            self.say(f"{failed}, so no file was written; the others are kept in {report.parts}")
+            gone = {failure.episode.index for failure in report.failures}
+            others = [item.episode.index for item in report.plan.items if item.episode.index not in gone]
+            if others and self.labels.shard is None:
+                self.say(f"to write the files without them: --episodes {listed(others)}")
+            return ExitCode.FAILED
+        if report.summary is None:
+            self.say(f"this shard is labelled; the same command without --shard writes the files from {report.parts}")
+            return ExitCode.OK
+        self._show(report.summary, report.files[0])
+        for file in report.files:
+            typer.echo(f"{file}")
+        return ExitCode.OK
+
+    def _record(self, folder: Path, report: Report) -> None:
+        """Record the chosen episodes, also those labelled by an earlier run."""
+        from rfm_labels.recordings import record_episodes
+
+        dataset = self._dataset()
+        chosen = {episode.index for episode in selected(dataset, self.labels)}
+        plan = replace(report.plan, items=[item for item in report.plan.items if item.episode.index in chosen])
+        for file in record_episodes(folder, dataset, plan, Parts(report.parts)):
+            typer.echo(f"{file}")
+
+    def _report(self) -> None:
+        """Show the summary of existing labels; the source is a dataset or a label file."""
+        path = Path(self.source)
+        if path.suffix.lower() in SUFFIXES:
+            path = self._in_hdf5(path)
+        elif path.is_dir() or self.labels.output is not None:
+            outputs = Outputs(self.labels.output or path, self.labels)
+            files = [*outputs.progress, *outputs.signals]
+            path = next((file for file in files if file.exists()), files[0])
+        summary = summarise(path)
+        for line in blank_cameras.lines(read_blank(path), len(summary.episodes)):
+            self.say(f"note: {line}")
+        self._show(summary, path)
+
+    def _in_hdf5(self, path: Path) -> Path:
+        """Existing labels of an HDF5 dataset: beside, or in place. Raises DatasetError."""
+        own = own_file(self.labels.output or path.parent, path.stem, self.labels.name)
+        files = [path] if self.labels.in_place or not own.exists() else [own]
+        found = [each for file in files for each in labels_in(file)]
+        named = [each for each in found if each.name == self.labels.name]
+        got = f"{', '.join(each.name for each in found) or 'none'}: choose with --name"
+        require(path, bool(named), f"labels with the name {self.labels.name}, in {own.name} or in place", got)
+        return named[0]
+
+    def _show(self, summary: Summary, file: Path) -> None:
+        _print(summary.rows())
+        if self.options.picture:
+            from rfm_labels.pictures import draw_summary
+
+            stored = stored_in(file)
+            beside = stored.parent.parent if stored.parent.name == "reward_signals" else stored.parent
+            source = Path(self.source)
+            of_file = f"{dataset_stem(source)}." if source.suffix.lower() in SUFFIXES else ""
+            picture = (self.labels.output or beside) / f"{of_file}{self.labels.name}_summary.png"
+            draw_summary(picture, summary)
+            typer.echo(f"{picture}")
+
+    def _dataset(self) -> Dataset:
+        return open_dataset(self.source, **self.texts.opening)
+
+
+def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int, watch: Watch) -> float:
+    """Estimate of the plan's time, from its first ``workers`` episodes. ``watch`` gets a line per blank camera."""
+    first = plan.items[:workers]
+    memory = FrameMemory()
+
+    def score(item: Item) -> tuple[int, Mapping[str, int]]:
+        told = episode_scores(dataset, item.episode, scorer, plan.recipe, memory=memory, go_on=lambda: None)
+        return item.episode.index, told.blank
+
+    score(first[0])  # without the clock: the first call has costs of its own
+    began_s = time.monotonic()
+    with ThreadPoolExecutor(workers) as pool:
+        blank = list(pool.map(score, first))
+    took_s = time.monotonic() - began_s
+    for line in blank_cameras.lines(blank_cameras.by_camera(blank), len(first)):
+        watch.note(line)
+    return took_s * plan.num_frames / sum(item.episode.num_frames for item in first)
+
+
+def _plan_rows(plan: Plan, dataset: Dataset, num_bytes: int, took_s: float) -> list[tuple[str, str]]:
+    tasks = sorted({task for item in plan.items for task, _ in item.episode.stretches})
+    cameras = plan.recipe.cameras
+    return [
+        ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),
+        ("episodes", str(len(plan.items))),
+        ("frames", f"{plan.num_frames}, of {len(cameras)} cameras: {plan.num_frames * len(cameras)} to be decoded"),
+        ("to be decoded", f"{num_bytes / _MIB:.1f} MiB"),
+        (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
+        ("it will take about", f"{took_s:.0f} s"),
+    ]
+
+
+def _print(rows: Sequence[tuple[str, str]]) -> None:
+    print_tables(table("", ("labels", ""), rows))
+    sys.stdout.flush()

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: MIT
+"""List the faults of all episodes, and the options that help."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+_MOST_SHOWN = 20
+
+
+def listed(numbers: Iterable[int]) -> str:
+    """Return sorted numbers in the form of ``--episodes``: ``0:17,18,20:40``."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1]:
+            runs[-1][1] += 1
+        else:
+            runs.append([number, number + 1])
+    return ",".join(str(first) if end == first + 1 else f"{first}:{end}" for first, end in runs)
+
+
+def shortened(lines: Sequence[str]) -> list[str]:
+    """Return the first lines, and a line with the number of the others."""
+    more = len(lines) - _MOST_SHOWN
+    return [*lines[:_MOST_SHOWN], *([f"... and {more} more"] if more > 0 else [])]
+
+
+def fault_lines(faults: Mapping[int, str], numbers: Sequence[int], num_without_task: int) -> list[str]:
+    """Return one line per distinct fault, then the options that help.
+
+    faults: messages by episode number
+    numbers: chosen episodes, with or without a fault
+    num_without_task: number of episodes without a task
+    """
+    alike: dict[str, list[int]] = {}
+    for number, fault in faults.items():
+        alike.setdefault(fault, []).append(number)
+    told = [fault if len(of) == 1 else f"{fault} (episodes {listed(of)})" for fault, of in alike.items()]
+    head = f"episodes: expected {len(numbers)} that can be labelled, got {len(faults)} with faults:"
+    lines = [*[head] * (len(told) > 1), *shortened(told)]
+    if num_without_task > 1:
+        lines.append(f'for the {num_without_task} without a task: --task "SENTENCE"')
+    others = [number for number in numbers if number not in faults]
+    if others:
+        lines.append(f"to continue without the faulty episodes: --episodes {listed(others)}")
+    return lines

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: MIT
+"""LeRobot datasets v2.0 to v3.0, read without LeRobot. Needs pyarrow and PyAV.
+
+Frame t belongs to row t; in a video, it is the frame at the row's time.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import cached_property, lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rfm_client.contract.checks import first_names
+from rfm_client.contract.numbers import checked_positive
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.frames.orientation import Corrections
+from rfm_client.frames.pictures import pillow
+from rfm_client.frames.video_decoding import decoder
+from rfm_labels.datasets import lerobot_v21, lerobot_v30
+from rfm_labels.datasets.faults import listed
+from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
+from rfm_labels.datasets.lerobot_rows import Entry, Info, RowReader, column_types, read_table
+from rfm_labels.datasets.lerobot_tasks import TASK_COLUMN, Sentences, has_numbers, table_of
+from rfm_labels.datasets.protocol import (
+    Dataset,
+    DatasetEpisode,
+    DatasetError,
+    TaskOverride,
+    corrections_of,
+    digest_of,
+    require,
+)
+from rfm_labels.datasets.stored_pictures import check_picture, decoded_picture, turn_mark
+from rfm_labels.datasets.video_frames import Span, Times, decode, video_identity, video_packets
+
+_VIDEOS_AT_A_TIME = 4  # whose packets stay in memory, or one of each camera
+_CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
+_BY_PLACE = "LeRobot finds a sentence by position, so it may read a different one"
+
+
+class LeRobotDataset(Dataset):
+    """A LeRobot dataset in a local folder.
+
+    source, revision: id and commit on the Hub; None for a local dataset
+    tolerance_s: most seconds between a row and its frame, as LeRobot's ``tolerance_s``
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        *,
+        source: str | None = None,
+        revision: str | None = None,
+        task: TaskOverride = TaskOverride(),
+        corrections: Corrections = Corrections(),
+        tolerance_s: float = TOLERANCE_S,
+    ) -> None:
+        try:
+            self._tolerance_s = checked_positive("tolerance_s", tolerance_s)
+        except ValueError as error:
+            raise DatasetError(str(error)) from None
+        self.root = root
+        self.source = source or root.resolve().name
+        self.revision = revision
+        self.info = info = Info.read(root)
+        self.kind = f"LeRobot {info.version}"
+        self.cameras = (*info.videos, *info.images)
+        self.depth_cameras = info.depth
+        self.corrections = corrections_of(corrections, self.cameras)
+        version = lerobot_v30 if info.version == "v3.0" else lerobot_v21
+        entries: list[tuple[int, Entry | DatasetError]] = list(version.read_entries(info))
+        self._entries = dict(entries)
+        self.numbers = sorted(self._entries)  # may have gaps, where episodes were deleted
+        self.given_task = task
+        self._rows = RowReader(self._sentences(version), task)
+        self._rows_in = lru_cache(max(_VIDEOS_AT_A_TIME, len(info.videos)))(self._read_video)
+        self._clocks: dict[int, str] = {}  # of the episodes that are read
+        self._without_rows: dict[str, dict[Path, tuple[int, int]]] = {}  # frames without rows, all frames
+        numbers = Counter(number for number, _ in entries)
+        twice = [number for number in self.numbers if numbers[number] > 1]
+        require(root / "meta", not twice, "each episode once", f"{listed(twice)} several times")
+        got = f"{len(self.numbers)}: correct total_episodes, or restore the others"
+        is_whole = len(self.numbers) == info.total_episodes
+        require(root / "meta", is_whole, f"{info.total_episodes} episodes, as info.json says", got)
+        lengths = [entry.length for entry in self._entries.values() if isinstance(entry, Entry)]
+        num_frames = sum(lengths)
+        is_whole = num_frames == info.total_frames or len(lengths) < len(self._entries)
+        require(root / "meta", is_whole, f"{info.total_frames} frames, as info.json says", num_frames)
+
+    def _sentences(self, version: ModuleType) -> Sentences:
+        """The meaning of the task column. Raises DatasetError for an unknown column or a broken task table."""
+        if self.given_task.overrides:
+            return Sentences()
+        column = self.given_task.column or TASK_COLUMN
+        file, types = self._types_of_rows() if column != TASK_COLUMN else (None, {})
+        if file is not None and not has_numbers(file, types, column):
+            return Sentences(column)
+        file, name = table_of(self.root, version.TASKS_FILE, column)
+        sentences = version.read_tasks(self.root, file, name)
+        if list(sentences) != list(range(len(sentences))) and file.suffix == ".parquet":
+            self.notes = [f"tasks: {file} is not in the order of {name}_index: {_BY_PLACE}"]
+        return Sentences(column, str(file.with_suffix("")), sentences)
+
+    def _types_of_rows(self) -> tuple[Path | None, Mapping[str, str]]:
+        """The first readable table of rows, and its column types."""
+        for entry in self._entries.values():
+            try:
+                if isinstance(entry, Entry):
+                    return entry.data_file, column_types(entry.data_file)
+            except DatasetError:  # raised again when its episode is read
+                continue
+        return None, {}
+
+    def read_episode(self, number: int) -> DatasetEpisode:
+        entry = self._entry(number)
+        rows = self._rows.read(entry)
+        self._clocks[number] = rows.clock(self.info.fps)
+        tasks = tuple(rows.tasks) if len(rows.tasks) > 1 else ()
+        return DatasetEpisode(number, entry.where, rows.tasks[0][1], len(rows.times_s), rows.first_index, tasks)
+
+    def decoder(self, camera: str) -> str | None:
+        return decoder() if camera in self.info.videos else pillow()
+
+    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        if camera not in self.info.videos:
+            return digest_of(image + turn_mark(image).encode() for image in self._images(episode, camera))
+        video, from_s = self._entry(episode.index).videos[camera]
+        clock = self._clocks[episode.index]
+        return f"{video_identity(video, verify=verify, revision=self.revision)} {from_s}{clock}"
+
+    def check(self, episode: DatasetEpisode, camera: str) -> int:
+        if camera in self.info.videos:
+            video, frames = self._frames_of(episode, camera)
+            self._note_frames_without_rows(camera, video)
+            return sum(video.packets.num_bytes[frame] for frame in frames.tolist())
+        images = self._images(episode, camera)
+        for t, image in enumerate(images):
+            check_picture(_where(episode, camera, t), image)
+        return sum(map(len, images))
+
+    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
+        if camera in self.info.videos:
+            return decode(self.span(episode, camera))
+        images = self._images(episode, camera)
+        return (decoded_picture(_where(episode, camera, t), image) for t, image in enumerate(images))
+
+    @property
+    def frame_notes(self) -> Sequence[str]:
+        lines = []
+        for camera, videos in self._without_rows.items():
+            num_left_out, num_frames = (sum(counts) for counts in zip(*videos.values(), strict=True))
+            names = first_names([file.relative_to(self.root).as_posix() for file in videos], 3)
+            of = f"{num_left_out} of the {num_frames} frames in {len(videos)} videos ({names})"
+            lines.append(f"left out: {camera}: {of}, because no row has their times")
+        return lines
+
+    def times_s(self, episode: DatasetEpisode) -> Times:
+        """Return float64 [T], each frame's time from the start of the episode. Raises DatasetError."""
+        return self._rows.read(self._entry(episode.index)).times_s
+
+    def video(self, episode: DatasetEpisode, camera: str) -> Path:
+        """Return the episode's video file of a camera in ``info.videos``."""
+        return self._entry(episode.index).videos[camera][0]
+
+    def span(self, episode: DatasetEpisode, camera: str) -> Span:
+        """Return the episode's frames in that video. Raises DatasetError if a row has no frame of its own."""
+        file = self.video(episode, camera)
+        video, frames = self._frames_of(episode, camera)
+        where, container = f"{episode.name}: {camera}", _CONTAINER.get(file.suffix.lower())
+        return Span(file, video.packets.times_s[frames], 0.5 * video.apart_s(frames), where, container)
+
+    def _entry(self, number: int) -> Entry:
+        entry = self._entries[number]
+        if isinstance(entry, DatasetError):
+            raise entry
+        return entry
+
+    def _frames_of(self, episode: DatasetEpisode, camera: str) -> tuple[VideoRows, Frames]:
+        """An episode's video, and the numbers of its frames in it."""
+        video = self._rows_in(camera, self.video(episode, camera))
+        frames = video.frames[episode.index]
+        if isinstance(frames, DatasetError):
+            raise frames
+        return video, frames
+
+    def _note_frames_without_rows(self, camera: str, video: VideoRows) -> None:
+        """Keep the number of frames without rows if the rows of all episodes in the video are known."""
+        is_known = len(video.parts) == len(self._in_video[camera, video.file])
+        if self.info.version == "v3.0":  # an episode whose metadata are broken may lie in any video
+            is_known = is_known and all(isinstance(entry, Entry) for entry in self._entries.values())
+        if is_known and video.num_without_rows:
+            counts = (video.num_without_rows, len(video.packets.times_s))
+            self._without_rows.setdefault(camera, {})[video.file] = counts
+
+    @cached_property
+    def _in_video(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
+        found: dict[tuple[str, Path], list[Entry]] = {}
+        for entry in [each for each in self._entries.values() if isinstance(each, Entry)]:
+            for camera, (file, _) in entry.videos.items():
+                found.setdefault((camera, file), []).append(entry)
+        return found
+
+    def _read_video(self, camera: str, file: Path) -> VideoRows:
+        """A video with the rows of all readable episodes in it."""
+        packets = video_packets(file, _CONTAINER.get(file.suffix.lower()))
+        require(file, len(packets.times_s) > 0, "frames with time stamps", "none")
+        parts = []
+        for entry in self._in_video[camera, file]:
+            with suppress(DatasetError):  # raised again if that episode is read
+                times_s = entry.videos[camera][1] + self._rows.read(entry).times_s
+                parts.append(Part(entry.index, entry.where, times_s))
+        return VideoRows(camera, file, packets, parts, self.info.fps, self._tolerance_s)
+
+    def _images(self, episode: DatasetEpisode, camera: str) -> list[bytes]:
+        file = self._entry(episode.index).data_file
+        stored = read_table(file, [camera], filters=[("episode_index", "=", episode.index)])[camera].to_pylist()
+        require(f"{file}: {camera}", len(stored) == episode.num_frames, f"{episode.num_frames} images", len(stored))
+        return [self._image_bytes(_where(episode, camera, t), image) for t, image in enumerate(stored)]
+
+    def _image_bytes(self, where: str, image: Any) -> bytes:
+        image = image if isinstance(image, dict) else {}
+        if isinstance(image.get("bytes"), bytes):
+            return bytes(image["bytes"])
+        path = image.get("path")
+        if not isinstance(path, str) or Path(path).is_absolute() or ".." in Path(path).parts:
+            raise DatasetError.at(where, "an image, or its path inside the dataset", repr(path))
+        try:
+            return (self.root / path).read_bytes()
+        except OSError as error:
+            raise DatasetError.at(where, "an image file", f"{error.strerror} ({path})") from error
+
+
+def _where(episode: DatasetEpisode, camera: str, t: int) -> str:
+    return f"{episode.name}: {camera}: frame {t}"

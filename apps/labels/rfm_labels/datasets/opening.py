@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: MIT
+"""Open a dataset by path or Hub id, or say how to convert its layout."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from rfm_client.contract.checks import first_names
+from rfm_client.contract.hub_access import HubError, cached_snapshot
+from rfm_client.frames.inputs import ARRAY_SUFFIXES
+from rfm_client.frames.orientation import Channels, Corrections, Orient
+from rfm_labels.datasets.array_files import ArrayFiles
+from rfm_labels.datasets.episode_files import (
+    TABLES,
+    Contents,
+    EpisodeFiles,
+    in_natural_order,
+    table_in,
+)
+from rfm_labels.datasets.frame_folders import FrameFolders, is_picture
+from rfm_labels.datasets.hdf5 import SUFFIXES, Hdf5Dataset, is_hdf5
+from rfm_labels.datasets.hdf5_layouts import foreign_layout_of
+from rfm_labels.datasets.lerobot import LeRobotDataset
+from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
+from rfm_labels.datasets.lerobot_rows import INFO_FILE
+from rfm_labels.datasets.protocol import SIGNALS_FOLDER, Dataset, DatasetError, SeveralTasks, TaskOverride, require
+from rfm_labels.datasets.task_tables import read_table_of_tasks
+from rfm_labels.datasets.videos import VideoFolder
+
+_HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
+_LAYOUTS = (
+    f"a LeRobot dataset ({INFO_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), a folder of videos, of folders "
+    f"of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {' or '.join(TABLES)}, "
+    "or a Hub id org/name[@revision]"
+)
+_TABLE = "list the videos in tasks.csv (columns video, task)"
+_GIVE_TASK = '--task "SENTENCE"'
+_FILL = "put a video, an array or a folder of pictures for each episode in it"
+_UNREAD = {  # remedies for layouts without a reader, by pattern of file names
+    r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with convert_dataset_v1_to_v2.py of lerobot/datasets/v2 "
+    "(LeRobot 0.3), and label that",
+    r"features\.json|.*\.tfrecord.*": "an RLDS (TensorFlow) dataset: convert it to LeRobot with openx2lerobot of "
+    "https://github.com/Tavish9/any4lerobot",
+    r".*\.zarr(\.zip)?|\.z(group|array|attrs|metadata)|zarr\.json": "Zarr arrays: convert them to LeRobot with "
+    "https://github.com/arpitg1304/forge, or write each episode's pictures to a video "
+    f"(imageio.mimwrite('0.mp4', frames, fps=10)) and {_TABLE}",
+    r".*\.(bag|mcap|db3)": "a rosbag: convert it to LeRobot with https://github.com/arpitg1304/forge, or write each "
+    f"camera's topic to a video (the package rosbags reads it without ROS) and {_TABLE}",
+}
+_VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")
+_SUFFIXES = {"videos": _VIDEO_SUFFIXES, "arrays": ARRAY_SUFFIXES}  # of episodes that are files
+_KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and the name of an episode
+    "videos": (VideoFolder, "video"),
+    "folders of pictures": (FrameFolders, "folder"),
+    "arrays": (ArrayFiles, "file"),
+}
+_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside the episodes, once they have labels
+
+
+def open_dataset(
+    source: str | Path,
+    *,
+    task: str | None = None,
+    override_task: bool = False,
+    several_tasks: SeveralTasks = "each",
+    task_column: str | None = None,
+    orient: Orient = Orient(),
+    channels: Channels = Channels(),
+    tolerance_s: float = TOLERANCE_S,
+) -> Dataset:
+    """Return the dataset at a path, or download the Hub id ``org/name[@revision]``. An existing path wins.
+
+    task: task of episodes without their own
+    override_task: True: ``task`` is the task of all episodes
+    several_tasks: of a LeRobot episode with several tasks: ``each``: each frame has its own; ``first``: all frames have
+        the first frame's, as in LeRobot's own scripts
+    task_column: column of a LeRobot dataset's rows that names the tasks: sentences, numbers of sentences in
+        ``meta/tasks``, or LeRobot's ``language_persistent``; None: ``task_index``, checked against the metadata
+    orient: turn of each camera's frames. HDF5 files marked as LIBERO's are turned by default
+    channels: order in which each camera's colours are stored: ``rgb`` (the default) or ``bgr``
+    tolerance_s: of a LeRobot dataset's videos: most seconds between a row and its frame, as LeRobot's ``tolerance_s``
+
+    Raises DatasetError.
+    """
+    path, given = Path(source), TaskOverride(task, override_task, several_tasks, task_column)
+    corrections = Corrections(orient, channels)
+    has_rows = not path.exists() or (path / INFO_FILE).is_file()
+    require("task_column", task_column is None or has_rows, f"none, since {path} is no LeRobot dataset", task_column)
+    if is_hdf5(path):
+        return Hdf5Dataset(path, task=given, corrections=corrections)
+    if (path / INFO_FILE).is_file():
+        return LeRobotDataset(path, task=given, corrections=corrections, tolerance_s=tolerance_s)
+    if path.exists():
+        return _open_files(path, given, corrections)
+    match = _HUB_ID.fullmatch(str(source))
+    if match is None:
+        raise DatasetError.at(source, _LAYOUTS, "none")
+    return _from_hub(match[1], match[2], task=given, corrections=corrections, tolerance_s=tolerance_s)
+
+
+def _from_hub(name: str, revision: str | None, **opening: Any) -> LeRobotDataset:
+    try:
+        folder = cached_snapshot(name, "dataset", revision)
+    except ImportError as error:
+        raise ImportError("datasets of the Hub need huggingface-hub: pip install ./client ./apps/labels") from error
+    except HubError as error:
+        raise DatasetError.at(name, "a local dataset or one of the Hub", f"none: {error}") from error
+    if not (folder / INFO_FILE).is_file():
+        raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(folder) or "none")
+    commit = folder.name  # the name of a snapshot's folder
+    return LeRobotDataset(folder, source=name, revision=commit, **opening)
+
+
+def hdf5_files(folder: str | Path) -> list[Path]:
+    """Return the HDF5 datasets of a folder and the folders in it; empty if it is no folder, or holds other data.
+
+    Files of labels and hidden files are left out. The order is that of the paths, with 2 before 10.
+    """
+    root = Path(folder)
+    if not root.is_dir() or (root / INFO_FILE).is_file() or table_in(root) or set(_found(root)) - {"HDF5 files"}:
+        return []
+    names = (str(file.relative_to(root)) for file in root.rglob("*") if file.suffix.lower() in SUFFIXES)
+    shown = [name for name in names if "/." not in f"/{name}" and not _FILES_OF_OURS.fullmatch(name)]
+    return [root / name for name in in_natural_order(shown)]
+
+
+def _open_files(path: Path, task: TaskOverride, corrections: Corrections) -> Dataset:
+    """The dataset of a folder with a file or a folder for each episode, or of its table. Raises DatasetError."""
+    if path.is_file() and path.suffix.lower() not in (".csv", ".json"):
+        raise DatasetError.at(path, _LAYOUTS, _unread(path) or "another file")
+    table = table_in(path) if path.is_dir() else path
+    if table is not None:
+        tasks = read_table_of_tasks(table, has_tasks=task.text is None)
+        there = [name for name in tasks if (table.parent / name).exists()] or list(tasks)
+        kinds = {_kind_of(table.parent / name): name for name in reversed(there)}
+        told = " and ".join(f"{kind} ({name})" for kind, name in sorted(kinds.items()))
+        require(table, len(kinds) == 1, "episodes of one kind", f"{told}: write a table for each kind")
+        (kind,) = kinds
+        dataset = _KINDS[kind][0](Contents(table.parent, tasks, table, task, corrections))
+        dataset.notes = [*dataset.notes, *_unlisted(table, kind, tasks)]
+        return dataset
+    kind, names = _listed(path)
+    reader, episode = _KINDS[kind]
+    is_told = task.text is not None or kind == "arrays"
+    got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
+    require(path, is_told, f"one of {' and '.join(TABLES)} with the task of each {episode}", got)
+    return reader(Contents(path, dict.fromkeys(names), path, task, corrections))
+
+
+def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
+    """A line about episodes beside those of a table that the table lacks; empty: it has all."""
+    beside = {table.parent, *((table.parent / name).parent for name in names)} if kind in _SUFFIXES else {table.parent}
+    found = [folder / name for folder in sorted(beside) if folder.is_dir() for name in _found(folder).get(kind, ())]
+    if kind not in _SUFFIXES:  # ``_found`` has folders without pictures, too
+        found = [each for each in found if any(_is_frame(file) for file in each.iterdir())]
+    gone = in_natural_order({Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names))
+    told = f"{table.name}: {len(gone)} {kind} beside it are not listed and get no labels: {first_names(gone)}"
+    return [told] if gone else []
+
+
+def _kind_of(path: Path) -> str:
+    if path.is_dir():
+        return "folders of pictures"
+    return "arrays" if path.suffix.lower() in ARRAY_SUFFIXES else "videos"
+
+
+def _listed(folder: Path) -> tuple[str, list[str]]:
+    """The kind of a folder's episodes, and their names. Raises DatasetError for several kinds, or none."""
+    found = _found(folder)
+    told = " and ".join(f"{kind} ({names[0]})" for kind, names in found.items())
+    got = f"{told}: give each kind a folder of its own, or list the episodes of one kind in tasks.csv"
+    require(folder, len(found) < 2, "episodes of one kind", got)
+    if not any(kind in _KINDS for kind in found):
+        other = f"{'other files' if _names_in(folder) else 'an empty folder'}: {_FILL}"
+        raise DatasetError.at(folder, _LAYOUTS, _unread(folder) or other)
+    return next(iter(found.items()))
+
+
+def _found(folder: Path) -> dict[str, list[str]]:
+    """Names of what may be episodes, by kind, without hidden files and files of labels."""
+    shown = [folder / name for name in _names_in(folder)]
+    files = [each for each in shown if each.is_file() and not _FILES_OF_OURS.fullmatch(each.name)]
+    folders = [each for each in shown if each.is_dir() and each.name != SIGNALS_FOLDER]
+    found = {
+        kind: [each.name for each in files if each.suffix.lower() in suffixes]
+        for kind, suffixes in (*_SUFFIXES.items(), ("HDF5 files", SUFFIXES))
+    }
+    has_frames = any(_is_frame(file) for each in folders for file in each.iterdir())
+    found["folders of pictures"] = [each.name for each in folders] if has_frames else []
+    if has_frames or not any(found.values()):  # elsewhere a picture is no frame
+        found["pictures"] = [each.name for each in files if _is_frame(each)]
+    return {kind: in_natural_order(names) for kind, names in found.items() if names}
+
+
+def _is_frame(file: Path) -> bool:
+    return is_picture(file) and not _FILES_OF_OURS.fullmatch(file.name)
+
+
+def _names_in(folder: Path) -> list[str]:
+    return [each.name for each in folder.iterdir() if not each.name.startswith(".")]
+
+
+def _unread(path: Path) -> str | None:
+    """A known layout without a reader, and its remedy; None: the layout is unknown."""
+    found = [path] if path.is_file() else [each for below in ("*", "*/*") for each in path.glob(below)]
+    names = [path.name, *(each.name for each in found)]
+    for pattern, what in _UNREAD.items():
+        if any(re.fullmatch(pattern, name, re.IGNORECASE) for name in names):
+            return what
+    if path.is_file():
+        is_video = path.suffix.lower() in _VIDEO_SUFFIXES
+        return f"a video: label its folder, with {_GIVE_TASK} or with tasks.csv in it" if is_video else None
+    files = hdf5_files(path)
+    if files:
+        remedy = "rfm-client label takes the folder, open_dataset each file"
+        return foreign_layout_of(files[0]) or f"a folder of HDF5 files, each a dataset of its own: {remedy}"
+    if pictures := [file for file in path.iterdir() if _is_frame(file)]:
+        moved = f"mkdir {path}/0 && mv {path}/*{pictures[0].suffix} {path}/0"
+        return f"pictures outside of the folder of an episode: {moved}"
+    deeper = next((file for file in path.glob("*/*/*") if is_picture(file)), None)
+    listed = deeper and deeper.parent.relative_to(path)
+    return f"pictures two levels down: list the folders of one camera ({listed}) in tasks.csv" if deeper else None

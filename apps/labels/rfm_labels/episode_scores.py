@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: MIT
+"""Labels of one episode: decode each camera's frames once, score them, fuse the scores. T frames, H x W pixels."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from traceback import clear_frames
+from typing import TypeAlias
+
+import numpy as np
+
+from rfm_client.contract.errors import InferenceFailedError
+from rfm_client.contract.results import ProgressResult
+from rfm_client.contract.samples import Float32Array, ProgressSample, Trajectory, UInt8Array
+from rfm_client.frames.blank_frames import BlankFrames
+from rfm_client.frames.camera_fusion import FUSES
+from rfm_client.frames.resize import resize_frames
+from rfm_client.frames.sampling import of_prefixes, prefix_samples
+from rfm_labels.datasets.protocol import Dataset, DatasetEpisode, require
+from rfm_labels.plan import Recipe
+from rfm_labels.scorer import Scorer
+
+Columns: TypeAlias = dict[str, Float32Array]
+
+PROGRESS, SUCCESS, LOG_PROB, UNCLEAR = "progress", "success", "log_prob", "unclear"
+SCORES = (PROGRESS, SUCCESS, LOG_PROB, UNCLEAR)  # in the order of columns
+FRAMES_AT_A_TIME = 64  # in a request to the encoder, as in its forward pass
+MAX_BYTES = 32 * 2**20  # of the samples in one call of the scorer
+MAX_FRAME_BYTES = 2 * 2**30  # of all workers of a process
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeScores:
+    """The scores of an episode.
+
+    columns: columns of the labels, float32 [T] each
+    blank: highest value of the frames of each camera that shows nothing, as in ``BlankFrames``
+    """
+
+    columns: Columns
+    blank: Mapping[str, int]
+
+
+class FrameMemory:
+    """A limit on the bytes of frames that all workers hold together; a larger video is held alone."""
+
+    def __init__(self, max_bytes: int = MAX_FRAME_BYTES) -> None:
+        self._max_bytes = max_bytes
+        self._held_bytes = 0
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def holding(self, num_bytes: int) -> Iterator[None]:
+        """Wait until ``num_bytes`` fit, and hold them during the block. Nested calls can deadlock."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._held_bytes or self._held_bytes + num_bytes <= self._max_bytes)
+            self._held_bytes += num_bytes
+        try:
+            yield
+        except Exception as error:
+            clear_frames(error.__traceback__)  # otherwise the error's traceback keeps the frames in memory
+            raise
+        finally:
+            with self._changed:
+                self._held_bytes -= num_bytes
+                self._changed.notify_all()
+
+
+def episode_scores(
+    dataset: Dataset,
+    episode: DatasetEpisode,
+    scorer: Scorer,
+    recipe: Recipe,
+    *,
+    memory: FrameMemory,
+    go_on: Callable[[], None],
+) -> EpisodeScores:
+    """Return the scores of an episode, and its cameras that show nothing. Raises RewardError.
+
+    Columns: ``progress``, and ``success``, ``log_prob`` and ``unclear`` (1: unclear, of any camera) if the checkpoint
+    gives them. Several cameras add ``progress.<camera>`` and so on.
+
+    memory: shared by all workers, for the frames of one camera at a time; unused if the checkpoint encodes frames
+    go_on: called between requests; its exception ends the episode
+
+    Each stretch of frames with one task is scored by itself, as an episode of this task.
+    """
+    by_camera: dict[str, list[ProgressResult]] = {}
+    shown = {camera: BlankFrames() for camera in recipe.cameras}
+    for camera in recipe.cameras:
+        frames = _checked(dataset.frames(episode, camera), episode, camera, shown[camera])
+        for number, (task, count) in enumerate(episode.stretches, 1):
+            is_last = number == len(episode.stretches)  # reads on, to find frames too many
+            chunks = _shrunk(frames if is_last else itertools.islice(frames, count), recipe, go_on)
+            if recipe.checkpoint.encodes:
+                result = _scores(_joined([scorer.encode(chunk, task) for chunk in chunks]), scorer, recipe, go_on)
+            else:
+                first = next(chunks)
+                with memory.holding(first[0].nbytes * count):
+                    result = _scores(_held(first, chunks, task, count), scorer, recipe, go_on)
+            by_camera.setdefault(camera, []).append(result)
+    highest = {camera: frames.highest for camera, frames in shown.items()}
+    blank = {camera: value for camera, value in highest.items() if value is not None}
+    return EpisodeScores(_columns(by_camera, episode, recipe), blank)
+
+
+def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: DatasetEpisode, recipe: Recipe) -> Columns:
+    columns: Columns = {}
+    for name in SCORES:
+        parts = [[getattr(result, name) for result in results] for results in by_camera.values()]
+        if parts[0][0] is None:
+            continue
+        scores = [np.concatenate(of_camera).astype(np.float32, copy=False) for of_camera in parts]
+        if name == SUCCESS and all(np.isnan(score).all() for score in scores):
+            continue
+        _check_numbers(name, scores, episode)
+        fuse = np.max if name == UNCLEAR else FUSES[recipe.fuse]
+        columns[name] = np.asarray(fuse(np.stack(scores), axis=0), np.float32)
+        if len(by_camera) > 1:
+            columns |= {f"{name}.{camera}": score for camera, score in zip(by_camera, scores, strict=True)}
+    return columns
+
+
+def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]) -> ProgressResult:
+    if recipe.in_one_pass(trajectory.num_frames):
+        (result,) = scorer.evaluate([ProgressSample(trajectory)])
+        return result
+    results: list[ProgressResult] = []
+    samples = prefix_samples(trajectory, recipe.sampling)
+    for together in _by_bytes(samples):
+        go_on()
+        results += scorer.evaluate(together)
+    return of_prefixes(results, recipe.sampling)
+
+
+def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], None]) -> Iterator[UInt8Array]:
+    """Yield arrays of at most FRAMES_AT_A_TIME frames, resized if the recipe says so."""
+    while chunk := list(itertools.islice(frames, FRAMES_AT_A_TIME)):
+        go_on()
+        stacked = np.stack(chunk)
+        if recipe.resize and recipe.checkpoint.frame_size is not None:
+            stacked = resize_frames(stacked, recipe.checkpoint.frame_size)
+        yield stacked
+
+
+def _joined(parts: Sequence[Trajectory]) -> Trajectory:
+    embeddings = np.concatenate([part.positions for part in parts])
+    return Trajectory(video_embeddings=embeddings, text_embedding=parts[0].text_embedding)
+
+
+def _held(first: UInt8Array, others: Iterator[UInt8Array], task: str, count: int) -> Trajectory:
+    frames = np.empty((count, *first.shape[1:]), np.uint8)
+    start = 0
+    for chunk in itertools.chain([first], others):
+        frames[start : start + len(chunk)] = chunk
+        start += len(chunk)
+    return Trajectory(frames=frames, task=task)
+
+
+def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:
+    """Yield lists of samples, each of at most MAX_BYTES or a single sample."""
+    together: list[ProgressSample] = []
+    num_bytes = 0
+    for sample in samples:
+        if together and num_bytes + sample.trajectory.positions.nbytes > MAX_BYTES:
+            yield together
+            together, num_bytes = [], 0
+        together.append(sample)
+        num_bytes += sample.trajectory.positions.nbytes
+    if together:
+        yield together
+
+
+def _checked(
+    frames: Iterator[UInt8Array], episode: DatasetEpisode, camera: str, shown: BlankFrames
+) -> Iterator[UInt8Array]:
+    """Yield the frames, counted in ``shown``. Raises DatasetError for a wrong number of frames, or several sizes."""
+    where, count, shape = f"{episode.name}: {camera}", 0, None
+    for frame in frames:
+        shape = shape or frame.shape
+        require(f"{where}: frame {count}", frame.shape == shape, f"the size {shape}", frame.shape)
+        count += 1
+        if count <= episode.num_frames:
+            shown.add(frame)
+            yield frame
+    require(where, count == episode.num_frames, f"{episode.num_frames} frames", count)
+
+
+def _check_numbers(name: str, scores: list[Float32Array], episode: DatasetEpisode) -> None:
+    for score in scores:
+        if score.shape != (episode.num_frames,) or not np.isfinite(score).all():
+            got = "NaN: this checkpoint does not predict it" if np.isnan(score).any() else str(list(score.shape))
+            raise InferenceFailedError(f"{name}: expected a score of each of {episode.num_frames} frames, got {got}")

@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: MIT
+"""Compare label files of one dataset: which reward model suits the data. Needs pyarrow. E episodes, T frames.
+
+Value-order correlation (VOC) is the rank correlation of progress with time over a successful episode, as GVL (Ma et
+al., 2024) and Robometer's evaluation measure it. It shows that progress rises, not that its values are right: a clock's
+VOC is 1.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_labels.datasets.lerobot_rows import column_types, read_table
+from rfm_labels.datasets.lerobot_v21 import EPISODES_FILE, json_lines
+from rfm_labels.datasets.protocol import DatasetError, require
+from rfm_labels.episode_scores import PROGRESS, SUCCESS
+from rfm_labels.hdf5_tables import full_path
+from rfm_labels.label_files import PROGRESS_ENDING, read_cost, read_label_table
+from rfm_labels.summary import BACKWARDS_BY
+
+Floats = npt.NDArray[np.floating[Any]]
+
+_OUTCOMES = {"1": True, "0": False, "true": True, "false": False, "1.0": True, "0.0": False}
+_EPISODE, _SUCCESS = "episode", "success"  # columns of a CSV file of outcomes
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """How well one number of an episode tells successes from failures.
+
+    auroc: probability that a success has the higher number, with half of the ties; 0.5 is chance
+    threshold: the lowest with the best balanced accuracy, for "success if at least this"
+    balanced_accuracy: mean of the shares of successes and of failures that the threshold gets right
+    """
+
+    auroc: float
+    threshold: float
+    balanced_accuracy: float
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """One label file's measures. A mean is over episodes.
+
+    name: the file's name without its ending
+    spearman, kendall: mean VOC, as Spearman's rho and Kendall's tau-b, over the known successes, or over all episodes
+        if outcomes are unknown; None: progress is constant in each
+    num_constant: episodes with constant progress, which have no VOC
+    by_success, by_progress: how success and progress at the last frame tell successes from failures; None: outcomes are
+        unknown or all alike, or success is not predicted
+    final_of_successes, final_of_failures: mean progress at the last frame; None: no such episode
+    final: mean progress at the last frame of all episodes
+    backwards: mean share of steps on which progress falls by more than 0.01
+    frames_per_s: frames that the labelling run scored in a second; None: the file does not say
+    final_progress: float64 [E], progress at the last frame of each episode
+    """
+
+    name: str
+    num_episodes: int
+    num_frames: int
+    spearman: float | None
+    kendall: float | None
+    num_constant: int
+    by_success: Ranking | None
+    by_progress: Ranking | None
+    final_of_successes: float | None
+    final_of_failures: float | None
+    final: float
+    backwards: float
+    frames_per_s: float | None
+    final_progress: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """How far two label files agree on progress. A mean is over episodes.
+
+    spearman: mean rank correlation of both files' progress; None: a file's progress is constant in each episode
+    distance: mean absolute difference
+    """
+
+    first: str
+    second: str
+    spearman: float | None
+    distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class LabelComparison:
+    """The evaluations of several label files on the episodes that all of them have.
+
+    episodes: numbers of these episodes
+    is_success: bool [E]; None: outcomes are unknown
+    num_left_out: episodes that only some files have
+    """
+
+    evaluations: Sequence[Evaluation]
+    agreements: Sequence[Agreement]
+    episodes: Sequence[int]
+    is_success: npt.NDArray[np.bool_] | None
+    num_left_out: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Scores:
+    """An episode's labelled frames. success: None: not predicted"""
+
+    frames: npt.NDArray[np.int64]
+    progress: Floats
+    success: Floats | None
+
+
+def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool] | None = None) -> LabelComparison:
+    """Return the evaluations of label files of one dataset.
+
+    files: Parquet, or HDF5 as ``find_label_files`` returns them
+    outcomes: True for each successful episode, by its number; None: unknown
+
+    Raises DatasetError for an unreadable file, files without a common episode, or an episode without an outcome.
+    """
+    require("labels", len(files) > 0, "at least one file", "none")
+    files = [full_path(file) for file in files]
+    names = _names(files)
+    read = {name: _episodes(file) for name, file in zip(names, files, strict=True)}
+    common = sorted(set.intersection(*(set(episodes) for episodes in read.values())))
+    everywhere = set.union(*(set(episodes) for episodes in read.values()))
+    require("labels", len(common) > 0, "an episode that all files have", "none")
+    if outcomes is not None:
+        missing = [episode for episode in common if episode not in outcomes]
+        require("outcome", not missing, "one for each labelled episode", f"none for episode {missing[:1]}")
+    is_success = None if outcomes is None else np.array([outcomes[episode] for episode in common])
+    evaluations = [
+        _evaluation(name, file, [read[name][each] for each in common], is_success)
+        for name, file in zip(names, files, strict=True)
+    ]
+    pairs = [(first, second) for index, first in enumerate(names) for second in names[index + 1 :]]
+    agreements = [_agreement(first, second, read[first], read[second], common) for first, second in pairs]
+    return LabelComparison(evaluations, agreements, common, is_success, len(everywhere) - len(common))
+
+
+def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool]:
+    """Return each episode's outcome by its number. Raises DatasetError.
+
+    source: a CSV file with the columns ``episode`` and ``success``, or the name of a column of a LeRobot dataset: of
+        its frames, whose last value counts, or of its episodes. Values: true, false, 1 or 0
+    dataset: the LeRobot dataset's folder
+    """
+    if Path(source).suffix.lower() == ".csv":
+        return _of_csv(Path(source))
+    if dataset is None or not (dataset / "meta").is_dir():
+        raise DatasetError.at("outcome", "a CSV file, or a column of a local LeRobot dataset", repr(source))
+    frames, episodes = (
+        sorted(dataset.glob(pattern)) for pattern in ("data/**/*.parquet", "meta/episodes/**/*.parquet")
+    )
+    columns = [list(column_types(files[0])) if files else [] for files in (frames, episodes)]
+    for files, names in zip((frames, episodes), columns, strict=True):
+        if source in names:
+            table = [read_table(file, ["episode_index", source]).to_pydict() for file in files]
+            rows = [row for part in table for row in zip(part["episode_index"], part[source], strict=True)]
+            return {
+                index: _outcome(f"outcome: {source}: episode {index}", value) for index, value in dict(rows).items()
+            }
+    file = dataset / EPISODES_FILE
+    told = list(json_lines(file)) if file.is_file() else []
+    if not told or source not in told[0][1]:
+        known = ", ".join(columns[0])
+        raise DatasetError.at("outcome", f"a CSV file, or a column of {dataset}: {known}", repr(source))
+    return {line["episode_index"]: _outcome(f"{where}: {source}", line.get(source)) for where, line in told}
+
+
+def _of_csv(file: Path) -> dict[int, bool]:
+    try:
+        with file.open(newline="", encoding="utf-8-sig") as content:
+            rows = list(csv.DictReader(content))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DatasetError.at(file, "a CSV file", error) from error
+    got = ", ".join(rows[0]) if rows else "no rows"
+    require(file, bool(rows) and {_EPISODE, _SUCCESS} <= rows[0].keys(), f"the columns {_EPISODE} and {_SUCCESS}", got)
+    outcomes: dict[int, bool] = {}
+    for number, row in enumerate(rows, 2):
+        where, text = f"{file}: line {number}", (row[_EPISODE] or "").strip()
+        require(f"{where}: {_EPISODE}", text.isdecimal(), "the number of an episode", repr(text))
+        require(where, int(text) not in outcomes, "each episode once", f"{text} again")
+        outcomes[int(text)] = _outcome(f"{where}: {_SUCCESS}", row[_SUCCESS])
+    return outcomes
+
+
+def _outcome(where: str, value: Any) -> bool:
+    while isinstance(value, list) and len(value) == 1:
+        (value,) = value
+    outcome = _OUTCOMES.get(str(value).strip().lower())
+    if outcome is None:
+        raise DatasetError.at(where, "true, false, 1 or 0", repr(value))
+    return outcome
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """Return a name for each file: that of the reward, with its folder if two are alike."""
+    short = [file.name.removesuffix(PROGRESS_ENDING).removesuffix(".parquet") for file in files]
+    names = [name if short.count(name) == 1 else str(file) for name, file in zip(short, files, strict=True)]
+    require("labels", len(set(names)) == len(names), "each file once", ", ".join(names))
+    return names
+
+
+def _episodes(file: Path) -> dict[int, _Scores]:
+    table = read_label_table(file)
+    require(file, len(table) > 0, "labels", "none")
+    episodes = table["episode_index"].to_numpy()
+    has_frames = "frame_index" in table.column_names
+    require(file, has_frames, "the column frame_index", ", ".join(table.column_names))
+    frames, progress = table["frame_index"].to_numpy(), table[PROGRESS].to_numpy()
+    success = table[SUCCESS].to_numpy() if SUCCESS in table.column_names else None
+    scores = {}
+    order = np.lexsort((frames, episodes))
+    numbers, starts = np.unique(episodes[order], return_index=True)
+    for episode, own in zip(numbers.tolist(), np.split(order, starts[1:]), strict=True):
+        rows = own[np.isfinite(progress[own])]  # NaN: a frame without a label
+        require(f"{file}: episode {episode}", len(rows) > 0, "progress", "none")
+        predicted = None if success is None or np.isnan(success[rows]).any() else success[rows]
+        scores[episode] = _Scores(frames[rows], progress[rows], predicted)
+    return scores
+
+
+def _evaluation(
+    name: str, file: Path, scores: Sequence[_Scores], is_success: npt.NDArray[np.bool_] | None
+) -> Evaluation:
+    cost = read_cost(file)
+    final = np.array([each.progress[-1] for each in scores], np.float64)
+    orders = [_order(each.progress) for index, each in enumerate(scores) if is_success is None or is_success[index]]
+    known = [order for order in orders if order is not None]
+    last = np.array([each.success[-1] for each in scores if each.success is not None], np.float64)
+    falls = [float((np.diff(each.progress) < -BACKWARDS_BY).sum()) / max(len(each.progress) - 1, 1) for each in scores]
+    return Evaluation(
+        name=name,
+        num_episodes=len(scores),
+        num_frames=sum(len(each.frames) for each in scores),
+        spearman=_mean([rho for rho, _ in known]),
+        kendall=_mean([tau for _, tau in known]),
+        num_constant=len(orders) - len(known),
+        by_success=_ranking(last, is_success) if len(last) == len(scores) else None,
+        by_progress=_ranking(final, is_success),
+        final_of_successes=None if is_success is None else _mean(final[is_success]),
+        final_of_failures=None if is_success is None else _mean(final[~is_success]),
+        final=float(final.mean()),
+        backwards=float(np.mean(falls)),
+        frames_per_s=None if cost is None else cost.frames_per_s,
+        final_progress=final,
+    )
+
+
+def _agreement(
+    first: str, second: str, of_first: Mapping[int, _Scores], of_second: Mapping[int, _Scores], episodes: Sequence[int]
+) -> Agreement:
+    orders, distances = [], []
+    for episode in episodes:
+        one, other = of_first[episode], of_second[episode]
+        frames, mine, theirs = np.intersect1d(one.frames, other.frames, assume_unique=True, return_indices=True)
+        require(f"labels: episode {episode}", len(frames) > 0, f"a frame that {first} and {second} have", "none")
+        orders.append(spearman(one.progress[mine], other.progress[theirs]))
+        distances.append(np.abs(one.progress[mine].astype(np.float64) - other.progress[theirs]).mean())
+    mean = float(np.mean(distances))
+    return Agreement(first, second, _mean([order for order in orders if order is not None]), mean)
+
+
+def _order(progress: Floats) -> tuple[float, float] | None:
+    """Return Spearman's rho and Kendall's tau-b of progress with time; None: progress is constant."""
+    time = np.arange(len(progress))
+    rho, tau = spearman(progress, time), kendall(progress)
+    return None if rho is None or tau is None else (rho, tau)
+
+
+def spearman(first: npt.NDArray[Any], second: npt.NDArray[Any]) -> float | None:
+    """Return Spearman's rank correlation of two arrays [T]; equal values share a rank. None: an array is constant."""
+    ranks = np.stack([_ranks(first), _ranks(second)])
+    return None if (np.ptp(ranks, axis=1) == 0).any() else float(np.corrcoef(ranks)[0, 1])
+
+
+def kendall(values: npt.NDArray[Any]) -> float | None:
+    """Return Kendall's tau-b of values [T] with time; None: the values are constant."""
+    pairs = len(values) * (len(values) - 1) // 2
+    _, counts = np.unique(values, return_counts=True)
+    ties = int((counts * (counts - 1) // 2).sum())
+    if pairs == ties:
+        return None
+    concordance = sum(int(np.sign(values[lag:] - values[:-lag]).sum()) for lag in range(1, len(values)))
+    return float(concordance / np.sqrt(float(pairs) * (pairs - ties)))
+
+
+def _ranks(values: npt.NDArray[Any]) -> Floats:
+    """Return the rank of each value, from 0; equal values share their mean rank."""
+    _, where, counts = np.unique(values, return_inverse=True, return_counts=True)
+    ends = np.cumsum(counts)
+    ranks: Floats = (ends - (counts + 1) / 2)[where.reshape(-1)]
+    return ranks
+
+
+def _ranking(numbers: Floats, is_success: npt.NDArray[np.bool_] | None) -> Ranking | None:
+    if is_success is None or is_success.all() or not is_success.any():
+        return None
+    ranks, positives = _ranks(numbers), int(is_success.sum())
+    negatives = len(numbers) - positives
+    auroc = (ranks[is_success].sum() - positives * (positives - 1) / 2) / (positives * negatives)
+    thresholds = np.unique(numbers)
+    accuracies = [
+        ((numbers[is_success] >= each).mean() + (numbers[~is_success] < each).mean()) / 2 for each in thresholds
+    ]
+    best = int(np.argmax(accuracies))
+    return Ranking(float(auroc), float(thresholds[best]), float(accuracies[best]))
+
+
+def _mean(numbers: Sequence[float] | Floats) -> float | None:
+    return float(np.mean(numbers)) if len(numbers) else None

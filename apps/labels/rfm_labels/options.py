@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: MIT
+"""Options of a labelling run, checked once: fields for programs, options for command lines."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal, TypeAlias, get_args
+
+from rfm_client.contract.numbers import checked_count, checked_finite
+from rfm_client.contract.settings import ConfigError, Settings, setting
+from rfm_client.frames.camera_fusion import Fuse
+from rfm_client.frames.sampling import Rule
+
+Mode: TypeAlias = Literal["prefix", "whole"]
+Format: TypeAlias = Literal["progress", "signals", "hdf5"]
+
+FORMATS: tuple[Format, ...] = get_args(Format)
+DEFAULT_WORKERS = 4
+
+_NAME = re.compile(r"[A-Za-z0-9][\w-]{0,63}")
+_RANGE = re.compile(r"(\d+)(?::(\d+))?")
+
+
+def parse_episodes(text: str) -> list[int]:
+    """Return the sorted numbers in ``0:100,205``: 0 to 99, and 205. Raises ValueError."""
+    numbers: list[int] = []
+    for part in text.split(","):
+        match = _RANGE.fullmatch(part.strip())
+        if match is None or (match[2] and int(match[2]) <= int(match[1])):
+            raise ValueError(f"episodes: expected numbers and ranges such as 0:100,205, got {text!r}")
+        numbers += range(int(match[1]), int(match[2])) if match[2] else [int(match[1])]
+    return sorted(set(numbers))
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """Return i and n of ``i/n``. Raises ValueError."""
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if match is None:
+        raise ValueError(f"shard: expected i/n, for example 0/8, got {text!r}")
+    return int(match[1]), int(match[2])
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split(",")) if text else ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelOptions(Settings):
+    """Options of a labelling run. Raises ConfigError, a ValueError.
+
+    formats: empty: ``progress`` and ``signals``, for an HDF5 dataset ``hdf5``
+    cameras: empty: all but depth cameras
+    sampling, frames: None: those of the checkpoint's training (``Sampling.of``)
+    episodes: numbers; None: all
+    filter_key: only these of the episodes; None: all
+    shard: (i, n): label share i, from 0, of n equal shares, without label files; a later run without shard writes them
+    parts: None: ``.<name>_parts`` in the output folder
+    """
+
+    TITLE: ClassVar[str] = "Labels"
+
+    output: Path | None = setting(None, "Folder of the labels; else the dataset's own.")
+    name: str = setting("rfm", "Name of the reward: NAME_progress.parquet and reward_signals/NAME.parquet.")
+    alias: str | None = setting(
+        None, "Write the progress file under this name, too: sarm_progress is what LeRobot reads."
+    )
+    formats: Sequence[Format] = setting(
+        (),
+        "Files to write; else progress,signals, of an HDF5 file hdf5.",
+        flag="--format",
+        metavar=",".join(FORMATS),
+        parse=_names,
+    )
+    cameras: Sequence[str] = setting(
+        (), "Cameras to score; else all but depth ones.", metavar="KEY[,KEY...]", parse=_names
+    )
+    fuse: Fuse = setting("mean", "How the scores of several cameras are fused.")
+    sampling: Rule | None = setting(
+        None, "Rule by which frame t's prefix is sampled; else that of the checkpoint's training."
+    )
+    frames: int | None = setting(None, "Frames that the rule shows the model; else as many as in training.", least=1)
+    mode: Mode = setting("prefix", "prefix: frame t is scored on the frames up to t. whole: all frames together.")
+    resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
+    episodes: Sequence[int] | None = setting(
+        None, "Some of the episodes, by number.", metavar="0:100,205", parse=parse_episodes
+    )
+    filter_key: str | None = setting(
+        None, "Only the episodes of a filter key of robomimic's HDF5 files, such as train or valid.", metavar="KEY"
+    )
+    limit: int | None = setting(None, "At most so many episodes.", least=1)
+    shard: tuple[int, int] | None = setting(
+        None, "Label part I of N alone, from 0; run without it to write the files.", metavar="I/N", parse=parse_shard
+    )
+    parts: str | None = setting(
+        None, "Where finished episodes are kept; else .NAME_parts in the output.", metavar="FOLDER|URL"
+    )
+    workers: int = setting(DEFAULT_WORKERS, "Episodes under way at a time.", least=1)
+    overwrite: bool = setting(False, "Replace labels of another recipe; those of the same are kept.")
+    verify: bool = setting(False, "Tell videos from others by their SHA-256, not by their size and time of change.")
+    in_place: bool = setting(False, "Write the labels into the HDF5 file itself.")
+
+    def __post_init__(self) -> None:
+        for name in ("workers", "limit", "frames"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, checked_count(name, getattr(self, name)))
+        for name in ("episodes", "shard"):
+            if getattr(self, name) is not None:
+                numbers = tuple(checked_count(name, each, least=0) for each in getattr(self, name))
+                object.__setattr__(self, name, numbers)
+        super().__post_init__()
+        for name in ("name", "alias"):
+            value = getattr(self, name)
+            if value is not None and not _NAME.fullmatch(value):
+                raise ConfigError(name, f"expected 1 to 64 letters, digits, _ or -, got {value!r}")
+        for each in self.formats:
+            if each not in FORMATS:
+                raise ConfigError("formats", f"expected one of {', '.join(FORMATS)}, got {each!r}")
+        if len(set(self.cameras)) != len(self.cameras):
+            raise ConfigError("cameras", f"expected each once, got {', '.join(self.cameras)}")
+        if self.mode == "whole" and self.sampling not in (None, "all"):
+            raise ConfigError("sampling", f"expected all in mode whole, which shows every frame, got {self.sampling}")
+        if self.shard is not None and self.shard[0] >= self.shard[1]:
+            raise ConfigError("shard", f"expected i/n with i from 0 to n - 1, got {self.shard[0]}/{self.shard[1]}")
+
+
+@dataclass(frozen=True)
+class RayOptions(Settings):
+    """Ray cluster, number of actors and their GPUs. Raises ConfigError, a ValueError."""
+
+    TITLE: ClassVar[str] = "With --engine ray"
+
+    address: str | None = setting(None, "Ray cluster; else a running cluster, or a new one on this machine.")
+    actors: int = setting(1, "Ray actors, each with a scorer.", least=1)
+    num_gpus_per_actor: float = setting(0.0, "GPUs of its node that a Ray actor takes.", least=0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "actors", checked_count("actors", self.actors))
+        object.__setattr__(self, "num_gpus_per_actor", checked_finite("num_gpus_per_actor", self.num_gpus_per_actor))
+        super().__post_init__()

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: MIT
+"""Scorers of a labelling run: a server behind a client, or an engine in this process. T frames, H x W pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol, cast
+
+from rfm_client.client import RewardClient
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.results import ProgressResult
+from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
+from rfm_labels.datasets.protocol import digest_of
+
+IDENTITY = ("weights_digest", "settings_digest", "computation")  # equal if scores are
+
+
+@dataclass(frozen=True)
+class CheckpointFacts:
+    """A checkpoint's origin, causes of its scores, and limits.
+
+    source, revision: origin; None: unknown
+    weights_digest: of the weights
+    settings_digest: of all else that decides the scores: configuration, encoders, dtype, device
+    computation: number type, PyTorch version and attention kernel; None: unknown
+    max_frames: most frames of a trajectory, in training or for the network, the smaller number; None: both unknown
+    frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
+    encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
+    is_causal: True if no frame's score depends on later frames
+    trained_padding: True if training padded shorter trajectories, or if unknown
+    has_log_prob: True if results have log-probabilities
+    needs_whole_episode: True if scores are relative to the whole episode
+    weights: form of rounded weights, whose scores are not the full checkpoint's; None: not rounded
+    """
+
+    source: str | None
+    revision: str | None
+    weights_digest: str
+    settings_digest: str
+    max_frames: int | None
+    frame_size: FrameSize | None
+    encodes: bool
+    is_causal: bool
+    trained_padding: bool = True
+    has_log_prob: bool = False
+    needs_whole_episode: bool = False
+    computation: str | None = None
+    weights: str | None = None
+
+    def document(self) -> dict[str, Any]:
+        """Return the facts for the provenance."""
+        told, newer = ("source", "revision", *IDENTITY, "weights"), ("computation", "weights")
+        there = {name: value for name, value in asdict(self).items() if name in told}
+        # Labels made before lack the newer fields, and the digests of episodes depend on the provenance.
+        return {name: value for name, value in there.items() if value is not None or name not in newer}
+
+
+class Scorer(Protocol):
+    """Scores samples with one checkpoint. Several threads use it at a time."""
+
+    def checkpoint(self) -> CheckpointFacts:
+        """Return the facts of the checkpoint that answers now. Raises RewardError."""
+
+    def encode(self, frames: UInt8Array, task: str) -> Trajectory:
+        """Return embeddings of frames, uint8 [T, H, W, 3], and task; needs ``encodes``. Raises RewardError."""
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        """Return the result of each sample. Raises RewardError for the first failure."""
+
+
+class ClientScorer:
+    """A scorer that asks the servers of a client. It leaves the client open."""
+
+    def __init__(self, client: RewardClient) -> None:
+        self._client = client
+        self._has_log_prob = False
+
+    def checkpoint(self) -> CheckpointFacts:
+        """Return the facts from the servers. Raises RewardError, also if the servers have different checkpoints."""
+        infos = self._client.model_infos()
+        digests: list[object] = [_digests(told) for told in infos.values()]
+        info = infos["frames"][0] if "frames" in infos else self._client.model_info(frames=True)
+        digests += ["marks_unclear"] * info.marks_unclear  # labels without this column cannot be joined with its own
+        if info.weights_digest is None:
+            raise InvalidSampleError.at(
+                f"model {info.name}", "a weights_digest, as exports have since version 0.1.0", "none: export it again"
+            )
+        self._has_log_prob = info.has_log_prob
+        embedded = infos["embeddings"][0] if "embeddings" in infos else None
+        network = info.network if embedded is None else embedded.network
+        return CheckpointFacts(
+            source=info.source,
+            revision=info.revision,
+            weights_digest=info.weights_digest,
+            settings_digest=digest_of(str(each).encode() for each in digests),
+            max_frames=info.max_frames,
+            frame_size=info.frame_size,
+            encodes=embedded is not None,
+            is_causal=network.get("config", {}).get("causal_mask") is True,
+            trained_padding=info.trained_padding,
+            has_log_prob=info.has_log_prob,
+            needs_whole_episode=info.needs_whole_episode,
+            computation=info.computation,
+            weights=info.weights,
+        )
+
+    def encode(self, frames: UInt8Array, task: str) -> Trajectory:
+        """Return embeddings of frames, uint8 [T, H, W, 3], and task. Raises RewardError."""
+        return self._client.encode(Trajectory(frames=frames, task=task))
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        """Return the result of each sample. Raises RewardError for the first failure."""
+        return cast("list[ProgressResult]", self._client.evaluate(samples, log_prob=self._has_log_prob))
+
+
+def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:
+    """Return name and digests of a model. Raises InvalidSampleError if servers differ in these or the computation."""
+    digests = {(info.name, *(getattr(info, name) for name in IDENTITY)) for info in infos}
+    if len(digests) > 1:
+        told = " and ".join(sorted(", ".join(map(str, values)) for _, *values in digests))
+        expected = f"the same {', '.join(IDENTITY[:-1])} and {IDENTITY[-1]} at every server"
+        raise InvalidSampleError.at(f"model {infos[0].name}", expected, told)
+    return digests.pop()[:3]

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""Summary of a label file. Needs pyarrow. E episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.results import SUCCESS_THRESHOLD
+from rfm_labels.datasets.protocol import require
+from rfm_labels.episode_scores import PROGRESS, SUCCESS
+from rfm_labels.label_files import read_label_table
+
+BACKWARDS_BY = 0.01  # kappa of reward-aligned behaviour cloning; a smaller fall is noise
+_MOST_LISTED = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """Scores of each episode.
+
+    episodes: int64 [E], numbers of the episodes
+    final_progress: float32 [E], at the last frame
+    best_success: float32 [E], highest success; None: the checkpoint does not predict success
+    last_success: float32 [E], success at the last frame; None as ``best_success``
+    backwards: float64 [E], share of steps on which progress falls by more than 0.01
+    disagreement: float64 [E], range of the cameras' progress, mean over frames; None: no scores of several cameras
+    num_frames: of all episodes
+    """
+
+    episodes: npt.NDArray[np.int64]
+    final_progress: npt.NDArray[np.float32]
+    best_success: npt.NDArray[np.float32] | None
+    last_success: npt.NDArray[np.float32] | None
+    backwards: npt.NDArray[np.float64]
+    disagreement: npt.NDArray[np.float64] | None
+    num_frames: int
+
+    @property
+    def never_succeed(self) -> npt.NDArray[np.int64] | None:
+        """int64 [N], episodes in which no frame has a success of 0.5 or more; None: success is not predicted."""
+        return None if self.best_success is None else self.episodes[self.best_success < SUCCESS_THRESHOLD]
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return name and value of each row of a table."""
+        quantiles = np.quantile(self.final_progress, [0, 0.25, 0.5, 0.75, 1])
+        names = ("lowest", "lower quarter", "median", "upper quarter", "highest")
+        failing = "-"
+        if self.never_succeed is not None:
+            numbers = self.never_succeed.tolist()
+            more = " ..." if len(numbers) > _MOST_LISTED else ""
+            failing = f"{len(numbers)}: {', '.join(map(str, numbers[:_MOST_LISTED]))}{more}"
+        return [
+            ("episodes", str(len(self.episodes))),
+            ("frames", str(self.num_frames)),
+            *((f"final progress: {name}", f"{value:.4f}") for name, value in zip(names, quantiles, strict=True)),
+            ("episodes that never succeed", failing),
+            ("steps on which progress falls", f"{self.backwards.mean():.1%}"),
+        ]
+
+
+def summarise(file: Path) -> Summary:
+    """Return the summary of a label file, Parquet or HDF5. Raises DatasetError for another file."""
+    table = read_label_table(file)
+    require(file, len(table) > 0, "labels", "none")
+    return summary_of(table)
+
+
+def summary_of(labels: Any) -> Summary:
+    """Return the summary of labels, a pyarrow Table with the parts' column names."""
+    episodes = labels["episode_index"].to_numpy()
+    starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1)).tolist()
+    numbers, final, best, last, backwards, apart = [], [], [], [], [], []
+    for start, end in zip(starts, [*starts[1:], len(labels)], strict=True):
+        table = labels.slice(start, end - start)
+        progress = table[PROGRESS].to_numpy()
+        cameras = [table[name].to_numpy() for name in table.column_names if name.startswith(f"{PROGRESS}.")]
+        numbers.append(episodes[start])
+        final.append(progress[-1])
+        backwards.append(np.mean(np.diff(progress) < -BACKWARDS_BY) if len(progress) > 1 else 0.0)
+        if SUCCESS in table.column_names:
+            success = table[SUCCESS].to_numpy()
+            best.append(success.max())
+            last.append(success[-1])
+        if cameras:
+            apart.append(np.ptp(np.stack(cameras), axis=0).mean(dtype=np.float64))
+    return Summary(
+        episodes=np.array(numbers, np.int64),
+        final_progress=np.array(final, np.float32),
+        best_success=np.array(best, np.float32) if best else None,
+        last_success=np.array(last, np.float32) if last else None,
+        backwards=np.array(backwards, np.float64),
+        disagreement=np.array(apart, np.float64) if apart else None,
+        num_frames=len(labels),
+    )

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: MIT
+"""HDF5 datasets for the page, whose pictures are encoded as a video. Needs h5py. T frames of an episode.
+
+A file with links to other files, or with data in them, is refused, since its author could show files of this machine.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.contract.settings import ConfigError
+from rfm_labels.datasets.hdf5 import Hdf5Dataset
+from rfm_labels.datasets.hdf5_contents import opened_hdf5
+from rfm_labels.datasets.protocol import DatasetEpisode, DatasetError, TaskOverride, chosen_cameras
+from rfm_labels.hdf5_tables import stored_in
+from rfm_labels.label_files import find_label_files
+from rfm_page.links import check_links
+from rfm_page.shown import ShownDataset
+
+_FILES_KNOWN = 64  # files whose last check is remembered
+_CODING = {"crf": "12", "g": "10", "preset": "veryfast"}  # of H.264: hardly any loss, and quick to move in
+
+
+@dataclass(frozen=True)
+class ShownHdf5(ShownDataset):
+    """An HDF5 dataset for the page."""
+
+    has_stored_pixels = False
+
+    dataset: Hdf5Dataset
+
+    @classmethod
+    def open(cls, file: str) -> ShownHdf5:
+        """Open a dataset. Raises ConfigError for another file, or one that needs other files."""
+        path = Path(file).resolve()
+        try:
+            dataset = Hdf5Dataset(path, task=TaskOverride(is_needed=False))
+            shown = cls(path.parent, path, dataset)
+            shown.check()
+            return shown
+        except (DatasetError, ImportError) as error:
+            raise ConfigError("dataset", str(error)) from None
+
+    def check(self) -> None:
+        """Raise DatasetError for data in other files, in the dataset or its labels."""
+        files = dict.fromkeys([self.path, *map(stored_in, find_label_files(self.path))])
+        check_links(self.root, files)
+        for file in files:
+            _check_inside(file, _changed_ns(file))
+
+    @property
+    def cameras(self) -> Sequence[str]:
+        """The cameras that are labelled without a choice."""
+        return chosen_cameras(self.dataset, ())
+
+    @property
+    def fps(self) -> float:
+        """Frames a second: robosuite's control frequency, else its default."""
+        return self.dataset.fps
+
+    def times_s(self, episode: DatasetEpisode) -> npt.NDArray[np.float64]:
+        """Return float64 [T], times at equal distances, since the file has none."""
+        return np.arange(episode.num_frames) / self.fps
+
+    def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
+        """Return the episode's pictures, as stored, as a video of nearly the same colours. Raises DatasetError."""
+        return _encoded(self.dataset.stored_frames(episode, camera), self.fps, take)
+
+
+def _changed_ns(file: Path) -> int:
+    """The time of a file's last change, which its author cannot set. Raises DatasetError."""
+    try:
+        return file.stat().st_ctime_ns
+    except OSError as error:
+        raise DatasetError.at(file, "an HDF5 file", error.strerror) from error
+
+
+@lru_cache(_FILES_KNOWN)
+def _check_inside(file: Path, _changed_ns: int) -> None:
+    """Raise DatasetError for data in another file."""
+    import h5py
+
+    def leaves(name: str, link: Any) -> str | None:
+        if isinstance(link, h5py.ExternalLink):
+            return name
+        found = opened.get(name) if isinstance(link, h5py.HardLink) else None
+        is_outside = isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)
+        return name if is_outside else None
+
+    with opened_hdf5(file) as opened:
+        name = opened.visititems_links(leaves)
+    if name is not None:
+        raise DatasetError.at(f"{file}: {name}", "data in the file", "data in another file: copy them into it")
+
+
+def _encoded(frames: Iterator[UInt8Array], fps: float, take: Callable[[int], object]) -> bytes:
+    video = io.BytesIO()
+    with av.open(video, "w", format="mp4") as container:
+        stream: Any = None
+        for frame in frames:
+            even = np.pad(frame, [(0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)], "edge")  # for H.264
+            if stream is None:
+                stream = container.add_stream("libx264", Fraction(fps).limit_denominator(1000), options=_CODING)
+                stream.height, stream.width, stream.pix_fmt = *even.shape[:2], "yuv420p"
+                take(even.nbytes)
+            _mux(container, stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")), take)
+        _mux(container, stream.encode(None), take)
+    return video.getvalue()
+
+
+def _mux(container: Any, packets: Sequence[Any], take: Callable[[int], object]) -> None:
+    for packet in packets:
+        take(packet.size)
+        container.mux(packet)

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: MIT
+"""The page's endpoints for videos: served models, the curve of a video, the comparison of two videos.
+
+A curve comes as server-sent events: ``video`` has its frames, ``scores`` some points, ``done`` or ``failed`` ends it.
+Each frame is scored on its prefix, a few prefixes at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import logging
+import math
+import time
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, cast
+
+import anyio
+import numpy as np
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import JSONResponse, StreamingResponse
+from starlette.datastructures import UploadFile
+
+from rfm_client.async_client import AsyncRewardClient
+from rfm_client.contract.errors import InvalidSampleError, ModelNotFoundError, RewardError
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.names import DEFAULT_MODEL, frames_name
+from rfm_client.contract.results import PreferenceResult, ProgressResult
+from rfm_client.contract.samples import ProgressSample, Trajectory
+from rfm_client.frames.blank_frames import BlankFrames
+from rfm_client.frames.fit_to_checkpoint import fitted
+from rfm_client.frames.orientation import CHANNEL_ORDERS, ORIENTATIONS
+from rfm_client.frames.sampling import RULES, Rule, Sampling, prefix_samples, trained_rule
+from rfm_client.transport.off_loop import off_loop
+from rfm_client.transport.status import read_status
+from rfm_gateway.mounting import Decoded, GatewayConfig, Surroundings, invalid, while_connected
+from rfm_page.numbers import numbers_or_null
+from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest
+
+MOST_PREFIXES = 32  # in a request
+MOST_BYTES = 64 * 2**20  # of the frames in a request
+STATUS_TIMEOUT_S = 5.0
+_AS_THEY_COME = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # the second tells proxies not to buffer
+_FRAMES_ENDING = frames_name("")
+
+logger = logging.getLogger("rfm_gateway")
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A request with its model and its videos."""
+
+    question: VideoRequest
+    sampling: Sampling
+    info: ModelInfo
+    videos: tuple[ShownVideo, ...]
+    request_id: str
+
+
+def viewer_routes(surroundings: Surroundings) -> APIRouter:
+    """Return the page's endpoints for videos. The evaluation server has no such endpoints."""
+    config, new_client, limits = surroundings.config, surroundings.new_client, surroundings.limits
+    max_decoded_bytes, metrics = surroundings.max_decoded_bytes, surroundings.metrics
+    router = APIRouter(include_in_schema=False)
+    default_model = config.model or DEFAULT_MODEL
+
+    @router.get("/viewer/served")
+    async def served() -> Response:
+        models = [_told_of(name, info) for name, info in await _infos(config, new_client)]
+        rules = [{"name": rule, "frames": _frames_of(rule)} for rule in RULES]
+        about = {"models": models, "model": default_model, "rules": rules}
+        about |= {"orientations": list(ORIENTATIONS), "channel_orders": list(CHANNEL_ORDERS)}
+        return JSONResponse({**about, "fps": DEFAULT_FPS, "url": config.triton_url})
+
+    @router.post("/viewer/score")
+    async def score(request: Request) -> Response:
+        asked = await read(request, "video")
+        return StreamingResponse(events(asked), media_type="text/event-stream", headers=_AS_THEY_COME)
+
+    @router.post("/viewer/compare")
+    async def compare(request: Request) -> Response:
+        asked = await read(request, "first", "second")
+        async with new_client(model=asked.question.model) as client:
+            answer = await while_connected(request, _preferences(client, asked))
+        metrics.samples.labels("preference").inc(len(answer["orders"]))
+        return JSONResponse(answer)
+
+    async def read(request: Request, *names: str) -> _Asked:
+        """Read a request with the videos of these names.
+
+        Raises RequestValidationError, HTTPException and RewardError.
+        """
+        async with limits.form(request) as (fields, uploads):
+            question = VideoRequest.of(fields, default_model)
+            async with new_client(model=question.model) as client:
+                info = await client.model_info(frames=True)
+            sampling = question.sampling(info)
+            videos = await while_connected(request, decoded(question, uploads, names))
+        return _Asked(question, sampling, info, videos, request.state.request_id)
+
+    async def decoded(
+        question: VideoRequest, uploads: Mapping[str, UploadFile], names: tuple[str, ...]
+    ) -> tuple[ShownVideo, ...]:
+        taken = Decoded(max_decoded_bytes)
+        try:
+            with anyio.move_on_after(config.timeout_s):
+                return tuple([await question.video(uploads, name, taken) for name in names])
+        finally:
+            taken.end()
+        raise invalid((names[0],), f"expected videos that are read within {config.timeout_s:g} s, got longer ones")
+
+    async def events(asked: _Asked) -> AsyncIterator[str]:
+        """Yield the events of a curve. An error is the last event, since the status has been sent already."""
+        (video,) = asked.videos
+        num_frames, began_s, version = video.trajectory.num_frames, time.monotonic(), None
+        times_s = None if video.times_s is None else video.times_s.tolist()
+        blank = await asyncio.to_thread(lambda: BlankFrames(video.trajectory.positions).told)
+        about = {"num_frames": num_frames, "times_s": times_s, "sampled_frames": asked.sampling.frames}
+        yield _event("video", **about, blank=blank or None)
+        try:
+            sample = ProgressSample(video.trajectory)
+            fit = await asyncio.to_thread(fitted, sample, asked.info, subsample=False, resize=asked.question.resize)
+            async with new_client(model=asked.question.model) as client:
+                async for points in _curve(client, fit.sample.trajectories[0], asked):
+                    version = points["model_version"]
+                    metrics.samples.labels("progress").inc(len(points["progress"]))
+                    yield _event("scores", **points)
+        except RewardError as error:
+            yield _event("failed", detail=str(error))
+        except Exception as error:
+            logger.error("unexpected", exc_info=error)
+            yield _event("failed", detail="the gateway failed; its log has the reason")
+        else:
+            yield _event("done", model_version=version, took_s=time.monotonic() - began_s)
+
+    return router
+
+
+async def _infos(config: GatewayConfig, new_client: Callable[..., AsyncRewardClient]) -> list[tuple[str, ModelInfo]]:
+    """Return the served models for raw frames, by the name of their export. Raises RewardError."""
+    status = await asyncio.to_thread(
+        read_status,
+        config.triton_url,
+        metrics_url=config.metrics_url,
+        timeout_s=STATUS_TIMEOUT_S,
+        credentials=config.credentials,
+    )
+    ready = {model.name for model in status.models if model.state == "READY" and model.name.endswith(_FRAMES_ENDING)}
+    infos = []
+    for name in sorted(each.removesuffix(_FRAMES_ENDING) for each in ready):
+        try:
+            async with new_client(model=name) as client:
+                infos.append((name, await client.model_info(frames=True, timeout_s=STATUS_TIMEOUT_S)))
+        except ModelNotFoundError:  # unloaded in the meantime
+            continue
+    return infos
+
+
+def _told_of(name: str, info: ModelInfo) -> dict[str, Any]:
+    rule = trained_rule(info.trained_padding)
+    about = {"name": name, "max_frames": info.max_frames, "rule": rule}
+    return {**about, "versions": list(info.versions), "source": info.source}
+
+
+def _frames_of(rule: Rule) -> int | str | None:
+    """Return a rule's own number of frames, "any" if the caller chooses it, None if the rule has no such number."""
+    try:
+        return Sampling(rule).frames
+    except ValueError:
+        return "any"
+
+
+async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Asked) -> AsyncIterator[dict[str, Any]]:
+    """Yield the points of a curve, in order. Requests double in size, so that the first point comes soon.
+
+    Raises RewardError.
+    """
+    assert trajectory.frames is not None
+    if asked.info.needs_whole_episode:
+        (whole,) = await client.evaluate([ProgressSample(trajectory)], request_id=asked.request_id)
+        yield _points(0, [cast(ProgressResult, whole)], [slice(None)])
+        return
+    sampling, frames = asked.sampling, trajectory.frames
+    sample_bytes = max(sampling.frames or 0, len(frames)) * math.prod(frames.shape[1:])
+    most = max(min(MOST_PREFIXES, MOST_BYTES // sample_bytes), 1)
+    samples, first, count = prefix_samples(trajectory, sampling), 0, 1
+
+    def following() -> list[ProgressSample]:
+        return list(itertools.islice(samples, count))
+
+    while part := await off_loop(count * sample_bytes, following):
+        results = cast("list[ProgressResult]", await client.evaluate(part, request_id=asked.request_id))
+        yield _points(first, results, [sampling.prefix(t).read for t in range(first, first + len(part))])
+        first, count = first + len(part), min(2 * count, most)
+
+
+def _points(first: int, results: Sequence[ProgressResult], reads: Sequence[int | slice]) -> dict[str, Any]:
+    """Return the points of a curve from frame ``first`` on. reads: index of the points in each result"""
+    progress, success = (
+        np.concatenate([np.atleast_1d(getattr(r, name)[read]) for r, read in zip(results, reads, strict=True)])
+        for name in ("progress", "success")
+    )
+    return {
+        "first": first,
+        "progress": numbers_or_null(progress.tolist()),
+        "success": numbers_or_null(success.tolist()),
+        "model_version": results[-1].model_version,
+    }
+
+
+async def _preferences(client: AsyncRewardClient, asked: _Asked) -> dict[str, Any]:
+    """Return the model's preference in both orders. Raises RewardError."""
+    first, second = (video.trajectory for video in asked.videos)
+    preferred = partial(client.preference, subsample=True, resize=asked.question.resize, request_id=asked.request_id)
+    try:
+        results = await asyncio.gather(preferred(first, second), preferred(second, first))
+    except InvalidSampleError as error:
+        where, _, message = error.message.partition(": ")
+        raise invalid((where,), message) from None
+    pair = PreferenceResult.of_both_orders(*results)
+    asked_orders = (("first", "second"), ("second", "first"))
+    return {
+        "orders": [
+            {"asked": names, "preference": result.preference}
+            for names, result in zip(asked_orders, results, strict=True)
+        ],
+        "verdict": pair.verdict,
+        "orders_agree": pair.orders_agree,
+        "model_version": pair.model_version,
+    }
+
+
+def _event(name: str, **document: Any) -> str:
+    return f"event: {name}\ndata: {json.dumps(document, allow_nan=False)}\n\n"

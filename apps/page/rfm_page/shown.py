@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: MIT
+"""A dataset for the page: what its episodes and their labels tell, whatever its kind.
+
+Needs pyarrow. T frames of an episode.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from fastapi import HTTPException
+
+from rfm_client.contract.results import SUCCESS_THRESHOLD
+from rfm_client.frames.orientation import CHANNEL_ORDERS, ORIENTATIONS, Correction
+from rfm_labels.datasets.protocol import Dataset, DatasetEpisode, DatasetError, unused_cameras
+from rfm_labels.hdf5_tables import stored_in
+from rfm_labels.label_files import (
+    Curve,
+    EpisodeLabels,
+    find_label_files,
+    read_episode_labels,
+    read_provenance,
+)
+from rfm_labels.summary import Summary, summarise
+from rfm_page.numbers import numbers_or_null
+
+_SUMMARIES_AT_A_TIME = 8  # summaries in memory
+
+
+@dataclass(frozen=True)
+class ShownDataset(ABC):
+    """A dataset for the page.
+
+    root: its folder, with links resolved
+    path: its folder or file
+    has_stored_pixels: True: its videos have every pixel as stored; False: they are encoded for the page
+
+    Its methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
+    """
+
+    has_stored_pixels: ClassVar[bool]
+
+    root: Path
+    path: Path
+    dataset: Dataset
+
+    @abstractmethod
+    def check(self) -> None:
+        """Raise DatasetError if the dataset would show other files of this machine. Before every reading."""
+
+    @property
+    @abstractmethod
+    def cameras(self) -> Sequence[str]:
+        """The cameras whose videos the page shows."""
+
+    @property
+    @abstractmethod
+    def fps(self) -> float:
+        """Frames a second of the videos."""
+
+    @abstractmethod
+    def times_s(self, episode: DatasetEpisode) -> npt.NDArray[np.float64]:
+        """Return float64 [T], the time of each frame. Raises DatasetError."""
+
+    @abstractmethod
+    def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
+        """Return an episode's video as an MP4 file. take: as of ``video``. Raises DatasetError."""
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """The dataset's name and kind, and the names of its label files."""
+        names = [self._name_of(file) for file in find_label_files(self.path)]
+        return {"name": self.dataset.source, "kind": self.dataset.kind, "labels": names}
+
+    def table(self, labels: str | None) -> dict[str, Any]:
+        """Return a row for each episode, with a summary of its labels.
+
+        ``unused`` has what each camera shows instead of colours, as in ``unused_cameras``; null: it shows colours.
+        """
+        file = self._labels(labels)
+        status = None if file is None else stored_in(file).stat()
+        summary = None if file is None or status is None else _summary(file, status.st_mtime_ns)
+        unused = unused_cameras(self.dataset, self.dataset.cameras)
+        rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
+        return {
+            "labels": None if file is None else self._name_of(file),
+            "cameras": list(self.cameras),
+            "has_stored_pixels": self.has_stored_pixels,
+            "unused": [unused.get(camera) for camera in self.cameras],
+            "corrections": [asdict(self._correction(file, camera)) for camera in self.cameras],
+            "fps": self.fps,
+            "threshold": SUCCESS_THRESHOLD,
+            "provenance": None if file is None else read_provenance(file),
+            "written_s": None if status is None else status.st_mtime,
+            "episodes": [
+                {
+                    "episode": episode.index,
+                    "task": episode.task,
+                    "num_frames": episode.num_frames,
+                    **rows.get(episode.index, {}),
+                }
+                for episode in self.dataset.episodes
+            ],
+        }
+
+    def faults(self) -> dict[str, str]:
+        """Return the fault of each episode that cannot be labelled now, by number, as ``rfm-client label`` tells it."""
+        found = {}
+        unused = unused_cameras(self.dataset, self.cameras)
+        cameras = [camera for camera in self.cameras if camera not in unused]
+        for episode in self.dataset.episodes:
+            try:
+                for camera in cameras:
+                    self.dataset.check(episode, camera)
+            except DatasetError as error:
+                found[str(episode.index)] = self.without_folder(str(error))
+        return found
+
+    def curves(self, number: int, labels: str | None) -> dict[str, Any]:
+        """Return an episode's curves over time."""
+        episode, file = self._episode(number), self._labels(labels)
+        times_s = self.times_s(episode)
+        times_s = times_s - times_s[0]
+        found = None if file is None else read_episode_labels(file, number)
+        if found is not None and (found.frames.min() < 0 or found.frames.max() >= len(times_s)):
+            raise DatasetError.at(f"episode {number}: {file}", f"frames from 0 to {len(times_s) - 1}", "others")
+        return {
+            "episode": number,
+            "task": episode.task,
+            "times_s": times_s.tolist(),
+            "curves": [] if found is None else _curves(found, len(times_s)),
+        }
+
+    def video(self, number: int, camera: int, take: Callable[[int], object]) -> bytes:
+        """Return an episode's video as an MP4 file. take: called with a number of bytes before they are allocated"""
+        if not 0 <= camera < len(self.cameras):
+            raise HTTPException(404, f"camera: expected one of {len(self.cameras)} with videos, got {camera}")
+        return self.mp4(self._episode(number), self.cameras[camera], take)
+
+    def without_folder(self, message: str) -> str:
+        """Return a message without the folder's path, for users on other machines."""
+        return message.replace(str(self.root), self.dataset.source)
+
+    def _episode(self, number: int) -> DatasetEpisode:
+        known = self.dataset.numbers
+        if number not in known:
+            expected = f"one from {known[0]} to {known[-1]}" if known else "none, since the dataset is empty"
+            gaps = ", with gaps" if known and known[-1] - known[0] >= len(known) else ""
+            raise HTTPException(404, f"episode: expected {expected}{gaps}, got {number}")
+        return self.dataset.episode(number)
+
+    def _labels(self, name: str | None) -> Path | None:
+        """Return the label file of this name, by default the first; None: no labels."""
+        files = {self._name_of(file): file for file in find_label_files(self.path)}
+        if name is None:
+            name = next(iter(files), None)
+        if name is not None and name not in files:
+            raise HTTPException(404, f"labels: expected one of {', '.join(files) or 'none'}, got another")
+        return None if name is None else files[name]
+
+    def _correction(self, file: Path | None, camera: str) -> Correction:
+        """Return how the camera's frames became upright RGB for these labels; without labels, how they do now."""
+        if file is None:
+            return self.dataset.corrections.get(camera, Correction())
+        told = read_provenance(file)
+        orient = told.get("orientations", {}).get(camera)  # labels of version 0.1.0 have none
+        order = told.get("channels", {}).get(camera)
+        return Correction(orient if orient in ORIENTATIONS else "none", order if order in CHANNEL_ORDERS else "rgb")
+
+    def _name_of(self, file: Path) -> str:
+        return file.relative_to(self.root).as_posix()
+
+
+@lru_cache(_SUMMARIES_AT_A_TIME)
+def _summary(file: Path, _changed_ns: int) -> Summary:
+    return summarise(file)
+
+
+def _rows(summary: Summary) -> list[dict[str, Any]]:
+    """Return a row of the summary for each episode."""
+    columns: dict[str, Sequence[Any]] = {
+        "final_progress": numbers_or_null(summary.final_progress.tolist()),
+        "backwards": numbers_or_null(summary.backwards.tolist()),
+    }
+    if summary.best_success is not None and summary.last_success is not None:
+        columns["best_success"] = numbers_or_null(summary.best_success.tolist())
+        columns["last_success"] = numbers_or_null(summary.last_success.tolist())
+    if summary.disagreement is not None:
+        columns["disagreement"] = numbers_or_null(summary.disagreement.tolist())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def _curves(labels: EpisodeLabels, num_frames: int) -> list[dict[str, Any]]:
+    """Return the fused curve, which training reads, then the curve of each camera."""
+    curves = [(None, labels.fused), *labels.cameras.items()]
+    return [{"camera": camera, **_scores(curve, labels.frames, num_frames)} for camera, curve in curves]
+
+
+def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dict[str, Any]:
+    """Return scores for all frames, null for frames without a label. frames: numbers of the labelled frames"""
+    scores: dict[str, Any] = {"progress": None, "success": None}
+    for name in scores:
+        labelled = getattr(curve, name)
+        if labelled is not None:
+            of_all = np.full(num_frames, np.nan)
+            of_all[frames] = labelled
+            scores[name] = numbers_or_null(of_all.tolist())
+    return scores

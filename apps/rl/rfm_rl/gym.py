@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: MIT
+"""Gymnasium environments with the reward of a served reward model. Needs ``pip install ./client ./apps/rl``.
+
+env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
+env = RewardModelWrapper(env, partial(RewardClient, "grpc://localhost:8001"), "balance the pole")
+
+A wrapper keeps all frames of the running episode, H * W * 3 bytes a step. The rule ``sampling`` selects from them.
+
+A wrapper scores the reset, every ``every``-th step (not in mode ``final`` without a success rule), and the last step of
+an episode. With ``blocking``, a step waits for its score. Without ``blocking``, a step uses the newest known score. It
+requests its own only if fewer than ``max_pending`` steps have open requests. The reset always waits for its score. The
+last step waits, too, and cancels older requests; without ``blocking``, ``await_last=False`` leaves it unscored.
+
+``info["reward_model"]`` has ``progress`` and ``success`` of the newest known score (success is NaN if the checkpoint
+does not predict it), its ``step``, its ``lag`` in steps, and the steps ``skipped`` in this episode. With
+``terminate_on_success`` or ``success_bonus`` it has ``succeeded``; after a step, ``env_reward``.
+
+``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
+frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
+ResetNeeded. A step after an episode's end does, too, unless the environment resets in that step.
+
+``compute_reward`` of RewardModelWrapper raises NotImplementedError: hindsight relabelling would mix the environment's
+rewards with the model's. If a Monitor or RecordEpisodeStatistics inside the wrapper reports an episode, the wrapper
+puts the sum of the model's rewards into ``info["episode"]``.
+
+A time limit belongs inside the wrapper, as ``gymnasium.make`` puts it. A reset of an unended episode that drops a
+reward logs a warning, once. In mode ``final``, a second such reset in a row, with no end of an episode and no error in
+between, raises ValueError.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_rl.own_rewards import (
+    RETURNS,
+    WritingMonitor,
+    refuse_relabelling,
+    refuse_statistics,
+    warn_of_file,
+    with_statistics,
+)
+from rfm_rl.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
+
+try:
+    import gymnasium
+    from gymnasium.error import ResetNeeded
+except ImportError as error:
+    raise ImportError("rfm_rl.gym needs gymnasium >= 1.1: pip install ./client ./apps/rl") from error
+
+INFO = "reward_model"  # key in info
+
+_ENDS = (
+    "final_obs",
+    "final_observation",
+    "terminal_observation",
+)  # in info, if the step that ended an episode also reset
+
+DEFAULTS = RewardOptions()
+_UNBATCH = (
+    "ManiSkill: RewardModelVectorWrapper(ManiSkillVectorEnv(env), ...), or CPUGymWrapper(env) if there is one; "
+    "Isaac Lab never shows an episode's last frame: score its frames with client.episodes(num_envs, task)"
+)
+LOST = "an earlier call failed before its frame was kept"
+
+
+class RewardModelWrapper(gymnasium.Wrapper):
+    """An environment with the reward of a reward model, by the rules in the module's docstring.
+
+    client: a RewardClient, which stays open; or a function that makes a client at the first reset, which ``close()``
+        closes. Pass a function if the environment will run in another process (AsyncVectorEnv)
+    task: the task sentence, or a function that reads it from the info of each reset
+
+    A step after an episode's end raises ResetNeeded. With ``Autoreset(RewardModelWrapper(env, ...))`` of
+    ``gymnasium.wrappers``, this step begins a new episode instead, with reward 0. An ``Autoreset`` among the wrappers
+    of ``env`` does the same, but does not see an end by ``terminate_on_success``. ``env`` itself must not reset in the
+    step that ends an episode.
+
+    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, and for ``terminate_on_success`` with
+    a Monitor or RecordEpisodeStatistics inside, which would miss that end; TypeError if ``env`` is no
+    ``gymnasium.Env``.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        client: ClientSource,
+        task: str | Callable[[Info], str],
+        options: RewardOptions = DEFAULTS,
+    ) -> None:
+        check_kind(env, gymnasium.Env)
+        check_frame_source(options, env.render_mode, env.observation_space)
+        _check_statistics(env, options)
+        super().__init__(env)
+        self._rewarder = EpisodeRewarder(client, options)
+        self._options = options
+        self._task = task
+        self._autoresets = [layer for layer in _layers(env) if isinstance(layer, gymnasium.wrappers.Autoreset)]
+        self._episode: RewardedEpisode | None = None
+        self._is_whole = False  # all frames of the episode are kept
+        self._has_ended = False
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environment and score its first frame. Cancel open requests. Raises RewardError, ValueError."""
+        if self._episode is not None and self._is_whole:
+            self._rewarder.check_reset([self._episode])
+        self._is_whole = False
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._has_ended = False
+        return observation, self._begin(observation, info)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+        """Step the environment; return the reward model's reward. Raises RewardError, ResetNeeded."""
+        resets = any(wrapper.autoreset for wrapper in self._autoresets)
+        episode = None if resets else self._checked_episode()
+        self._is_whole = False  # until the frame is kept
+        observation, env_reward, terminated, truncated, info = self.env.step(action)
+        self._has_ended = bool(terminated or truncated)
+        if episode is None:
+            return observation, 0.0, terminated, truncated, self._begin(observation, info)
+        if self._has_ended:
+            _check_shows_its_end(info)
+        episode.add(self._frame(observation))
+        self._is_whole = True
+        self._rewarder.score({episode: self._has_ended})
+        reward = episode.reward(float(env_reward), bool(terminated))
+        scores = {**episode.info(), "env_reward": float(env_reward)}
+        return (
+            observation,
+            reward,
+            bool(terminated or episode.succeeded),
+            truncated,
+            {**with_statistics(info, episode), INFO: scores},
+        )
+
+    compute_reward = refuse_relabelling
+
+    def close(self) -> None:
+        """Cancel open requests; close the environment, and the client if it was made here."""
+        if self._episode is not None:
+            self._episode.end()
+        self._rewarder.close()
+        super().close()
+
+    def _begin(self, observation: Any, info: Info) -> Info:
+        if self._episode is not None:
+            self._episode.end()
+        task = self._task if isinstance(self._task, str) else self._task(info)
+        self._episode = self._rewarder.begin(task, self._frame(observation))
+        self._is_whole = True
+        self._rewarder.score({self._episode: False})
+        return {**info, INFO: self._episode.info()}
+
+    def _checked_episode(self) -> RewardedEpisode:
+        """The episode that the next step continues. Raises ResetNeeded if there is none."""
+        if self._episode is None:
+            raise ResetNeeded("step: expected a reset before it")
+        if self._has_ended or self._episode.succeeded:
+            remedy = "call reset, or wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
+            raise ResetNeeded(f"step: expected a reset, since the episode has ended, got another step; {remedy}")
+        if not self._is_whole:
+            raise ResetNeeded(f"step: expected a reset, since {LOST}, got another step; call reset")
+        return self._episode
+
+    def _frame(self, observation: Any) -> Any:
+        return self.env.render() if self._options.renders else self._options.frames_of(observation)
+
+
+def check_kind(env: Any, kind: type[Any]) -> None:
+    """Raise TypeError for another kind of environment, and for an ``Env`` that is a batch of environments."""
+    is_batch = isinstance(env, gymnasium.Env) and _is_batch(env)
+    if is_batch or not isinstance(env, kind):
+        of = env.unwrapped if is_batch else env
+        got = f"{type(of).__module__}.{type(of).__name__}"
+        remedy = "for a gymnasium vector use RewardModelVectorWrapper; else wrap each environment in RewardModelWrapper"
+        if is_batch:
+            got, remedy = f"an Env that is a batch of environments, {got}", _UNBATCH
+        raise TypeError(f"env: expected a gymnasium {kind.__name__}, got {got}; {remedy}")
+
+
+def _layers(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
+    """The environment, and those inside its wrappers."""
+    yield env
+    while isinstance(env, gymnasium.Wrapper):
+        env = env.env
+        yield env
+
+
+def _is_batch(env: gymnasium.Env[Any, Any]) -> bool:
+    """True for an environment of ManiSkill or Isaac Lab, unless a wrapper picks the only environment of its batch."""
+    single = getattr(env.unwrapped, "single_observation_space", None)
+    return single is not None and all(layer.observation_space != single for layer in _layers(env))
+
+
+def _check_shows_its_end(info: Info) -> None:
+    found = [key for key in _ENDS if key in info]
+    if found:
+        expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"
+        remedy = "turn off its own reset, and wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
+        raise InvalidSampleError.at("info", expected, f"{', '.join(found)}; {remedy}")
+
+
+def _check_statistics(env: gymnasium.Env[Any, Any], options: RewardOptions) -> None:
+    """Raise ValueError for statistics that would miss episodes; warn of a file with the environment's rewards."""
+    if options.terminate_on_success is not None and env.has_wrapper_attr(RETURNS):
+        make = "call make_vec_env with a function that makes RewardModelWrapper(...)"
+        refuse_statistics(options.terminate_on_success, f"Monitor(RewardModelWrapper(...)); {make}")
+    if any(isinstance(layer, WritingMonitor) for layer in _layers(env)):
+        warn_of_file("env", "Monitor(RewardModelWrapper(...), filename)")
+
+
+def tasks_of(task: str | Sequence[str], num_envs: int) -> list[str]:
+    """Return a task sentence for each environment of a vector. Raises ValueError for another number of sentences."""
+    tasks = [task] * num_envs if isinstance(task, str) else list(task)
+    require("task", len(tasks) == num_envs, f"one for each of the {num_envs} environments", len(tasks))
+    return tasks
+
+
+def check_frame_source(options: RewardOptions, render_mode: str | None, space: gymnasium.Space[Any]) -> None:
+    """Raise ValueError if the options name a source of frames that the environment lacks."""
+    if options.renders and render_mode != "rgb_array":
+        expected = "'rgb_array', since frames come from render() unless frames_from or cameras say otherwise"
+        raise ValueError(f"render_mode: expected {expected}, got {render_mode!r}")
+    keys = list(space.keys()) if isinstance(space, gymnasium.spaces.Dict) else []
+    if isinstance(options.frames_from, str) and options.frames_from not in keys:
+        raise ValueError(f"frames_from: expected a key of the observation {keys}, got {options.frames_from!r}")
+    if options.frames_from is None and not set(options.cameras) <= set(keys):
+        raise ValueError(f"cameras: expected keys of the observation {keys}, got {list(options.cameras)}")

@@ -1,0 +1,382 @@
+# SPDX-License-Identifier: MIT
+"""Rewards of a Gymnasium environment from the scores of its episodes. ``gym.py`` states the rules."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
+
+from rfm_client.client import RewardClient
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import InvalidSampleError, RewardError
+from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.numbers import checked_count, checked_finite
+from rfm_client.contract.results import ProgressResult
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, SuccessRule
+from rfm_client.frames.camera_fusion import Fuse
+from rfm_client.frames.orientation import ChannelOrder, Orientation
+from rfm_client.frames.sampling import Rule
+from rfm_rl.live import LiveView
+
+Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
+Info: TypeAlias = dict[str, Any]
+ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
+
+_PAID: dict[Mode, Callable[[float, float, float, bool], float]] = {  # of progress now and before, gamma, the end
+    "absolute": lambda now, before, gamma, is_end: now,
+    "delta": lambda now, before, gamma, is_end: now - before,
+    "shaping": lambda now, before, gamma, is_end: gamma * now - before,
+    "final": lambda now, before, gamma, is_end: now if is_end else 0.0,
+}
+
+_INSIDE = (
+    "put the time limit inside the wrapper: RewardModelWrapper(TimeLimit(env, steps), ...), "
+    "or gymnasium.make(..., max_episode_steps=steps)"
+)
+
+logger = logging.getLogger("rfm_client")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardOptions:
+    """How to score an episode, and to make rewards of progress. Raises ValueError for contradictory options.
+
+    mode: ``absolute``: the reward is the newest known progress. ``delta``: its change since the step before, so that an
+        episode's rewards add up to its last known progress minus its first, however late scores come. ``shaping``:
+        ``gamma`` times the newest known progress minus that of the step before (potential-based shaping; where it is
+        added to a reward, the progress of a terminal state counts as 0). ``final``: 0, and at the last step of an
+        episode its progress; without a rule of success, only the reset and the last step are scored
+    gamma: discount of the policy's training, above 0 and at most 1, for ``shaping`` alone
+    scale: factor of this reward
+    success_bonus: added once an episode, at the first step that is known to succeed by ``success``, or by
+        ``terminate_on_success``; never at the reset. The reset raises ValueError if the checkpoint does not predict
+        success
+    success: rule of the bonus; None: ``terminate_on_success``, else the default rule
+    add_to_env_reward: True: add the environment's own reward; False: replace it
+    every: steps from one score to the next; until a new score comes, ``absolute`` repeats its value
+        and ``delta`` is 0
+    terminate_on_success: rule that ends the episode at a success, except at the frame of the reset. The reset raises
+        ValueError if the checkpoint does not predict success
+    frames_from: source of frames, uint8 [H, W, 3]: a key of the observation, or a function from an environment's
+        observation to its frame; None: ``render()``
+    cameras: keys of the frames to score and fuse, in the observation or the result of ``frames_from``; empty: a single
+        camera without a name
+    sampling, fuse, orient, channels, resize, live: as in ``rfm_client.episodes.EpisodeOptions``; rendered frames are
+        changed alike
+    max_frames: ``frames`` of EpisodeOptions: the rule's number of frames
+    blocking: True: a step waits for its score
+    max_pending: most steps of an environment with open requests when not blocking
+    await_last: True: wait for the score of an episode's last step even when not blocking; False: drop open requests
+    """
+
+    mode: Mode = "absolute"
+    gamma: float | None = None
+    scale: float = 1.0
+    success_bonus: float = 0.0
+    success: SuccessRule | None = None
+    add_to_env_reward: bool = False
+    every: int = 1
+    terminate_on_success: SuccessRule | None = None
+    frames_from: str | Callable[[Any], UInt8Array | Mapping[str, UInt8Array]] | None = None
+    cameras: Sequence[str] = ()
+    fuse: Fuse = "mean"
+    orient: Orientation | Mapping[str, Orientation] = "none"
+    channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
+    sampling: Rule | None = None
+    resize: bool = False
+    max_frames: int | None = None
+    blocking: bool = True
+    max_pending: int = 4
+    await_last: bool = True
+    live: LiveView | None = None
+
+    def __post_init__(self) -> None:
+        require("mode", self.mode in get_args(Mode), f"one of {', '.join(get_args(Mode))}", repr(self.mode))
+        checked_finite("scale", self.scale)
+        checked_finite("success_bonus", self.success_bonus)
+        if self.mode == "shaping":
+            is_discount = self.gamma is not None and 0 < checked_finite("gamma", self.gamma) <= 1
+            require(
+                "gamma", is_discount, "the policy's discount, above 0 and at most 1, with mode 'shaping'", self.gamma
+            )
+        else:
+            require("gamma", self.gamma is None, f"None with mode {self.mode!r}", self.gamma)
+        is_used = self.success is None or self.success_bonus != 0
+        require("success", is_used, "None without success_bonus (terminate_on_success has a rule)", self.success)
+        is_one = None in (self.success, self.terminate_on_success) or self.success == self.terminate_on_success
+        require(
+            "success", is_one, f"None or the rule of terminate_on_success, {self.terminate_on_success}", self.success
+        )
+        has_end = self.mode != "final" or self.await_last
+        require("await_last", has_end, "True with mode 'final', which pays for the last frame", self.await_last)
+        for name in ("every", "max_pending", "max_frames"):
+            if getattr(self, name) is not None:
+                checked_count(name, getattr(self, name))
+        object.__setattr__(self, "cameras", self.scoring.cameras)
+
+    @cached_property
+    def scoring(self) -> EpisodeOptions:
+        """Options of the episode's steps. Raises ValueError."""
+        return EpisodeOptions(
+            sampling=self.sampling,
+            frames=self.max_frames,
+            cameras=self.cameras,
+            fuse=self.fuse,
+            orient=self.orient,
+            channels=self.channels,
+            resize=self.resize,
+            success=self.success_rule or SuccessRule(),
+            live=self.live,
+        )
+
+    @property
+    def success_rule(self) -> SuccessRule | None:
+        """The rule that ends episodes or decides the bonus; None: success decides nothing."""
+        return self.terminate_on_success or self.success or (SuccessRule() if self.success_bonus else None)
+
+    @property
+    def shapes_another(self) -> bool:
+        """True if ``shaping`` is added to another reward, whose best policies it then keeps.
+
+        This needs a potential of 0 in terminal states (Ng, Harada and Russell 1999; Grzes 2017). Alone, such a shaping
+        would add up to the same return for every policy, so there the last progress counts.
+        """
+        return self.mode == "shaping" and (self.add_to_env_reward or self.success_bonus != 0)
+
+    def is_due(self, step: int) -> bool:
+        """True if a step between the first and the last of an episode is scored."""
+        return (self.mode != "final" or self.success_rule is not None) and step % self.every == 0
+
+    @property
+    def renders(self) -> bool:
+        """True if frames come from ``render()``."""
+        return self.frames_from is None and not self.cameras
+
+    def frames_of(self, observation: Any) -> Any:
+        """Return the frame in an environment's observation; with cameras, a dict. Raises InvalidSampleError."""
+        source = self.frames_from
+        if source is None:
+            found = observation
+        elif callable(source):
+            found = source(observation)
+        else:
+            found = observation[source]
+        if not self.cameras:
+            return found
+        if not isinstance(found, Mapping) or not found.keys() >= set(self.cameras):
+            got = list(found) if isinstance(found, Mapping) else type(found).__name__
+            raise InvalidSampleError.at("frames", f"a frame of each of the cameras {list(self.cameras)}", str(got))
+        return {camera: found[camera] for camera in self.cameras}
+
+
+class RewardedEpisode:
+    """One episode: its frames, newest known score, and open requests.
+
+    index: number of its environment; None: the only environment
+    size: size to which frames shrink; None: no change
+    pending: open requests, with the future of each window
+    known: the newest known score
+    total_reward: sum of its rewards until now
+    """
+
+    def __init__(self, options: RewardOptions, task: str, index: int | None, size: FrameSize | None) -> None:
+        where = "" if index is None else f"envs[{index}]"
+        self.index = index
+        self.frames = EpisodeFrames(task, options.scoring, index or 0, where)
+        self._options, self._size = options, size
+        self.pending: list[tuple[StepRequest, list[Future[ProgressResult]]]] = []
+        self.known: StepScore | None = None
+        self._paid_progress = np.nan
+        self.total_reward = 0.0
+        self.num_skipped = 0
+        self.succeeded = False  # ends the episode
+        self._has_succeeded = self._has_bonus = self._has_ended = False
+
+    @property
+    def is_unpaid(self) -> bool:
+        """True if the episode goes on, and a step of it is not yet paid."""
+        paid = 0 if self.known is None or self._options.mode == "final" else self.known.step
+        return not self._has_ended and self.frames.step > paid
+
+    def add(self, frame: Any) -> None:
+        """Add a copy of a frame, uint8 [H, W, 3], or of a dict of these by camera. Raises InvalidSampleError."""
+        self.frames.append(self.frames.checked(frame, self._size))
+
+    def collect(self) -> None:
+        """Take over the scores of completed requests. Raises the RewardError of a failed request."""
+        for each in [each for each in self.pending if all(answer.done() for answer in each[1])]:
+            self.pending.remove(each)
+            question, answers = each
+            outcomes = []
+            for answer in answers:
+                error = answer.exception()
+                outcomes.append(error if isinstance(error, RewardError) else answer.result())
+            self.learn(*question.scores(outcomes))
+
+    def cancel(self) -> None:
+        """Cancel the requests that are still open."""
+        for _, answers in self.pending:
+            for answer in answers:
+                answer.cancel()
+        self.pending.clear()
+
+    def end(self) -> None:
+        """Cancel open requests, and tell the live view that the episode has ended."""
+        self.cancel()
+        self.frames.end()
+        self._has_ended = True
+
+    def learn(self, score: StepScore) -> None:
+        """Take over a score, unless a newer score is known.
+
+        Raises ValueError if ``terminate_on_success`` or ``success_bonus`` is set, but success is not predicted.
+        """
+        if self.known is not None and score.step <= self.known.step:
+            return
+        rule, ending = self._options.success_rule, self._options.terminate_on_success
+        if rule is not None and np.isnan(score.success):
+            name, none = ("success_bonus", "0") if ending is None else ("terminate_on_success", "None")
+            expected = f"{none} with a checkpoint that does not predict success"
+            raise ValueError(f"{name}: expected {expected}, got {getattr(self._options, name)}")
+        if self.known is None:
+            self._paid_progress = score.progress
+        score = replace(score, succeeded=score.succeeded and score.step > 0)  # a reset is no success
+        self.known = score
+        self._has_succeeded |= rule is not None and score.succeeded
+        self.succeeded |= ending is not None and score.succeeded
+        self.frames.report(score)
+
+    def reward(self, env_reward: float, terminated: bool) -> float:
+        """Return the reward of the newest step, once it has been scored if it is due.
+
+        terminated: True if the environment has reached a terminal state; False at a time limit
+        """
+        options = self._options
+        progress = np.nan if self.known is None else self.known.progress
+        if options.shapes_another and (terminated or self.succeeded):
+            progress = 0.0
+        before, self._paid_progress = self._paid_progress, progress
+        reward = options.scale * _PAID[options.mode](progress, before, options.gamma or 1.0, self._has_ended)
+        if self._has_succeeded and not self._has_bonus:
+            self._has_bonus = True
+            reward += options.success_bonus
+        reward += env_reward if options.add_to_env_reward else 0.0
+        self.total_reward += reward
+        return reward
+
+    def info(self) -> Info:
+        """Return the newest known scores, and their lag in steps."""
+        known = self.known or StepScore(np.nan, np.nan, False, -1, np.nan)
+        told = {"progress": known.progress, "success": known.success, "step": known.step}
+        told |= {"lag": self.frames.step - known.step, "skipped": self.num_skipped}
+        return told if self._options.success_rule is None else told | {"succeeded": self._has_succeeded}
+
+
+class EpisodeRewarder:
+    """Scores the episodes of environments through one client. Connects at the first request."""
+
+    def __init__(self, client: ClientSource, options: RewardOptions) -> None:
+        if not (isinstance(client, RewardClient) or callable(client)):
+            raise TypeError(
+                f"client: expected a RewardClient or a function that makes one, got {type(client).__name__}"
+            )
+        self._source = client
+        self._options = options
+        self._made: RewardClient | None = None
+        self._has_dropped = False  # the last reset has, and no episode has ended since
+        self._has_warned = False
+
+    def check_reset(self, episodes: Iterable[RewardedEpisode]) -> None:
+        """Warn once of a reset that drops the reward of unended episodes. Call it before the reset.
+
+        Raises ValueError in mode ``final`` for the second such reset in a row: episodes that end outside the wrapper
+        would never be paid. An end or an error between the resets allows the second.
+        """
+        unpaid = next((episode for episode in episodes if episode.is_unpaid), None)
+        if unpaid is None:
+            return
+        where = "reset" if unpaid.index is None else f"envs[{unpaid.index}]: reset"
+        got = f"one after {unpaid.frames.step} steps, whose reward is lost"
+        self._has_dropped = not self._has_dropped  # a third reset may go on
+        if not self._has_dropped and self._options.mode == "final":
+            expected = "the end of an episode before it, where mode 'final' pays"
+            raise ValueError(f"{where}: expected {expected}, got {got}, for the second time in a row; {_INSIDE}")
+        if not self._has_warned:
+            self._has_warned = True
+            logger.warning("%s: expected the end of the episode before it, got %s; %s", where, got, _INSIDE)
+
+    def begin(self, task: str, frame: Any, index: int | None = None) -> RewardedEpisode:
+        """Return a new episode with its first frame. Raises RewardError.
+
+        frame, index: as of RewardedEpisode
+        """
+        size = self._client.model_info(frames=True).frame_size if self._options.resize else None
+        episode = RewardedEpisode(self._options, task, index, size)
+        episode.add(frame)
+        return episode
+
+    def score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
+        """Collect known scores, and request those of newest frames that are due. Raises RewardError.
+
+        episodes: to each, True if its newest frame is its last
+        """
+        has_dropped, self._has_dropped = self._has_dropped, False  # after an error, a reset may drop a reward
+        try:
+            self._score(episodes)
+            self._has_dropped = has_dropped
+        finally:
+            for episode in (episode for episode, ends in episodes.items() if ends or episode.succeeded):
+                episode.end()
+                self._has_dropped = False
+
+    def close(self) -> None:
+        """Close the client if it was made here."""
+        if self._made is not None:
+            self._made.close()
+
+    def _score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
+        awaited = []
+        for episode, ends in episodes.items():
+            episode.collect()
+            ends = ends or episode.succeeded
+            is_first = episode.known is None
+            due = ends or is_first or self._options.is_due(episode.frames.step)
+            waits = self._options.blocking or is_first or (ends and self._options.await_last)
+            if ends:
+                episode.cancel()
+            if due and waits:
+                awaited.append(episode)
+            elif due and not ends and len(episode.pending) >= self._options.max_pending:
+                episode.num_skipped += 1
+            elif due and not ends:
+                question = self._question([episode])
+                answers = [self._client.submit_window(window) for window in question.windows]
+                episode.pending.append((question, answers))
+        if awaited:
+            question = self._question(awaited)
+            scores = question.scores(self._client.score_windows(question.windows))
+            for episode, score in zip(awaited, scores, strict=True):
+                episode.learn(score)
+
+    def _question(self, episodes: Sequence[RewardedEpisode]) -> StepRequest:
+        """Request about their newest frames, sampled by the options and the checkpoint now served."""
+        asked_s = time.perf_counter()
+        scoring = self._options.scoring
+        info = self._client.model_info(frames=True)
+        return StepRequest([episode.frames for episode in episodes], scoring.sampling_for(info), asked_s)
+
+    @property
+    def _client(self) -> RewardClient:
+        if isinstance(self._source, RewardClient):
+            return self._source
+        if self._made is None:
+            self._made = self._source()
+        return self._made

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: MIT
+"""Vectors of Stable-Baselines3 with the reward of a served reward model. Needs ``./apps/rl[sb3]``.
+
+envs = make_vec_env("CartPole-v1", 8, env_kwargs={"render_mode": "rgb_array"}, wrapper_class=RenderedFrame)
+envs = RewardModelVecEnv(envs, partial(RewardClient, "grpc://localhost:8001"), "balance the pole")
+
+``gym.py`` states the rules. A ``VecEnv`` resets an environment in the step that ends its episode. The last frame
+of that episode is then in the info: ``terminal_observation``, or the frame of RenderedFrame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.error import ResetNeeded
+
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.episodes.steps import copied
+from rfm_rl.gym import DEFAULTS, INFO, LOST, check_frame_source, tasks_of
+from rfm_rl.gym_vector import check_differ
+from rfm_rl.own_rewards import (
+    RELABELS,
+    WritingMonitor,
+    refuse_relabelling,
+    warn_of_file,
+    with_statistics,
+)
+from rfm_rl.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
+
+try:
+    from stable_baselines3.common.vec_env import (
+        DummyVecEnv,
+        SubprocVecEnv,
+        VecEnv,
+        VecEnvWrapper,
+        unwrap_vec_normalize,
+    )
+except ImportError as error:
+    raise ImportError('rfm_rl.sb3 needs stable-baselines3: pip install ./client "./apps/rl[sb3]"') from error
+
+_FRAME = "rendered_frame"  # key in the infos of RenderedFrame
+_RENDERED = "make_vec_env(..., wrapper_class=RenderedFrame)"
+
+
+class RenderedFrame(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment that renders at each step, for a RewardModelVecEnv around its ``VecEnv``.
+
+    The picture is part of the info, since the ``VecEnv`` resets before it returns.
+    """
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environment, and add a picture to the info."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation, {**info, _FRAME: np.array(self.env.render())}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, Info]:
+        """Step the environment, and add a picture to the info."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, {**info, _FRAME: np.array(self.env.render())}
+
+
+class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is optional, and so untyped here
+    """A ``VecEnv`` with the reward of a reward model. With ``blocking``, a step scores all environments in one call.
+
+    client: as in RewardModelWrapper
+    task: one task sentence for all environments, or a sequence with a sentence for each
+
+    ``infos[i]["reward_model"]`` is as in RewardModelWrapper. ``reset_infos`` has that of each reset.
+
+    Raises ValueError if ``options`` names a source of frames that ``venv`` lacks; for frames from ``render()`` unless
+    each environment is wrapped in RenderedFrame; and for ``terminate_on_success``, because an environment that resets
+    by itself does not know of the success: wrap each environment in RewardModelWrapper instead. Raises ValueError for a
+    ``VecNormalize`` inside: off-policy algorithms would store the rewards that it got. Raises TypeError if ``venv`` is
+    no ``VecEnv``.
+    """
+
+    def __init__(
+        self,
+        venv: Any,
+        client: ClientSource,
+        task: str | Sequence[str],
+        options: RewardOptions = DEFAULTS,
+    ) -> None:
+        if not isinstance(venv, VecEnv):
+            got = f"{type(venv).__module__}.{type(venv).__name__}"
+            remedy = "rfm_rl.gym has wrappers of gymnasium's environments and vectors"
+            raise TypeError(f"venv: expected a VecEnv of stable_baselines3, got {got}; {remedy}")
+        check_frame_source(options, venv.render_mode, venv.observation_space)
+        is_rendered = not options.renders or all(venv.env_is_wrapped(RenderedFrame))
+        require(
+            "venv", is_rendered, "each environment in RenderedFrame, for frames from render()", f"none: {_RENDERED}"
+        )
+        instead = f"{options.terminate_on_success}; wrap each environment in RewardModelWrapper instead"
+        require("terminate_on_success", options.terminate_on_success is None, "None, since a VecEnv resets", instead)
+        _check_own_rewards(venv)
+        tasks = tasks_of(task, venv.num_envs)
+        self._rewarder = EpisodeRewarder(client, options)  # before super, which reads the attributes
+        self._reward_options, self._tasks = options, tasks
+        self._episodes: list[RewardedEpisode] = []
+        self._is_whole = False  # all frames of the episodes are kept
+        super().__init__(venv)
+
+    def reset(self) -> Any:
+        """Reset the environments and score their first frames. Cancel open requests. Raises RewardError."""
+        if self._is_whole:
+            self._rewarder.check_reset(self._episodes)
+        self._is_whole = False
+        observations = self.venv.reset()
+        for episode in self._episodes:
+            episode.end()
+        self._take_reset_infos(range(self.num_envs))
+        self._episodes = [self._begin(index, observations) for index in range(self.num_envs)]
+        self._is_whole = True
+        self._rewarder.score(dict.fromkeys(self._episodes, False))
+        for index, episode in enumerate(self._episodes):
+            self.reset_infos[index] |= {INFO: episode.info()}
+        return observations
+
+    def step_async(self, actions: Any) -> None:
+        """Begin a step. Raises ResetNeeded before a reset, and after a step whose frames were lost."""
+        if not self._episodes:
+            raise ResetNeeded("step: expected a reset before it")
+        if not self._is_whole:
+            raise ResetNeeded(f"step: expected a reset, since {LOST}, got another step; call reset")
+        self._is_whole = False  # until each frame is kept
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> tuple[Any, Any, Any, list[Info]]:
+        """End the step; return the model's rewards, float32 [num_envs]. Raises RewardError."""
+        observations, env_rewards, dones, told = self.venv.step_wait()
+        infos = [dict(info) for info in told]  # a list in one ``VecEnv``, a tuple in another
+        ended = np.flatnonzero(dones).tolist()
+        self._take_reset_infos(ended)
+        frames = [info.pop(_FRAME, None) for info in infos]
+        stepped = list(self._episodes)
+        for index, episode in enumerate(stepped):
+            if index in ended and not self._reward_options.renders:
+                frames[index] = copied(self._final_frame(index, infos[index]))
+            elif not self._reward_options.renders:
+                frames[index] = self._reward_options.frames_of(_of_env(observations, index))
+            episode.add(frames[index])
+        for index in ended:
+            self._episodes[index] = self._begin(index, observations)
+            if not self._reward_options.renders:  # a rendered frame is a copy
+                first = copied(self._reward_options.frames_of(_of_env(observations, index)))
+                check_differ(f"infos[{index}]['terminal_observation']", frames[index], first, "use RenderedFrame")
+        self._is_whole = True
+        fresh = [self._episodes[index] for index in ended]
+        questions = {episode: bool(dones[index]) for index, episode in enumerate(stepped)}
+        self._rewarder.score(questions | dict.fromkeys(fresh, False))
+        rewards = np.zeros(self.num_envs, np.float32)
+        for index, episode in enumerate(stepped):
+            terminated = bool(dones[index]) and not infos[index].get("TimeLimit.truncated", False)
+            rewards[index] = episode.reward(float(env_rewards[index]), terminated)
+            infos[index] = with_statistics(infos[index], episode)
+            infos[index][INFO] = episode.info() | {"env_reward": float(env_rewards[index])}
+        for index in ended:
+            self.reset_infos[index] |= {INFO: self._episodes[index].info()}
+        return observations, rewards, dones, infos
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Call a method of the environments. Raises NotImplementedError for ``compute_reward``, which HER calls."""
+        if method_name == RELABELS:
+            refuse_relabelling()
+        results: list[Any] = self.venv.env_method(method_name, *args, indices=indices, **kwargs)
+        return results
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the environments. Raises NotImplementedError for ``compute_reward``."""
+        if attr_name == RELABELS:
+            refuse_relabelling()
+        values: list[Any] = self.venv.get_attr(attr_name, indices)
+        return values
+
+    def close(self) -> None:
+        """Cancel open requests; close the environments, and the client if it was made here."""
+        for episode in self._episodes:
+            episode.end()
+        self._rewarder.close()
+        self.venv.close()
+
+    def _begin(self, index: int, observations: Any) -> RewardedEpisode:
+        """The new episode of an environment, whose reset has just been."""
+        if self._reward_options.renders:
+            frame = self.reset_infos[index].pop(_FRAME, None)
+            require(
+                f"reset_infos[{index}]", frame is not None, "the frame of RenderedFrame", "none", InvalidSampleError
+            )
+        else:
+            frame = self._reward_options.frames_of(_of_env(observations, index))
+        return self._rewarder.begin(self._tasks[index], frame, index)
+
+    def _take_reset_infos(self, indices: Sequence[int]) -> None:
+        for index in indices:
+            self.reset_infos[index] = dict(self.venv.unwrapped.reset_infos[index])
+
+    def _final_frame(self, index: int, info: Mapping[str, Any]) -> Any:
+        where, expected = f"infos[{index}]", "the terminal_observation of the episode that ended in this step"
+        require(where, "terminal_observation" in info, expected, f"none in {list(info)}", InvalidSampleError)
+        return self._reward_options.frames_of(info["terminal_observation"])
+
+
+def _check_own_rewards(venv: Any) -> None:
+    """Raise ValueError where the environments' rewards would be learnt; warn where they would be written to a file."""
+    expected = "no VecNormalize inside, whose rewards SAC and other off-policy algorithms would learn from"
+    instead = "one; wrap in the other order: VecNormalize(RewardModelVecEnv(...))"
+    require("venv", unwrap_vec_normalize(venv) is None, expected, instead)
+    has_envs = isinstance(venv.unwrapped, (DummyVecEnv, SubprocVecEnv))  # other kinds may not be able to look
+    if isinstance(venv, WritingMonitor) or (has_envs and any(venv.env_is_wrapped(WritingMonitor))):
+        warn_of_file("venv", "VecMonitor(RewardModelVecEnv(...), filename)")
+
+
+def _of_env(observations: Any, index: int) -> Any:
+    """The observation of one environment in a ``VecEnv``'s: arrays [num_envs, ...], or a dict or tuple of them."""
+    if isinstance(observations, Mapping):
+        return {key: value[index] for key, value in observations.items()}
+    if isinstance(observations, tuple):
+        return tuple(value[index] for value in observations)
+    return observations[index]

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: MIT
+"""Fit a sample to its checkpoint: fewer frames, smaller frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
+from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, with_trajectories
+from rfm_client.frames.resize import resize_frames
+from rfm_client.frames.sampling import FrameIndices, taken, thinned
+
+
+@dataclass(frozen=True)
+class FittedSample:
+    """A sample to send, and the frames that it kept.
+
+    frame_indices: for each trajectory int64 [N], its frames in the sample; None: all
+    """
+
+    sample: Sample
+    frame_indices: Sequence[FrameIndices | None]
+
+
+def whole(sample: Sample) -> FittedSample:
+    """Return the sample with all its frames. Raises InvalidSampleError for any other value."""
+    if not isinstance(sample, Sample):
+        expected = "ProgressSample, PreferenceSample or SimilaritySample"
+        raise InvalidSampleError.at("sample", expected, type(sample).__name__)
+    return FittedSample(sample, (None,) * len(sample.trajectories))
+
+
+def snapshot(sample: Sample) -> Sample:
+    """Return the sample with copies of its arrays, so that the caller may change the originals before it is sent."""
+
+    def copied(trajectory: Trajectory) -> Trajectory:
+        names = ("frames", "video_embeddings", "text_embedding")
+        arrays = {name: getattr(trajectory, name) for name in names}
+        return replace(trajectory, **{name: array.copy() for name, array in arrays.items() if array is not None})
+
+    return with_trajectories(sample, [copied(t) for t in sample.trajectories]) if isinstance(sample, Sample) else sample
+
+
+def fitted(sample: Sample, info: ModelInfo, *, subsample: bool, resize: bool) -> FittedSample:
+    """Return the sample with at most ``info.max_frames`` frames a trajectory, of at most ``info.frame_size``.
+
+    subsample: leave frames out, as training does (``sampling.thinned``). Not in dense mode, where the server samples
+        each prefix
+    resize: shrink frames
+    """
+    dense = isinstance(sample, ProgressSample) and sample.frame_steps > 0
+    limit = info.max_frames if subsample and not dense else None
+    kept = [thinned(trajectory.num_frames, limit) for trajectory in sample.trajectories]
+    trajectories = [
+        t if indices is None else taken(t, indices) for t, indices in zip(sample.trajectories, kept, strict=True)
+    ]
+    if resize and info.frame_size is not None:
+        size = info.frame_size
+        trajectories = [
+            t if t.frames is None else replace(t, frames=resize_frames(t.frames, size)) for t in trajectories
+        ]
+    return FittedSample(with_trajectories(sample, trajectories), kept)
+
+
+def with_frame_indices(result: Result, indices: Sequence[FrameIndices | None]) -> Result:
+    """Return the result with the indices of the scored frames, as of ``FittedSample.frame_indices``."""
+    if all(kept is None for kept in indices):
+        return result
+    if isinstance(result, ProgressResult):
+        return replace(result, frame_indices=indices[0])
+    first, second = indices
+    if isinstance(result, PreferenceResult):
+        return replace(result, first=_of_frames(result.first, first), second=_of_frames(result.second, second))
+    return replace(result, reference=_of_frames(result.reference, first), other=_of_frames(result.other, second))
+
+
+def _of_frames(scores: FrameScores, indices: FrameIndices | None) -> FrameScores:
+    return replace(scores, frame_indices=indices)

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: MIT
+"""Decode pictures of 8-bit colours, upright by EXIF orientation, like ``datasets`` and LeRobot. Needs Pillow.
+
+H x W pixels.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfm_client.contract.samples import UInt8Array
+
+_UPRIGHT = {  # Pillow's name by EXIF orientation
+    2: "FLIP_LEFT_RIGHT",
+    3: "ROTATE_180",
+    4: "FLIP_TOP_BOTTOM",
+    5: "TRANSPOSE",
+    6: "ROTATE_270",
+    7: "TRANSVERSE",
+    8: "ROTATE_90",
+}
+_HEAD_BYTES = 2**13  # in which EXIF and XMP data begin
+_MARKS = (b"Exif", b"eXIf", b"type exif", b"adobe", b"WEBP")  # JPEG, PNG, older PNG, XMP; WebP has EXIF at its end
+
+
+_COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's modes of at most 8 bits a channel
+_BROKEN = (OSError, SyntaxError, ValueError)  # Pillow's errors for broken pixels, headers and EXIF data
+_DEEP = ";16"  # Pillow's mark of 16 bits a channel, which it cuts to 8
+
+
+class PictureError(Exception):
+    """A file that is not one readable picture. ``expected`` and ``got`` are the parts of a message."""
+
+    def __init__(self, expected: str, got: object) -> None:
+        super().__init__(expected, got)
+        self.expected = expected
+        self.got = got
+
+
+def pillow() -> str:
+    """Return Pillow's name and version. Raises ImportError with the extra to install."""
+    try:
+        import PIL
+    except ImportError as error:
+        raise ImportError("pictures need Pillow: pip install ./client ./apps/labels") from error
+    return f"Pillow {PIL.__version__}"
+
+
+def opened_picture(picture: bytes | Path) -> Any:
+    """Open a picture of 8-bit colours, or its file, and read only its header. Raises PictureError."""
+    pillow()
+    from PIL import Image
+
+    try:
+        opened = Image.open(picture if isinstance(picture, Path) else io.BytesIO(picture))
+    except (*_BROKEN, Image.DecompressionBombError) as error:
+        raise PictureError("an image", error) from error
+    is_deep = _DEEP in str(opened.tile)
+    if is_deep or opened.mode not in _COLOURS:
+        opened.close()
+        expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
+        raise PictureError(expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
+    return opened
+
+
+def decoded_picture(picture: Any) -> UInt8Array:
+    """Return the pixels of an opened picture, uint8 [H, W, 3], upright by EXIF, and close it. Raises PictureError."""
+    with picture:
+        try:
+            return np.asarray(upright_picture(picture).convert("RGB"))
+        except _BROKEN as error:
+            raise PictureError("an image", error) from error
+
+
+def upright_picture(picture: Any) -> Any:
+    """Return a picture, turned and mirrored according to the EXIF orientation.
+
+    ``ImageOps.exif_transpose`` gives the same pixels, but fails if it cannot write the other EXIF data again.
+    """
+    from PIL import Image
+
+    picture.load()  # which turns a TIFF file's picture
+    name = _UPRIGHT.get(_orientation(picture))
+    return picture if name is None else picture.transpose(Image.Transpose[name])
+
+
+def exif_turn(picture: bytes | Path) -> int | None:
+    """Return the EXIF orientation of a picture or file. None: it changes nothing, or cannot be read.
+
+    Decodes no pixels.
+    """
+    pillow()
+    from PIL import Image
+
+    if isinstance(picture, Path):
+        with picture.open("rb", buffering=0) as file:
+            head = file.read(_HEAD_BYTES)
+    else:
+        head = picture[:_HEAD_BYTES]
+    if not any(mark in head for mark in _MARKS):
+        return None
+    try:
+        with Image.open(picture if isinstance(picture, Path) else io.BytesIO(picture)) as opened:
+            orientation = _orientation(opened)
+    except (*_BROKEN, Image.DecompressionBombError):  # ``opened_picture`` says what is wrong
+        return None
+    return orientation if orientation in _UPRIGHT else None
+
+
+def _orientation(picture: Any) -> int:
+    from PIL import ExifTags
+
+    orientation = picture.getexif().get(ExifTags.Base.Orientation)
+    return orientation if isinstance(orientation, int) else 1

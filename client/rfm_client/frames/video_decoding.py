@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: MIT
+"""Decoding shared by all readers of videos: stream, colours, orientation, damaged frames, broken files.
+
+Containers, streams, packets and frames are PyAV's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.frames.broken_off import broken_off
+
+UNDAMAGED = "an undamaged frame"
+DAMAGED = "one that the decoder marks, or is made from such a one"
+REENCODE = "download it again, or keep what can be decoded: ffmpeg -i IN OUT"
+_HEADLESS = ("an HEVC video that begins with a key frame (cut it there: ffmpeg -ss SECONDS -i IN OUT)", "another frame")
+
+_NO_MATRIX, _BT601, _BT2020 = 0, 5, 9  # from YUV to RGB, as ITU-T H.273 numbers them
+_MATRICES = (1, 4, _BT601, 7, _BT2020)  # that libswscale knows; it takes BT.601 in place of others
+_SAME_MATRIX = {6: _BT601, 10: _BT2020}  # other numbers for the same matrix
+_BITS = 8  # most bits of a grey video's only channel; depth maps have more
+_NEARLY = math.tan(math.radians(1))  # FFmpeg's tolerance for quarter turns of a display matrix
+
+
+class VideoError(Exception):
+    """A file that is not one readable video. ``expected`` and ``got`` are the parts of a message."""
+
+    def __init__(self, expected: str, got: str) -> None:
+        super().__init__(expected, got)
+        self.expected = expected
+        self.got = got
+
+
+def import_av() -> Any:
+    """Return the module ``av``. Raises ImportError with the extra to install."""
+    try:
+        import av
+    except ImportError as error:
+        raise ImportError('video files need PyAV: pip install "./client[video]"') from error
+    return av
+
+
+def decoder() -> str:
+    """Return the versions of PyAV and of its libraries that decide the pixels of a decoded frame."""
+    av = import_av()
+    names = ("libswscale", "libavcodec", "libavfilter")
+    libraries = (f"{name} {'.'.join(map(str, av.library_versions[name]))}" for name in names)
+    return f"PyAV {av.__version__}, {', '.join(libraries)}"
+
+
+def video_stream(container: Any) -> Any:
+    """Return the only video stream of an opened container. Attached pictures, such as cover art, do not count.
+
+    Raises VideoError for no stream, several streams, or depth maps.
+    """
+    attached = import_av().stream.Disposition.attached_pic
+    videos = {n: stream for n, stream in enumerate(container.streams.video) if not stream.disposition & attached}
+    if not videos:
+        raise VideoError("a file with a video stream", "none")
+    if len(videos) > 1:
+        codecs = {n: stream.codec_context for n, stream in videos.items()}
+        told = ", ".join(f"0:v:{n} ({codec.name}, {codec.width}x{codec.height})" for n, codec in codecs.items())
+        raise VideoError("one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)", f"{len(videos)}: {told}")
+    (stream,) = videos.values()
+    _check_colours(stream.codec_context.format)
+    return stream
+
+
+@dataclass(frozen=True, eq=False)
+class Packets:
+    """The packets of a video's frames, read without decoding.
+
+    count: packets of frames that are shown; equals the number of frames unless a packet holds several
+    times_s: float64 [N], sorted time stamps; packets without a time stamp are left out
+    num_bytes: size of each of these N packets
+    num_hidden: packets that are not shown, as in videos cut without encoding
+    tick_s: unit of the time stamps, in seconds
+    fps: average frames a second; 0: the file does not say it
+    """
+
+    count: int
+    times_s: npt.NDArray[np.float64]
+    num_bytes: tuple[int, ...]
+    num_hidden: int
+    tick_s: float
+    fps: float
+
+    @property
+    def since_first_s(self) -> npt.NDArray[np.float64]:
+        """Return float64 [N], the time stamps from the first frame on."""
+        return self.times_s - self.times_s[:1]
+
+
+def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
+    """Return the packets of a video. They are counted, because the container's own count may be wrong.
+
+    container: FFmpeg's name of the file's format; None: FFmpeg guesses it
+
+    Raises VideoError, also for a truncated file and broken packets, and the errors of PyAV.
+    """
+    missing = broken_off(file)
+    if missing is not None:
+        raise VideoError("a whole video file", missing)
+    file.seek(0)
+    timed: list[tuple[float, int]] = []
+    count = num_hidden = 0
+    with import_av().open(file, format=container) as opened:
+        stream = video_stream(opened)
+        for packet in opened.demux(stream):
+            if (
+                packet.size
+                and not count + num_hidden
+                and not packet.is_keyframe
+                and stream.codec_context.name == "hevc"
+            ):
+                raise VideoError(*_HEADLESS)  # FFmpeg 7 makes pictures up to the first key frame, without a mark
+            if not packet.size or packet.is_discard:
+                num_hidden += bool(packet.size)
+                continue
+            if packet.is_corrupt:
+                raise VideoError("a whole video file", f"one whose packet {count} is broken ({REENCODE})")
+            if packet.pts is not None:
+                timed.append((float(packet.pts * packet.time_base), packet.size))
+            count += 1
+        tick_s, fps = float(stream.time_base), float(stream.average_rate or 0)
+    timed.sort()
+    times_s = np.array([time_s for time_s, _ in timed])
+    return Packets(count, times_s, tuple(size for _, size in timed), num_hidden, tick_s, fps)
+
+
+class Upright:
+    """Convert decoded frames to RGB, turned and mirrored as FFmpeg shows them.
+
+    Keeps FFmpeg's converter from frame to frame, so each video needs one of its own.
+    """
+
+    def __init__(self) -> None:
+        self._kind = ""
+        self._graph: Any = None
+
+    def __call__(self, frame: Any) -> UInt8Array:
+        """Return uint8 [H, W, 3]. Raises VideoError for a frame that FFmpeg would show aslant."""
+        try:
+            image, matrix = self._rgb(frame), frame.side_data.get("DISPLAYMATRIX")
+        except ValueError as error:  # PyAV 17.1 and newer fail at the EXIF data of a Motion JPEG video
+            remedy = "encode it anew: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
+            raise VideoError(f"frames without EXIF data, which PyAV cannot read ({remedy})", str(error)) from error
+        return image if matrix is None else np.ascontiguousarray(_shown(image, np.frombuffer(bytes(matrix), np.int32)))
+
+    def _rgb(self, frame: Any) -> UInt8Array:
+        """Return uint8 [H, W, 3], equal to the output of ``ffmpeg -pix_fmt rgb24``.
+
+        The filter does what the program does. PyAV's ``reformat`` differs from release to release.
+        """
+        frame.colorspace = _known_matrix(frame)
+        kind = f"{frame.width}x{frame.height}:pix_fmt={frame.format.name}:time_base=1/1"
+        kind += f":colorspace={int(frame.colorspace)}:range={int(frame.color_range)}"
+        if kind != self._kind:
+            self._kind, self._graph = kind, _rgb_graph(kind)
+        self._graph.push(frame)
+        image: UInt8Array = self._graph.pull().to_ndarray()
+        return image
+
+
+def judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
+    """Yield each decoded frame with True if the decoder marked it, or a frame before it since the last key frame."""
+    is_damaged = False
+    for frame in frames:
+        is_damaged = frame.is_corrupt or (is_damaged and not frame.key_frame)
+        yield frame, is_damaged
+
+
+def _check_colours(pixels: Any) -> None:
+    """Refuse pixels of depth maps: floats, or a single deep channel besides transparency."""
+    if pixels is None:
+        return
+    has_one = len(pixels.components) <= 2 and max(component.bits for component in pixels.components) > _BITS
+    if has_one or "f16" in pixels.name or "f32" in pixels.name:
+        remedy = "leave a depth camera out (--cameras), or convert the video: ffmpeg -i IN -pix_fmt yuv420p OUT"
+        raise VideoError(f"a video of colours ({remedy})", f"{pixels.name}, as depth maps have")
+
+
+def _known_matrix(frame: Any) -> int:
+    """The frame's matrix, or the one that FFmpeg takes in its place where it does not know the frame's."""
+    if frame.format.is_rgb:
+        return _NO_MATRIX
+    matrix = _SAME_MATRIX.get(frame.colorspace, frame.colorspace)
+    return int(matrix if matrix in _MATRICES else _BT601)
+
+
+def _rgb_graph(kind: str) -> Any:
+    graph = import_av().filter.Graph()
+    filters = (("buffer", f"video_size={kind}"), ("scale", "flags=bicubic"), ("format", "rgb24"), ("buffersink", None))
+    graph.link_nodes(*(graph.add(name, options) for name, options in filters)).configure()
+    return graph
+
+
+def _shown(image: UInt8Array, matrix: npt.NDArray[np.int32]) -> UInt8Array:
+    """Turn the image by a display matrix: x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12)."""
+    a, b, _, c, d = (float(value) for value in matrix[:5])
+    is_turned = max(abs(a), abs(d)) < _NEARLY * min(abs(b), abs(c))
+    if not is_turned and max(abs(b), abs(c)) > _NEARLY * min(abs(a), abs(d)):
+        got = f"one that is turned by {abs(math.degrees(math.atan2(b, a))):.0f} degrees, or skewed"
+        raise VideoError("a video that is shown upright or by quarter turns (turn it: ffmpeg -i IN OUT)", got)
+    across, down = (c, b) if is_turned else (a, d)
+    image = image.swapaxes(0, 1) if is_turned else image
+    return image[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1]

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Rewards and recordings for other libraries."""

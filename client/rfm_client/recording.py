@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: MIT
+"""Rerun recordings (.rrd) of frames and scores, on one timeline.
+
+Needs ``rfm-client[rerun]``. T frames, H x W pixels.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.results import FrameScores
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.transport.lifetime import Closing
+
+TIME = "video_time"  # timeline in seconds of the video
+FRAME = "frame"  # timeline in frames, where seconds are unknown
+IMAGE, PROGRESS, SUCCESS = "image", "progress", "success"
+JPEG_QUALITY = 90  # as good as the video, at a tenth of the size
+
+_APPLICATION = "rfm-client"
+_COLOURS = {PROGRESS: (31, 119, 180), SUCCESS: (44, 160, 44)}  # as in plots
+
+
+def load_rerun() -> Any:
+    """Return the package ``rerun``. Raises ImportError with the extra to install."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise ImportError('recordings need rerun-sdk: pip install "./client[rerun]"') from error
+    return rerun
+
+
+class Recording(Closing):
+    """A recording file to which any thread can add trajectories. The first trajectory creates the file.
+
+    Each trajectory is an entity with ``image``, ``progress`` and ``success``. Scores that the checkpoint does not
+    predict are left out.
+    """
+
+    def __init__(self, file: Path) -> None:
+        """Raise ImportError if the package is missing."""
+        self._rerun = load_rerun()
+        self._file = file
+        self._stream: Any = None
+        self._lock = threading.Lock()
+
+    def add(
+        self,
+        entity: Sequence[str],
+        scores: FrameScores,
+        videos: Mapping[str, Iterable[UInt8Array]],
+        times_s: npt.NDArray[np.float64] | None = None,
+    ) -> None:
+        """Add a trajectory with its scores.
+
+        entity: parts of its name; empty for the only trajectory of a file
+        videos: by camera, T frames, uint8 [H, W, 3]; a single camera's name is empty; empty for embeddings
+        times_s: float64 [T], times of the frames in the video; None: unknown
+        """
+        scored = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
+        curves = {curve: getattr(scores, curve) for curve in _COLOURS if not np.isnan(getattr(scores, curve)).all()}
+        with self._lock:
+            self._open()
+            self._stream.reset_time()  # of this thread's trajectory before
+            for curve in curves:
+                style = self._rerun.SeriesLines(names=curve, colors=_COLOURS[curve])
+                self._log((*entity, curve), style, static=True)
+            for camera, frames in videos.items():
+                for index, frame in enumerate(frames):
+                    self._set_time(index, times_s)
+                    image = self._rerun.Image(frame).compress(jpeg_quality=JPEG_QUALITY)
+                    self._log((*entity, IMAGE, *filter(None, [camera])), image)
+            for position, index in enumerate(scored.tolist()):
+                self._set_time(index, times_s)
+                for curve, values in curves.items():
+                    self._log((*entity, curve), self._rerun.Scalars(float(values[position])))
+
+    def close(self) -> None:
+        """Write the rest to the file."""
+        if self._stream is not None:
+            self._stream.disconnect()
+
+    def _open(self) -> None:
+        if self._stream is None:
+            self._stream = self._rerun.RecordingStream(_APPLICATION)
+            self._stream.save(self._file)
+
+    def _set_time(self, index: int, times_s: npt.NDArray[np.float64] | None) -> None:
+        if times_s is None:
+            self._stream.set_time(FRAME, sequence=index)
+        else:
+            self._stream.set_time(TIME, duration=float(times_s[index]))
+
+    def _log(self, parts: Sequence[str], what: Any, *, static: bool = False) -> None:
+        self._stream.log(list(parts), what, static=static, strict=True)  # otherwise it only warns of errors

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: MIT
+"""A broken episode that is not chosen does not stop the others."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer
+from pictures import numbered, write_video
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+
+TASK = "stack the cups"
+
+
+def v21(folder: Path, break_it: Callable[[Path], object]) -> Path:
+    root = shutil.copytree(LEROBOT / "toy_v21", folder / "toy")
+    break_it(root)
+    return root
+
+
+def v30(folder: Path, break_it: Callable[[Path], object]) -> Path:
+    root = shutil.copytree(LEROBOT / "toy_v30_many", folder / "toy")
+    break_it(root)
+    return root
+
+
+def tables_of(root: Path, below: str) -> list[Path]:
+    return sorted((root / below).rglob("*.parquet"))
+
+
+def changed(below: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    """Changes the rows of episode 1 in the tables of a folder."""
+
+    def apply(root: Path) -> None:
+        for file in tables_of(root, below):
+            table = parquet.read_table(file, partitioning=None)
+            rows = table.to_pylist()
+            for row in rows:
+                if row["episode_index"] == 1:
+                    change(row)
+            parquet.write_table(pa.Table.from_pylist(rows, schema=table.schema), file)
+
+    return apply
+
+
+def longer_metadata(root: Path) -> None:
+    file = root / "meta" / "episodes.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    lines[1]["length"] = "many"
+    file.write_text("\n".join(map(json.dumps, lines)))
+
+
+BROKEN_LEROBOT: dict[str, tuple[Callable[..., Path], Callable[[Path], object], str]] = {
+    "v2.1, no table": (v21, lambda root: tables_of(root, "data")[1].unlink(), "expected a Parquet file, got none"),
+    "v2.1, no video": (
+        v21,
+        lambda root: (root / "videos" / "chunk-000" / WRIST / "episode_000001.mp4").unlink(),
+        "expected a video file, got none",
+    ),
+    "v2.1, metadata": (v21, longer_metadata, "length: expected a whole number"),
+    "v3.0, rows": (v30, changed("data", lambda row: row.update(frame_index=7)), "episode 1: .* frame_index: expected"),
+    "v3.0, metadata": (
+        v30,
+        changed("meta/episodes", lambda row: row.update({"dataset_to_index": row["dataset_to_index"] + 1})),
+        "episode 1: .*length: expected",
+    ),
+}
+
+
+@pytest.mark.parametrize(("make", "break_it", "message"), BROKEN_LEROBOT.values(), ids=BROKEN_LEROBOT)
+def test_a_broken_episode_of_lerobot_lets_the_others_through(
+    tmp_path: Path, output: Path, make: Callable[..., Path], break_it: Callable[[Path], object], message: str
+) -> None:
+    whole = make(tmp_path / "whole", lambda root: None)
+    expected = {number: open_dataset(whole).episodes[number] for number in (0, 2, 3)}
+    broken = make(tmp_path / "broken", break_it)
+    options: dict[str, Any] = {"output": output, "cameras": (WRIST,), "frames": 2, "formats": ("progress",)}
+    with pytest.raises(DatasetError, match=message):
+        label(open_dataset(broken), BrightnessScorer(), LabelOptions(episodes=[0, 1], **options))
+    dataset = open_dataset(broken)
+    report = label(dataset, BrightnessScorer(), LabelOptions(episodes=[0, 2, 3], **options))
+    assert not report.failures
+    assert {item.episode.index: item.episode for item in report.plan.items} == expected
+    table = parquet.read_table(report.files[0])
+    assert sorted(set(table["episode_index"].to_pylist())) == [0, 2, 3]
+    for number in (0, 2, 3):
+        frames = list(open_dataset(whole).frames(expected[number], FRONT))
+        np.testing.assert_array_equal(list(dataset.frames(expected[number], FRONT)), frames)
+
+
+def test_episodes_that_are_not_chosen_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = v21(tmp_path, lambda root: None)
+    read: list[Path] = []
+    read_table = parquet.read_table
+
+    def seen(file: Path, **options: Any) -> Any:
+        read.append(file)
+        return read_table(file, **options)
+
+    monkeypatch.setattr(parquet, "read_table", seen)
+    label(
+        open_dataset(root), BrightnessScorer(), LabelOptions(output=tmp_path, episodes=[2], cameras=(WRIST,), frames=2)
+    )
+    assert {file.name for file in read if "data" in file.parts} == {"episode_000002.parquet"}
+
+
+def videos(folder: Path) -> Path:
+    for name, count in (("a.mp4", 3), ("b.mp4", 4), ("c.mp4", 5)):
+        write_video(folder / name, numbered(count))
+    (folder / "b.mp4").write_bytes((folder / "b.mp4").read_bytes()[:300])
+    return folder
+
+
+def demos(folder: Path, break_it: Callable[[Any], object]) -> Path:
+    with h5py.File(folder / "demos.hdf5", "w") as opened:
+        opened.create_group("data").attrs["env_args"] = json.dumps({"env_name": "Lift"})
+        for index in range(3):
+            opened[f"data/demo_{index}/obs/front"] = numbered(3 + index)
+            opened[f"data/demo_{index}/obs/wrist"] = numbered(3 + index)
+            opened[f"data/demo_{index}/actions"] = np.zeros((3 + index, 7))
+        break_it(opened["data"])
+    return folder / "demos.hdf5"
+
+
+def test_a_broken_video_lets_the_others_through(tmp_path: Path, output: Path) -> None:
+    """It counts as no frames, since its length is unknown."""
+    root = videos(tmp_path)
+    with pytest.raises(DatasetError, match=r"b\.mp4: expected a whole video file"):
+        label(open_dataset(root, task=TASK), BrightnessScorer(), LabelOptions(output=output))
+    report = label(open_dataset(root, task=TASK), BrightnessScorer(), LabelOptions(output=output, episodes=[0, 2]))
+    table = parquet.read_table(report.files[0])
+    assert table["episode_index"].to_pylist() == [0] * 3 + [2] * 5
+    assert table["index"].to_pylist() == list(range(8))
+
+
+BROKEN_DEMOS: dict[str, tuple[Callable[[Any], object], str]] = {
+    "no observations": (lambda data: data["demo_1"].pop("obs"), "cameras|a camera as uint8"),
+    "no group": (lambda data: [data.pop("demo_1"), data.create_dataset("demo_1", data=1)], "a camera as uint8"),
+    "lengths that differ": (
+        lambda data: [data["demo_1"].pop("actions"), data["demo_1"].create_dataset("actions", data=np.zeros((9, 7)))],
+        "data/demo_1: expected one length, above 0, got obs/front 4, obs/wrist 4, actions 9",
+    ),
+    "a camera that is missing": (lambda data: data["demo_1/obs"].pop("wrist"), "got 'wrist', which is left out: miss"),
+}
+
+
+@pytest.mark.parametrize(("break_it", "message"), BROKEN_DEMOS.values(), ids=BROKEN_DEMOS)
+def test_a_broken_demonstration_lets_the_others_through(
+    tmp_path: Path, break_it: Callable[[Any], object], message: str
+) -> None:
+    file = demos(tmp_path, break_it)
+    asked: dict[str, Any] = {"cameras": ("front", "wrist")}
+    with pytest.raises(DatasetError, match=message):
+        label(open_dataset(file, task=TASK), BrightnessScorer(), LabelOptions(**asked))
+    label(open_dataset(file, task=TASK), BrightnessScorer(), LabelOptions(episodes=[0, 2]))
+    with h5py.File(tmp_path / "demos.rfm_rewards.hdf5") as opened:
+        assert {name: len(opened[f"data/{name}/rfm_progress.wrist"]) for name in opened["data"]} == {
+            "demo_0": 3,
+            "demo_2": 5,
+        }

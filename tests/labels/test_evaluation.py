@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: MIT
+"""Which reward model suits a dataset: measures of label files, against slow formulas and known cases."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+from typer.testing import CliRunner
+
+from labelling import FEW, BrightnessScorer
+from rfm_client.cli.commands import app
+from rfm_labels import (
+    DatasetError,
+    LabelOptions,
+    Watch,
+    evaluate_labels,
+    label,
+    open_dataset,
+    read_outcomes,
+)
+from rfm_labels.cost import Cost
+from rfm_labels.evaluation import kendall, spearman
+from rfm_labels.label_files import read_cost
+from shown_datasets import copied
+
+Curves = Mapping[int, Sequence[float]]
+
+QUIET = Watch()
+RISING, FALLING, FLAT = [0.0, 0.2, 0.5, 0.9], [0.9, 0.5, 0.2, 0.0], [0.3] * 4
+
+
+def labels(file: Path, progress: Curves, success: Curves | None = None) -> Path:
+    episodes = np.concatenate([[episode] * len(values) for episode, values in progress.items()]).astype(np.int64)
+    frames = np.concatenate([np.arange(len(values)) for values in progress.values()])
+    columns = {"index": np.arange(len(episodes)), "episode_index": episodes, "frame_index": frames}
+    scores = {"progress_sparse": progress} | ({"success": success} if success else {})
+    columns |= {name: np.concatenate([*values.values()]).astype(np.float32) for name, values in scores.items()}
+    parquet.write_table(pa.table(columns), file)
+    return file
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_rank_correlations_are_those_of_slow_formulas(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    values = random.integers(0, 6, random.integers(2, 30)).astype(np.float32)  # with ties
+    time = np.arange(len(values))
+    pairs = list(itertools.combinations(range(len(values)), 2))
+    signs = [int(np.sign(values[later] - values[earlier])) for earlier, later in pairs]
+    untied = sum(sign != 0 for sign in signs)
+    if not untied:
+        assert kendall(values) is spearman(values, time) is None
+        return
+    assert kendall(values) == pytest.approx(sum(signs) / np.sqrt(len(pairs) * untied))
+    ranks = [np.mean(np.flatnonzero(np.sort(values) == value)) for value in values]
+    assert spearman(values, time) == pytest.approx(float(np.corrcoef(ranks, time)[0, 1]))
+
+
+def test_successes_are_told_from_failures(tmp_path: Path) -> None:
+    final = {0: 0.9, 1: 0.8, 2: 0.8, 3: 0.1}  # the last of each episode; a tie between a success and a failure
+    success = {0: [0.0, 0.7], 1: [0.0, 0.4], 2: [0.9, 0.3], 3: [0.0, 0.1]}
+    file = labels(tmp_path / "good_progress.parquet", {each: [0.0, value] for each, value in final.items()}, success)
+    comparison = evaluate_labels([file], {0: True, 1: True, 2: False, 3: False})
+    (found,) = comparison.evaluations
+    assert found.name == "good"
+    assert found.by_progress is not None
+    assert found.by_success is not None
+    assert found.by_progress.auroc == pytest.approx((4 - 0.5) / 4)  # of four pairs one is a tie
+    assert (found.by_success.auroc, found.by_success.balanced_accuracy) == (1.0, 1.0)
+    assert found.by_success.threshold == pytest.approx(0.4)
+    assert (found.final_of_successes, found.final_of_failures) == (pytest.approx(0.85), pytest.approx(0.45))
+
+
+def test_the_order_is_that_of_successes_and_a_constant_curve_has_none(tmp_path: Path) -> None:
+    file = labels(tmp_path / "a.parquet", {0: RISING, 1: FALLING, 2: FLAT})
+    (of_all,) = evaluate_labels([file]).evaluations
+    assert (of_all.spearman, of_all.kendall, of_all.num_constant) == (pytest.approx(0), pytest.approx(0), 1)
+    assert (of_all.by_success, of_all.by_progress, of_all.final_of_successes) == (None, None, None)
+    assert of_all.backwards == pytest.approx(1 / 3)
+    (of_successes,) = evaluate_labels([file], {0: True, 1: False, 2: True}).evaluations
+    assert (of_successes.spearman, of_successes.num_constant) == (pytest.approx(1), 1)
+
+
+def test_models_are_compared_on_the_episodes_and_frames_that_both_have(tmp_path: Path) -> None:
+    first = labels(tmp_path / "a.parquet", {0: RISING, 1: RISING, 7: FLAT})
+    gaps = [0.1, np.nan, 0.3, 0.5]  # a frame without a label
+    second = labels(tmp_path / "b.parquet", {0: FALLING, 1: gaps})
+    comparison = evaluate_labels([first, second])
+    assert (comparison.episodes, comparison.num_left_out) == ([0, 1], 1)
+    (agreement,) = comparison.agreements
+    assert (agreement.first, agreement.second) == ("a", "b")
+    assert agreement.spearman == pytest.approx((-1 + 1) / 2)
+    distances = [np.mean([0.9, 0.3, 0.3, 0.9]), np.mean([0.1, 0.2, 0.4])]
+    assert agreement.distance == pytest.approx(np.mean(distances), abs=1e-6)
+
+
+def test_many_episodes_take_a_moment(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    file = labels(tmp_path / "a.parquet", {each: random.random(20) for each in range(3000)})
+    assert evaluate_labels([file], {each: each % 2 == 0 for each in range(3000)}).evaluations[0].num_frames == 60_000
+
+
+def test_the_cost_is_that_of_the_frames_that_the_run_scored(tmp_path: Path) -> None:
+    dataset, output = open_dataset(copied("toy_v30_many", tmp_path)), tmp_path / "labels"
+    request_s = 0.05  # and each episode is one request
+
+    def frames_per_s(scorer: BrightnessScorer, watch: Watch = QUIET, **options: Any) -> float | None:
+        label(dataset, scorer, LabelOptions(output=output, workers=1, **{**FEW, **options}), watch)
+        files = output / "rfm_progress.parquet", output / "reward_signals" / "rfm.parquet"
+        (rate,) = {each.frames_per_s for each in evaluate_labels(files).evaluations}
+        return rate
+
+    def check(episodes: range, watch: Watch = QUIET) -> float | None:
+        """Return the rate that the files tell, which is that of five episodes."""
+        scorer, began_s = BrightnessScorer(request_s), time.monotonic()
+        rate = frames_per_s(scorer, watch, episodes=episodes)
+        took_s = time.monotonic() - began_s
+        cost = read_cost(output / "rfm_progress.parquet")
+        assert cost is not None
+        assert cost.frames == scorer.num_samples
+        assert 5 * request_s < cost.seconds < took_s
+        assert rate == cost.frames / cost.seconds
+        return rate
+
+    check(range(5))
+    rate = check(range(5, 10))  # the labels of the first five are kept
+    for _ in range(2):
+        assert frames_per_s(BrightnessScorer()) == rate  # nothing was scored
+        shutil.rmtree(output / ".rfm_parts")
+    assert frames_per_s(BrightnessScorer(), frames=3, overwrite=True) not in (rate, None)
+    assert frames_per_s(BrightnessScorer(), overwrite=True, parts=str(tmp_path / "parts")) is not None
+    frames_per_s(BrightnessScorer(), frames=3, overwrite=True)
+    assert frames_per_s(BrightnessScorer(), overwrite=True, parts=str(tmp_path / "parts")) is None  # the other recipe's
+
+    class Meanwhile(Watch):
+        def begin(self, num_frames: int, num_finished: int) -> None:
+            frames_per_s(BrightnessScorer(), episodes=range(5))
+
+    shutil.rmtree(output)
+    check(range(10), Meanwhile())
+
+
+def test_a_file_that_does_not_say_its_cost_has_none(tmp_path: Path) -> None:
+    file = labels(tmp_path / "a.parquet", {0: RISING})
+    (found,) = evaluate_labels([file]).evaluations
+    assert found.frames_per_s is None
+    done = CliRunner().invoke(app, ["evaluate", str(tmp_path), "--labels", str(file)])
+    assert re.search(r"frames/s.*\n.*\n  a .* -\s", done.stdout), done.output
+    for told in ("soon", "[]", '{"frames": 3}', '{"frames": 0, "seconds": 1.0}', '{"frames": 3, "seconds": NaN}'):
+        assert Cost.parse(told.encode()) is None
+    assert Cost.parse(Cost(3, 0.5).json()) == Cost(3, 0.5)
+
+
+def written(file: Path, text: str) -> str:
+    file.write_text(text)
+    return str(file)
+
+
+def test_outcomes_are_read_from_a_table_the_frames_or_the_episodes(tmp_path: Path) -> None:
+    assert read_outcomes(written(tmp_path / "a.csv", "\ufeffepisode,success\n0,1\n1,FALSE\n")) == {0: True, 1: False}
+    v30, v21 = copied("toy_v30_many", tmp_path), copied("toy_v21", tmp_path)
+    for file in sorted(v30.rglob("data/**/*.parquet")):
+        table = parquet.read_table(file)
+        done = np.append(np.diff(table["episode_index"].to_numpy()) != 0, True)
+        done &= table["episode_index"].to_numpy() % 2 == 0
+        parquet.write_table(table.append_column("next.success", pa.array(done)), file)
+    outcomes = read_outcomes("next.success", v30)
+    assert outcomes == {episode.index: episode.index % 2 == 0 for episode in open_dataset(v30).episodes}
+    lines = v21 / "meta" / "episodes.jsonl"
+    rows = [json.loads(line) | {"success": index % 3 == 0} for index, line in enumerate(lines.read_text().splitlines())]
+    lines.write_text("\n".join(map(json.dumps, rows)))
+    assert read_outcomes("success", v21) == {row["episode_index"]: row["success"] for row in rows}
+
+
+REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "no such column": (
+        lambda folder: read_outcomes("succes", copied("toy_v30_many", folder)),
+        r"outcome: expected a CSV file, or a column of .*: .*frame_index.*, got 'succes'",
+    ),
+    "a column without a dataset": (
+        lambda folder: read_outcomes("success", folder),
+        "outcome: expected a CSV file, or a column of a local LeRobot dataset, got 'success'",
+    ),
+    "a column of other numbers": (
+        lambda folder: read_outcomes("timestamp", copied("toy_v30_many", folder)),
+        r"outcome: timestamp: episode \d: expected true, false, 1 or 0, got ",
+    ),
+    "other headers": (
+        lambda folder: read_outcomes(written(folder / "a.csv", "id,ok\n0,1\n")),
+        r"a\.csv: expected the columns episode and success, got id, ok",
+    ),
+    "an episode twice": (
+        lambda folder: read_outcomes(written(folder / "a.csv", "episode,success\n0,1\n0,0\n")),
+        r"a\.csv: line 3: expected each episode once, got 0 again",
+    ),
+    "another word": (
+        lambda folder: read_outcomes(written(folder / "a.csv", "episode,success\n0,maybe\n")),
+        r"line 2: success: expected true, false, 1 or 0, got 'maybe'",
+    ),
+    "no outcome": (
+        lambda folder: evaluate_labels([labels(folder / "a.parquet", {0: RISING, 1: RISING})], {0: True}),
+        r"outcome: expected one for each labelled episode, got none for episode \[1\]",
+    ),
+    "no common episode": (
+        lambda folder: evaluate_labels([labels(folder / f"{n}.parquet", {n: RISING}) for n in range(2)]),
+        "labels: expected an episode that all files have, got none",
+    ),
+    "one file twice": (
+        lambda folder: evaluate_labels([labels(folder / "a.parquet", {0: RISING})] * 2),
+        "labels: expected each file once",
+    ),
+}
+
+
+@pytest.mark.parametrize("ask, message", REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_compared_is_refused(tmp_path: Path, ask: Callable[[Path], Any], message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        ask(tmp_path)
+
+
+def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    for name, frames in (("short", 2), ("long", 8)):
+        label(open_dataset(root), BrightnessScorer(), LabelOptions(name=name, sampling="rint_pad", frames=frames))
+    numbers = [episode.index for episode in open_dataset(root).episodes]
+    rows = "".join(f"{number},{number % 2}\n" for number in numbers)
+    outcomes = written(tmp_path / "outcomes.csv", f"episode,success\n{rows}")
+    done = CliRunner().invoke(app, ["evaluate", str(root), "--outcome", outcomes])
+    assert done.exit_code == 0, done.output
+    assert all(
+        word in done.stdout
+        for word in ("short", "long", f"{sum(number % 2 for number in numbers)} successes", "agreement", "AUROC")
+    )
+    json_file, picture = tmp_path / "out.json", tmp_path / "out.png"
+    done = CliRunner().invoke(app, ["evaluate", str(root), "--json", str(json_file), "--plot", str(picture)])
+    assert done.exit_code == 0, done.output
+    document = json.loads(json_file.read_text())
+    assert [each["name"] for each in document["evaluations"]] == ["long", "short"]
+    assert document["is_success"] is None
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    empty = CliRunner().invoke(app, ["evaluate", str(tmp_path)])
+    assert (empty.exit_code, "expected label files, NAME_progress.parquet" in empty.stderr) == (1, True)

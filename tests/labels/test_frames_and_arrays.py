@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: MIT
+"""Episodes as folders of frames and as arrays, and folders of HDF5 files."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import PIL
+import pytest
+from PIL import Image
+from pyarrow import parquet
+
+from labelling import BrightnessScorer, brightness
+from pictures import numbered, numbers
+from rfm_client.cli.command import ExitCode
+from rfm_client.frames.orientation import Orient
+from rfm_labels import DatasetError, LabelOptions, RayOptions, Scorer, label, open_dataset
+from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
+
+TASK = "stack the cups"
+COUNT = 12  # frames of an episode, so that 10.png is there
+
+
+def write_frames(folder: Path, frames: Any, suffix: str = ".png") -> None:
+    folder.mkdir(parents=True)
+    for t, frame in enumerate(frames):
+        Image.fromarray(frame).save(folder / f"frame_{t}{suffix}")
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> Path:
+    root = tmp_path / "frames"
+    for name in ("0", "2", "10"):
+        write_frames(root / name, numbered(COUNT))
+    return root
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".JPEG"])
+def test_folders_of_frames_are_read_in_natural_order_by_one_task(tmp_path: Path, suffix: str) -> None:
+    root = tmp_path / "frames"
+    for name in ("10", "2"):
+        write_frames(root / name, numbered(COUNT), suffix)
+        (root / name / "camera.json").write_text("{}")
+        (root / name / f"._frame_0{suffix}").write_bytes(b"of a Mac")
+    dataset = open_dataset(root, task=TASK)
+    assert (dataset.kind, dataset.root, list(dataset.cameras)) == ("folders of frames", root, ["frames"])
+    told = [(e.index, e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
+    assert told == [(0, "2", TASK, COUNT, 0), (1, "10", TASK, COUNT, COUNT)]
+    for episode in dataset.episodes:
+        video = np.stack(list(dataset.frames(episode, "frames")))
+        assert numbers(video, COUNT) == list(range(COUNT))
+        size = sum(file.stat().st_size for file in (root / episode.name).glob(f"frame_*{suffix}"))
+        assert dataset.check(episode, "frames") == size
+    assert dataset.decoder("frames") == f"Pillow {PIL.__version__}"
+
+
+def test_labels_of_folders_of_frames_stay_and_new_folders_are_added(folders: Path) -> None:
+    """Also with the labels and their picture in the folder of the dataset."""
+    scorer = BrightnessScorer()
+    report = label(open_dataset(folders, task=TASK), scorer, LabelOptions(episodes=[0, 1]))
+    (folders / "rfm_summary.png").write_bytes((folders / "0" / "frame_0.png").read_bytes())
+    scored = scorer.num_samples
+    label(open_dataset(folders, task=TASK), scorer, LabelOptions())
+    assert scorer.num_samples == scored * 3 // 2
+    table = parquet.read_table(report.files[0])
+    assert table["episode_index"].to_pylist() == [0] * COUNT + [1] * COUNT + [2] * COUNT
+    np.testing.assert_allclose(table["progress_sparse"].to_numpy()[:COUNT], brightness(numbered(COUNT)), atol=1e-6)
+    os.utime(folders / "2" / "frame_3.png", (1, 1))
+    with pytest.raises(DatasetError, match=r"2: expected no change since the labels"):
+        label(open_dataset(folders, task=TASK), scorer, LabelOptions(episodes=[0]))
+
+
+@pytest.mark.parametrize("column", ["video", "episode"])
+def test_a_table_names_folders_their_tasks_and_their_order(folders: Path, column: str) -> None:
+    for camera in ("front", "wrist"):
+        write_frames(folders / "11" / camera, numbered(3))
+    (folders / "tasks.csv").write_text(f"{column},task\n10,open the box\n11/front,{TASK}\n")
+    dataset = open_dataset(folders)
+    assert [(e.name, e.task, e.num_frames) for e in dataset.episodes] == [
+        ("10", "open the box", COUNT),
+        ("11/front", TASK, 3),
+    ]
+
+
+def depth(root: Path) -> None:
+    Image.fromarray(np.zeros((4, 4), np.uint16)).save(root / "2" / "frame_0.png")
+
+
+BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "an empty folder": (
+        lambda root: (root / "3").mkdir(),
+        "3: expected PNG or JPEG files, got an empty folder: remove it, or leave it out (--episodes)",
+    ),
+    "a folder of other files": (
+        lambda root: [(root / "3").mkdir(), (root / "3" / "a.txt").write_text("a")],
+        "3: expected PNG or JPEG files, got other files: remove it, or leave it out (--episodes)",
+    ),
+    "folders of cameras": (
+        lambda root: write_frames(root / "3" / "front", numbered(2)),
+        "3: expected PNG or JPEG files, got the folders front: list the folders of one camera in tasks.csv (3/front)",
+    ),
+    "two formats": (
+        lambda root: Image.fromarray(numbered(1)[0]).save(root / "2" / "x.jpg"),
+        "2: expected frames of one format, got JPEG (x.jpg) and PNG (frame_0.png): give each format a folder of its own",
+    ),
+    "no picture": (
+        lambda root: (root / "2" / "frame_1.png").write_bytes(b"x"),
+        "frame_1.png: expected an image, got ",
+    ),
+    "a depth map": (depth, "frame_0.png: expected a picture of 8-bit colours (convert it"),
+}
+
+
+@pytest.mark.parametrize(("break_it", "message"), BROKEN.values(), ids=BROKEN)
+def test_a_folder_without_frames_is_refused_before_a_score(
+    folders: Path, break_it: Callable[[Path], object], message: str
+) -> None:
+    break_it(folders)
+    scorer = BrightnessScorer()
+    with pytest.raises(DatasetError) as refused:
+        label(open_dataset(folders, task=TASK), scorer, LabelOptions())
+    assert message in str(refused.value)
+    assert scorer.num_samples == 0
+
+
+def test_arrays_are_episodes_with_their_own_tasks_or_the_callers(tmp_path: Path) -> None:
+    frames = numbered(COUNT)
+    np.save(tmp_path / "10.npy", frames[:4])
+    np.savez(tmp_path / "9.npz", frames=frames.astype(np.float32) / 255, task="open the box")
+    dataset = open_dataset(tmp_path, task=TASK, orient=Orient.parse(["flip-vertical"]))
+    assert (dataset.kind, dataset.decoder("frames")) == ("arrays", None)
+    told = [(e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
+    assert told == [("9.npz", "open the box", COUNT, 0), ("10.npy", TASK, 4, COUNT)]
+    for episode in dataset.episodes:
+        np.testing.assert_array_equal(list(dataset.frames(episode, "frames")), frames[: episode.num_frames, ::-1])
+        assert dataset.check(episode, "frames") == frames[: episode.num_frames].nbytes
+    with pytest.raises(DatasetError, match=r'10\.npy: expected a task as a sentence, got none: add --task "SENTENCE"'):
+        _ = open_dataset(tmp_path).episodes
+    (tmp_path / "tasks.json").write_text(json.dumps({"10.npy": "open the box", "9.npz": ""}))
+    assert [(e.name, e.task) for e in open_dataset(tmp_path).episodes] == [
+        ("10.npy", "open the box"),
+        ("9.npz", "open the box"),
+    ]
+
+
+UNREADABLE: dict[str, tuple[Any, str]] = {
+    "embeddings": (np.zeros((3, 8), np.float32), r"frames, uint8 \[T, H, W, 3\], got embeddings: score them with"),
+    "grey pictures": (np.zeros((3, 8, 8), np.uint8), r"a\.npy: .*expected .*\[T, H, W, 3\]"),
+    "objects": (np.array([{}]), r"a\.npy: file: expected arrays of numbers and text, none pickled"),
+}
+
+
+@pytest.mark.parametrize(("array", "message"), UNREADABLE.values(), ids=UNREADABLE)
+def test_arrays_that_are_no_frames_are_refused(tmp_path: Path, array: Any, message: str) -> None:
+    np.save(tmp_path / "a.npy", array)
+    with pytest.raises(DatasetError, match=message):
+        _ = open_dataset(tmp_path, task=TASK).episodes
+
+
+def test_a_table_lists_episodes_of_one_kind(folders: Path) -> None:
+    np.save(folders / "a.npy", numbered(2))
+    (folders / "tasks.csv").write_text(f"video,task\n0,{TASK}\na.npy,{TASK}\n")
+    with pytest.raises(
+        DatasetError, match=r"got arrays \(a\.npy\) and folders of pictures \(0\): write a table for each"
+    ):
+        open_dataset(folders)
+
+
+def test_a_table_of_folders_tells_what_it_lacks_and_what_is_missing(folders: Path) -> None:
+    (folders / "notes").mkdir()
+    (folders / "tasks.csv").write_text(f"episode,task\n11,{TASK}\n10,{TASK}\n")
+    dataset = open_dataset(folders)
+    assert dataset.notes == ["tasks.csv: 2 folders of pictures beside it are not listed and get no labels: 0, 2"]
+    with pytest.raises(DatasetError, match=r"11: expected a folder of PNG or JPEG files, got No such file"):
+        _ = dataset.episodes
+
+
+def write_demos(file: Path, task: str, num_demos: int = 1) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(file, "w") as opened:
+        opened.create_group("data").attrs["env_args"] = json.dumps({"env_name": "Lift", "lang": task})
+        for index in range(num_demos):
+            opened[f"data/demo_{index}/obs/front"] = numbered(5)
+
+
+def command(source: Path, labels: LabelOptions, *, dry_run: bool = False) -> tuple[ExitCode, list[str], set[str]]:
+    """Exit code, what it says, and the tasks that were scored."""
+    scorer, said = BrightnessScorer(), list[str]()
+
+    @contextmanager
+    def connect() -> Iterator[Scorer]:
+        yield scorer
+
+    options = RunOptions(dry_run=dry_run)
+    code = LabelCommand(str(source), EpisodeTexts(), labels, options, RayOptions(), connect, said.append).run()
+    return code, said, scorer.tasks
+
+
+def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = tmp_path / "libero"
+    for name, task in (("task_2.hdf5", "a"), ("task_10.hdf5", "b"), ("more/task_1.h5", "c")):
+        write_demos(root / name, task)
+    code, said, tasks = command(root, LabelOptions())
+    assert (code, tasks) == (ExitCode.OK, {"a", "b", "c"})
+    files = [f"{root}/more/task_1.h5", f"{root}/task_2.hdf5", f"{root}/task_10.hdf5"]
+    assert [line for line in said if line in files] == files
+    for folder, stem in (("more", "task_1"), ("", "task_2"), ("", "task_10")):
+        assert (root / folder / f"{stem}.rfm_summary.png").exists()
+        with h5py.File(root / folder / f"{stem}.rfm_rewards.hdf5") as opened:
+            np.testing.assert_allclose(opened["data/demo_0/rfm_progress"], brightness(numbered(5)), atol=1e-6)
+    assert command(root, LabelOptions())[::2] == (ExitCode.OK, set())  # files of labels are no datasets
+    capsys.readouterr()
+
+
+REFUSED_FOLDERS: dict[str, tuple[LabelOptions, str]] = {
+    "another format": (
+        LabelOptions(formats=["progress"]),
+        "format: expected hdf5 for a folder of HDF5 files, each with",
+    ),
+    "one name twice": (
+        LabelOptions(output=Path("out")),
+        r"output: expected .* names differ, got .*a\.h5.*: leave out --o",
+    ),
+    "a file without pictures": (LabelOptions(), r"low_dim\.hdf5: data/demo_0/obs: expected a camera as uint8"),
+}
+
+
+@pytest.mark.parametrize(("labels", "message"), REFUSED_FOLDERS.values(), ids=REFUSED_FOLDERS)
+def test_a_folder_of_hdf5_files_is_refused_before_a_score(tmp_path: Path, labels: LabelOptions, message: str) -> None:
+    write_demos(tmp_path / "a.hdf5", TASK)
+    write_demos(tmp_path / "b" / "a.h5", TASK)
+    with h5py.File(tmp_path / "low_dim.hdf5", "w") as opened:
+        opened["data/demo_0/obs/states"] = np.zeros((5, 3))
+    with pytest.raises(DatasetError, match=message):
+        command(tmp_path, labels)
+    assert not list(tmp_path.rglob("*rewards*"))

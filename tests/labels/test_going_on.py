@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: MIT
+"""What is finished stays finished: after a kill, beside another process, without a server, on a full disk."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import labelling
+from labelling import FEW, LEROBOT, BrightnessScorer, Notes, PickyScorer, without_cost
+from rfm_client import ProgressResult, ServerUnavailableError
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+
+ROOT = LEROBOT / "toy_v30_many"
+FILES = ("rfm_progress.parquet", "reward_signals/rfm.parquet")
+NUM_FRAMES = 428
+
+
+def contents(output: Path) -> list[bytes]:
+    return [without_cost(output / name) for name in FILES]
+
+
+def parts_of(output: Path) -> list[str]:
+    return sorted(path.name for path in (output / ".rfm_parts").glob("*.parquet"))
+
+
+def goes_on(output: Path, undisturbed: list[bytes], **options: Any) -> int:
+    """How many frames the same call then scores, after which the labels are those of a run that nothing disturbed."""
+    rest = BrightnessScorer()
+    label(open_dataset(ROOT), rest, LabelOptions(output=output, **FEW, **options))
+    assert contents(output) == undisturbed
+    return rest.num_samples
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    output = tmp_path_factory.mktemp("undisturbed")
+    label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, **FEW))
+    return contents(output)
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_again_and_again_leaves_what_is_finished(
+    output: Path, undisturbed: list[bytes]
+) -> None:
+    for how in (signal.SIGKILL, signal.SIGINT, signal.SIGKILL):
+        num_before = len(parts_of(output))
+        words = [sys.executable, labelling.__file__, str(ROOT), str(output), "0.5"]
+        process = subprocess.Popen(words, stderr=subprocess.DEVNULL)
+        while len(parts_of(output)) == num_before:
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(how)
+        assert process.wait(timeout=60) != 0
+    assert not (output / FILES[0]).exists()
+    assert 0 < goes_on(output, undisturbed) < NUM_FRAMES
+
+
+def test_two_runs_at_a_time_write_the_same_files(output: Path, undisturbed: list[bytes]) -> None:
+    options = LabelOptions(output=output, workers=2, **FEW)
+    threads = [
+        threading.Thread(target=label, args=(open_dataset(ROOT), BrightnessScorer(0.01), options)) for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert contents(output) == undisturbed
+    assert len(parts_of(output)) == 10
+
+
+def test_shards_are_put_together_by_a_run_without_one(output: Path, undisturbed: list[bytes]) -> None:
+    output = output / "a new" / "folder"
+    for shard in ((0, 3), (2, 3), (1, 3)):
+        report = label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, shard=shard, **FEW))
+        assert (report.files, report.failures, report.summary) == ([], [], None)
+    assert len(parts_of(output)) == 10
+    assert goes_on(output, undisturbed) == 0
+
+
+def test_an_episode_that_fails_is_told_and_the_others_go_on(output: Path, undisturbed: list[bytes]) -> None:
+    notes, dataset = Notes(), open_dataset(ROOT)
+    failing = [episode for episode in dataset.episodes if episode.task == PickyScorer.REFUSED]
+    assert failing
+    report = label(dataset, PickyScorer(), LabelOptions(output=output, **FEW), notes)
+    assert [failure.episode for failure in report.failures] == failing
+    assert sorted(notes.failures) == sorted(f"{e.name}: task: expected another one, got this" for e in failing)
+    assert (report.files, (output / FILES[0]).exists()) == ([], False)
+    assert goes_on(output, undisturbed) == sum(episode.num_frames for episode in failing)
+
+
+def test_a_server_that_is_gone_stops_the_run_and_not_one_episode_after_the_other(
+    output: Path, undisturbed: list[bytes]
+) -> None:
+    class Gone(BrightnessScorer):
+        def evaluate(self, samples: Any) -> list[ProgressResult]:
+            if self.num_samples >= 150:
+                raise ServerUnavailableError("no server")
+            return super().evaluate(samples)
+
+    with pytest.raises(ServerUnavailableError, match=r"^no server$"):
+        label(open_dataset(ROOT), Gone(), LabelOptions(output=output, workers=1, **FEW))
+    assert 0 < len(parts_of(output)) < 10
+    goes_on(output, undisturbed)
+
+
+def test_a_full_disk_stops_the_run_and_leaves_no_half_of_a_part(
+    output: Path, undisturbed: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = os.fsync
+    count = 0
+
+    def full(file: int) -> None:
+        nonlocal count
+        count += 1
+        if count == 4:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        synced(file)
+
+    monkeypatch.setattr(os, "fsync", full)
+    advice = "make room or name another place with --parts, and run the same command"
+    with pytest.raises(OSError, match=rf"\.rfm_parts: expected .* got No space left on device: {advice}$"):
+        label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, workers=1, **FEW))
+    assert len(parts_of(output)) == len(list((output / ".rfm_parts").iterdir())) == 3
+    goes_on(output, undisturbed)
+
+
+BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "truncated": (lambda part: part.write_bytes(part.read_bytes()[:100]), "expected a whole part"),
+    "another's": (
+        lambda part: part.write_bytes(sorted(part.parent.glob("*.parquet"))[3].read_bytes()),
+        "expected the part of episode 0",
+    ),
+}
+
+
+@pytest.mark.parametrize(("break_it", "message"), BROKEN.values(), ids=BROKEN)
+def test_a_part_that_is_not_whole_is_no_label(
+    output: Path, undisturbed: list[bytes], break_it: Callable[[Path], object], message: str
+) -> None:
+    goes_on(output, undisturbed)
+    break_it(sorted((output / ".rfm_parts").glob("*.parquet"))[0])
+    with pytest.raises(DatasetError, match=f"{message}.*delete it, and run the same command"):
+        goes_on(output, undisturbed)
+    assert contents(output) == undisturbed
+
+
+@pytest.mark.parametrize("url", ["memory://labels/parts", "file://{}/elsewhere"])
+def test_parts_may_be_behind_a_url(output: Path, undisturbed: list[bytes], url: str) -> None:
+    assert goes_on(output, undisturbed, parts=url.format(output)) == NUM_FRAMES
+    assert goes_on(output, undisturbed, parts=url.format(output)) == 0
+    assert not (output / ".rfm_parts").exists()

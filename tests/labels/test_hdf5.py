@@ -1,0 +1,522 @@
+# SPDX-License-Identifier: MIT
+"""HDF5 files: their demonstrations, which of their pictures are scored and which way up, and their labels."""
+
+from __future__ import annotations
+
+import json
+import resource
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+from pyarrow import parquet
+
+from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, brightness
+from rfm_client import ProgressResult, ProgressSample
+from rfm_client.frames.orientation import ORIENTATIONS, Correction, Orient, Orientation, turned
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+from rfm_labels.datasets.protocol import chosen_cameras
+
+LENGTHS = (5, 7, 3)
+TASK = "open the drawer"
+CAMERAS = ("agentview_rgb", "eye_in_hand_rgb")
+LIBERO = {
+    "problem_info": json.dumps({"problem_name": "libero_kitchen", "language_instruction": TASK}),
+    "bddl_file_name": "open_the_drawer.bddl",
+    "macros_image_convention": "opengl",
+}
+ROBOMIMIC = {"env_args": json.dumps({"env_name": "Lift", "lang": "lift the cube"})}
+
+
+def frames_of(index: int, camera: str) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    size = 24 if camera == "agentview_rgb" else 16
+    return np.random.default_rng([index, size]).integers(0, 256, (LENGTHS[index], size, 16, 3), np.uint8)
+
+
+def expected(index: int) -> Any:
+    """Progress as the scorer gives it: the mean of the cameras' brightness."""
+    return np.mean([brightness(frames_of(index, camera)) for camera in CAMERAS], axis=0)
+
+
+def write(file: Path, attributes: Mapping[str, Any], *observations: Mapping[str, Any]) -> Path:
+    """A file of demonstrations with these observations."""
+    with h5py.File(file, "w") as opened:
+        opened.create_group("data").attrs.update(attributes)
+        for index, of_demo in reversed(list(enumerate(observations))):
+            demo = opened["data"].create_group(f"demo_{index}")
+            demo["actions"] = np.zeros((LENGTHS[index], 7))
+            demo.create_group("obs")
+            for name, value in of_demo.items():
+                if isinstance(value, list):  # of a file a step
+                    stored = demo.create_dataset(f"obs/{name}", (len(value),), dtype=h5py.vlen_dtype(np.uint8))
+                    stored[:] = value
+                else:
+                    demo[f"obs/{name}"] = value
+    return file
+
+
+def pictures(index: int = 0, **more: Any) -> dict[str, Any]:
+    return {**{camera: frames_of(index, camera) for camera in CAMERAS}, **more}
+
+
+@pytest.fixture
+def demos(tmp_path: Path) -> Path:
+    states = [{"gripper_states": np.zeros((length, 2))} for length in LENGTHS]
+    return write(tmp_path / "demos.hdf5", LIBERO, *(pictures(index, **states[index]) for index in range(3)))
+
+
+def test_a_file_gives_its_demonstrations_in_the_order_of_their_numbers(demos: Path) -> None:
+    dataset = open_dataset(demos)
+    assert (dataset.kind, dataset.source, dataset.root) == ("HDF5", "demos.hdf5", demos.parent)
+    assert tuple(dataset.cameras) == CAMERAS
+    told = [(e.index, e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
+    assert told == [(0, "demo_0", TASK, 5, 0), (1, "demo_1", TASK, 7, 5), (2, "demo_2", TASK, 3, 12)]
+    for episode in dataset.episodes:
+        for camera in dataset.cameras:
+            upright = frames_of(episode.index, camera)[:, ::-1]  # as upstream turns LIBERO's
+            np.testing.assert_array_equal(list(dataset.frames(episode, camera)), upright)
+            assert dataset.check(episode, camera) == upright.nbytes
+
+
+def edited(change: Callable[[Any], object]) -> Callable[[Path], None]:
+    def apply(file: Path) -> None:
+        with h5py.File(file, "r+") as opened:
+            change(opened["data"])
+
+    return apply
+
+
+def shorten(data: Any) -> None:
+    del data["demo_1/actions"]
+    data["demo_1/actions"] = np.zeros((5, 7))
+
+
+BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "lengths that differ": (edited(shorten), r"data/demo_1: expected one length, above 0, got .*_rgb 7, .*actions 5"),
+    "a camera that is missing": (
+        edited(lambda data: data["demo_2/obs"].pop(CAMERAS[1])),
+        f"cameras: expected some of {CAMERAS[0]}, got '{CAMERAS[1]}', which is left out: missing in demo_2",
+    ),
+    "no task": (
+        edited(lambda data: data.attrs.pop("problem_info")),
+        r"problem_info or env_args: expected a task as a sentence, got none",
+    ),
+    "no demonstration": (
+        edited(lambda data: [data.pop(name) for name in list(data)]),
+        r"data: expected demo_0, demo_1 and so on, got none",
+    ),
+    "a truncated file": (
+        lambda file: file.write_bytes(file.read_bytes()[:3000]),
+        r"demos\.hdf5: expected an HDF5 file, got ",
+    ),
+}
+
+
+@pytest.mark.parametrize(("break_it", "message"), BROKEN.values(), ids=BROKEN)
+def test_a_file_that_contradicts_itself_is_refused(
+    demos: Path, break_it: Callable[[Path], object], message: str
+) -> None:
+    break_it(demos)
+    scorer = BrightnessScorer()
+    with pytest.raises(DatasetError, match=message):
+        label(open_dataset(demos), scorer, LabelOptions(cameras=CAMERAS))
+    assert scorer.num_samples == 0
+
+
+TURNED_BY_PILLOW: dict[Orientation, Image.Transpose | None] = {
+    "none": None,
+    "rotate180": Image.Transpose.ROTATE_180,
+    "flip-vertical": Image.Transpose.FLIP_TOP_BOTTOM,
+    "flip-horizontal": Image.Transpose.FLIP_LEFT_RIGHT,
+    "rotate90": Image.Transpose.ROTATE_270,  # Pillow turns to the left
+    "rotate270": Image.Transpose.ROTATE_90,
+}
+
+
+@pytest.mark.parametrize(("orientation", "transpose"), TURNED_BY_PILLOW.items(), ids=TURNED_BY_PILLOW)
+def test_a_picture_is_turned_as_pillow_turns_it(orientation: Orientation, transpose: Image.Transpose | None) -> None:
+    assert set(TURNED_BY_PILLOW) == set(ORIENTATIONS)
+    frames = frames_of(0, "agentview_rgb")
+    image = Image.fromarray(frames[0])
+    upright = np.asarray(image if transpose is None else image.transpose(transpose))
+    np.testing.assert_array_equal(turned(frames[0], orientation), upright)
+    np.testing.assert_array_equal(turned(frames, orientation)[0], upright)
+
+
+BOTH = ", ".join(CAMERAS)
+TOLD = f"orient: {BOTH} flip-vertical (LIBERO stores its pictures upside down; --orient none leaves them)"
+TOLD_WRIST = TOLD.replace(BOTH, CAMERAS[1])
+DOUBT = (
+    f"orient: {BOTH} as stored, but LIBERO, which names cameras so, stores them upside down: look at a frame, and turn "
+    "them with --orient flip-vertical if they are upside down"
+)
+UPRIGHT, FLIPPED = ("none", "none"), ("flip-vertical", "flip-vertical")
+ENV_ARGS = {"env_args": json.dumps({"env_name": "Libero_Kitchen_Tabletop_Manipulation"})}
+ONE_AND_OTHERS = ["rotate90", "eye_in_hand_rgb=flip-horizontal"]
+STATED: dict[str, tuple[Mapping[str, Any], list[str], tuple[str, str], list[str]]] = {
+    "LIBERO": (LIBERO, [], FLIPPED, [TOLD]),
+    "LIBERO by its task file": ({"bddl_file_name": "a.bddl"}, [], FLIPPED, [TOLD]),
+    "LIBERO by its environment": (ENV_ARGS, [], FLIPPED, [TOLD]),
+    "LIBERO, left as stored": (LIBERO, ["none"], UPRIGHT, []),
+    "LIBERO, one camera otherwise": (LIBERO, ["agentview_rgb=none"], ("none", "flip-vertical"), [TOLD_WRIST]),
+    "LIBERO rendered upright": ({**LIBERO, "macros_image_convention": "opencv"}, [], UPRIGHT, []),
+    "robomimic with LIBERO's cameras": (ROBOMIMIC, [], UPRIGHT, [DOUBT]),
+    "robomimic, one and all others": (ROBOMIMIC, ONE_AND_OTHERS, ("rotate90", "flip-horizontal"), []),
+}
+
+
+@pytest.mark.parametrize(("attributes", "orient", "orientations", "notes"), STATED.values(), ids=STATED)
+def test_pictures_are_turned_as_the_file_says_or_as_the_caller_says(
+    tmp_path: Path, attributes: Mapping[str, Any], orient: list[str], orientations: Any, notes: list[str]
+) -> None:
+    file = write(tmp_path / "demos.hdf5", attributes, pictures())
+    task = None if "lang" in str(attributes) else "lift the cube"
+    dataset = open_dataset(file, task=task, orient=Orient.parse(orient))
+    by_camera = dict(zip(CAMERAS, orientations, strict=True))
+    assert dataset.corrections == {camera: Correction(one) for camera, one in by_camera.items() if one != "none"}
+    assert list(dataset.notes) == notes
+    (episode,) = dataset.episodes
+    for camera, orientation in by_camera.items():
+        read = np.stack(list(dataset.frames(episode, camera)))
+        np.testing.assert_array_equal(read, turned(pictures()[camera], orientation))
+
+
+def test_videos_are_turned_as_the_caller_says() -> None:
+    root, turn = LEROBOT / "toy_v21", Orient.parse(["wrist=rotate90"])
+    stored, dataset = open_dataset(root), open_dataset(root, orient=turn)
+    assert (stored.corrections, dataset.corrections) == ({}, {WRIST: Correction("rotate90")})
+    episode = dataset.episodes[0]
+    upright = turned(np.stack(list(stored.frames(episode, WRIST))), "rotate90")
+    np.testing.assert_array_equal(np.stack(list(dataset.frames(episode, WRIST))), upright)
+    with pytest.raises(DatasetError, match=f"orient: expected one of the cameras .*{WRIST}.*, got 'top'"):
+        open_dataset(root, orient=Orient.parse(["top=rotate90"]))
+
+
+FRAMES = np.random.default_rng(3).integers(0, 256, (5, 16, 24, 3), np.uint8)
+JPEG = np.frombuffer(b"\xff\xd8\xff\xe0" + bytes(60), np.uint8)
+
+
+def virtual(file: Path, *sources: tuple[str, str, int, slice]) -> None:
+    """Replaces a camera of the first demonstration by a virtual dataset.
+
+    sources: file and name, the frames that are claimed to be there, and those of the camera that they make up
+    """
+    layout = h5py.VirtualLayout(FRAMES.shape, np.uint8)
+    for name, dataset, count, part in sources:
+        source = h5py.VirtualSource(name, dataset, (count, *FRAMES.shape[1:]))
+        layout[part] = source[: part.stop - part.start]
+    with h5py.File(file, "r+") as opened:
+        del opened[OF_VIRTUAL]
+        opened.create_virtual_dataset(OF_VIRTUAL, layout)
+
+
+OF_VIRTUAL = "data/demo_0/obs/agentview_rgb"
+SOURCES: dict[str, tuple[list[tuple[str, str, int, slice]], str | None]] = {
+    "whole": ([("one.h5", "x", 3, slice(0, 3)), ("two.h5", "deep/x", 2, slice(3, 5))], None),
+    "without a file": ([("one.h5", "x", 3, slice(0, 3)), ("gone.h5", "x", 2, slice(3, 5))], "the file gone.h5"),
+    "without a dataset": ([("one.h5", "y", 5, slice(0, 5))], "y in .*one.h5"),
+    "with a shorter dataset": (
+        [("one.h5", "x", 5, slice(0, 4)), ("two.h5", "deep/x", 2, slice(4, 5))],
+        "4 frames of x in .*",
+    ),
+    "with a hole": ([("one.h5", "x", 3, slice(0, 3))], "a source for each frame"),
+    "of one that lacks a file": ([("nested.h5", "x", 5, slice(0, 5))], "the file gone.h5"),
+}
+
+
+@pytest.mark.parametrize(("sources", "lacks"), SOURCES.values(), ids=SOURCES)
+def test_a_virtual_camera_is_refused_if_h5py_would_fill_its_frames_with_zeros(
+    tmp_path: Path, sources: list[tuple[str, str, int, slice]], lacks: str | None
+) -> None:
+    file = write(tmp_path / "demos.hdf5", LIBERO, pictures())
+    for name, dataset, part in (("one.h5", "x", slice(0, 3)), ("two.h5", "deep/x", slice(3, 5))):
+        with h5py.File(tmp_path / name, "w") as opened:
+            opened[dataset] = FRAMES[part]
+    layout = h5py.VirtualLayout(FRAMES.shape, np.uint8)
+    layout[:] = h5py.VirtualSource("gone.h5", "x", FRAMES.shape)
+    with h5py.File(tmp_path / "nested.h5", "w") as opened:
+        opened.create_virtual_dataset("x", layout)
+    virtual(file, *sources)
+    dataset = open_dataset(file)
+    (episode,) = dataset.episodes
+    if lacks is None:
+        np.testing.assert_array_equal(list(dataset.stored_frames(episode, "agentview_rgb")), FRAMES)
+        return
+    expected = rf"{file}: {OF_VIRTUAL}: expected {lacks}, a source of this virtual dataset, got none"
+    for read in (dataset.check, lambda *of: list(dataset.frames(*of))):
+        with pytest.raises(DatasetError, match=expected):
+            read(episode, "agentview_rgb")
+
+
+def test_external_storage_without_its_file_is_an_error(tmp_path: Path) -> None:
+    file = write(tmp_path / "demos.hdf5", LIBERO, pictures())
+    with h5py.File(file, "r+") as opened:
+        del opened[OF_VIRTUAL]
+        stored = opened.create_dataset(OF_VIRTUAL, FRAMES.shape, np.uint8, external=str(tmp_path / "raw"))
+        stored[()] = FRAMES
+    dataset = open_dataset(file)
+    np.testing.assert_array_equal(list(dataset.stored_frames(dataset.episodes[0], "agentview_rgb")), FRAMES)
+    (tmp_path / "raw").unlink()
+    with pytest.raises(DatasetError, match=rf"{OF_VIRTUAL}: expected readable frames, got .*external raw data file"):
+        label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path))
+
+
+NO_COLOURS = "a depth map, a mask or another form: no colours as uint8 [T, H, W, 3]"
+UNLIKE: dict[str, tuple[Any, str]] = {
+    "floats": (FRAMES / np.float32(255), "float32 [5, 16, 24, 3], not uint8: store colours as 0..255"),
+    "channels first": (
+        FRAMES.transpose(0, 3, 1, 2),
+        "uint8 [5, 3, 16, 24], channels first: store it as uint8 [T, H, W, 3]",
+    ),
+    "RGBA": (
+        np.concatenate([FRAMES, FRAMES[..., :1]], -1),
+        "uint8 [5, 16, 24, 4], RGBA: store its first three channels, if they are uint8 RGB",
+    ),
+    "JPEG files": ([JPEG] * 5, "object [5], JPEG or PNG files: store decoded pictures as uint8 [T, H, W, 3]"),
+    "depth": (FRAMES[..., 0].astype(np.uint16), f"uint16 [5, 16, 24], {NO_COLOURS}"),
+}
+
+
+@pytest.mark.parametrize(("value", "reason"), UNLIKE.values(), ids=UNLIKE)
+def test_a_picture_that_is_no_8_bit_colours_is_left_out_with_the_reason(
+    tmp_path: Path, value: Any, reason: str
+) -> None:
+    numbers = {"ee_pos": np.zeros((5, 3)), "poses": np.zeros((5, 4, 4)), "gripper": np.ones((5, 1), np.uint8)}
+    file = tmp_path / "demos.hdf5"
+    dataset = open_dataset(write(file, LIBERO, pictures(other=value, **numbers)))
+    assert (tuple(dataset.cameras), dataset.left_out) == (CAMERAS, {"other": reason})
+    with pytest.raises(DatasetError) as refused:
+        chosen_cameras(dataset, ["other"])
+    assert str(refused.value) == f"cameras: expected some of {BOTH}, got 'other', which is left out: {reason}"
+    with pytest.raises(DatasetError) as refused:
+        open_dataset(write(file, LIBERO, {"other": value, **numbers}))
+    form = "a camera as uint8 [T, H, W, 3] in every demonstration"
+    assert str(refused.value) == f"{file}: data/demo_0/obs: expected {form}, got other: {reason}"
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "reason"),
+    [
+        ({}, {"other": FRAMES}, "missing in demo_0"),
+        ({"other": FRAMES}, {"other": FRAMES / 255}, "float64 [5, 16, 24, 3], not uint8: store colours as 0..255"),
+    ],
+    ids=["missing in the first", "of another form in the last"],
+)
+def test_a_camera_of_some_demonstrations_is_left_out_with_the_reason(
+    tmp_path: Path, first: Any, last: Any, reason: str
+) -> None:
+    dataset = open_dataset(write(tmp_path / "demos.hdf5", LIBERO, pictures(0, **first), pictures(1, **last)))
+    assert (tuple(dataset.cameras), dataset.left_out, len(dataset.episodes)) == (CAMERAS, {"other": reason}, 2)
+
+
+def test_a_file_without_pictures_says_what_it_holds_and_what_renders_them(tmp_path: Path) -> None:
+    file = write(tmp_path / "demos.hdf5", ROBOMIMIC, {"ee_pos": np.zeros((5, 3))})
+    with pytest.raises(DatasetError, match=r"got ee_pos float64 \[5, 3\]: robomimic's dataset_states_to_obs\.py rend"):
+        open_dataset(file)
+
+
+def test_labels_go_to_a_file_beside_it(demos: Path) -> None:
+    before = demos.read_bytes()
+    report = label(open_dataset(demos), BrightnessScorer(), LabelOptions())
+    assert report.files == [demos.with_name("demos.rfm_rewards.hdf5")]
+    assert demos.read_bytes() == before
+    with h5py.File(report.files[0]) as opened:
+        assert sorted(opened["data"]) == ["demo_0", "demo_1", "demo_2"]
+        assert json.loads(opened["data"].attrs["rfm_provenance"])["dataset"]["kind"] == "HDF5"
+        for index, length in enumerate(LENGTHS):
+            demo = opened[f"data/demo_{index}"]
+            assert demo["rfm_progress"].dtype == np.float32
+            np.testing.assert_allclose(demo["rfm_progress"], expected(index), atol=1e-6)
+            of_camera = brightness(frames_of(index, CAMERAS[0]))
+            np.testing.assert_allclose(demo[f"rfm_progress.{CAMERAS[0]}"], of_camera, atol=1e-6)
+            assert demo["rfm_success"].shape == (length,)
+    parquet_report = label(open_dataset(demos), BrightnessScorer(), LabelOptions(formats=("progress",)))
+    assert parquet.read_table(parquet_report.files[0])["index"].to_pylist() == list(range(15))
+
+
+class WithoutSuccess(BrightnessScorer):
+    """Another checkpoint, which predicts no success."""
+
+    def __init__(self) -> None:
+        super().__init__(digest="without success")
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        results = super().evaluate(samples)
+        return [
+            ProgressResult(progress=1 - result.progress, success=np.full_like(result.progress, np.nan))
+            for result in results
+        ]
+
+
+def rewards_in(file: Path) -> dict[str, list[str]]:
+    """Names of what is in each demonstration besides what was recorded."""
+    with h5py.File(file) as opened:
+        return {name: sorted({*demo} - {"actions", "obs"}) for name, demo in opened["data"].items()}
+
+
+COLUMNS = [f"{score}{camera}" for score in ("progress", "success") for camera in ("", *(f".{c}" for c in CAMERAS))]
+ONE_OF_ANOTHER = LabelOptions(in_place=True, overwrite=True, cameras=CAMERAS[:1], episodes=[1])
+
+
+def test_labels_in_place_are_of_one_provenance_and_leave_all_else_as_it_is(demos: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    demos.chmod(0o640)
+    real = demos.rename(tmp_path / "elsewhere" / "real.hdf5")
+    demos.symlink_to(real)
+    scorer = BrightnessScorer()
+    for name in ("rfm", "rfm", "rfm_b"):
+        report = label(open_dataset(demos), scorer, LabelOptions(in_place=True, name=name))
+        assert report.files == [demos]
+    assert demos.is_symlink()
+    assert real.stat().st_mode & 0o777 == 0o640
+    assert scorer.num_samples == 2 * 2 * sum(LENGTHS)  # the same labels again cost nothing
+    assert report.summary is not None
+    np.testing.assert_allclose(report.summary.final_progress, [expected(index)[-1] for index in range(3)], atol=1e-6)
+    with h5py.File(demos, "r+") as opened:
+        opened["data/demo_0/rfm_notes"] = "a user's own"
+        others = opened["data"].attrs["rfm_b_provenance"]
+    label(open_dataset(demos), WithoutSuccess(), ONE_OF_ANOTHER)
+    of_others = sorted(f"rfm_b_{column}" for column in COLUMNS)
+    assert rewards_in(demos) == {
+        "demo_0": [*of_others, "rfm_notes"],
+        "demo_1": [*of_others, "rfm_progress"],
+        "demo_2": of_others,
+    }
+    with h5py.File(demos) as opened:
+        attributes = opened["data"].attrs
+        added = {f"{name}_{what}" for name in ("rfm", "rfm_b") for what in ("cost", "episodes", "provenance")}
+        assert set(attributes) == {*LIBERO, *added}
+        assert attributes["rfm_b_provenance"] == others
+        assert json.loads(attributes["rfm_provenance"])["checkpoint"]["weights_digest"] == "without success"
+        dark = 1 - brightness(frames_of(1, CAMERAS[0]))
+        np.testing.assert_allclose(opened["data/demo_1/rfm_progress"], dark, atol=1e-6)
+        assert opened["data/demo_1/actions"].shape == (7, 7)
+
+
+def test_in_place_the_file_is_whole_whoever_is_killed_and_whatever_is_full(
+    demos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    label(open_dataset(demos), WithoutSuccess(), LabelOptions(in_place=True))
+    before, options = demos.read_bytes(), LabelOptions(in_place=True, overwrite=True)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 500, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"no file has changed: .*make room, or leave --in-place away"):
+            label(open_dataset(demos), BrightnessScorer(), options)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert demos.read_bytes() == before
+    assert [file.name for file in demos.parent.iterdir() if "demos" in file.name] == ["demos.hdf5"]
+
+    replace, left = Path.replace, []  # what a kill at the last moment before the new file would leave
+
+    def seen(self: Path, target: Path) -> Path:
+        left.extend([demos.read_bytes()] if target == demos else [])
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", seen)
+    label(open_dataset(demos), BrightnessScorer(), options)
+    assert left == [before]
+    assert set(map(len, rewards_in(demos).values())) == {len(COLUMNS)}
+
+
+def test_in_place_needs_room_for_a_copy_before_a_frame_is_scored(demos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = demos.stat().st_size + 100
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(2 * free, free, free))  # type: ignore[attr-defined]
+    scorer = BrightnessScorer()
+    with pytest.raises(DatasetError, match=rf"demos\.hdf5: expected \d+ bytes of free disk.*, got {free}: make room"):
+        label(open_dataset(demos), scorer, LabelOptions(in_place=True))
+    assert scorer.num_samples == 0
+
+
+def test_what_a_user_wrote_under_the_name_of_a_reward_is_not_replaced(demos: Path) -> None:
+    with h5py.File(demos, "r+") as opened:
+        opened["data/demo_2/rfm_success.front"] = np.zeros(3)
+    with pytest.raises(DatasetError, match=r"expected no labels, or .* got labels of another program: choose another"):
+        label(open_dataset(demos), BrightnessScorer(), LabelOptions(in_place=True))
+
+
+def test_labels_say_which_cameras_are_turned_and_which_are_left_out(demos: Path) -> None:
+    with h5py.File(demos, "r+") as opened:
+        for index, length in enumerate(LENGTHS):
+            opened[f"data/demo_{index}/obs/tactile"] = np.zeros((length, 16, 16, 3), np.float32)
+    dataset, notes = open_dataset(demos, orient=Orient.parse([f"{CAMERAS[1]}=rotate180"])), Notes()
+    (reason,) = dataset.left_out.values()
+    label(dataset, BrightnessScorer(), LabelOptions(), notes)
+    assert f"left out: tactile: {reason}" in notes.lines
+    told = [line for line in notes.lines if line.startswith("orient: ")]
+    assert told == [*dataset.notes, f"orient: {CAMERAS[1]} rotate180 (asked for)"]
+    with h5py.File(demos.with_name("demos.rfm_rewards.hdf5")) as opened:
+        provenance = json.loads(opened["data"].attrs["rfm_provenance"])
+    assert provenance["orientations"] == dict(zip(CAMERAS, ("flip-vertical", "rotate180"), strict=True))
+    assert provenance["decoders"] == dict.fromkeys(CAMERAS)
+    with pytest.raises(DatasetError, match=rf"got orientations\.{CAMERAS[1]}: rotate180 there, flip-vertical now: ch"):
+        label(open_dataset(demos), BrightnessScorer(), LabelOptions())
+    notes = Notes()
+    label(dataset, BrightnessScorer(), LabelOptions(cameras=CAMERAS[:1], name="front"), notes)
+    assert not [line for line in notes.lines if "tactile" in line or CAMERAS[1] in line]
+
+
+def test_a_demonstration_s_own_task_goes_before_that_of_the_file(demos: Path) -> None:
+    with h5py.File(demos, "r+") as opened:
+        opened["data/demo_1"].attrs["ep_meta"] = json.dumps({"lang": "close the drawer", "layout_id": 3})
+        opened["data/demo_2"].attrs["language_instruction"] = np.bytes_("turn on the stove")
+        opened["data/demo_0"].attrs["ep_meta"] = json.dumps({"layout_id": 3})
+    tasks = [TASK, "close the drawer", "turn on the stove"]
+    assert [episode.task for episode in open_dataset(demos).episodes] == tasks
+    with h5py.File(demos, "r+") as opened:
+        del opened["data"].attrs["problem_info"]
+    assert [open_dataset(demos).episode(number).task for number in (1, 2)] == tasks[1:]
+    with pytest.raises(DatasetError, match=r"demo_0: ep_meta, or data: problem_info or env_args: expected a task as a"):
+        open_dataset(demos).episode(0)
+    assert [episode.task for episode in open_dataset(demos, task="stack").episodes] == ["stack", *tasks[1:]]
+
+
+MASKS = {"train": ["demo_2", "demo_0"], "valid": ["demo_1"], "gone": ["demo_7"]}
+
+
+@pytest.fixture
+def masked(demos: Path) -> Path:
+    with h5py.File(demos, "r+") as opened:
+        for key, names in MASKS.items():
+            opened[f"mask/{key}"] = np.array(names, dtype="S8")  # as robomimic's split_train_val.py
+    return demos
+
+
+def test_a_filter_key_chooses_demonstrations_and_labels_of_others_stay(masked: Path) -> None:
+    assert open_dataset(masked).filter_keys == {"gone": [7], "train": [0, 2], "valid": [1]}
+    report = label(open_dataset(masked), BrightnessScorer(), LabelOptions(filter_key="train"))
+    assert [item.episode.name for item in report.plan.items] == ["demo_0", "demo_2"]
+    assert set(rewards_in(report.files[0])) == {"demo_0", "demo_2"}
+    scorer = BrightnessScorer()
+    report = label(open_dataset(masked), scorer, LabelOptions(filter_key="valid"))
+    assert scorer.num_samples == LENGTHS[1] * len(CAMERAS)
+    assert set(rewards_in(report.files[0])) == {"demo_0", "demo_1", "demo_2"}
+
+
+FILTERS: dict[str, tuple[LabelOptions, str]] = {
+    "another key": (LabelOptions(filter_key="test"), "filter_key: expected one of gone, train, valid, got 'test'"),
+    "no episode of both": (
+        LabelOptions(filter_key="valid", episodes=[0, 2]),
+        "filter_key: expected some of the 3 episodes of the dataset, got none in valid",
+    ),
+    "an episode that is not there": (LabelOptions(filter_key="gone"), "filter_key: expected some .* got 7 in gone"),
+}
+
+
+@pytest.mark.parametrize(("options", "message"), FILTERS.values(), ids=FILTERS)
+def test_a_filter_key_without_episodes_is_refused(masked: Path, options: LabelOptions, message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        label(open_dataset(masked), BrightnessScorer(), options)
+
+
+def test_a_filter_key_needs_a_file_that_has_it(demos: Path) -> None:
+    with h5py.File(demos, "r+") as opened:
+        opened["mask/train"] = np.array([3])  # no names of demonstrations
+    with pytest.raises(DatasetError, match="filter_key: expected none, since the dataset has no filter keys, got"):
+        label(open_dataset(demos), BrightnessScorer(), LabelOptions(filter_key="train"))

@@ -1,0 +1,493 @@
+# SPDX-License-Identifier: MIT
+"""LeRobot datasets that LeRobot's own writer made: frame t is the dataset's frame t, and contradictions are refused."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import PIL
+import pyarrow as pa
+import pytest
+from PIL import Image
+from pyarrow import parquet
+
+import goldens
+import local_hub
+from encoding import encode, encode_here
+from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer
+from pictures import write_video
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+from rfm_labels.datasets import lerobot
+from rfm_labels.datasets.protocol import chosen_cameras, digest_of
+from rfm_labels.datasets.video_frames import video_packets
+
+HUB_ID = "org/name"
+ELSEWHERE = goldens.ROOT.parent / "lerobot"  # beside the further reference cases, where there are some
+DATASETS = [
+    pytest.param(LEROBOT / "toy_v21", id="v2.1"),
+    pytest.param(LEROBOT / "toy_v30_many", id="v3.0 in several files"),
+    *(
+        pytest.param(folder, id=f"elsewhere {folder.name}", marks=pytest.mark.reference)
+        for folder in (sorted(ELSEWHERE.glob("toy_*")) if ELSEWHERE != LEROBOT else [])
+    ),
+]
+
+
+def whole_video(file: Path) -> list[np.ndarray[Any, Any]]:
+    with av.open(str(file)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def videos(root: Path, camera: str) -> list[Path]:
+    found = [file for file in root.rglob("*.mp4") if camera in file.parts]
+    return sorted(found, key=lambda file: (file.parent.name if "chunk" in file.parent.name else "", file.name))
+
+
+@pytest.mark.parametrize("root", DATASETS)
+def test_every_frame_is_that_of_the_video_in_order_and_every_episode_that_of_the_rows(root: Path) -> None:
+    """LeRobot writes episodes one behind the other: all videos of a camera, decoded whole, are all frames."""
+    dataset = open_dataset(root)
+    assert list(dataset.cameras) == [FRONT, WRIST]
+    info = json.loads((root / "meta" / "info.json").read_text())
+    for camera, size in ((FRONT, 256), (WRIST, 128)):
+        expected = (frame for file in videos(root, camera) for frame in whole_video(file))
+        read = (frame for episode in dataset.episodes for frame in dataset.frames(episode, camera))
+        pairs = zip(read, expected, strict=True)
+        same = [one.shape == (size, size, 3) and np.array_equal(one, other) for one, other in pairs]
+        assert same == [True] * info["total_frames"]
+    tables = [parquet.read_table(file, partitioning=None) for file in sorted((root / "data").rglob("*.parquet"))]
+    rows = pa.concat_tables([table.select(["index", "episode_index", "task_index"]) for table in tables]).to_pylist()
+    sentences = {episode.task for episode in dataset.episodes}
+    assert all(sentence.startswith("put the ") for sentence in sentences)
+    assert len(sentences) == len({row["task_index"] for row in rows})
+    for episode in dataset.episodes:
+        own = [row for row in rows if row["episode_index"] == episode.index]
+        assert (episode.num_frames, episode.first_index) == (len(own), own[0]["index"])
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+def test_a_video_may_begin_later_than_its_rows(tmp_path: Path, suffix: str) -> None:
+    """Also where time stamps are rounded to a millisecond, as in Matroska."""
+    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "later")
+    video = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
+    frames = np.stack(whole_video(video))
+    change_info(root, lambda info: info.update(video_path=info["video_path"].replace(".mp4", suffix)))
+    write_video(video.with_suffix(suffix), frames, [7 + t for t in range(len(frames))])
+    with av.open(str(video.with_suffix(suffix))) as container:
+        assert [frame.time for frame in container.decode(video=0)][:2] == [0.7, 0.8]
+    dataset = open_dataset(root)
+    read = list(dataset.frames(dataset.episodes[0], FRONT))
+    np.testing.assert_array_equal(np.stack(read), np.stack(whole_video(video.with_suffix(suffix))))
+
+
+def test_av1_and_images_in_tables_are_read(tmp_path: Path) -> None:
+    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "mixed")
+    video = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
+    frames = whole_video(video)
+    encode(video, frames, "libsvtav1", {"crf": "20", "g": "2", "svtav1-params": "lp=1"})
+    stored = store_as_images(root, WRIST, saved())
+    dataset = open_dataset(root)
+    assert list(dataset.cameras) == [FRONT, WRIST]
+    first = dataset.episodes[0]
+    for frame, expected in zip(dataset.frames(first, FRONT), frames, strict=True):
+        assert np.abs(frame.astype(int) - expected).mean() < 8
+    for frame, expected in zip(dataset.frames(first, WRIST), stored, strict=True):
+        np.testing.assert_array_equal(frame, expected)
+    assert dataset.check(first, WRIST) > 0
+    assert dataset.decoder(WRIST) == f"Pillow {PIL.__version__}"
+    assert (dataset.decoder(FRONT) or "").startswith(f"PyAV {av.__version__}, libswscale ")
+
+
+DEPTH_MARKS: dict[str, dict[str, Any]] = {
+    "info": {"info": {"video.is_depth_map": True}},
+    "video_info": {"video_info": {"video.is_depth_map": True}},
+    "without a prefix": {"info": {"is_depth_map": True}},
+}
+
+
+@pytest.mark.parametrize("mark", DEPTH_MARKS.values(), ids=DEPTH_MARKS)
+def test_a_depth_camera_counts_only_where_it_is_named(tmp_path: Path, mark: dict[str, Any]) -> None:
+    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "toy")
+    change_info(root, lambda info: info["features"][WRIST].update(mark))
+    dataset = open_dataset(root)
+    assert chosen_cameras(dataset, ()) == (FRONT,)
+    assert (list(dataset.cameras), list(dataset.depth_cameras)) == ([FRONT, WRIST], [WRIST])
+    assert chosen_cameras(dataset, ["front", "wrist"]) == (FRONT, WRIST)
+    report = label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path, limit=1, frames=2, formats=("progress",)))
+    assert "progress.wrist" not in parquet.read_schema(report.files[0]).names
+    change_info(root, lambda info: info["features"][FRONT].update(mark))
+    with pytest.raises(DatasetError, match=r"^cameras: expected .* named: all are depth cameras, got none$"):
+        chosen_cameras(open_dataset(root), ())
+
+
+def saved(convert: Callable[[Any], Any] = lambda image: image, form: str = "PNG") -> Callable[[Any], bytes]:
+    """Makes a file of a picture. convert: what Pillow makes of it first"""
+
+    def save(image: Any) -> bytes:
+        written = io.BytesIO()
+        convert(image).save(written, form)
+        return written.getvalue()
+
+    return save
+
+
+def png_of_16_bits(image: Any) -> bytes:
+    """Pillow writes none of 16 bits a channel, and would read the upper 8 alone."""
+    encoder: Any = av.CodecContext.create("png", "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = *image.size, "rgb48be", Fraction(1, 10)
+    frame = av.VideoFrame.from_ndarray(np.asarray(image), format="rgb24").reformat(format="rgb48be")
+    return b"".join(map(bytes, [*encoder.encode(frame), *encoder.encode()]))
+
+
+PICTURES: dict[str, tuple[Callable[[Any], bytes], str | None]] = {
+    "grey": (saved(lambda image: image.convert("L")), None),
+    "black and white": (saved(lambda image: image.convert("1")), None),
+    "a palette": (saved(lambda image: image.quantize(16)), None),
+    "transparency": (saved(lambda image: image.convert("RGBA")), None),
+    "JPEG": (saved(form="JPEG"), None),
+    "16 bits": (
+        saved(lambda image: Image.fromarray(np.asarray(image.convert("L")).astype("u2"))),
+        "PNG of 16-bit I;16",
+    ),
+    "16 bits a channel": (png_of_16_bits, "PNG of 16-bit RGB"),
+    "32 bits": (saved(lambda image: image.convert("I"), "TIFF"), "TIFF of I"),
+    "floats": (saved(lambda image: image.convert("F"), "TIFF"), "TIFF of F"),
+    "inks": (saved(lambda image: image.convert("CMYK"), "JPEG"), "JPEG of CMYK"),
+}
+
+
+@pytest.mark.parametrize(("save", "refused"), PICTURES.values(), ids=PICTURES)
+def test_pictures_in_tables_are_of_8_bit_colours(
+    tmp_path: Path, save: Callable[[Any], bytes], refused: str | None
+) -> None:
+    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "pictures")
+    store_as_images(root, WRIST, save)
+    dataset = open_dataset(root)
+    first = dataset.episodes[0]
+    if refused is None:
+        dataset.check(first, WRIST)
+        pictures = np.stack(list(dataset.frames(first, WRIST)))
+        assert pictures.shape == (first.num_frames, 128, 128, 3)
+        assert pictures.std() > 10
+        return
+    message = (
+        "episode 0: observation.images.wrist: frame 0: expected a picture of 8-bit colours "
+        f"(convert it, or leave a depth camera out: --cameras), got {refused}"
+    )
+    for read in (dataset.check, lambda *asked: next(dataset.frames(*asked))):
+        with pytest.raises(DatasetError, match=re.escape(message) + "$"):
+            read(first, WRIST)
+
+
+def test_exif_data_turn_images_in_tables_and_change_the_identity_of_the_episode(tmp_path: Path) -> None:
+    """As LeRobot reads them, through ``datasets``."""
+    root, exif = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "dataset"), Image.Exif()
+    exif[0x0112] = 6
+
+    def save(image: Any) -> bytes:
+        written = io.BytesIO()
+        image.save(written, "PNG", exif=exif)
+        return written.getvalue()
+
+    stored = store_as_images(root, WRIST, save)
+    dataset = open_dataset(root)
+    episode = dataset.episode(0)
+    np.testing.assert_array_equal(list(dataset.frames(episode, WRIST)), np.rot90(stored, -1, axes=(1, 2)))
+    pictures = [save(Image.fromarray(frame)) for frame in stored]
+    assert dataset.identity(episode, WRIST, verify=False) != digest_of(pictures)
+
+
+def store_as_images(root: Path, camera: str, save: Callable[[Any], bytes]) -> list[np.ndarray[Any, Any]]:
+    """Episode 0's video of a camera goes into its table, as images in the rows and as files; gives its frames."""
+    frames = whole_video(root / "videos" / "chunk-000" / camera / "episode_000000.mp4")
+    images = []
+    (root / "images").mkdir()
+    for t, frame in enumerate(frames):
+        stored = save(Image.fromarray(frame))
+        if t % 2:
+            (root / "images" / f"{t}.png").write_bytes(stored)
+        images.append({"bytes": None if t % 2 else stored, "path": f"images/{t}.png"})
+    file = root / "data" / "chunk-000" / "episode_000000.parquet"
+    table = parquet.read_table(file, partitioning=None).append_column(camera, pa.array(images))
+    parquet.write_table(table, file)
+    change_info(root, lambda info: info["features"][camera].update(dtype="image"))
+    return frames
+
+
+def change_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    file = root / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    change(info)
+    file.write_text(json.dumps(info))
+
+
+def change_table(file: Path, column: str, change: Callable[[list[Any]], list[Any]]) -> None:
+    table = parquet.read_table(file, partitioning=None)
+    values = change(table[column].to_pylist())
+    field = table.schema.field(column)
+    number = table.schema.get_field_index(column)
+    parquet.write_table(table.set_column(number, field, pa.array(values, field.type)), file)
+
+
+def truncate(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
+
+
+V30_EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+V30_ROWS = "data/chunk-000/file-000.parquet"
+V30_VIDEO = f"videos/{FRONT}/chunk-000/file-001.mp4"
+V21_ROWS = "data/chunk-000/episode_000003.parquet"
+V21_VIDEO = f"videos/chunk-000/{WRIST}/episode_000005.mp4"
+
+Break = Callable[[Path], object]
+
+
+def cells(file: str, column: str, change: Callable[[list[Any]], list[Any]]) -> Break:
+    """Other values in a column of a table."""
+    return lambda root: change_table(root / file, column, change)
+
+
+def spans(change: Callable[[list[Any]], list[Any]]) -> Break:
+    """Other times at which episodes lie in the videos of the front camera."""
+
+    def apply(root: Path) -> None:
+        for name in ("from_timestamp", "to_timestamp"):
+            change_table(root / V30_EPISODES, f"videos/{FRONT}/{name}", change)
+
+    return apply
+
+
+def at(place: int, change: Callable[[Any], Any]) -> Callable[[list[Any]], list[Any]]:
+    return lambda values: [change(value) if k == place else value for k, value in enumerate(values)]
+
+
+def told(**more: Any) -> Break:
+    """Other statements in ``meta/info.json``."""
+    return lambda root: change_info(root, lambda info: info.update(more))
+
+
+def video(change: Callable[[list[Any]], list[Any]], file: str = V21_VIDEO, fps: Fraction = Fraction(10)) -> Break:
+    """A video of other frames, or of another rate."""
+    coded: dict[str, Any] = {"options": {"crf": "1"}, "pixels": "yuv444p", "rate": fps}
+    return lambda root: encode_here(root / file, change(whole_video(root / file)), **coded)
+
+
+END = r"to_timestamp: expected 3\.9000 s for 39 frames, got 3\.7000 s"
+CONTRADICTIONS: dict[str, dict[str, tuple[Break, str]]] = {
+    "toy_v30_many": {
+        "a truncated video": (
+            lambda root: truncate(root / V30_VIDEO),
+            r"file-001\.mp4: expected a whole video file, got ",
+        ),
+        "a missing video": (
+            lambda root: (root / V30_VIDEO).unlink(),
+            r"file-001\.mp4: expected a video file, got none",
+        ),
+        "a length that the rows do not have": (
+            cells(V30_EPISODES, "length", at(2, lambda length: length + 1)),
+            r"episode 2: .*file-000\.parquet: length: expected 59, from 97 to 156, got 60",
+        ),
+        "a video that is too short for its episode": (
+            cells(V30_EPISODES, f"videos/{FRONT}/to_timestamp", at(1, lambda time_s: time_s - 0.2)),
+            rf"episode 1: .*{END}",
+        ),
+        "an episode that begins behind its video's end": (
+            spans(at(9, lambda time_s: time_s + 100)),
+            r"episode 9, row 0: .*front: .*mp4: expected its frame at 105\.5000 s, got one at 9\.5000 s; write the data",
+        ),
+        "starts of episodes that drift": (
+            spans(lambda times_s: [time_s - 0.01 * k for k, time_s in enumerate(times_s)]),
+            r"episode 1, row 0: .*front: .*file-000\.mp4: expected its frame at 5\.7900 s, got one at 5\.8000 s; write ",
+        ),
+        "a row that is missing": (
+            cells(V30_ROWS, "episode_index", at(60, lambda _: 0)),
+            r"episode 0: .*file-000\.parquet: expected 58 rows, as its metadata say, got 59",
+        ),
+        "rows out of order": (
+            cells(V30_ROWS, "frame_index", at(5, lambda _: 6)),
+            r"episode 0: .*frame_index: expected 5 in row 5, got 6",
+        ),
+        "rows of other numbers": (
+            cells(V30_ROWS, "index", at(7, lambda _: 9)),
+            r"episode 0: .*parquet: index: expected 7 in row 7, got 9",
+        ),
+        "no task": (
+            cells(V30_ROWS, "task_index", lambda values: [9] * 58 + values[58:]),
+            r"episode 0: task 9 in meta/tasks: expected a task as a sentence, got none",
+        ),
+        "a row without a task": (
+            cells(V30_ROWS, "task_index", at(3, lambda _: None)),
+            r"episode 0: task_index: expected a task as a sentence, got none",
+        ),
+        "a row without a number": (
+            cells(V30_ROWS, "index", at(0, lambda _: None)),
+            r"episode 0: .*file-000\.parquet: index: expected 0 in row 0, got -1",
+        ),
+        "a second task that the metadata lack": (
+            cells(V30_ROWS, "task_index", at(3, lambda _: 4)),
+            r"episode 0: meta/episodes: tasks: expected 'put the .*', got \['put the .*'\]",
+        ),
+        "no metadata of episodes": (
+            lambda root: shutil.rmtree(root / "meta" / "episodes"),
+            r"meta/episodes: expected Parquet files, got none",
+        ),
+        "fewer episodes than it says": (
+            told(total_episodes=11),
+            r"meta: expected 11 episodes, as info\.json says, got 10",
+        ),
+        "fewer frames than it says": (
+            told(total_frames=430),
+            r"meta: expected 430 frames, as info\.json says, got 428",
+        ),
+        "a video that lacks its last frames": (
+            video(lambda frames: frames[:-2], V30_VIDEO),
+            r"episode \d, row \d+: .*front: .*file-001\.mp4: expected its frame at \d+\.\d+ s, got one at .*; write the",
+        ),
+        "episodes that share frames": (
+            spans(at(1, lambda time_s: time_s - 0.5)),
+            r"episode 0, row 53: .*front: .*: expected a frame of its own at 5\.3000 s, got that of episode 1, row 0; w",
+        ),
+    },
+    "toy_v21": {
+        "a missing table": (
+            lambda root: (root / V21_ROWS).unlink(),
+            r"episode_000003\.parquet: expected a Parquet file, got none",
+        ),
+        "a truncated table": (
+            lambda root: truncate(root / V21_ROWS),
+            r"episode_000003\.parquet: expected a readable Parquet file, got ",
+        ),
+        "a video of another episode": (
+            lambda root: shutil.copy(root / V21_VIDEO.replace("005", "007"), root / V21_VIDEO),
+            r"episode 5, row 20: .*wrist: .*: expected its frame at 2\.0000 s, got one at 1\.9000 s; write the dataset again, "
+            r"or leave this episode out \(--episodes\)$",
+        ),
+        "a video of half the rate": (
+            video(lambda frames: frames[::2], fps=Fraction(5)),
+            r"row 1: .* expected its frame at 0\.1000 s, got one at 0\.2000 s \(the video has 5\.00 frames a second, meta/info"
+            r"\.json says 10\); write",
+        ),
+        "a video whose rate is nearly that of the rows": (
+            video(lambda frames: frames, fps=Fraction(10_000, 1001)),
+            r"episode 5, row 2: .*mp4: expected its frame at 0\.2000 s, got one at 0\.2002 s \(the video has 9\.99 frames "
+            r"a second, meta/info\.json says 10\); ffmpeg -r 10 -i IN OUT gives it that rate$",
+        ),
+        "a row whose time is another's": (
+            cells(V21_ROWS, "timestamp", at(4, lambda time_s: time_s + 0.06)),
+            r"episode 3, row 4: .*front: .*mp4: expected its frame at 0\.4600 s, got one at 0\.5000 s; write ",
+        ),
+        "times that fall": (
+            cells(V21_ROWS, "timestamp", at(4, lambda _: 0.0)),
+            r"episode 3: .*timestamp: expected times that rise, after 0\.3000 s, got 0\.0000 s in row 4: write ",
+        ),
+        "an empty task": (
+            lambda root: (root / "meta" / "tasks.jsonl").write_text('{"task_index": 0, "task": " "}\n'),
+            r"episode 0: task 0 in meta/tasks: expected a task as a sentence, got ' '",
+        ),
+        "a line that is no JSON": (
+            lambda root: (root / "meta" / "episodes.jsonl").write_text('{"episode_index": 0\n'),
+            r"episodes\.jsonl: line 1: expected a JSON object, got ",
+        ),
+        "a version of the future": (
+            told(codebase_version="v4.0"),
+            r"codebase_version: expected one of v2\.0, v2\.1, v3\.0, got 'v4\.0'",
+        ),
+        "a path out of the dataset": (
+            told(data_path="../{episode_index}.parquet"),
+            r"meta/info\.json: expected a path inside the dataset, got '\.\./0\.parquet'",
+        ),
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "break_it", "message"),
+    [
+        pytest.param(name, *case, id=f"{name}: {what}")
+        for name, cases in CONTRADICTIONS.items()
+        for what, case in cases.items()
+    ],
+)
+def test_a_dataset_that_contradicts_itself_is_refused_before_a_frame_is_decoded(
+    tmp_path: Path, name: str, break_it: Callable[[Path], object], message: str
+) -> None:
+    root = shutil.copytree(LEROBOT / name, tmp_path / name)
+    with pytest.raises(DatasetError, match=message):
+        break_it(root)
+        dataset = open_dataset(root)
+        for episode in dataset.episodes:
+            for camera in dataset.cameras:
+                dataset.check(episode, camera)
+
+
+OPENED = f"""
+import sys
+from rfm_labels import DatasetError, open_dataset
+for source in sys.argv[1:]:
+    try:
+        dataset = open_dataset(source)
+        frames = dataset.frames(dataset.episodes[7], {WRIST!r})
+        print(dataset.source, dataset.revision, len(dataset.episodes), len(list(frames)))
+    except DatasetError as error:
+        print(error)
+"""
+
+
+def test_a_hub_that_cannot_be_reached_is_told_in_words(tmp_path: Path) -> None:
+    """Once it has not answered, the cache is asked, which holds no dataset."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        endpoint = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(tmp_path), "HF_HUB_OFFLINE": "0"}
+        environment["HF_HUB_ETAG_TIMEOUT"] = "1"
+        words = [sys.executable, "-c", OPENED, HUB_ID]
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=100, check=True)
+    got = f"none: {endpoint} did not answer within 1 s, and the cache has no such revision of it"
+    assert done.stdout.strip() == f"{HUB_ID}: expected a local dataset or one of the Hub, got {got}"
+
+
+def test_a_dataset_of_the_hub_is_fetched_at_its_revision(tmp_path: Path) -> None:
+    """By a process of its own: the Hub's library reads its settings when it is imported."""
+    old = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "old")
+    (old / "meta").rename(old / "meta_data")
+    revisions = {"main": LEROBOT / "toy_v30_many", "v1": LEROBOT / "toy_v21", "old": old}
+    with local_hub.hub({HUB_ID: revisions}, "datasets") as endpoint:
+        environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(tmp_path), "HF_HUB_OFFLINE": "0"}
+        words = [sys.executable, "-c", OPENED, *(HUB_ID + revision for revision in ("", "@v1", "@v2", "@old"))]
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=100, check=True)
+    newest, first, missing, of_v1 = done.stdout.splitlines()
+    for name, line in {"main": newest, "v1": first}.items():
+        episodes = open_dataset(revisions[name]).episodes
+        assert line == f"{HUB_ID} {local_hub.commit_of(name)} {len(episodes)} {episodes[7].num_frames}"
+    expected = f"org/name: expected a local dataset or one of the Hub, got none: {endpoint} has no such revision of it"
+    assert missing == expected
+    assert "expected a LeRobot dataset's meta/info.json, got a LeRobot dataset of v1: convert it to v2.0 with " in of_v1
+
+
+def test_a_check_reads_the_packets_of_each_video_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also with more cameras than videos that otherwise stay in memory."""
+    read: list[Path] = []
+
+    def counted(file: Path, container: str | None = None) -> Any:
+        read.append(file)
+        return video_packets(file, container)
+
+    monkeypatch.setattr(lerobot, "video_packets", counted)
+    monkeypatch.setattr(lerobot, "_VIDEOS_AT_A_TIME", 1)
+    dataset = open_dataset(LEROBOT / "toy_v30_many")
+    for episode in dataset.episodes:
+        for camera in dataset.cameras:
+            dataset.check(episode, camera)
+    assert len(read) == len(set(read)) > len(dataset.cameras)

@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: MIT
+"""Folders of pictures: names tell the order, EXIF data which way is up; and pictures stored as BGR."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import subprocess
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image, ImageOps, PngImagePlugin
+from pyarrow import parquet
+
+from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, redness
+from pictures import numbered, numbers
+from rfm_client.contract.samples import UInt8Array
+from rfm_labels import Channels, DatasetError, LabelOptions, Orient, label, open_dataset
+from rfm_labels.datasets.frame_names import in_order_of_numbers
+from rfm_labels.datasets.protocol import digest_of
+from rfm_labels.datasets.video_frames import video_identity
+
+TASK = "stack the cups"
+ORIENTATION, RESOLUTION_UNIT = 0x0112, 0x0128  # EXIF's tags
+BRIGHT = np.zeros((6, 8, 3), np.uint8)  # no turn and no swap leaves it as it is
+BRIGHT[:2, :3], BRIGHT[0, 0] = (200, 60, 20), (20, 200, 60)
+
+
+def stored(folder: Path, names: Sequence[str]) -> Path:
+    """A dataset of one episode, whose frames in order have these names. Returns its folder."""
+    (folder / "0").mkdir(parents=True)
+    for frame, name in zip(numbered(len(names)), names, strict=True):
+        Image.fromarray(frame).save(folder / "0" / name)
+    return folder
+
+
+def order(root: Path, count: int) -> list[int]:
+    """The frames of the only episode, each by its number."""
+    dataset = open_dataset(root, task=TASK)
+    (episode,) = dataset.episodes
+    return numbers(np.stack(list(dataset.frames(episode, "frames"))), count)
+
+
+IN_ORDER: dict[str, Sequence[str]] = {
+    "counts": ["frame_0.png", "frame_2.png", "frame_10.png"],
+    "times, as Python prints them": [f"frame_{0.25 * t}.png" for t in range(10)],
+    "times since 1970": [f"{1764168000 + 0.125 * t}.png" for t in range(12)],
+    "times in nanoseconds": ["1764168000.123456788.png", "1764168000.123456789.png"],
+    "times with and without decimals": ["0.5.png", "1.png", "1.25.png", "10.png"],
+    "times without a zero": ["t_.25.png", "t_.5.png"],
+    "tiny times": ["0.0.png", "1e-05.png", "5e-05.png", "0.0001.png", "1.5e+01.png"],
+    "negative numbers": ["-10.png", "-2.png", "-1.png", "0.png", "1.png"],
+    "negative times": ["t_-0.5.png", "t_-0.25.png", "t_0.png"],
+    "a hyphen before a count": ["frame-1.png", "frame-2.png", "frame-10.png"],
+    "a point before a count": ["frame.1.png", "frame.2.png", "frame.10.png"],
+    "versions": ["v1.2.9.png", "v1.2.10.png", "v1.10.0.png"],
+    "dates": ["2026-10-26_12-30-00.png", "2026-11-05_09-00-00.png", "2026-11-26_08-00-00.png"],
+    "dates with milliseconds": [f"20261126T1200{s:02d}_{ms:03d}.png" for s in range(3) for ms in (0, 500 + s, 900)],
+    "seconds and nanoseconds": ["1_500.png", "1_900.png", "2_100.png", "2_500.png"][:3],
+    "a count and a time": [f"frame{t}_{0.1 * t:.1f}.png" for t in range(11)],
+    "gaps": ["0.png", "1.png", "3.png"],
+    "one picture without a number": ["only.png"],
+}
+
+
+@pytest.mark.parametrize("names", IN_ORDER.values(), ids=IN_ORDER)
+def test_numbers_in_names_order_the_frames(tmp_path: Path, names: Sequence[str]) -> None:
+    assert in_order_of_numbers(tmp_path, sorted(names, reverse=True)) == list(names)
+    assert order(stored(tmp_path / "pictures", names), len(names)) == list(range(len(names)))
+
+
+def of_cameras(pattern: str, cameras: Sequence[object], count: int = 3) -> list[str]:
+    return [pattern.format(camera=camera, t=t) for camera in cameras for t in range(count)]
+
+
+SEVERAL = "expected pictures of one camera, whose names differ in a number, got "
+MOVED = {
+    "words before": (of_cameras("{camera}_{t:04d}.png", ("left", "right")), "left_*.png (3) and right_*.png (3)"),
+    "colours and depths": (of_cameras("{camera}_{t}.png", ("depth", "rgb")), "rgb_*.png (3) and depth_*.png (3)"),
+    "masks": (of_cameras("{t:04d}{camera}.png", ("", "_mask")), "*.png (3) and *_mask.png (3)"),
+    "a copy of a browser": ([*of_cameras("{t}.png", ("",)), "1 (1).png"], "*.png (3) and *' ('*')'.png (1)"),
+    "a picture of the goal": ([*of_cameras("{t}.png", ("",)), "goal.png"], "*.png (3) and goal.png (1)"),
+    "numbers of cameras": (of_cameras("cam{camera}_{t}.png", (0, 1))[:-1], "cam0_*.png (3) and cam1_*.png (2)"),
+    "numbers of cameras behind": (of_cameras("{t}_cam{camera}.png", (0, 1)), "*_cam0.png (3) and *_cam1.png (3)"),
+    "a grid of numbers": (of_cameras("{t:04d}_{camera}.png", (1, 2)), "*_1.png (3) and *_2.png (3)"),
+}
+
+
+@pytest.mark.parametrize(("names", "told"), MOVED.values(), ids=MOVED)
+def test_several_kinds_of_names_are_refused_and_the_command_in_the_message_leaves_one(
+    tmp_path: Path, names: Sequence[str], told: str
+) -> None:
+    root, scorer = stored(tmp_path / "my pictures", names), BrightnessScorer()
+    with pytest.raises(DatasetError) as refused:
+        label(open_dataset(root, task=TASK), scorer, LabelOptions())
+    message = str(refused.value)
+    assert (f"{root / '0'}: {SEVERAL}{told}: move " in message, scorer.num_samples) == (True, 0)
+    subprocess.run(["bash", "-ec", message.partition("such as: ")[2]], check=True)
+    left = told.partition(" (")[0]
+    kept = [file.name for file in sorted((root / "0").iterdir()) if file.is_file()]
+    assert len(kept) == int(told.partition(f"{left} (")[2][0])
+    assert set(names) - set(kept) == {file.name for file in (root / "0").glob("*/*")}
+    assert open_dataset(root, task=TASK).episodes[0].num_frames == len(kept)
+
+
+TWICE = {
+    "leading zeros": (["001.png", "1.png"], "expected each number once, got 001.png and 1.png: remove one of them"),
+    "two endings": (["1.jpeg", "1.jpg", "2.jpg"], "expected each number once, got 1.jpeg and 1.jpg: remove one of"),
+    "a decimal more": (["1.1.png", "1.10.png"], "expected each number once, got 1.1.png and 1.10.png: remove one of"),
+    "no number": (["a.png", "b.png"], "expected names that differ in a number, got a.png (1) and b.png (1): rename"),
+}
+
+
+@pytest.mark.parametrize(("names", "message"), TWICE.values(), ids=TWICE)
+def test_names_that_do_not_tell_the_order_are_refused(tmp_path: Path, names: Sequence[str], message: str) -> None:
+    dataset = open_dataset(stored(tmp_path / "pictures", names), task=TASK)
+    with pytest.raises(DatasetError) as refused:
+        _ = dataset.episodes
+    assert message in str(refused.value)
+
+
+def with_exif(orientation: int, form: str) -> bytes:
+    exif, written = Image.Exif(), io.BytesIO()
+    exif[ORIENTATION] = orientation
+    Image.fromarray(BRIGHT).save(written, form, exif=exif, quality=100)
+    return written.getvalue()
+
+
+def with_xmp() -> bytes:
+    written, info = io.BytesIO(), PngImagePlugin.PngInfo()
+    info.add_itxt("XML:com.adobe.xmp", '<x tiff:Orientation="6"/>')
+    Image.fromarray(BRIGHT).save(written, "PNG", pnginfo=info)
+    return written.getvalue()
+
+
+TURNED = {
+    **{f"JPEG {number}": with_exif(number, "JPEG") for number in range(2, 9)},
+    "PNG": with_exif(6, "PNG"),
+    "XMP": with_xmp(),
+}
+AS_STORED = {f"JPEG {number}": with_exif(number, "JPEG") for number in (0, 1, 9)}
+
+
+def shown(picture: bytes) -> UInt8Array:
+    """What ``datasets.Image`` decodes, and so LeRobot."""
+    opened = Image.open(io.BytesIO(picture))
+    opened.load()
+    if opened.getexif().get(ORIENTATION) is not None:
+        opened = ImageOps.exif_transpose(opened)
+    return np.asarray(opened.convert("RGB"))
+
+
+@pytest.mark.parametrize(
+    "picture", [*TURNED.values(), *AS_STORED.values()], ids=[*TURNED, *(f"{n}, as stored" for n in AS_STORED)]
+)
+def test_exif_data_turn_the_frames_of_a_folder_and_change_their_identity(tmp_path: Path, picture: bytes) -> None:
+    is_turned = picture in TURNED.values()
+    file = tmp_path / "0" / ("0.png" if picture.startswith(b"\x89PNG") else "0.jpg")
+    file.parent.mkdir()
+    file.write_bytes(picture)
+    dataset = open_dataset(tmp_path, task=TASK)
+    (episode,) = dataset.episodes
+    (frame,) = dataset.frames(episode, "frames")
+    np.testing.assert_array_equal(frame, shown(picture))
+    assert np.array_equal(frame, np.asarray(Image.open(file).convert("RGB"))) != is_turned
+    for verify in (False, True):  # labels of other pictures stay
+        before = digest_of([f"{file.name} {video_identity(file, verify=verify)}".encode()])
+        assert (dataset.identity(episode, "frames", verify=verify) != before) == is_turned
+
+
+def test_other_exif_data_may_be_spoilt(tmp_path: Path) -> None:
+    exif, file = Image.Exif(), tmp_path / "0" / "0.jpg"
+    exif[ORIENTATION], exif[RESOLUTION_UNIT] = 6, 2
+    spoilt = exif.tobytes().replace(
+        RESOLUTION_UNIT.to_bytes(2, "big") + b"\0\3", RESOLUTION_UNIT.to_bytes(2, "big") + b"\0\2"
+    )
+    file.parent.mkdir()
+    Image.fromarray(BRIGHT).save(file, exif=spoilt, quality=100)
+    with pytest.raises(struct.error):
+        ImageOps.exif_transpose(Image.open(file))
+    dataset = open_dataset(tmp_path, task=TASK)
+    (frame,) = dataset.frames(dataset.episodes[0], "frames")
+    np.testing.assert_array_equal(frame, shown(with_exif(6, "JPEG")))
+
+
+def test_exif_data_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
+    """``datasets`` fails at them, too."""
+    file = tmp_path / "0" / "0.png"
+    file.parent.mkdir()
+    file.write_bytes(with_exif(6, "PNG"))
+    whole = file.read_bytes()
+    begin = whole.index(b"eXIf") + 4
+    chunk = b"eXIf" + b"no" + whole[begin + 2 : begin + int.from_bytes(whole[begin - 8 : begin - 4], "big")]
+    end = begin - 4 + len(chunk)
+    file.write_bytes(whole[: begin - 4] + chunk + zlib.crc32(chunk).to_bytes(4, "big") + whole[end + 4 :])
+    dataset = open_dataset(tmp_path, task=TASK)
+    episode = dataset.episodes[0]
+    assert dataset.identity(episode, "frames", verify=False)
+    with pytest.raises(DatasetError, match=r"0\.png: expected an image, got not a TIFF file"):
+        list(dataset.frames(episode, "frames"))
+
+
+def bgr_folder(root: Path) -> Path:
+    (root / "0").mkdir(parents=True)
+    for t in range(4):
+        Image.fromarray(np.ascontiguousarray(np.roll(BRIGHT, t, axis=1)[..., ::-1])).save(root / "0" / f"{t}.png")
+    return root
+
+
+def test_labels_of_pictures_stored_as_bgr_are_those_of_rgb_and_say_so(tmp_path: Path) -> None:
+    root, notes = bgr_folder(tmp_path / "pictures"), Notes()
+    swapped = open_dataset(root, task=TASK, channels=Channels("bgr"), orient=Orient("rotate90"))
+    report = label(swapped, BrightnessScorer(), LabelOptions(), notes)
+    table = parquet.read_table(report.files[0])
+    expected = redness(np.stack([np.roll(BRIGHT, t, axis=1) for t in range(4)]))
+    np.testing.assert_allclose(table["success"].to_numpy(), expected, atol=1e-6)
+    assert {"orient: frames rotate90 (asked for)", "channels: frames bgr (asked for)"} <= set(notes.lines)
+    (episode,) = swapped.episodes
+    for t, frame in enumerate(swapped.frames(episode, "frames")):
+        np.testing.assert_array_equal(frame, np.rot90(np.roll(BRIGHT, t, axis=1), -1))
+        assert frame.flags.c_contiguous
+
+
+def provenance(file: Path) -> Any:
+    return json.loads(parquet.read_schema(file).metadata[b"rfm.provenance"])
+
+
+def test_labels_made_with_other_channels_are_not_kept(tmp_path: Path) -> None:
+    root = bgr_folder(tmp_path / "pictures")
+    (file, *_) = label(open_dataset(root, task=TASK), BrightnessScorer(), LabelOptions()).files
+    assert "channels" not in provenance(file)  # as in labels made before there was a choice
+    swapped = open_dataset(root, task=TASK, channels=Channels.parse(["frames=bgr"]))
+    with pytest.raises(DatasetError, match=r"got channels\.frames: none there, bgr now: choose another --name"):
+        label(swapped, BrightnessScorer(), LabelOptions())
+    scorer = BrightnessScorer()
+    label(swapped, scorer, LabelOptions(overwrite=True))
+    assert (scorer.num_samples > 0, provenance(file)["channels"]) == (True, {"frames": "bgr"})
+    with pytest.raises(DatasetError, match=r"got channels\.frames: bgr there, none now: choose another --name"):
+        label(open_dataset(root, task=TASK), BrightnessScorer(), LabelOptions())
+
+
+def test_channels_of_one_camera_of_a_lerobot_dataset_are_swapped() -> None:
+    root = LEROBOT / "toy_v21"
+    stored, swapped = open_dataset(root), open_dataset(root, channels=Channels.parse(["wrist=bgr"]))
+    episode = stored.episodes[0]
+    for camera in stored.cameras:
+        frames, others = (np.stack(list(each.frames(episode, camera))) for each in (stored, swapped))
+        np.testing.assert_array_equal(others, frames[..., ::-1] if camera == WRIST else frames)
+    with pytest.raises(DatasetError, match=r"channels: expected one of the cameras .*, got 'top'"):
+        open_dataset(root, channels=Channels.parse(["top=bgr"]))
+    with pytest.raises(ValueError, match=r"^channels: expected one of rgb, bgr, got 'brg'$"):
+        Channels.parse(["brg"])

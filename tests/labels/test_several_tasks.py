@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: MIT
+"""LeRobot episodes with several tasks: each stretch of frames by its own task, or all by the first."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from labelling import LEROBOT, WRIST, BrightnessScorer, Notes
+from rfm_client import ProgressResult, ProgressSample, Trajectory
+from rfm_client.contract.samples import UInt8Array
+from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, label, open_dataset, read_episode_labels
+from rfm_labels.datasets.lerobot_v30 import read_tasks
+
+CUTS = (0, 20, 30)  # first frames of the stretches of episode 0
+TASKS = (0, 4, 0)  # and their numbers
+
+
+class SinceTheFirst(BrightnessScorer):
+    """Progress is by how much the newest frame is brighter than the first that is shown; keeps each sample's task."""
+
+    def __init__(self, encodes: bool = False) -> None:
+        super().__init__()
+        self.encodes = encodes
+        self.asked: list[str] = []
+
+    def checkpoint(self) -> CheckpointFacts:
+        return replace(super().checkpoint(), encodes=self.encodes)
+
+    def encode(self, frames: UInt8Array, task: str) -> Trajectory:
+        self.asked.append(task)
+        embeddings = frames.reshape(len(frames), -1).mean(axis=1, dtype=np.float32)[:, None]
+        return Trajectory(video_embeddings=embeddings, text_embedding=np.zeros(1, np.float32))
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        self.asked += [sample.trajectory.task for sample in samples if sample.trajectory.task]
+        return super().evaluate(samples)
+
+    def _result(self, sample: ProgressSample) -> ProgressResult:
+        shown = sample.trajectory.positions
+        means = shown.reshape(len(shown), -1).mean(axis=1, dtype=np.float32) / 255
+        return ProgressResult(progress=means - means[0], success=means)
+
+
+class Rising(BrightnessScorer):
+    """Progress rises from 0.1 to 0.9 over the frames of a sample."""
+
+    def _result(self, sample: ProgressSample) -> ProgressResult:
+        rising = np.linspace(0.1, 0.9, len(sample.trajectory.positions), dtype=np.float32)
+        return ProgressResult(progress=rising, success=rising)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Episode 0 has two tasks in three stretches, all other episodes have one."""
+    root = shutil.copytree(LEROBOT / "toy_v30_many", tmp_path / "toy")
+    rows = root / "data" / "chunk-000" / "file-000.parquet"
+    change(rows, "task_index", lambda values: [*numbers(58), *values[58:]])
+    sentences = read_tasks(root)
+    episodes = root / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    change(episodes, "tasks", lambda values: [[sentences[0], sentences[4]], *values[1:]])
+    return root
+
+
+def numbers(count: int) -> list[int]:
+    return [TASKS[max(k for k, cut in enumerate(CUTS) if cut <= t)] for t in range(count)]
+
+
+def change(file: Path, column: str, change: Any) -> None:
+    table = parquet.read_table(file, partitioning=None)
+    place = table.column_names.index(column)
+    values = pa.array(change(table[column].to_pylist()), table.schema.field(column).type)
+    parquet.write_table(table.set_column(place, table.schema.field(column), values), file)
+
+
+def options(output: Path, **more: Any) -> LabelOptions:
+    few: dict[str, Any] = {"cameras": (WRIST,), "episodes": [0, 1], "frames": 4, "formats": ("progress",)}
+    return LabelOptions(output=output, **{**few, **more})
+
+
+@pytest.mark.parametrize("encodes", [False, True])
+@pytest.mark.parametrize("mode", ["prefix", "whole"])
+def test_each_stretch_of_frames_is_scored_as_an_episode_of_its_task(
+    root: Path, output: Path, mode: Any, encodes: bool
+) -> None:
+    dataset, notes, scorer = open_dataset(root), Notes(), SinceTheFirst(encodes)
+    scorer.max_frames = None
+    sentences = read_tasks(root)
+    first = dataset.episode(0)
+    assert (first.task, first.tasks) == (
+        sentences[0],
+        tuple((cut, sentences[t]) for cut, t in zip(CUTS, TASKS, strict=True)),
+    )
+    report = label(dataset, scorer, options(output, mode=mode, frames=4 if mode == "prefix" else None), notes)
+    table = parquet.read_table(report.files[0])
+    means = np.array([frame.mean() / 255 for frame in dataset.frames(first, WRIST)], np.float32)
+    since = np.array([means[max(cut for cut in CUTS if cut <= t)] for t in range(len(means))])
+    np.testing.assert_allclose(table["progress"].to_numpy()[: len(means)], means - since, atol=1e-5)
+    assert table["frame_index"].to_pylist()[: len(means)] == list(range(len(means)))
+    assert set(scorer.asked) == {sentences[0], sentences[4], dataset.episode(1).task}
+    assert [line for line in notes.lines if line.startswith("tasks: 1 episodes have several: each stretch")]
+
+
+def gains(table: Any, chunk: int) -> list[float]:
+    """What LeRobot's reward-aligned behaviour cloning reads of each frame: it weights the frame 0 if this is below 0."""
+    progress, episodes = table["progress_sparse"].to_numpy(), table["episode_index"].to_numpy()
+    last = {episode: int(np.flatnonzero(episodes == episode)[-1]) for episode in set(episodes.tolist())}
+    return [float(progress[min(i + chunk, last[episodes[i]])] - progress[i]) for i in range(len(progress))]
+
+
+@pytest.mark.parametrize("chunk", [1, 10, 50])
+def test_frames_before_a_change_of_tasks_keep_their_weight_in_behaviour_cloning(
+    root: Path, output: Path, chunk: int
+) -> None:
+    notes = Notes()
+    chosen = options(output, mode="whole", frames=None, formats=("progress", "signals"), alias="sarm_progress")
+    scorer = Rising(max_frames=None)
+    report = label(open_dataset(root), scorer, chosen, notes)
+    assert [
+        line for line in notes.lines if line.startswith("progress_sparse: the sum of the gains in an episode's tasks")
+    ]
+    named, alias, signals = map(parquet.read_table, report.files)
+    assert named.equals(alias)
+    assert min(gains(named, chunk)) >= 0
+    lengths = np.diff([*CUTS, 58])
+    own = np.concatenate([np.linspace(0.1, 0.9, length, dtype=np.float32) for length in lengths])
+    begins = np.repeat([0.1, 0.9, 1.7], lengths)
+    np.testing.assert_array_equal(named["progress"].to_numpy()[:58], own)
+    np.testing.assert_allclose(named["progress_sparse"].to_numpy()[:58], begins + own - 0.1, atol=1e-6)
+    np.testing.assert_array_equal(named["progress_sparse"].to_numpy()[58:], named["progress"].to_numpy()[58:])
+    np.testing.assert_array_equal(signals["reward.rfm.progress"].to_numpy(), named["progress"].to_numpy())
+    shown = read_episode_labels(report.files[0], 0)
+    assert shown is not None
+    np.testing.assert_array_equal(shown.fused.progress, own)
+    asked = scorer.num_samples
+    shutil.rmtree(report.parts)
+    again = label(open_dataset(root), scorer, chosen)
+    assert scorer.num_samples == asked
+    assert parquet.read_table(again.files[0]).equals(named)
+
+
+def test_all_frames_have_the_first_task_by_choice(root: Path, output: Path) -> None:
+    dataset, scorer = open_dataset(root, several_tasks="first"), SinceTheFirst()
+    assert dataset.episode(0).tasks == ()
+    report = label(dataset, scorer, options(output))
+    means = np.array([frame.mean() / 255 for frame in dataset.frames(dataset.episode(0), WRIST)], np.float32)
+    progress = parquet.read_table(report.files[0])["progress_sparse"].to_numpy()[: len(means)]
+    np.testing.assert_allclose(progress, means - means[0], atol=1e-5)
+    assert read_tasks(root)[4] not in scorer.asked
+    with pytest.raises(DatasetError, match="episode 0: expected no change since the labels"):
+        label(open_dataset(root), scorer, options(output, episodes=[1]))
+    with pytest.raises(DatasetError, match="several_tasks: expected one of each, first, got 'last'"):
+        open_dataset(root, several_tasks="last")  # type: ignore[arg-type]
+
+
+def test_a_task_of_the_caller_is_that_of_all_frames(root: Path) -> None:
+    episode = open_dataset(root, task="open the box", override_task=True).episode(0)
+    assert (episode.task, episode.tasks) == ("open the box", ())

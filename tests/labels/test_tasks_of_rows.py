@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: MIT
+"""Which sentence LeRobot rows have: columns to choose from, gaps in numbers, contradictions, and what is told of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from labelling import FEW, FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+from rfm_labels.datasets.lerobot_v30 import read_tasks
+
+V21, V30 = LEROBOT / "toy_v21", LEROBOT / "toy_v30_many"
+LENGTH = 58  # of episode 0 of V30
+CUT = 20  # first row with the second subtask
+SUBTASKS = ("reach for the block", "lift the block")
+
+
+def rows_of(root: Path) -> list[Path]:
+    return sorted((root / "data").rglob("*.parquet"))
+
+
+def with_columns(folder: Path, source: Path = V30, **columns: Callable[[int, int], Any]) -> Path:
+    """A copy whose rows have further columns, made of the episode and the frame of a row."""
+    root = Path(shutil.copytree(source, folder / "toy"))
+    for file in rows_of(root):
+        table = parquet.read_table(file, partitioning=None)
+        places = list(zip(table["episode_index"].to_pylist(), table["frame_index"].to_pylist(), strict=True))
+        for name, value in columns.items():
+            table = table.append_column(name, pa.array([value(*place) for place in places]))
+        parquet.write_table(table, file)
+    return root
+
+
+def persistent(*subtasks: tuple[float, str | None], style: str = "subtask") -> list[dict[str, Any]]:
+    """The value of ``language_persistent`` in all rows of an episode, as LeRobot 0.6 writes it."""
+    rest = {"role": "assistant", "camera": None, "tool_calls": None}
+    plan = {"content": "first this, then that", "style": "plan", "timestamp": 0.0, **rest}
+    return [plan, *({"content": text, "style": style, "timestamp": time_s, **rest} for time_s, text in subtasks)]
+
+
+def in_two(episode: int, frame: int) -> int:
+    return int(frame >= CUT)
+
+
+def write_subtasks(root: Path, table: pa.Table) -> None:
+    parquet.write_table(table, root / "meta" / "subtasks.parquet")
+
+
+def sentences() -> dict[int, str | None]:
+    return read_tasks(V30)
+
+
+ANNOTATION = "annotation.human.action.task_description"
+IN_TWO = ((0, SUBTASKS[0]), (CUT, SUBTASKS[1]))
+COLUMNS: dict[str, tuple[str, Callable[[int, int], Any], Any]] = {
+    "sentences": ("annotation.human.coarse_action", lambda *place: SUBTASKS[in_two(*place)], IN_TWO),
+    "numbers of tasks": (ANNOTATION, lambda *place: 1 + in_two(*place), ((0, sentences()[1]), (CUT, sentences()[2]))),
+    "numbers with a gap in another episode": (
+        ANNOTATION,
+        lambda episode, frame: None if episode else 1 + in_two(episode, frame),
+        ((0, sentences()[1]), (CUT, sentences()[2])),
+    ),
+    "numbers of subtasks": ("subtask_index", in_two, IN_TWO),
+    "LeRobot's persistent subtasks": (
+        "language_persistent",
+        lambda *_: persistent((0.0, SUBTASKS[0]), (CUT / 10, SUBTASKS[1])),
+        IN_TWO,
+    ),
+}
+
+
+@pytest.mark.parametrize(("name", "value", "expected"), COLUMNS.values(), ids=COLUMNS)
+def test_a_column_names_the_tasks(
+    tmp_path: Path, output: Path, name: str, value: Callable[[int, int], Any], expected: Any
+) -> None:
+    root = with_columns(tmp_path, **{name: value})
+    write_subtasks(root, pa.table({"subtask_index": [0, 1], "__index_level_0__": list(SUBTASKS)}))
+    dataset, scorer = open_dataset(root, task_column=name), BrightnessScorer()
+    assert dataset.episode(0).tasks == expected
+    report = label(dataset, scorer, LabelOptions(output=output, episodes=[0], **FEW))
+    assert scorer.tasks == {sentence for _, sentence in expected}
+    first = open_dataset(root, task_column=name, several_tasks="first").episode(0)
+    assert (first.task, first.tasks) == (expected[0][1], ())
+    own = label(open_dataset(root), scorer, LabelOptions(output=output, name="own", episodes=[0], **FEW))
+    assert own.plan.items[0].digest != report.plan.items[0].digest
+
+
+def test_a_column_of_v21_counts_in_its_own_table(tmp_path: Path) -> None:
+    root = with_columns(tmp_path, V21, subtask_index=in_two)
+    lines = [{"subtask_index": k, "subtask": text} for k, text in enumerate(SUBTASKS)]
+    (root / "meta" / "subtasks.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    assert open_dataset(root, task_column="subtask_index").episode(0).tasks == IN_TWO
+
+
+def test_frames_before_the_first_subtask_get_the_callers_task(tmp_path: Path, output: Path) -> None:
+    root = with_columns(tmp_path, language_persistent=lambda *_: persistent((CUT / 10, SUBTASKS[1])))
+    with pytest.raises(DatasetError, match="episode 0: language_persistent: expected a task as a sentence, got none"):
+        open_dataset(root, task_column="language_persistent").episode(0)
+    dataset = open_dataset(root, task_column="language_persistent", task=SUBTASKS[0])
+    assert dataset.episode(0).tasks == IN_TWO
+    notes = Notes()
+    label(dataset, BrightnessScorer(), LabelOptions(output=output, episodes=[0, 1], **FEW), notes)
+    assert "tasks: 0 episodes keep their own sentence, 2 get --task" in notes.lines
+
+
+CANDIDATES = "expected one of task_index, annotation.human.coarse_action, language_persistent, got "
+UNUSABLE = {
+    "unknown": ("subtask", CANDIDATES),
+    "no text": ("is_valid", CANDIDATES),
+    "identity": ("frame_index", CANDIDATES),
+    "events": ("language_events", CANDIDATES),
+    "a number without a sentence": ("task_index", "episode 0: task 9 in meta/tasks: expected a task as a sentence"),
+    "half a number": ("half", "half 0.5 in meta/tasks: expected a task as a sentence, got 0.5: correct it"),
+    "two subtasks at a time": ("language_persistent", "expected one subtask at a time, got several"),
+}
+
+
+@pytest.mark.parametrize(("name", "message"), UNUSABLE.values(), ids=UNUSABLE)
+def test_a_column_without_tasks_is_refused(tmp_path: Path, name: str, message: str) -> None:
+    columns: dict[str, Callable[[int, int], Any]] = {
+        "annotation.human.coarse_action": lambda *_: SUBTASKS[0],
+        "is_valid": lambda *_: True,
+        "half": lambda *_: 0.5,
+        "language_persistent": lambda *_: persistent((0.0, SUBTASKS[0]), (0.0, SUBTASKS[1])),
+        "language_events": lambda *_: [{"role": "user", "content": "stop", "style": "interjection"}],
+    }
+    root = with_columns(tmp_path, **columns)
+    change(rows_of(root)[0], "task_index", lambda values: [9] * LENGTH + values[LENGTH:])
+    with pytest.raises(DatasetError) as caught:
+        _ = open_dataset(root, task_column=name).episodes
+    assert message in str(caught.value)
+
+
+def test_a_column_is_no_task_of_another_dataset_or_of_an_override(tmp_path: Path) -> None:
+    (tmp_path / "tasks.csv").write_text("video,task\na.mp4,stack the cups\n")
+    with pytest.raises(DatasetError, match=r"task_column: expected none, since .* is no LeRobot dataset, got task"):
+        open_dataset(tmp_path, task_column="task")
+    with pytest.raises(DatasetError, match="task_column: expected none with --override-task, which reads no tasks"):
+        open_dataset(V21, task="stack the cups", override_task=True, task_column="task_index")
+
+
+def change(file: Path, column: str, change: Callable[[list[Any]], list[Any]]) -> None:
+    table = parquet.read_table(file, partitioning=None)
+    place = table.column_names.index(column)
+    values = pa.array(change(table[column].to_pylist()), table.schema.field(column).type)
+    parquet.write_table(table.set_column(place, table.schema.field(column), values), file)
+
+
+def rename_tasks(root: Path, *texts: str) -> None:
+    """Other sentences in ``meta/tasks.jsonl``; ``meta/episodes.jsonl`` keeps the old ones."""
+    file = root / "meta" / "tasks.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    for line, text in zip(lines, texts, strict=False):
+        line["task"] = text
+    file.write_text("\n".join(json.dumps(line, ensure_ascii=False) for line in lines))
+
+
+def test_outdated_sentences_in_the_metadata_are_told_with_the_option_that_follows_the_rows(tmp_path: Path) -> None:
+    root = Path(shutil.copytree(V21, tmp_path / "toy"))
+    rename_tasks(root, "lift the block onto the plate")
+    with pytest.raises(DatasetError) as caught:
+        open_dataset(root).episode(0)
+    assert str(caught.value) == (
+        "episode 0: meta/episodes: tasks: expected 'lift the block onto the plate', got "
+        "['put the blue block on the plate']: correct it, or follow the rows, as LeRobot's reader does: "
+        "--task-column task_index"
+    )
+    episodes = open_dataset(root, task_column="task_index").episodes
+    assert [episode.task for episode in episodes][:2] == [
+        "lift the block onto the plate",
+        "put the red block in the bowl",
+    ]
+
+
+def test_a_sentence_may_have_any_character_that_is_no_end_of_a_line(tmp_path: Path) -> None:
+    root = Path(shutil.copytree(V21, tmp_path / "toy"))
+    text = "lift the block\u2028onto\x85the plate\u2029"
+    rename_tasks(root, text)
+    content = (root / "meta" / "tasks.jsonl").read_text().replace("\n", "\r\n")
+    (root / "meta" / "tasks.jsonl").write_bytes(b"\xef\xbb\xbf" + content.encode())
+    assert open_dataset(root, task_column="task_index").episode(0).task == text
+
+
+def test_identifiers_in_place_of_sentences_are_told(tmp_path: Path, output: Path) -> None:
+    root = Path(shutil.copytree(V21, tmp_path / "toy"))
+    rename_tasks(root, "PnPCupToDrawerClose", "pick_place_cup", "lift it", "杯子放进抽屉里")
+    notes = Notes()
+    dataset = open_dataset(root, task_column="task_index")
+    label(dataset, BrightnessScorer(), LabelOptions(output=output, **FEW), notes)
+    assert [line for line in notes.lines if line.startswith("tasks:")] == [
+        "tasks: 2 of 4 are a single word, not a sentence (PnPCupToDrawerClose, pick_place_cup); --task with "
+        "--override-task gives all episodes a sentence, --task-column reads another column (LeRobot)"
+    ]
+
+
+def test_an_override_is_told_to_be_the_task_of_all(output: Path) -> None:
+    notes = Notes()
+    dataset = open_dataset(V21, task="stack the cups", override_task=True)
+    label(dataset, BrightnessScorer(), LabelOptions(output=output, limit=3, **FEW), notes)
+    assert [line for line in notes.lines if line.startswith("tasks:")] == ["tasks: all 3 episodes get --task"]
+
+
+def renumbered(folder: Path, numbers: dict[int, int]) -> Path:
+    """A v2.1 dataset of these episodes alone, with other numbers."""
+    root = Path(shutil.copytree(V21, folder / "toy"))
+    lines = [json.loads(line) for line in (root / "meta" / "episodes.jsonl").read_text().splitlines()]
+    kept = [
+        {**line, "episode_index": numbers[line["episode_index"]]} for line in lines if line["episode_index"] in numbers
+    ]
+    (root / "meta" / "episodes.jsonl").write_text("\n".join(map(json.dumps, kept)))
+    info = json.loads((root / "meta" / "info.json").read_text())
+    info |= {"total_episodes": len(kept), "total_frames": sum(line["length"] for line in kept)}
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    for old, new in numbers.items():
+        paths = (
+            "data/chunk-{:03d}/episode_{:06d}.parquet",
+            *(f"videos/chunk-{{:03d}}/{c}/episode_{{:06d}}.mp4" for c in (FRONT, WRIST)),
+        )
+        for path in paths:
+            target = root / path.format(new // 1000, new)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (root / path.format(0, old)).rename(target)
+        change(root / paths[0].format(new // 1000, new), "episode_index", lambda values, new=new: [new] * len(values))  # type: ignore[misc]
+    return root
+
+
+SPARSE = {0: 10, 1: 20, 2: 340_020}
+
+
+def test_episode_numbers_may_have_gaps(tmp_path: Path, output: Path) -> None:
+    root = renumbered(tmp_path, SPARSE)
+    dataset = open_dataset(root)
+    report = label(dataset, BrightnessScorer(), LabelOptions(output=output, **FEW))
+    table, whole = parquet.read_table(report.files[0]), open_dataset(V21)
+    assert table["episode_index"].unique().to_pylist() == list(SPARSE.values())
+    for old, new in SPARSE.items():
+        told, first = dataset.episode(new), whole.episode(old)
+        assert (told.task, told.num_frames, told.first_index) == (first.task, first.num_frames, first.first_index)
+        np.testing.assert_array_equal(list(dataset.frames(told, WRIST)), list(whole.frames(first, WRIST)))
+    with pytest.raises(DatasetError, match="expected some of the 3 of the dataset, got 11; it has 10,20,340020"):
+        label(dataset, BrightnessScorer(), LabelOptions(output=output, episodes=[10, 11]))
+
+
+def test_another_number_of_episodes_is_told_as_it_is(tmp_path: Path) -> None:
+    root = renumbered(tmp_path, SPARSE)
+    file = root / "meta" / "episodes.jsonl"
+    lines = file.read_text().splitlines()
+    for text, message in (
+        ("\n".join(lines[:2]), "meta: expected 3 episodes, as info.json says, got 2: correct total_episodes, or"),
+        ("\n".join([*lines, lines[1]]), "meta: expected each episode once, got 20 several times"),
+    ):
+        file.write_text(text)
+        with pytest.raises(DatasetError) as caught:
+            open_dataset(root)
+        assert message in str(caught.value)
+
+
+def test_two_sentences_for_one_number_are_refused(tmp_path: Path) -> None:
+    root = Path(shutil.copytree(V21, tmp_path / "toy"))
+    with (root / "meta" / "tasks.jsonl").open("a") as file:
+        file.write('\n{"task_index": 0, "task": "open the box"}\n')
+    with pytest.raises(
+        DatasetError, match=r"tasks\.jsonl: expected one sentence for the number 0, got 'put .* and 'open"
+    ):
+        open_dataset(root)
+
+
+TABLES: dict[str, tuple[dict[str, list[Any]], list[str]]] = {
+    "an index without a name": ({"task_index": [0, 1], "__index_level_0__": ["a b", "c d"]}, ["a b", "c d"]),
+    "a column of sentences": ({"task": ["a b", "c d"], "task_index": [0, 1]}, ["a b", "c d"]),
+    "further columns": ({"task_index": [0, 1], "task": ["a b", "c d"], "robot": ["x", "y"]}, ["a b", "c d"]),
+    "another name": ({"task_index": [0, 1], "sentence": ["a b", "c d"]}, ["a b", "c d"]),
+}
+
+
+@pytest.mark.parametrize(("columns", "expected"), TABLES.values(), ids=TABLES)
+def test_a_table_of_tasks_is_read_as_its_writers_name_its_columns(
+    tmp_path: Path, columns: dict[str, list[Any]], expected: list[str]
+) -> None:
+    (tmp_path / "meta").mkdir()
+    parquet.write_table(pa.table(columns), tmp_path / "meta" / "tasks.parquet")
+    assert list(read_tasks(tmp_path).values()) == expected
+
+
+def test_a_table_of_tasks_out_of_order_is_told_since_lerobot_counts_its_rows(tmp_path: Path, output: Path) -> None:
+    root = Path(shutil.copytree(V30, tmp_path / "toy"))
+    file = root / "meta" / "tasks.parquet"
+    table = parquet.read_table(file)
+    parquet.write_table(table.take(list(reversed(range(len(table))))), file)
+    dataset, notes = open_dataset(root), Notes()
+    assert dataset.episode(0).task == open_dataset(V30).episode(0).task
+    label(dataset, BrightnessScorer(), LabelOptions(output=output, limit=1, **FEW), notes)
+    assert any("meta/tasks.parquet is not in the order of task_index: LeRobot finds" in line for line in notes.lines)

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: MIT
+"""The toy dataset and the comparison of two checkpoints on it, with the commands of the guide."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import toy_dataset
+from paths import ROOT
+from rfm_client.cli.commands import app as rfm_client
+from rfm_commands.cli import app as rfm
+from rfm_labels import evaluate_labels, open_dataset, read_outcomes
+from toy_world import TASKS
+
+GUIDE = ROOT / "docs" / "guides" / "choose_a_checkpoint.md"
+COMMAND = re.compile(r"^ {4}((?:python|rfm|rfm-client) .*demo_output/toy(?:.*\\\n)*.*)", re.MULTILINE)
+ROW = re.compile(r"^ *(early|full) +(\d.*) \S+ *$", re.MULTILINE)  # without the rate, which differs from run to run
+
+
+def run(command: str) -> str:
+    """Return the output of a command of the guide, run in this process."""
+    example = typer.Typer()
+    example.command()(toy_dataset.write)
+    program, *words = shlex.split(command.replace("\\\n", " "))
+    if program == "python":
+        assert words.pop(0) == "examples/toy_dataset.py"
+    done = CliRunner().invoke({"python": example, "rfm": rfm, "rfm-client": rfm_client}[program], words)
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+def rows(text: str) -> dict[str, list[float]]:
+    return {name: [float(cell.rstrip("%")) for cell in cells.split()] for name, cells in ROW.findall(text)}
+
+
+def test_the_guide_s_commands_tell_the_trained_checkpoint_from_the_early_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("model_repository", "examples"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    guide = GUIDE.read_text()
+    *_, printed = map(run, COMMAND.findall(guide))
+    assert rows(printed).keys() == {"early", "full"}
+    for name, numbers in rows(printed).items():
+        assert rows(guide)[name] == pytest.approx(numbers, abs=0.01)  # rounding, on another CPU
+    assert (tmp_path / "demo_output" / "models.png").read_bytes().startswith(b"\x89PNG")
+
+    toy = tmp_path / "demo_output" / "toy"
+    files = [toy / f"{name}_progress.parquet" for name in ("early", "full")]
+    early, full = evaluate_labels(files, read_outcomes(str(toy / "outcomes.csv"))).evaluations
+    assert early.by_progress is not None
+    assert full.by_progress is not None
+    assert full.by_progress.auroc > early.by_progress.auroc + 0.2  # five times the training
+    assert early.frames_per_s is not None
+    assert full.frames_per_s is not None
+
+
+def test_the_toy_dataset_has_all_tasks_and_as_many_failures_as_successes(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        toy_dataset.write(folder, clips=12)
+    outcomes = read_outcomes(str(first / "outcomes.csv"))
+    assert sum(outcomes.values()) == len(outcomes) / 2 == 6
+    episodes = open_dataset(first).episodes
+    assert [episode.index for episode in episodes] == list(outcomes)
+    assert {episode.task for episode in episodes} == {task.sentence() for task in TASKS}
+    assert [file.read_bytes() for file in sorted(first.iterdir())] == [
+        file.read_bytes() for file in sorted(second.iterdir())
+    ]
+    with pytest.raises(typer.BadParameter, match="expected a folder that does not exist"):
+        toy_dataset.write(first)

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: MIT
+"""Videos that are turned, that break off, that are damaged: labels and scores judge them alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from encoding import encode_here
+from pictures import TURNS, Matrix, numbered, numbers, turn, write_video
+from rfm_client import InvalidSampleError
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.frames.video import frame_times_s, read_video
+from rfm_labels import DatasetError, open_dataset
+
+NUM_FRAMES = 40
+Write = Callable[[Path, UInt8Array], object]
+
+
+def noise(count: int = NUM_FRAMES) -> UInt8Array:
+    """Frames that hardly compress: the video is mostly frames."""
+    return np.random.default_rng(0).integers(0, 256, (count, 64, 64, 3), np.uint8)
+
+
+def labelled(file: Path) -> UInt8Array:
+    """The frames that ``label`` shows of a folder that holds this video."""
+    (file.parent / "tasks.csv").write_text(f"video,task\n{file.name},stack the cups\n")
+    dataset = open_dataset(file.parent)
+    episode = dataset.episodes[0]
+    dataset.check(episode, "video")
+    return np.stack(list(dataset.frames(episode, "video")))
+
+
+def assert_both_refuse(file: Path, reason: str) -> None:
+    """Both readers give the reason, a pattern."""
+    with pytest.raises(InvalidSampleError, match=rf"^video: {reason}.* \({file}\)$"):
+        read_video(file)
+    with pytest.raises(DatasetError, match=rf"{file}: {reason}"):
+        labelled(file)
+
+
+@pytest.mark.parametrize(("matrix", "shown"), TURNS.values(), ids=TURNS)
+def test_a_turned_or_mirrored_video_is_read_upright(
+    tmp_path: Path, matrix: Matrix, shown: Callable[[UInt8Array], UInt8Array]
+) -> None:
+    file = tmp_path / "video.mp4"
+    pictures = np.zeros((3, 32, 64, 3), np.uint8)
+    pictures[:, :16, :32], pictures[:, :16, 32:], pictures[:, 16:, :32] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+    write_video(file, pictures)
+    turn(file, matrix)
+    read = labelled(file)
+    upright = np.stack([shown(picture) for picture in pictures])
+    assert read.shape == upright.shape
+    assert np.abs(read.astype(int) - upright).mean() < 3
+    np.testing.assert_array_equal(read, read_video(file))
+
+
+@pytest.mark.parametrize("matrix", [(1, 1, -1, 1), (1, 0, 1, 1)], ids=["half a quarter turn", "skewed"])
+def test_a_video_that_is_shown_aslant_is_refused(tmp_path: Path, matrix: Matrix) -> None:
+    write_video(tmp_path / "video.mp4", numbered(3))
+    turn(tmp_path / "video.mp4", matrix)
+    reason = r"expected a video that is shown upright or by quarter turns \(turn it: ffmpeg -i IN OUT\), got one that"
+    assert_both_refuse(tmp_path / "video.mp4", reason)
+
+
+def test_packets_that_are_not_shown_are_no_frames(tmp_path: Path) -> None:
+    file = tmp_path / "video.mp4"
+    write_video(file, numbered(10), shown_from=4)
+    with av.open(str(file)) as container:
+        assert container.streams.video[0].frames == 10  # as the container tells, wrongly
+    assert numbers(labelled(file), 10) == numbers(read_video(file), 10) == [4, 5, 6, 7, 8, 9]
+    assert numbers(read_video(file, 5), 10) == [4, 6, 9]
+
+
+# Pixel format, matrix and range (1: limited, 2: full) of a video, as ITU-T H.273 numbers them; 2: no matrix is named.
+COLOURS = {
+    "BT.709": ("yuv420p", 1, 1),
+    "BT.709, full range": ("yuv420p", 1, 2),
+    "BT.709, 4:2:2": ("yuv422p", 1, 1),
+    "BT.709, 4:4:4": ("yuv444p", 1, 1),
+    "BT.709, 10 bits": ("yuv420p10le", 1, 1),
+    "BT.709, 10 bits of full range": ("yuv420p10le", 1, 2),
+    "BT.601": ("yuv420p", 6, 1),
+    "BT.601, full range": ("yuv420p", 5, 2),
+    "no matrix": ("yuv420p", 2, 1),
+    "no matrix, full range": ("yuvj420p", 2, 2),
+    "no matrix, 10 bits": ("yuv420p10le", 2, 1),
+    "SMPTE 240M": ("yuv444p", 7, 1),
+    "BT.2020": ("yuv420p", 9, 1),
+    "BT.2020, 10 bits": ("yuv420p10le", 9, 1),
+}
+WEIGHTS = {1: (0.2126, 0.0722), 7: (0.212, 0.087), 9: (0.2627, 0.0593)}  # Kr and Kb; BT.601's where there are none
+BLOCK_PX = 16
+
+
+def rgb(levels: np.ndarray[Any, Any], matrix: int, is_full: bool) -> np.ndarray[Any, Any]:
+    """float64 [..., 3], 0..255, of levels Y, Cb, Cr in 8 bits (ITU-T H.273, equations of matrix coefficients)."""
+    kr, kb = WEIGHTS.get(matrix, (0.299, 0.114))
+    low, scale, chroma = (0, 255, 255) if is_full else (16, 219, 224)
+    y, pb, pr = (levels[..., 0] - low) / scale, (levels[..., 1] - 128) / chroma, (levels[..., 2] - 128) / chroma
+    red, blue = y + 2 * (1 - kr) * pr, y + 2 * (1 - kb) * pb
+    return np.clip(np.stack([red, (y - kr * red - kb * blue) / (1 - kr - kb), blue], -1) * 255, 0, 255)
+
+
+def write_levels(file: Path, levels: UInt8Array, pixels: str, matrix: int, full: int) -> None:
+    """A video of blocks of one colour each, levels uint8 [rows, columns, 3], without a loss."""
+    with av.open(str(file), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=10, options={"qp": "0"})
+        stream.height, stream.width, stream.pix_fmt = *(BLOCK_PX * n for n in levels.shape[:2]), pixels
+        stream.codec_context.colorspace, stream.codec_context.color_range = matrix, full
+        frame = av.VideoFrame(stream.width, stream.height, pixels)
+        frame.colorspace, frame.color_range = matrix, full
+        for plane, channel in zip(frame.planes, np.moveaxis(levels, -1, 0), strict=True):
+            size = (plane.height // levels.shape[0], plane.width // levels.shape[1])
+            is_deep = pixels.endswith("10le")
+            values = np.kron(channel, np.ones(size, np.uint8)).astype("<u2" if is_deep else np.uint8) << 2 * is_deep
+            padded = np.zeros((plane.height, plane.line_size // values.itemsize), values.dtype)
+            padded[:, : plane.width] = values
+            plane.update(padded.tobytes())
+        for _ in range(2):
+            container.mux(stream.encode(frame))
+            frame.pts = None
+        container.mux(stream.encode())
+
+
+@pytest.mark.parametrize(("pixels", "matrix", "full"), COLOURS.values(), ids=COLOURS)
+def test_colours_are_those_of_the_video_s_matrix_and_range(tmp_path: Path, pixels: str, matrix: int, full: int) -> None:
+    """Whatever PyAV is installed: some take each video for one of BT.601, 6 to 29 levels off."""
+    levels = np.random.default_rng(0).integers(60, 190, (6, 8, 3), np.uint8)
+    write_levels(tmp_path / "video.mp4", levels, pixels, matrix, full)
+    read = read_video(tmp_path / "video.mp4")[0]
+    centres = read[BLOCK_PX // 2 :: BLOCK_PX, BLOCK_PX // 2 :: BLOCK_PX]
+    assert np.abs(centres - rgb(levels.astype(float), matrix, full == 2)).max() < 3.5  # libswscale rounds
+    np.testing.assert_array_equal(labelled(tmp_path / "video.mp4")[0], read)
+
+
+GREY = {"gray": False, "gray10le": True, "gray16le": True, "yuv420p10le": False, "bgr0": False}
+
+
+@pytest.mark.parametrize(("pixels", "is_depth"), GREY.items())
+def test_videos_of_one_deep_channel_are_refused_as_depth_maps(tmp_path: Path, pixels: str, is_depth: bool) -> None:
+    file = tmp_path / "video.mkv"
+    encode_here(file, numbered(3), "ffv1", pixels=pixels)
+    if is_depth:
+        refused = rf"expected a video of colours \(leave a depth camera out .*\), got {pixels}, as depth maps have"
+        assert_both_refuse(file, refused)
+    else:
+        assert numbers(read_video(file), 3) == numbers(labelled(file), 3) == [0, 1, 2]
+
+
+def write_streams(file: Path, *videos: tuple[UInt8Array, bool]) -> None:
+    """Several videos in one file, and whether each is an attached picture."""
+    with av.open(str(file), "w") as container:
+        streams: list[Any] = []
+        for frames, attached in videos:
+            stream: Any = container.add_stream("mjpeg" if attached else "libx264", rate=10)
+            stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuvj420p" if attached else "yuv420p"
+            if attached:
+                stream.disposition = av.stream.Disposition.attached_pic.value
+            streams.append(stream)
+        for stream, (frames, _) in zip(streams, videos, strict=True):
+            for image in [*frames, None]:
+                frame = None if image is None else av.VideoFrame.from_ndarray(image, format="rgb24")
+                container.mux(stream.encode(frame))
+
+
+def test_cover_art_is_no_video(tmp_path: Path) -> None:
+    file = tmp_path / "video.mp4"
+    write_streams(file, (numbered(1)[:, :16], True), (numbered(5), False))
+    with av.open(str(file)) as container:
+        assert len(container.streams.video) == 2
+    assert numbers(read_video(file), 5) == numbers(labelled(file), 5) == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose(frame_times_s(file, 5), np.arange(5) / 10)
+    write_streams(file, (numbered(1), True))
+    assert_both_refuse(file, "expected a file with a video stream, got none")
+
+
+def test_a_file_of_several_videos_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "video.mp4"
+    write_streams(file, (numbered(1)[:, :16], False), (numbered(1), True), (numbered(5), False))
+    refused = (
+        r"expected one video stream \(take one: ffmpeg -i IN -map 0:v:N -c copy OUT\), "
+        r"got 2: 0:v:\d \(h264, 32x16\), 0:v:\d \(h264, 32x32\)"
+    )
+    assert_both_refuse(file, refused)
+    with pytest.raises(InvalidSampleError, match=f"^video: {refused}"):
+        frame_times_s(file, 5)
+
+
+def at_irregular_times(file: Path, frames: UInt8Array) -> None:
+    write_video(file, frames, times=[2 * t + 30 * (t > 10) + 90 * (t == len(frames) - 1) for t in range(len(frames))])
+
+
+def coded(codec: str = "libx264", **more: Any) -> Write:
+    """Writes a video with this codec. more: as in ``encode_here``"""
+    return lambda file, frames: encode_here(file, frames, codec, **more)
+
+
+def recorded_live(file: Path, frames: UInt8Array) -> None:
+    """As into a pipe: nothing that is written is corrected afterwards."""
+    codec, format = ("mpeg4", "avi") if file.suffix == ".avi" else ("libx264", "matroska")
+    with file.open("wb") as opened:
+        encode_here(SimpleNamespace(write=opened.write), frames, codec, format=format)
+
+
+BROKEN_OFF: dict[str, tuple[str, Write]] = {
+    "Matroska": ("video.mkv", write_video),
+    "Matroska of a variable rate": ("video.mkv", at_irregular_times),
+    "WebM": ("video.webm", coded("libvpx", options={"deadline": "realtime"})),
+    "MP4": ("video.mp4", write_video),
+    "MP4 with its index in front": ("video.mp4", coded(of_container={"movflags": "+faststart"})),
+    "MP4 in fragments": ("video.mp4", coded(of_container={"movflags": "+frag_keyframe+empty_moov"})),
+    "AVI": ("video.avi", coded("mpeg4")),
+    "GIF": ("video.gif", coded("gif", pixels="rgb8")),
+    "Ogg": ("video.ogv", coded("libvpx", options={"deadline": "realtime"})),
+    "Matroska recorded live": ("video.mkv", recorded_live),
+}
+UNBOUNDED: dict[str, tuple[str, Write]] = {  # the file does not say where it ends
+    "Matroska recorded live": ("video.mkv", recorded_live),
+    "AVI recorded live": ("video.avi", recorded_live),
+    "MPEG-TS": ("video.ts", coded()),
+    "MPEG-PS": ("video.mpg", coded("mpeg2video", rate=Fraction(25))),
+    "FLV": ("video.flv", coded("flv")),
+    "ASF": ("video.wmv", coded("wmv2")),
+}
+
+
+@pytest.mark.parametrize(("name", "write"), UNBOUNDED.values(), ids=UNBOUNDED)
+def test_a_video_that_does_not_say_where_it_ends_is_read(tmp_path: Path, name: str, write: Write) -> None:
+    write(tmp_path / name, noise())
+    assert len(read_video(tmp_path / name)) == len(labelled(tmp_path / name)) == NUM_FRAMES
+
+
+@pytest.mark.parametrize(("name", "write"), BROKEN_OFF.values(), ids=BROKEN_OFF)
+def test_a_whole_video_is_read_and_one_that_breaks_off_refused(tmp_path: Path, name: str, write: Write) -> None:
+    """Behind a frame, and amid one."""
+    file = tmp_path / name
+    write(file, noise())
+    assert len(read_video(file)) == len(labelled(file)) == NUM_FRAMES
+    with av.open(str(file)) as container:
+        begins = sorted(packet.pos for packet in container.demux(video=0) if packet.size)
+    whole = file.read_bytes()
+    is_live = write is recorded_live  # whose size is known up to the frame that breaks off
+    for num_bytes in [begins[24] + 100] if is_live else [begins[24] + 100, begins[24]]:
+        file.write_bytes(whole[:num_bytes])
+        size = r"\d+" if is_live else len(whole)
+        told = f"the first {num_bytes} bytes of at least {size}" if name.endswith("mkv") else ""
+        assert_both_refuse(file, f"expected a whole video file, got {told}")
+
+
+@pytest.mark.parametrize(("name", "write"), UNBOUNDED.values(), ids=UNBOUNDED)
+def test_a_frame_that_breaks_off_is_no_frame_where_the_file_s_size_is_unknown(
+    tmp_path: Path, name: str, write: Write
+) -> None:
+    file = tmp_path / name
+    write(file, noise())
+    whole = file.read_bytes()
+    for share in (0.31, 0.5, 0.77):
+        file.write_bytes(whole[: int(len(whole) * share)])
+        assert_both_refuse(file, ".*expected (a whole video file|an undamaged frame), got ")
+
+
+def test_damage_counts_up_to_the_next_key_frame_and_only_in_frames_that_are_used(tmp_path: Path) -> None:
+    """Each 20th frame needs no other; the others are made from the one before. x264 notices damage in CAVLC."""
+    file = tmp_path / "video.mp4"
+    options = {"preset": "ultrafast", "bf": "0", "g": "20", "sc_threshold": "0"}
+    encode_here(file, noise(), "libx264", options)
+    assert len(read_video(file)) == len(labelled(file)) == NUM_FRAMES
+    with av.open(str(file)) as container:
+        packet = [packet for packet in container.demux(video=0) if packet.size][5]
+        start = packet.pos + packet.size // 3
+    content = bytearray(file.read_bytes())
+    content[start : start + 40] = np.random.default_rng(1).integers(0, 256, 40, np.uint8).tobytes()
+    file.write_bytes(content)
+    refused = "expected an undamaged frame, got one that the decoder marks, or is made from such a one"
+    assert_both_refuse(file, f"frame 5: {refused}")
+    with pytest.raises(InvalidSampleError, match=rf"^video: frame 13: {refused}"):
+        read_video(file, 1)  # frames 0, 13, 26 and 39
+    assert len(read_video(file, start_s=0, end_s=0.5)) == 5
+    assert len(read_video(file, start_s=2, end_s=4)) == 20

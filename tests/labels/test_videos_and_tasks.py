@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: MIT
+"""Folders of videos with a table of tasks, and the tasks that a caller gives for any dataset."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+from labelling import LEROBOT, BrightnessScorer, Notes
+from pictures import numbered, numbers, write_video
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+
+
+@pytest.fixture
+def videos(tmp_path: Path) -> Path:
+    folder = tmp_path / "videos"
+    (folder / "day").mkdir(parents=True)
+    write_video(folder / "b.mp4", numbered(6))
+    write_video(folder / "day" / "a.mp4", numbered(4), times=[0, 1, 5, 6])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("tasks.csv", "task,video\nstack the cups,b.mp4\nopen the box,day/a.mp4\n"),
+        ("tasks.json", '{"b.mp4": "stack the cups", "day/a.mp4": "open the box"}'),
+    ],
+)
+def test_a_folder_of_videos_is_read_in_the_order_of_its_table(videos: Path, name: str, text: str, output: Path) -> None:
+    (videos / name).write_text(text)
+    dataset = open_dataset(videos)
+    assert open_dataset(videos / name).episodes == dataset.episodes
+    assert [(e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes] == [
+        ("b.mp4", "stack the cups", 6, 0),
+        ("day/a.mp4", "open the box", 4, 6),
+    ]
+    for episode in dataset.episodes:
+        video = np.stack(list(dataset.frames(episode, "video")))
+        assert numbers(video, episode.num_frames) == list(range(episode.num_frames))
+    report = label(dataset, BrightnessScorer(), LabelOptions(output=output))
+    assert parquet.read_table(report.files[0])["episode_index"].to_pylist() == [0] * 6 + [1] * 4
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("tasks.csv", '\ufeffvideo,task\r\nb.mp4," put the block in the bowl, then close the lid "\r\n'),
+        ("tasks.json", '{"b.mp4": "put the block in the bowl, then close the lid\\n"}'),
+    ],
+)
+def test_a_task_may_have_commas_and_loses_the_blanks_around_it_and_the_table_its_byte_order_mark(
+    videos: Path, name: str, text: str
+) -> None:
+    (videos / name).write_text(text)
+    assert [e.task for e in open_dataset(videos).episodes] == ["put the block in the bowl, then close the lid"]
+
+
+TABLES = {
+    "a line break in quotes": (
+        "tasks.csv",
+        'video,task\nb.mp4,"stack\r\n  the cups"\nday/a.mp4,open the box\n',
+        ["stack the cups", "open the box"],
+    ),
+    "semicolons": (
+        "tasks.csv",
+        "Video;Task\nb.mp4;stack, then rest\nday/a.mp4;open it\n",
+        ["stack, then rest", "open it"],
+    ),
+    "tabs": (
+        "tasks.csv",
+        "video\ttask\nb.mp4\tstack, then rest\nday/a.mp4\topen it\n",
+        ["stack, then rest", "open it"],
+    ),
+    "spaces after commas": (
+        "tasks.csv",
+        'video, task\nb.mp4, "stack, then rest"\nday/a.mp4 , open it\n',
+        ["stack, then rest", "open it"],
+    ),
+    "empty lines of a spreadsheet": (
+        "tasks.csv",
+        "video,task\nb.mp4,stack\n,\n\nday/a.mp4,open it\n,\n",
+        ["stack", "open it"],
+    ),
+    "other spellings of a path": ("tasks.csv", "video,task\n./b.mp4,stack\nday\\a.mp4,open it\n", ["stack", "open it"]),
+    "spellings in JSON": ("tasks.json", '{"./b.mp4": "stack", "day/../day/a.mp4": "open it"}', ["stack", "open it"]),
+}
+
+
+@pytest.mark.parametrize(("name", "text", "expected"), TABLES.values(), ids=TABLES)
+def test_a_table_is_read_as_spreadsheets_and_people_write_it(
+    videos: Path, name: str, text: str, expected: list[str]
+) -> None:
+    (videos / name).write_text(text, newline="")
+    assert [(e.name, e.task) for e in open_dataset(videos).episodes] == list(
+        zip(["b.mp4", "day/a.mp4"], expected, strict=True)
+    )
+
+
+def test_videos_beside_a_table_that_it_lacks_are_told(videos: Path, output: Path) -> None:
+    (videos / "tasks.csv").write_text("video,task\nday/a.mp4,open the box\n")
+    (videos / "day" / "c.mp4").write_bytes((videos / "b.mp4").read_bytes())
+    (videos / "elsewhere").mkdir()
+    (videos / "elsewhere" / "d.mp4").write_bytes(b"of no listed folder")
+    notes = Notes()
+    label(open_dataset(videos), BrightnessScorer(), LabelOptions(output=output), notes)
+    line = "tasks.csv: 2 videos beside it are not listed and get no labels: b.mp4, day/c.mp4"
+    assert [each for each in notes.lines if "tasks.csv" in each] == [line]
+    (videos / "tasks.csv").write_text("video,task\nb.mp4,a b\nday/a.mp4,open the box\nday/c.mp4,c d\n")
+    assert not open_dataset(videos).notes
+
+
+def test_all_faulty_lines_of_a_table_are_named_at_once(videos: Path) -> None:
+    (videos / "tasks.csv").write_text("video,task\nb.mp4,a\n./b.mp4,b\nday/a.mp4,put it, and go\n ,c\n")
+    with pytest.raises(DatasetError) as caught:
+        open_dataset(videos)
+    assert str(caught.value).splitlines() == [
+        f"{videos}/tasks.csv: line 3: expected each video once, got ./b.mp4",
+        f"{videos}/tasks.csv: line 4: expected 2 cells (text with a comma in quotes), got 3",
+        f"{videos}/tasks.csv: line 5: expected the path of a video, got none",
+    ]
+
+
+def test_all_videos_of_a_table_that_are_missing_are_named_at_once(videos: Path) -> None:
+    (videos / "tasks.csv").write_text("video,task\nc.mp4,a b\nday/a.mp4,open the box\nday/d.mp4,c d\n")
+    with pytest.raises(DatasetError) as caught:
+        _ = open_dataset(videos).episodes
+    assert str(caught.value).splitlines() == [
+        "episodes: expected 3 that can be labelled, got 2 with faults:",
+        f"{videos}/c.mp4: expected a video file, got none",
+        f"{videos}/day/d.mp4: expected a video file, got none",
+        "to continue without the faulty episodes: --episodes 1",
+    ]
+
+
+REFUSED = {
+    "a key twice": ("tasks.json", '{"b.mp4": "stack", "b.mp4": "open"}', "expected each video once, got b.mp4"),
+    "no object": ("tasks.json", "{}", "tasks.json: expected an object of tasks by video, got an empty one"),
+    "a task that is no text": (
+        "tasks.json",
+        '{"b.mp4": ["stack", "open"]}',
+        "got ['stack', 'open']: correct it, or add --task \"SENTENCE\" --override-task",
+    ),
+    "a quote that does not end": (
+        "tasks.csv",
+        'video,task\nb.mp4,"stack the cups\nday/a.mp4,open the box\n',
+        'expected quotes around a whole cell, and "" for a quote in it, got unexpected end of data',
+    ),
+    "no table": (None, "", "expected one of tasks.csv and tasks.json with the task of each video, got none"),
+    "no column of tasks": ("tasks.csv", "video\nb.mp4\n", "expected the columns video and task, got video"),
+    "a video twice": ("tasks.csv", "video,task\nb.mp4,a\nb.mp4,b\n", "line 3: expected each video once, got b.mp4"),
+    "no task": ("tasks.csv", "video,task\nb.mp4,\n", "b.mp4: expected a task as a sentence, got none"),
+    "a task of blanks": ("tasks.csv", "video,task\nb.mp4,  \n", "b.mp4: expected a task as a sentence, got '  '"),
+    "a comma without quotes": (
+        "tasks.csv",
+        "video,task\nday/a.mp4,a\nb.mp4,put the block in the bowl, then close the lid\n",
+        "tasks.csv: line 3: expected 2 cells (text with a comma in quotes), got 3",
+    ),
+    "a video that is missing": ("tasks.json", '{"c.mp4": "a"}', "c.mp4: expected a video file, got none"),
+    "no JSON": ("tasks.json", "{", "tasks.json: expected JSON, got "),
+}
+
+
+@pytest.mark.parametrize(("name", "text", "message"), REFUSED.values(), ids=REFUSED)
+def test_a_table_of_videos_that_is_wrong_is_refused(videos: Path, name: str | None, text: str, message: str) -> None:
+    if name is not None:
+        (videos / name).write_text(text)
+    with pytest.raises(DatasetError) as caught:
+        _ = open_dataset(videos).episodes
+    assert message in str(caught.value)
+
+
+def lerobot(folder: Path, task: str) -> Path:
+    """A dataset whose tasks are this one."""
+    root = shutil.copytree(LEROBOT / "toy_v21", folder / "toy")
+    lines = [json.dumps({"task_index": index, "task": task}) for index in range(6)]
+    (root / "meta" / "tasks.jsonl").write_text("\n".join(lines))
+    episodes = (root / "meta" / "episodes.jsonl").read_text().splitlines()
+    lines = [json.dumps({**json.loads(line), "tasks": []}) for line in episodes]
+    (root / "meta" / "episodes.jsonl").write_text("\n".join(lines))
+    return root
+
+
+def hdf5(folder: Path, task: str) -> Path:
+    with h5py.File(folder / "demos.hdf5", "w") as opened:
+        opened.create_group("data").attrs["env_args"] = json.dumps({"env_name": "Lift", "lang": task})
+        opened["data/demo_0/obs/front"] = np.zeros((3, 8, 8, 3), np.uint8)
+    return folder / "demos.hdf5"
+
+
+def table(folder: Path, task: str) -> Path:
+    write_video(folder / "a.mp4", numbered(3))
+    (folder / "tasks.csv").write_text(f"video,task\na.mp4,{task}\n")
+    return folder
+
+
+KINDS: dict[str, Callable[[Path, str], Path]] = {"LeRobot": lerobot, "HDF5": hdf5, "videos": table}
+
+
+@pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
+def test_a_task_fills_in_where_episodes_have_none(tmp_path: Path, make: Callable[[Path, str], Path]) -> None:
+    source = make(tmp_path, "")
+    with pytest.raises(DatasetError, match="--task"):
+        _ = open_dataset(source).episodes
+    assert {episode.task for episode in open_dataset(source, task="open the box").episodes} == {"open the box"}
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("video,task\nb.mp4,\nday/a.mp4,stack the cups\n", ["open the box", "stack the cups"]),
+        ("video\nb.mp4\nday/a.mp4\n", ["open the box"] * 2),
+    ],
+    ids=["an empty cell", "no column"],
+)
+def test_a_task_fills_in_where_a_table_has_none(videos: Path, text: str, expected: list[str]) -> None:
+    (videos / "tasks.csv").write_text(text)
+    assert [episode.task for episode in open_dataset(videos, task="open the box").episodes] == expected
+
+
+@pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
+def test_a_task_replaces_those_of_episodes_only_on_request(tmp_path: Path, make: Callable[[Path, str], Path]) -> None:
+    source = make(tmp_path, "stack the cups")
+    with pytest.raises(DatasetError) as refused:
+        _ = open_dataset(source, task="open the box").episodes
+    assert str(refused.value) == (
+        "task: expected none for episodes that all have tasks of their own, got 'open the box': leave it out, or put it "
+        "in the place of theirs with --override-task"
+    )
+    told = {episode.task for episode in open_dataset(source, task="open the box", override_task=True).episodes}
+    assert told == {"open the box"}
+    with pytest.raises(DatasetError, match=r"^task: expected a sentence, got none$"):
+        open_dataset(source, override_task=True)

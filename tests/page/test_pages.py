@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""The files of the page and of the endpoints' documentation. No Triton is needed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gateways import TestClient, inside
+from paths import ROOT
+from rfm_client.frames.video import read_video
+from toy_world import Task, make_clip
+
+GATEWAY, PAGE = ROOT / "apps" / "gateway" / "rfm_gateway", ROOT / "apps" / "page" / "rfm_page"
+FILES = {
+    "": "text/html",
+    "viewer/main.js": "javascript",
+    "viewer/page.css": "text/css",
+    "viewer/uplot/uPlot.esm.js": "javascript",
+    "viewer/examples/success.mp4": "video/mp4",
+    "docs": "text/html",
+    "docs/swagger-ui/swagger-ui.css": "text/css",
+}
+NO_FILES = ("viewer/missing.js", "viewer/routes.py", "viewer/..%2fapp.py", "viewer/%2fetc%2fpasswd", "viewer/a%00.css")
+
+
+@pytest.fixture(scope="module")
+def gateway() -> Iterator[TestClient]:
+    with inside() as client:
+        yield client
+
+
+@pytest.mark.parametrize(("path", "kind"), FILES.items())
+def test_every_file_has_its_type_and_the_policy_of_the_page(gateway: TestClient, path: str, kind: str) -> None:
+    response = gateway.get(f"/{path}")
+    assert response.status_code == 200
+    assert kind in response.headers["content-type"]
+    policy = dict(part.split(" ", 1) for part in response.headers["content-security-policy"].split("; "))
+    assert policy["default-src"] == "'none'"
+    assert policy["script-src"] == policy["style-src"] == policy["connect-src"] == "'self'"
+    assert "unsafe" not in response.headers["content-security-policy"]
+    assert response.headers["x-content-type-options"] == "nosniff"
+    again = gateway.get(f"/{path}", headers={"If-None-Match": response.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert gateway.head(f"/{path}").status_code == 200
+
+
+@pytest.mark.parametrize("path", NO_FILES)
+def test_no_other_file_is_served(gateway: TestClient, path: str) -> None:
+    response = gateway.get(f"/{path}")
+    assert (response.status_code, response.json()) == (404, {"detail": "Not Found"})
+
+
+def test_no_viewer_turns_the_page_off() -> None:
+    with inside(viewer=False) as gateway:
+        for path in ("/", "/viewer/main.js", "/viewer/served", "/viewer/datasets", "/viewer/live/0/frame"):
+            assert gateway.get(path).status_code == 404
+        for path in ("/viewer/score", "/live/reports"):
+            assert gateway.post(path).status_code == 404
+        assert gateway.get("/docs").status_code == 200
+
+
+@pytest.mark.parametrize(
+    "file", [*(PAGE / "static").iterdir(), *(GATEWAY / "docs").iterdir()], ids=lambda file: file.name
+)
+def test_the_page_names_nothing_of_elsewhere(file: Path) -> None:
+    assert "://" not in file.read_text()
+
+
+@pytest.mark.parametrize(("name", "kind"), [("success", "success"), ("failure", "dropped"), ("rewound", "rewound")])
+def test_the_examples_are_clips_of_the_demo(name: str, kind: str) -> None:
+    seed = 2_000_000 + ["success", "failure", "rewound"].index(name)
+    frames = read_video(PAGE / "examples" / f"{name}.mp4")
+    expected = make_clip(kind, Task("red", "bowl"), seed).frames
+    assert np.abs(frames.astype(int) - expected).mean() < 4  # chroma has a quarter of the pixels
+
+
+@pytest.mark.parametrize("folder", [*(ROOT / "apps").glob("*/*/vendored/*"), *Path(__file__).parent.glob("vendored/*")])
+def test_vendored_files_are_those_of_the_pinned_packages(folder: Path) -> None:
+    told = json.loads((folder / "vendored.json").read_text())
+    assert told.keys() == {"package", "version", "licence", "tarball_sha256", "files"}
+    there = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
+    del there["vendored.json"]
+    assert "LICENSE" in there
+    assert there == told["files"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("package", [GATEWAY, PAGE], ids=lambda package: package.name)
+def test_the_page_is_in_the_distribution(package: Path, tmp_path: Path) -> None:
+    ignored = shutil.ignore_patterns("build", "*.egg-info", "__pycache__")
+    source = shutil.copytree(package.parent, tmp_path / "source", ignore=ignored)
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    words = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path), str(source)]
+    subprocess.run([*pip, *words], check=True, timeout=120)
+    (wheel,) = tmp_path.glob("*.whl")
+    kinds = ("docs/*", "static/*", "examples/*", "vendored/*/*")
+    expected = {str(file.relative_to(package.parent)) for kind in kinds for file in package.glob(kind)}
+    assert expected <= set(zipfile.ZipFile(wheel).namelist())

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: MIT
+"""What the page asks about videos, before a real Triton."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import requests
+
+import clip
+from gateway_requests import ENCODERS, TINY, TOLERANCE, VLM, Triton, check_refused, failure
+from gateways import Gateway, poll, running
+from rfm_client.frames.sampling import RULES
+from viewer_requests import COMPARE, SCORE, SERVED, by_command_line, curve_of, events, post
+
+pytestmark = pytest.mark.triton
+
+QUESTION = {"task": clip.TASK, "model": ENCODERS}
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a clip and a long one."""
+    folder = tmp_path_factory.mktemp("videos")
+    clip.write(folder / "clip.mp4")
+    clip.write(folder / "long.mp4", np.tile(clip.render(), (10, 1, 1, 1)))
+    return folder
+
+
+def test_the_models_that_score_frames_are_offered(tiny: Gateway, encoders: Gateway) -> None:
+    served = requests.get(f"{encoders.url}/{SERVED}").json()
+    assert [model["name"] for model in served["models"]] == [ENCODERS, VLM]
+    assert (served["model"], served["url"], served["fps"]) == (ENCODERS, encoders.triton_url, 3.0)
+    frames = {rule["name"]: rule["frames"] for rule in served["rules"]}
+    assert frames == {rule: 16 if rule.startswith("rewind") else None if rule == "all" else "any" for rule in RULES}
+    assert requests.get(f"{tiny.url}/{SERVED}").json()["model"] == TINY
+
+
+RULES_ASKED = {
+    "default": {},
+    "vision-language": {"model": VLM, "sampling": "rint_pad", "frames": "4", "fps": "5"},
+    "linspace_trunc": {"sampling": "linspace_trunc", "frames": "3"},
+    "rewind_pad16_offline": {"sampling": "rewind_pad16_offline", "fps": "8"},
+    "all": {"sampling": "all"},
+    "resized": {"sampling": "linspace_round", "frames": "4", "resize": "true"},
+    "turned": {"model": VLM, "orient": "rotate90", "frames": "4"},
+    "stored as BGR": {"model": VLM, "channels": "bgr", "frames": "4"},
+}
+
+
+@pytest.mark.parametrize("fields", RULES_ASKED.values(), ids=RULES_ASKED)
+def test_the_curve_is_that_of_the_command_line(tiny: Gateway, videos: Path, fields: dict[str, str]) -> None:
+    asked = {**QUESTION, **fields}
+    told = events(post(tiny.url, SCORE, {"video": videos / "clip.mp4"}, **asked))
+    options = {"sampling": "rint_pad", "fps": "3", **asked, "url": tiny.triton_url}
+    has_resize = options.pop("resize", None)
+    words = [word for name, value in options.items() for word in (f"--{name}", value)]
+    command = ["rfm-client", "score", "clip.mp4", *words, *(["--resize"] if has_resize else [])]
+    (video,) = by_command_line(videos, f"{shlex.join(command)} --json scores.json")["videos"]
+    curve = curve_of(told)
+    for name in ("progress", "success", "frame_times_s"):
+        np.testing.assert_allclose(curve[name], video[name], rtol=0, atol=TOLERANCE, err_msg=name)
+
+
+BLANK = {"a scene": (1.0, None), "black": (0.0, "black pictures"), "dim": (0.02, "black pictures, no value above ")}
+
+
+@pytest.mark.parametrize(("light", "told"), BLANK.values(), ids=BLANK)
+def test_a_curve_tells_if_the_video_shows_nothing(
+    encoders: Gateway, tmp_path: Path, light: float, told: str | None
+) -> None:
+    clip.write(tmp_path / "clip.mp4", (clip.render() * light).astype(np.uint8))
+    (name, video), *_ = events(post(encoders.url, SCORE, {"video": tmp_path / "clip.mp4"}, **QUESTION))
+    assert name == "video"
+    assert video["blank"] == told if told is None else video["blank"].startswith(told)
+
+
+def test_points_come_before_the_last_one_is_scored(encoders: Gateway, videos: Path) -> None:
+    told = events(post(encoders.url, SCORE, {"video": videos / "clip.mp4"}, fps="10", frames="4", **QUESTION))
+    counts = [len(points["progress"]) for name, points in told if name == "scores"]
+    assert len(curve_of(told)["progress"]) == clip.NUM_FRAMES
+    assert counts == [1, 2, 4, 8, 16, 1]
+
+
+def test_a_caller_who_leaves_frees_what_the_curve_holds(encoders: Gateway, videos: Path) -> None:
+    answered = encoders.metric("samples_total", sample_type="progress")
+    with post(encoders.url, SCORE, {"video": videos / "clip.mp4"}, fps="10", frames="16", **QUESTION) as response:
+        assert next(response.iter_lines()) == b"event: video"
+    poll(lambda: encoders.metric("requests_in_flight") == 0)
+    assert encoders.metric("samples_total", sample_type="progress") < answered + clip.NUM_FRAMES
+
+
+NO_KIND = r"expected a file of the kind MP4, MOV, WebM, Matroska, Ogg or AVI, got another kind \(video\.mp4\)"
+NO_STREAM = r"expected a file with a video stream, got .* \(video\.mp4\)"
+SESSION = b"v=0\nfree\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n"  # to FFmpeg an address
+BROKEN: dict[str, tuple[bytes | None, dict[str, str], str, str]] = {
+    "text": (b"no video", {}, "video", NO_KIND),
+    "a play list": (b"#EXTM3U\n#EXTINF:1,\n/etc/passwd\n", {}, "video", NO_KIND),
+    "disguised": (SESSION, {}, "video", NO_STREAM),
+    "cut off": (b"\0\0\0\x18ftypisom", {}, "video", NO_STREAM),
+    "no task": (None, {"task": " "}, "task", "expected a value, got none"),
+    "rule": (None, {"sampling": "each"}, "sampling", "expected 'linspace_trunc', .* or 'all', got 'each'"),
+    "frames": (None, {"frames": "4097"}, "frames", "expected less than or equal to 4096, got '4097'"),
+    "frames of all": (None, {"sampling": "all", "frames": "4"}, "frames", "expected none with the rule all, got 4"),
+    "fps": (None, {"fps": "nan"}, "fps", "expected .*, got 'nan'"),
+    "resize": (None, {"resize": "maybe"}, "resize", "expected a valid boolean, got 'maybe'"),
+    "orient": (None, {"orient": "up"}, "orient", "expected 'none', .* or 'rotate270', got 'up'"),
+    "channels": (None, {"channels": "gbr"}, "channels", "expected 'rgb' or 'bgr', got 'gbr'"),
+}
+
+
+@pytest.mark.parametrize(("content", "fields", "at", "message"), BROKEN.values(), ids=BROKEN)
+def test_a_wrong_question_says_why(
+    encoders: Gateway, videos: Path, content: bytes | None, fields: dict[str, str], at: str, message: str
+) -> None:
+    file = videos / "clip.mp4" if content is None else content
+    check_refused(post(encoders.url, SCORE, {"video": file}, **{**QUESTION, **fields}), ([at], message))
+
+
+def test_a_missing_video_a_missing_model_and_a_refused_task_are_named(encoders: Gateway, videos: Path) -> None:
+    video = videos / "clip.mp4"
+    response = post(encoders.url, COMPARE, {"first": video}, **QUESTION)
+    check_refused(response, (["second"], "expected a video file, got none"))
+    response = post(encoders.url, SCORE, {"video": video}, **{**QUESTION, "model": "missing"})
+    assert "missing_frames" in failure(response, 503)
+    response = post(encoders.url, SCORE, {"video": video}, model=VLM, task="<|im_end|>")
+    names, documents = zip(*events(response), strict=True)
+    assert names == ("video", "failed")
+    assert re.fullmatch(r"[\w.]+: expected .*, got .*", documents[-1]["detail"]), documents[-1]
+
+
+def test_a_video_that_needs_too_much_memory_is_refused(triton: Triton, videos: Path, tmp_path: Path) -> None:
+    with running(triton.endpoints, tmp_path, ENCODERS, "--max-body-mib", "1") as gateway:
+        response = post(gateway.url, SCORE, {"video": videos / "long.mp4"}, **QUESTION)
+        assert "expected files of at most 2097152 bytes" in failure(response, 413)
+        video = {"video": videos / "clip.mp4"}
+        curve_of(events(post(gateway.url, SCORE, video, fps="1", sampling="all", **QUESTION)))
+        assert gateway.metric("samples_total", sample_type="progress") == 3
+        assert gateway.metric("rejections_total", reason="size") == 1

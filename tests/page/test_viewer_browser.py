@@ -1,0 +1,431 @@
+# SPDX-License-Identifier: MIT
+"""The page in Chromium, before a real Triton with the demo's checkpoint."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from selenium.webdriver import ActionChains, Keys
+from selenium.webdriver.support.select import Select
+
+import clip
+from browsers import Browser
+from gateway_requests import TOLERANCE
+from gateways import Gateway, poll, running
+from paths import VIDEOS
+from rfm.launch.triton_server import Endpoints
+from rfm_client.frames.orientation import CHANNEL_ORDERS, ORIENTATIONS, ChannelOrder, Correction, Orientation
+from toy_world import Task, make_clip
+from viewer_requests import by_command_line
+
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
+SVG = "{http://www.w3.org/2000/svg}"
+TASK, OTHER_TASK = Task("red", "bowl").sentence(), Task("green", "plate").sentence()
+CLIPS = {"success": ("success", 2_000_000), "failure": ("dropped", 2_000_001)}
+FPS = 10
+SIGNALS = ("progress", "success")
+SHOWN = 5e-4  # three decimals
+PLAYERS = "#videos video, #time"  # the videos, then the slider
+
+
+@dataclass(frozen=True)
+class Page:
+    """The page, ready, with a task, and the folder of videos."""
+
+    gateway: Gateway
+    browser: Browser
+    videos: Path
+
+    def drop(self, *names: str) -> None:
+        self.browser.drop([self.videos / f"{name}.mp4" for name in names])
+
+    def score(self, *names: str) -> None:
+        """Drops videos, and waits for their curves."""
+        self.drop(*names)
+        self.browser.until_text("status", f"{len(names)} of {len(names)} curves are done.")
+
+    def compare(self) -> Any:
+        self.browser["compare"].click()
+        self.browser.until("document.querySelector('#pairs p')")
+        (answer,) = self.saved()["comparisons"]
+        return answer
+
+    def saved(self) -> Any:
+        """What the page lets a person take along."""
+        self.browser["json"].click()
+        return json.loads(self.browser.saved("curves.json"))
+
+    def beside_the_lines(self) -> list[float]:
+        """The numbers at the cursor: progress of each curve, then success of each."""
+        return [float(text) for signal in SIGNALS for text in self.browser.values("chart", signal).values()]
+
+    def is_at(self, time_s: float, abs_s: float = 0.005) -> bool:
+        times_s = self.browser.times_s(PLAYERS)
+        return times_s == pytest.approx([time_s] * len(times_s), abs=abs_s)
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("videos")
+    for name, (kind, seed) in CLIPS.items():
+        clip.write(folder / f"{name}.mp4", make_clip(kind, Task("red", "bowl"), seed).frames, FPS)
+    (folder / "copy.mp4").write_bytes((folder / "success.mp4").read_bytes())
+    (folder / "broken.mp4").write_text("no video")
+    (folder / "large.mp4").write_bytes((VIDEOS / "berkeley_rpt_stack_cup.mp4").read_bytes())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def gateway(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    with running(demo_server, tmp_path_factory.mktemp("gateway")) as started:
+        yield started
+
+
+@pytest.fixture
+def page(gateway: Gateway, quiet_browser: Browser, videos: Path) -> Page:
+    quiet_browser.driver.get(gateway.url)
+    quiet_browser.run("localStorage.clear()")
+    quiet_browser.open(gateway.url)
+    quiet_browser.write("tasks", TASK)
+    quiet_browser.write("fps", str(FPS))
+    return Page(gateway, quiet_browser, videos)
+
+
+def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
+    page.score("success", "failure")
+    document = page.saved()
+    assert [video["source"] for video in document["videos"]] == ["success.mp4", "failure.mp4"]
+    videos = by_command_line(page.videos, page.browser["command"].text)["videos"]
+    for shown, video, row in zip(document["videos"], videos, page.browser.cells("#curves tr"), strict=True):
+        for name in ("progress", "success", "frame_times_s"):
+            np.testing.assert_allclose(shown[name], video[name], rtol=0, atol=TOLERANCE, err_msg=name)
+        assert (shown["num_frames"], shown["model_version"]) == (video["num_frames"], video["model_version"])
+        last = [video[name][-1] for name in ("progress", "success")]
+        assert [float(text) for text in row[5:7]] == pytest.approx(last, abs=SHOWN + TOLERANCE)
+    assert page.beside_the_lines() == pytest.approx(
+        [each[name][0] for name in SIGNALS for each in videos], abs=2 * SHOWN
+    )
+    assert "success.mp4: put the red block in the bowl" in page.browser["chart"].get_attribute("aria-label")
+    for threshold in (0.5, 1.0):
+        page.browser.run(
+            "const slider = document.getElementById('threshold'); slider.value = arguments[0]; "
+            "slider.dispatchEvent(new Event('input'))",
+            threshold,
+        )
+        first = [np.flatnonzero(np.array(video["success"]) >= threshold) for video in document["videos"]]
+        told = [f"{index[0] / FPS:.2f} s" if len(index) else "-" for index in first]
+        assert [row[7] for row in page.browser.cells("#curves tr")] == told
+
+
+def picture(page: Page) -> Image.Image:
+    """What the page shows of its one video, without the box around it."""
+    (player,) = page.browser.all("#videos video")
+    page.browser.run("arguments[0].scrollIntoView()", player)
+    page.browser.draw()
+    shown = Image.open(io.BytesIO(player.screenshot_as_png)).convert("RGB")
+    lit = np.argwhere(np.asarray(shown).max(axis=2) > 8)  # beside a quarter turn the box is black
+    (top, left), (bottom, right) = lit.min(axis=0), lit.max(axis=0)
+    return shown.crop((left, top, right + 1, bottom + 1))
+
+
+@pytest.mark.parametrize(
+    ("orientation", "channels"),
+    [*((orientation, "rgb") for orientation in ORIENTATIONS), ("none", "bgr"), ("rotate90", "bgr")],
+)
+def test_a_person_sees_what_the_model_sees(page: Page, orientation: Orientation, channels: ChannelOrder) -> None:
+    frames = make_clip("success", Task("red", "bowl"), 2_000_000).frames[:, :40]
+    clip.write(page.videos / "wide.mp4", frames, FPS)
+    Select(page.browser["orient"]).select_by_value(orientation)
+    Select(page.browser["channels"]).select_by_value(channels)
+    page.score("wide")
+    (told,) = page.saved()["videos"]
+    (video,) = by_command_line(page.videos, page.browser["command"].text)["videos"]
+    assert (told["orient"], told["channels"]) == (orientation, channels)
+    np.testing.assert_allclose(told["progress"], video["progress"], rtol=0, atol=TOLERANCE)
+
+    page.browser["time"].send_keys(Keys.HOME)
+    poll(lambda: page.is_at(0))
+    seen = picture(page)
+
+    def distance(correction: Correction) -> float:
+        expected = Image.fromarray(correction.applied(frames[0]))
+        return float(np.abs(np.float32(seen.resize(expected.size)) - np.float32(expected)).mean())
+
+    corrections = [Correction(*both) for both in itertools.product(ORIENTATIONS, CHANNEL_ORDERS)]
+    assert min(corrections, key=distance) == Correction(orientation, channels)
+
+
+def test_tasks_are_overlaid_and_taken_along(page: Page) -> None:
+    page.browser.write("tasks", f"{TASK}\n{OTHER_TASK}\n{TASK}")
+    Select(page.browser["rule"]).select_by_visible_text("linspace_trunc")
+    page.browser.write("frames", "4")
+    page.drop("success")
+    page.browser.until_text("status", "2 of 2 curves are done.")
+    first, second = page.saved()["videos"]
+    assert (first["task"], second["task"]) == (TASK, OTHER_TASK)
+    assert first["progress"] != second["progress"]
+    assert len(page.browser["command"].text.splitlines()) == 2
+    page.browser["csv"].click()
+    lines = list(csv.DictReader(page.browser.saved("curves.csv").decode().splitlines()))
+    assert [float(line["progress"]) for line in lines] == first["progress"] + second["progress"]
+    assert {(line["sampling"], line["frames"]) for line in lines} == {("linspace_trunc", "4")}
+
+
+def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(page: Page) -> None:
+    page.score("success", "failure")
+    (over,) = page.browser.all(".u-over")
+    width = over.size["width"]
+    ActionChains(page.browser.driver).move_to_element(over).perform()  # pointing is enough
+    poll(lambda: page.is_at(1.5 / 2, 0.02))
+    ActionChains(page.browser.driver).move_to_element_with_offset(over, -width // 4, 0).click_and_hold().perform()
+    poll(lambda: page.is_at(1.5 / 4, 0.02))
+    ActionChains(page.browser.driver).move_by_offset(width // 2, 0).release().perform()
+    poll(lambda: page.is_at(1.5 * 3 / 4, 0.02))
+    expected = [video[name][11] for name in SIGNALS for video in page.saved()["videos"]]
+    assert page.beside_the_lines() == pytest.approx(expected, abs=SHOWN)
+    told = page.browser["time"].get_attribute("aria-valuetext")
+    assert told.startswith("1.1")
+    assert f"progress {expected[0]:.3f}, success {expected[2]:.3f}" in told
+    page.browser["time"].send_keys(Keys.HOME)
+    poll(lambda: page.is_at(0))
+    for key, time_s in ((Keys.ARROW_RIGHT, 0.1), (Keys.ARROW_RIGHT, 0.2), (Keys.ARROW_LEFT, 0.1)):
+        page.browser["time"].send_keys(key)
+        poll(lambda time_s=time_s: page.is_at(time_s))  # type: ignore[misc]
+    page.browser["play"].click()
+    page.browser.until_text("play", "Pause")
+    seen = [0.1]
+    poll(lambda: seen.append(page.browser.times_s(PLAYERS)[-1]) or seen[-1] == pytest.approx(1.5))  # type: ignore[func-returns-value]
+    assert len(set(seen)) > 2
+    assert sorted(seen) == seen
+    page.browser.until_text("play", "Play")
+
+
+def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
+    page.score("success", "failure")
+    answer = page.compare()
+    commands = [line for line in page.browser["command"].text.splitlines() if line.startswith("rfm-client compare")]
+    shown = [item.text for item in page.browser.all("#pairs li")]
+    for order, command, line in zip(answer["orders"], commands, shown, strict=True):
+        preference = by_command_line(page.videos, f"{command} --json pair.json")["preference"]
+        assert order["preference"] == pytest.approx(preference, abs=TOLERANCE)
+        assert float(line.rpartition(" ")[2]) == pytest.approx(preference, abs=SHOWN + TOLERANCE)
+    assert page.browser.all("#pairs p")[0].text == "Both orders agree: success.mp4 is better."
+    assert (answer["verdict"], answer["orders_agree"]) == ("first", True)
+
+
+def test_a_video_is_no_better_than_its_copy(page: Page) -> None:
+    page.score("success", "copy")
+    answer = page.compare()
+    assert answer["verdict"] is None
+    why = "both are exactly 0.5" if answer["orders_agree"] else "the orders disagree"
+    assert page.browser.all("#pairs p")[0].text == f"No answer: {why}."
+
+
+def test_what_is_missing_or_broken_is_named_and_the_others_are_scored(page: Page) -> None:
+    submit = page.browser.all("#question .first")[0]
+    submit.click()
+    assert page.browser["errors"].text == "video: expected a file, got none: drop one"
+    page.browser.write("tasks", " ")
+    page.drop("broken", "success")
+    page.browser.until_text("task-wanted", "What is the robot to do? Type it, then press Score.")
+    assert page.browser.run("return document.activeElement.id") == "tasks"
+    submit.click()
+    assert page.browser["errors"].text == "task: expected a sentence, got none"
+    assert page.browser.cells("#curves tr") == []
+    page.browser.write("tasks", TASK)
+    submit.click()
+    assert page.browser["task-wanted"].text == ""
+    page.browser.until_text("status", "1 of 2 curves are done.")
+    kinds = "MP4, MOV, WebM, Matroska, Ogg or AVI"
+    told = f"video: expected a file of the kind {kinds}, got another kind (broken.mp4)"
+    page.browser.until_text("errors", f"broken.mp4: {told}")
+    assert [row[-1] for row in page.browser.cells("#curves tr")] == [told, "done"]
+
+
+SIZES = ((1440, 900), (1024, 700))
+IN_VIEW = """
+return arguments[0].map((name) => {
+  const { top, left, bottom, right, height } = document.getElementById(name).getBoundingClientRect();
+  return [top >= 0 && left >= 0 && bottom <= innerHeight && right <= innerWidth, height / innerHeight];
+});
+"""
+TOO_WIDE = "return document.documentElement.scrollWidth - innerWidth"
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_videos_and_chart_are_in_view_without_scrolling(page: Page, size: tuple[int, int]) -> None:
+    with page.browser.window(*size):
+        page.score("success", "large", "failure")
+        shares = dict(
+            zip(
+                ("videos", "legend", "chart", "time"),
+                page.browser.run(IN_VIEW, ["videos", "legend", "chart", "time"]),
+                strict=True,
+            )
+        )
+        assert [is_in_view for is_in_view, _ in shares.values()] == [True] * 4
+        assert shares["chart"][1] >= 0.5
+        assert (
+            page.browser.run(
+                "return Math.min(...[...document.querySelectorAll('#videos video')].map((v) => v.clientHeight))"
+            )
+            >= 96
+        )
+
+
+def test_a_telephone_has_one_column_and_cards_for_rows(page: Page) -> None:
+    with page.browser.window(390, 844):
+        page.score("success", "failure")
+        assert page.browser.run(TOO_WIDE) <= 0
+        names = page.browser.run(
+            "return [...document.querySelectorAll('#curves tr:first-child td')].map((cell) => "
+            "getComputedStyle(cell, '::before').content)"
+        )
+        assert names[-2:] == ['"Success at"', '"State"']
+
+
+def test_the_settings_fold_away_and_stay_so(page: Page) -> None:
+    page.browser["fold"].click()
+    assert not page.browser["question"].is_displayed()
+    page.browser.open(page.gateway.url)
+    assert not page.browser["question"].is_displayed()
+    page.drop("success")  # without a task: it is asked for
+    assert page.browser.until("document.activeElement.id") == "tasks"
+    assert page.browser["question"].is_displayed()
+
+
+def test_the_threshold_is_dragged_in_the_chart(page: Page) -> None:
+    page.score("success")
+    (line,) = page.browser.all("#chart .threshold")
+    assert line.get_attribute("data-value") == "0.50"
+    height = page.browser.run("return document.querySelector('#chart .u-over').clientHeight")
+    drag = ActionChains(page.browser.driver).move_to_element(line).click_and_hold()
+    drag.move_by_offset(0, -round(0.24 * height * 0.3)).release().perform()  # the band has 0.24 of the height
+    assert float(page.browser["threshold"].get_attribute("value")) == pytest.approx(0.8, abs=0.02)
+    assert line.get_attribute("data-value") == f"{float(page.browser['threshold'].get_attribute('value')):.2f}"
+    (video,) = page.saved()["videos"]
+    value = float(page.browser["threshold"].get_attribute("value"))
+    first = np.flatnonzero(np.array(video["success"]) >= value)[0]
+    assert page.browser.cells("#curves tr")[0][7] == f"{first / FPS:.2f} s"
+
+
+def legend(page: Page) -> list[str]:
+    return [str(name.get_attribute("textContent")) for name in page.browser.all("#legend .nameable button")]
+
+
+def test_videos_and_curves_are_renamed_coloured_and_removed(page: Page) -> None:
+    page.score("success", "failure")
+    assert legend(page) == ["success.mp4", "failure.mp4"]
+    page.browser.all("#videos .nameable button")[0].click()
+    page.browser.all("#videos .nameable input")[0].send_keys(
+        "a robot that does what it should do, first try", Keys.ENTER
+    )
+    assert legend(page) == ["a robot that does wh…hould do, first try", "failure.mp4"]
+    page.browser.all("#legend .nameable button")[1].click()
+    page.browser.all("#legend .nameable input")[1].send_keys("dropped", Keys.ENTER)
+    assert legend(page)[1] == "dropped"
+    page.browser.run(
+        "const colour = document.querySelectorAll('#legend [type=color]')[1]; colour.value = '#ff00ff'; "
+        "colour.dispatchEvent(new Event('input'))"
+    )
+    colours = page.browser.run(
+        "return [...document.querySelectorAll('#chart .values span')].map((each) => each.style.color)"
+    )
+    assert colours[1::2] == ["rgb(255, 0, 255)"] * 2
+    assert [video["source"] for video in page.saved()["videos"]] == ["success.mp4", "failure.mp4"]  # the files' names
+    page.browser.all("#videos .remove")[0].click()
+    assert legend(page) == ["dropped"]
+    assert len(page.browser.all("#videos video")) == 1
+    page.browser.all("#legend .remove")[0].click()
+    assert page.browser.cells("#curves tr") == []
+    page.browser.all("#question .first")[0].click()  # the video is still there
+    page.browser.until_text("status", "1 of 1 curves are done.")
+
+
+def test_an_example_is_scored_with_a_click_and_its_command_line_runs(page: Page) -> None:
+    page.browser.write("tasks", "")
+    page.browser.write("fps", "3")
+    page.browser.all("#examples [data-example=success]")[0].click()
+    page.browser.until_text("status", "1 of 1 curves are done.")
+    (shown,) = page.saved()["videos"]
+    (video,) = by_command_line(page.videos, page.browser["command"].text)["videos"]
+    np.testing.assert_allclose(shown["progress"], video["progress"], rtol=0, atol=TOLERANCE)
+    assert shown["progress"][-1] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("triton", "shown_by", "options"),
+    [
+        ("grpc://127.0.0.1:8001", "http://localhost:8100/", ["--url", "grpc://127.0.0.1:8001"]),
+        ("grpc://localhost:8001", "https://gpu-box.lan:8443/", []),
+        ("grpc://triton:8001", "https://gpu-box.lan:8443/", ["--url", "grpc://triton:8001"]),
+    ],
+)
+def test_the_command_line_names_a_triton_that_can_be_reached(
+    page: Page, triton: str, shown_by: str, options: list[str]
+) -> None:
+    script = """
+    const [triton, page, done] = arguments;
+    import("/viewer/takeaway.js").then(({ serverOption }) => done(serverOption(triton, page)));
+    """
+    assert page.browser.driver.execute_async_script(script, triton, shown_by) == options
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page, theme: str) -> None:
+    with page.browser.theme(theme):
+        page.score("success", "failure")
+        page.browser["png"].click()
+        picture = Image.open(io.BytesIO(page.browser.saved("curves.png"))).convert("RGB")
+        page.browser["svg"].click()
+        svg = ElementTree.fromstring(page.browser.saved("curves.svg"))
+    assert picture.width == 2100
+    assert np.asarray(picture)[[0, 0, -1], [0, -1, -1]].tolist() == [[255] * 3] * 3
+    assert (np.asarray(picture).std(axis=2) > 20).any()  # the coloured lines
+    assert svg.attrib["width"] == "252pt"
+    texts = [element.text for element in svg.iter(f"{SVG}text")]
+    assert {TASK, "success.mp4", "failure.mp4", "progress", "success", "seconds"} <= set(texts)
+    lines = [
+        [tuple(map(float, point.split(","))) for point in line.attrib["points"].split()]
+        for line in svg.iter(f"{SVG}polyline")
+    ]
+    told = page.saved()["videos"]
+    marks = [float(line.attrib["y1"]) for line in svg.iter(f"{SVG}line") if line.attrib["y1"] == line.attrib["y2"]]
+    ends = {"progress": (marks[0], marks[2]), "success": (marks[3], marks[4])}  # where 0 and 1 lie
+    of_all = [(*ends[name], video[name]) for video in told for name in SIGNALS]
+    for points, (zero, one, values) in zip(lines, of_all, strict=True):
+        heights = (zero - np.array([y for _, y in points])) / (zero - one)
+        np.testing.assert_allclose(heights, values, rtol=0, atol=1e-3)
+
+
+def test_axe_finds_nothing_in_either_theme(page: Page) -> None:
+    page.score("success", "failure")
+    page.compare()
+    for theme in ("light", "dark"):
+        with page.browser.theme(theme):
+            assert page.browser.violations() == []
+
+
+def test_the_documentation_of_endpoints_needs_no_network(gateway: Gateway, quiet_browser: Browser) -> None:
+    quiet_browser.driver.get(f"{gateway.url}/docs")
+    quiet_browser.until("document.body.textContent.includes('/evaluate_batch_npy')")
+
+
+def test_a_picture_of_the_page(page: Page) -> None:
+    page.score("success", "failure")
+    page.browser["time"].send_keys(*[Keys.ARROW_RIGHT] * 12)
+    poll(lambda: page.is_at(1.2))
+    page.compare()
+    page.browser.picture("page.png")

@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: MIT
+"""What the page asks of datasets: episodes, curves and videos, and what it is refused. No Triton is needed for that."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from gateway_requests import failure
+from gateways import inside
+from labelling import LEROBOT, BrightnessScorer
+from pictures import TURNS, turn
+from rfm_client.contract.settings import ConfigError
+from rfm_client.frames.orientation import Channels, Orient
+from rfm_gateway.config import GatewayConfig
+from rfm_labels import LabelOptions, label, open_dataset
+from rfm_labels.datasets.lerobot import LeRobotDataset
+from rfm_labels.options import Format
+from rfm_page.page import shown_datasets
+from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew
+
+V21, V30 = range(2)  # numbers of the datasets with labels; one without follows
+VIDEO = "videos/observation.images.front/chunk-000/file-000.mp4"  # of the episodes below
+OF_VIDEO = range(4)
+NEEDS_LATER = {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "3", "b_strategy": "0"}
+Get = Callable[[str], Any]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Of the datasets, by their numbers."""
+    folder = tmp_path_factory.mktemp("shelf")
+    labelled = [copied(name, folder) for name in ("toy_v21", "toy_v30_many")]
+    for root in labelled:
+        label(open_dataset(root), BrightnessScorer(), LabelOptions())
+    return [*labelled, copied("toy_v30_many", folder / "plain")]
+
+
+@contextmanager
+def serving(*roots: Path, **settings: Any) -> Iterator[Get]:
+    """Gives the answers of a gateway that shows the datasets in these folders."""
+    with inside(dataset=tuple(map(str, roots)), **settings) as gateway:
+        yield lambda path: gateway.get(f"/viewer/datasets{path}")
+
+
+@pytest.fixture(scope="module")
+def get(folders: list[Path]) -> Iterator[Get]:
+    with serving(*folders) as answers:
+        yield answers
+
+
+@pytest.mark.parametrize("number", [V21, V30])
+def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: list[Path], number: int) -> None:
+    told = get(f"/{number}").json()
+    root = folders[number]
+    episodes = LeRobotDataset(root).episodes
+    assert [(each["episode"], each["task"], each["num_frames"]) for each in told["episodes"]] == [
+        (episode.index, episode.task, episode.num_frames) for episode in episodes
+    ]
+    for row in told["episodes"]:
+        columns = columns_of(root, row["episode"])
+        apart = np.abs(columns[f"progress.{CAMERAS[0]}"] - columns[f"progress.{CAMERAS[1]}"])
+        expected = {
+            "final_progress": columns["progress_sparse"][-1],
+            "best_success": columns["success"].max(),
+            "last_success": columns["success"][-1],
+            "backwards": (np.diff(columns["progress_sparse"]) < -0.01).mean(),
+            "disagreement": apart.mean(),
+        }
+        assert {name: row[name] for name in expected} == pytest.approx(expected, abs=1e-6)
+    assert (told["labels"], told["cameras"], told["threshold"]) == ("rfm_progress.parquet", list(CAMERAS), 0.5)
+    file = root / "rfm_progress.parquet"
+    assert told["provenance"] == json.loads(parquet.read_schema(file).metadata[b"rfm.provenance"])
+    assert told["written_s"] == pytest.approx(file.stat().st_mtime)
+
+
+@pytest.mark.parametrize("form", ["progress", "signals"])
+def test_the_table_tells_how_pictures_became_upright_rgb_for_the_labels(tmp_path: Path, form: Format) -> None:
+    root = copied("toy_v21", tmp_path)
+    corrected = open_dataset(root, orient=Orient.parse(["wrist=rotate180"]), channels=Channels("bgr"))
+    label(corrected, BrightnessScorer(), LabelOptions(formats=(form,)))
+    with serving(root) as get:
+        front, wrist = get("/0").json()["corrections"]
+    assert front == {"orient": "none", "channels": "bgr"}
+    assert wrist == {"orient": "rotate180", "channels": "bgr"}
+
+
+def test_the_table_tells_which_cameras_show_no_colours(tmp_path: Path) -> None:
+    root = copied("toy_v21", tmp_path)
+    file = root / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    info["features"]["observation.images.depth_head"] = info["features"].pop(CAMERAS[1])
+    file.write_text(json.dumps(info))
+    with serving(root) as get:
+        told = get("/0").json()
+    assert dict(zip(told["cameras"], told["unused"], strict=True)) == {
+        CAMERAS[0]: None,
+        "observation.images.depth_head": "depth",
+    }
+
+
+@pytest.mark.parametrize(("number", "episode"), [(V21, 7), (V30, 9)])
+def test_the_curves_are_those_of_the_labels(get: Get, folders: list[Path], number: int, episode: int) -> None:
+    told = get(f"/{number}/episodes/{episode}").json()
+    columns = columns_of(folders[number], episode)
+    np.testing.assert_allclose(told["times_s"], columns["frame_index"] / 10, atol=1e-4)
+    names = [(None, "progress_sparse", "success"), *((each, f"progress.{each}", f"success.{each}") for each in CAMERAS)]
+    assert [curve["camera"] for curve in told["curves"]] == [name for name, *_ in names]
+    for curve, (_, progress, success) in zip(told["curves"], names, strict=True):
+        np.testing.assert_array_equal(np.float32(curve["progress"]), columns[progress])
+        np.testing.assert_array_equal(np.float32(curve["success"]), columns[success])
+
+
+def check_frames(get: Get, root: Path, episode: int, number: int = 0, camera: int = 0) -> None:
+    """The video that is answered has the episode's frames and no other, from 0 s on."""
+    response = get(f"/{number}/episodes/{episode}/videos/{camera}")
+    assert (response.status_code, response.headers["content-type"]) == (200, "video/mp4")
+    with av.open(io.BytesIO(response.content)) as container:
+        frames = [(float(frame.time or 0), frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
+    opened = LeRobotDataset(root)
+    expected = list(opened.frames(opened.episodes[episode], CAMERAS[camera]))
+    np.testing.assert_array_equal(np.stack([frame for _, frame in frames]), np.stack(expected))
+    np.testing.assert_allclose([time for time, _ in frames], np.arange(len(frames)) / 10, atol=1e-3)
+
+
+@pytest.mark.parametrize("camera", [0, 1])
+@pytest.mark.parametrize("number", [V21, V30])
+def test_a_video_has_the_frames_of_its_episode(get: Get, folders: list[Path], number: int, camera: int) -> None:
+    for episode in (0, 3, 7):
+        check_frames(get, folders[number], episode, number, camera)
+
+
+@pytest.mark.parametrize("coding", CODINGS.values(), ids=CODINGS)
+def test_a_cut_is_exact_however_the_video_is_coded(tmp_path: Path, coding: tuple[str, dict[str, str]]) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    encoded_anew(root / VIDEO, *coding)
+    with serving(root) as get:
+        for episode in OF_VIDEO:
+            check_frames(get, root, episode)
+
+
+def test_an_episode_that_needs_frames_behind_its_end_is_refused(tmp_path: Path) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    encoded_anew(root / VIDEO, "libx264", NEEDS_LATER)
+    with serving(root) as get:
+        responses = [get(f"/0/episodes/{episode}/videos/0") for episode in OF_VIDEO]
+    refused = [response for response in responses if response.status_code != 200]
+    assert refused
+    for response in refused:
+        assert "-bf 0" in failure(response, 500)
+
+
+def test_a_cut_of_a_turned_video_is_turned_alike(tmp_path: Path) -> None:
+    root = copied("toy_v21", tmp_path)
+    video = next(root.rglob("*front/episode_000002.mp4"))
+    turn(video, TURNS["clockwise"][0])
+    with serving(root) as get:
+        cut = get("/0/episodes/2/videos/0").content
+    turns = []
+    for content in (video.read_bytes(), cut):
+        with av.open(io.BytesIO(content)) as container:
+            turns.append({frame.rotation for frame in container.decode(video=0)})
+    assert turns[0] == turns[1] != {0}
+
+
+UNKNOWN = {
+    "/3": "dataset: expected one of 3, got 3",
+    "/-1": "dataset: expected one of 3, got -1",
+    "/0/episodes/8": "episode: expected one from 0 to 7, got 8",
+    "/0/episodes/-1": "episode: expected one from 0 to 7, got -1",
+    "/0/episodes/0/videos/2": "camera: expected one of 2 with videos, got 2",
+    "/0/episodes/0/videos/-1": "camera: expected one of 2 with videos, got -1",
+    "/0?labels=../toy_v30_many/rfm_progress.parquet": "labels: expected one of rfm_progress.parquet, got another",
+    "/0/episodes/0?labels=meta/info.json": "labels: expected one of rfm_progress.parquet, got another",
+    "/0/meta/info.json": "Not Found",
+    "/0/episodes/..%2f..%2fmeta%2finfo.json": "Not Found",
+}
+
+
+@pytest.mark.parametrize(("path", "message"), UNKNOWN.items())
+def test_what_is_not_there_is_not_found(get: Get, path: str, message: str) -> None:
+    assert failure(get(path), 404) == message
+
+
+def test_tasks_that_are_no_sentences_and_numbers_with_gaps_are_shown_as_they_are_stored(tmp_path: Path) -> None:
+    root = copied("toy_v21", tmp_path)
+    tasks = [{"task_index": 0, "task": "N/A"}, {"task_index": 1, "task": "lift it"}]
+    (root / "meta" / "tasks.jsonl").write_text("\n".join(map(json.dumps, tasks)))
+    episodes = [json.loads(line) for line in (root / "meta" / "episodes.jsonl").read_text().splitlines()]
+    kept = [line for line in episodes if line["episode_index"] in (1, 6)]
+    (root / "meta" / "episodes.jsonl").write_text("\n".join(map(json.dumps, kept)))
+    info = json.loads((root / "meta" / "info.json").read_text())
+    info |= {"total_episodes": 2, "total_frames": sum(line["length"] for line in kept)}
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    with serving(root) as get:
+        rows = get("/0").json()["episodes"]
+        assert [(row["episode"], row["task"]) for row in rows] == [(1, "lift it"), (6, "N/A")]
+        assert get("/0/episodes/6").json()["task"] == "N/A"
+        assert failure(get("/0/episodes/2"), 404) == "episode: expected one from 1 to 6, with gaps, got 2"
+
+
+@pytest.mark.parametrize("name", [VIDEO, "rfm_progress.parquet", "README.md", "videos"])
+def test_a_dataset_with_links_that_leave_it_is_refused(folders: list[Path], tmp_path: Path, name: str) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    if (root / name).exists():
+        (root / name).rename(tmp_path / "moved")
+    (root / name).symlink_to(folders[V30] / name)
+    expected = f"{root / name}: expected a file in the dataset's folder, got a link that leaves it"
+    with pytest.raises(ConfigError, match=expected):
+        shown_datasets(GatewayConfig(dataset=(str(root),)))
+
+
+@pytest.mark.parametrize(("name", "path"), [(VIDEO, "/0/episodes/0/videos/0"), ("rfm_progress.parquet", "/0")])
+def test_a_file_that_becomes_a_link_out_of_the_dataset_is_not_read(
+    folders: list[Path], tmp_path: Path, name: str, path: str
+) -> None:
+    root = Path(shutil.copytree(folders[V30], tmp_path / "swapped"))
+    with serving(root) as get:
+        assert get(path).status_code == 200
+        (root / name).unlink()
+        (root / name).symlink_to(folders[V30] / name)
+        expected = f"swapped/{name}: expected a file in the dataset's folder, got a link that leaves it"
+        assert failure(get(path), 500).startswith(expected)
+
+
+def test_a_folder_that_hides_its_links_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root, listed = copied("toy_v30_many", tmp_path), os.scandir
+
+    def scandir(folder: Path) -> Any:
+        if folder == root / "videos":  # as if it had mode 0711, which does not keep root out
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return listed(folder)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    with pytest.raises(ConfigError, match="videos: expected a folder whose files can be listed, got Permission denied"):
+        shown_datasets(GatewayConfig(dataset=(str(root),)))
+
+
+def test_a_pipe_in_a_dataset_is_not_read(tmp_path: Path) -> None:
+    """Whoever opened it would wait for somebody to write."""
+    root = copied("toy_v30_many", tmp_path)
+    with serving(root) as get:
+        (root / VIDEO).unlink()
+        os.mkfifo(root / VIDEO)
+        expected = f"{VIDEO}: expected a file or a folder, got a pipe, a socket or a device"
+        assert failure(get("/0/episodes/0/videos/0"), 500).endswith(expected)
+
+
+def test_links_inside_a_dataset_are_followed(tmp_path: Path) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    (root / "videos").rename(root / "elsewhere")
+    (root / "videos").symlink_to(root / "elsewhere")
+    with serving(root) as get:
+        check_frames(get, root, 1)
+
+
+BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, its content, the path that is asked, what is told
+    "no video": (VIDEO, None, "/0/episodes/0/videos/0", "file-000.mp4: expected a video file, got none"),
+    "a play list": (
+        VIDEO,
+        b"#EXTM3U\n/etc/passwd\n",
+        "/0/episodes/0/videos/0",
+        "file-000.mp4: expected a whole video file, got Invalid data",
+    ),
+    "another video": (
+        VIDEO,
+        (LEROBOT / "toy_v30_many" / VIDEO.replace("000.mp4", "002.mp4")).read_bytes(),
+        "/0/episodes/2/videos/0",
+        r"episode 2, row 0: .*: expected its frame at 9\.7000 s, got one at 9\.5000 s",
+    ),
+    "no rows": ("data/chunk-000/file-000.parquet", None, "/0", "file-000.parquet: expected a Parquet file, got none"),
+    "no labels": ("rfm_progress.parquet", b"no labels", "/0", "rfm_progress.parquet: expected a file of labels"),
+}
+
+
+@pytest.mark.parametrize(("name", "content", "path", "message"), BROKEN.values(), ids=BROKEN)
+def test_a_dataset_that_breaks_says_why(
+    folders: list[Path], tmp_path: Path, name: str, content: bytes | None, path: str, message: str
+) -> None:
+    root = Path(shutil.copytree(folders[V30], tmp_path / "spoilt"))
+    with serving(root) as get:
+        (root / name).unlink()
+        if content is not None:
+            (root / name).write_bytes(content)
+        told = failure(get(path), 500)
+        assert re.search(message, told), told
+        assert str(tmp_path) not in told
+
+
+def test_labels_that_come_or_change_are_shown_at_once(tmp_path: Path) -> None:
+    root = copied("toy_v21", tmp_path)
+    with serving(root) as get:
+        assert get("/0").json()["labels"] is None
+        options = LabelOptions(name="later", cameras=("front",), formats=("signals",))
+        label(open_dataset(root), BrightnessScorer(), options)
+        first = get("/0").json()
+        assert first["labels"] == "reward_signals/later.parquet"
+        assert "disagreement" not in first["episodes"][0]  # there is one camera alone
+        label(open_dataset(root), BrightnessScorer(), LabelOptions(limit=3))
+        second = get("/0").json()
+        assert second["labels"] == "rfm_progress.parquet"
+        assert [("backwards" in row) for row in second["episodes"]] == [True] * 3 + [False] * 5
+        assert get("/0?labels=reward_signals/later.parquet").json() == first
+        assert get("/0/episodes/5").json()["curves"] == []
+        by_name = get("/0/episodes/5?labels=reward_signals/later.parquet").json()["curves"]
+        columns = columns_of(root, 5, "reward_signals/later.parquet")
+        np.testing.assert_array_equal(np.float32(by_name[0]["progress"]), columns["reward.later.progress"])
+
+
+def test_labels_of_others_may_lack_success_and_rows(tmp_path: Path) -> None:
+    root = copied("toy_v21", tmp_path)
+    lengths = [episode.num_frames for episode in LeRobotDataset(root).episodes[:2]]
+    progress = np.linspace(0, 1.5, sum(lengths), dtype=np.float32)
+    progress[[3, lengths[0] - 1]] = np.nan
+    identity = {
+        "index": np.arange(sum(lengths)),
+        "episode_index": np.repeat([0, 1], lengths),
+        "frame_index": np.concatenate([np.arange(length) for length in lengths]),
+    }
+    table = pa.table({**identity, "progress_sparse": progress})
+    parquet.write_table(table.filter(pa.array(identity["frame_index"] != 5)), root / "sarm_progress.parquet")
+    with serving(root) as get:
+        first, second, third, *_ = get("/0").json()["episodes"]
+        assert first["final_progress"] is None
+        assert second["final_progress"] == pytest.approx(1.5)
+        assert first.keys() == second.keys() == third.keys() | {"final_progress", "backwards"}
+        (curve,) = get("/0/episodes/0").json()["curves"]
+        missing = [t for t, value in enumerate(curve["progress"]) if value is None]
+        assert (missing, curve["success"]) == ([3, 5, lengths[0] - 1], None)
+
+
+def test_a_video_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    encoded_anew(root / VIDEO, "libx264", {"g": "2", "qp": "0"}, noise=np.random.default_rng(0))
+    message = "body: expected files of at most 2097152 bytes in one request, when they are decoded, got more"
+    with serving(root, max_body_mib=1) as get:
+        responses = [get(f"/0/episodes/{episode}/videos/0") for episode in OF_VIDEO]
+        too_large = [response for response in responses if response.status_code != 200]
+        assert {failure(response, 413) for response in too_large} == {message}
+
+
+REFUSED = {
+    "nowhere": r"expected the folder of a LeRobot dataset \(meta/info\.json\), or an HDF5 file, got .*nowhere",
+    "v9": r"codebase_version: expected one of v2.0, v2.1, v3.0, got 'v9.9'",
+}
+
+
+@pytest.mark.parametrize(("name", "message"), REFUSED.items())
+def test_a_folder_that_is_no_dataset_is_refused_at_start(tmp_path: Path, name: str, message: str) -> None:
+    (tmp_path / "v9" / "meta").mkdir(parents=True)
+    info = json.loads((LEROBOT / "toy_v21" / "meta" / "info.json").read_text())
+    (tmp_path / "v9" / "meta" / "info.json").write_text(json.dumps({**info, "codebase_version": "v9.9"}))
+    with pytest.raises(ConfigError, match=rf"dataset: .*{message}"):
+        shown_datasets(GatewayConfig(dataset=(str(tmp_path / name),)))
+
+
+def test_a_missing_package_names_the_mend(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    message = r'dataset: expected pyarrow, which reads datasets, got none: pip install "./client\[label\]"'
+    with pytest.raises(ConfigError, match=message):
+        GatewayConfig(triton="grpc://robot:8001", dataset=(str(LEROBOT / "toy_v21"),)).check({})

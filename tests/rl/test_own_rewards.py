@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: MIT
+"""An environment's own reward stays out of what an algorithm learns from and of what it shows."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
+from gymnasium.wrappers import RecordEpisodeStatistics
+from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
+
+from coded_env import CodedEnv, Recorder
+from environments import TASK
+from goal_env import LENGTH, Reach
+from rfm_client import ProgressResult, RewardClient
+from rfm_client.episodes.windows import Window
+from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
+
+pytest.importorskip("stable_baselines3", reason="the extra sb3 is not installed")
+
+from stable_baselines3 import PPO, SAC, HerReplayBuffer
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
+
+from rfm_rl.own_rewards import WritingMonitor
+from rfm_rl.sb3 import RenderedFrame, RewardModelVecEnv
+
+ALL = RewardOptions(sampling="all")
+
+
+@pytest.fixture
+def recorder() -> Iterator[Recorder]:
+    with Recorder() as client:
+        yield client
+
+
+def vector(client: RewardClient, venv: Any) -> Any:
+    return RewardModelVecEnv(venv, client, TASK, ALL)
+
+
+def single(client: RewardClient, env: gym.Env[Any, Any], **options: Any) -> gym.Env[Any, Any]:
+    return RewardModelWrapper(env, client, TASK, RewardOptions(sampling="all", **options))
+
+
+def rendered() -> Any:
+    return DummyVecEnv([lambda: RenderedFrame(Reach())])
+
+
+def monitored(**options: Any) -> Any:
+    return make_vec_env(Reach, 2, wrapper_class=RenderedFrame, **options)
+
+
+WRAPPINGS: dict[str, Callable[[RewardClient], Any]] = {
+    "a VecMonitor outside": lambda client: VecMonitor(vector(client, rendered())),
+    "a VecMonitor inside": lambda client: vector(client, VecMonitor(rendered())),
+    "a Monitor inside": lambda client: vector(client, monitored()),
+    "a VecNormalize outside": lambda client: VecNormalize(VecMonitor(vector(client, rendered()))),
+    "a Monitor inside one environment": lambda client: DummyVecEnv([lambda: single(client, Monitor(Reach()))]),
+    "a Monitor outside one environment": lambda client: make_vec_env(lambda: single(client, Reach()), 2),
+}
+
+
+class Ledger(VecEnvWrapper):  # type: ignore[misc]
+    """Adds up what the reward model said about each step, whatever reward the step had."""
+
+    def __init__(self, venv: Any) -> None:
+        super().__init__(venv)
+        self.progress: list[list[float]] = []  # of each step
+        self.sums: list[float] = []  # of each ended episode
+        self._running = np.zeros(self.num_envs)
+
+    def reset(self) -> Any:
+        self._running[:] = 0
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        step = self.venv.step_wait()
+        self.progress.append([info["reward_model"]["progress"] for info in step[3]])
+        self._running += self.progress[-1]
+        for index in np.flatnonzero(step[2]):
+            self.sums.append(self._running[index])
+            self._running[index] = 0
+        return step
+
+
+@pytest.mark.triton
+@pytest.mark.parametrize("algorithm", [PPO, SAC])
+@pytest.mark.parametrize("wrapping", WRAPPINGS.values(), ids=WRAPPINGS)
+def test_all_that_stable_baselines3_shows_is_the_reward_model_s(
+    client: RewardClient, wrapping: Callable[[RewardClient], Any], algorithm: Any
+) -> None:
+    trained, evaluated = Ledger(wrapping(client)), Ledger(wrapping(client))
+    num_steps = 2 * LENGTH * trained.num_envs
+    settings = {"n_steps": 2 * LENGTH, "batch_size": num_steps} if algorithm is PPO else {"buffer_size": num_steps}
+    callback = EvalCallback(evaluated, n_eval_episodes=2, eval_freq=2 * LENGTH, verbose=0)
+    model = algorithm("MultiInputPolicy", trained, device="cpu", **settings).learn(num_steps, callback)
+    assert [episode["r"] for episode in model.ep_info_buffer] == pytest.approx(trained.sums, abs=1e-4)
+    assert [episode["l"] for episode in model.ep_info_buffer] == [LENGTH] * len(trained.sums)
+    assert callback.last_mean_reward == pytest.approx(np.mean(evaluated.sums), abs=1e-4)
+    evaluated.sums.clear()
+    assert evaluate_policy(model, evaluated, 2, return_episode_rewards=True)[0] == pytest.approx(
+        evaluated.sums, abs=1e-4
+    )
+    if algorithm is SAC:
+        np.testing.assert_allclose(model.replay_buffer.rewards, trained.progress, atol=1e-6)
+    assert len(trained.sums) == 2 * trained.num_envs
+    trained.close()
+    evaluated.close()
+
+
+RELABELLED: dict[str, Callable[[RewardClient], Any]] = {
+    name: WRAPPINGS[name] for name in ("a VecMonitor outside", "a Monitor inside", "a Monitor outside one environment")
+}
+
+
+@pytest.mark.parametrize("wrapping", RELABELLED.values(), ids=RELABELLED)
+def test_hindsight_relabelling_is_refused(recorder: Recorder, wrapping: Callable[[RewardClient], Any]) -> None:
+    """Four fifths of a batch would have the environment's own reward."""
+    settings = {"replay_buffer_class": HerReplayBuffer, "learning_starts": 4 * LENGTH, "buffer_size": 100}
+    model = SAC("MultiInputPolicy", wrapping(recorder), device="cpu", **settings)
+    refusal = "compute_reward: expected no rewards for other goals, .* turn off hindsight relabelling"
+    with pytest.raises(NotImplementedError, match=refusal):
+        model.learn(8 * LENGTH)
+    with pytest.raises(NotImplementedError, match=refusal):
+        model.env.get_attr("compute_reward")[0](np.zeros((1, 2)), np.zeros((1, 2)), [{}])
+    assert model.env.env_method("render")
+    assert model.env.get_attr("action_space") == [Reach.action_space] * model.env.num_envs
+
+
+def test_a_normalization_inside_is_refused(recorder: Recorder) -> None:
+    """Off-policy algorithms look for a ``VecNormalize`` and store the rewards that it got."""
+    with pytest.raises(ValueError, match=r"^venv: expected no VecNormalize inside.*; wrap in the other order: VecNorm"):
+        vector(recorder, VecMonitor(VecNormalize(rendered())))
+
+
+class Pleased(Recorder):
+    """Sees a success in each frame."""
+
+    def score_windows(self, windows: Sequence[Window], **options: Any) -> Any:
+        ones = [np.ones(len(window.frames), np.float32) for window in windows]
+        return [ProgressResult(progress=each, success=each) for each in ones]
+
+
+def test_a_monitor_outside_counts_episodes_that_end_by_success() -> None:
+    with Pleased() as client:
+        env = single(client, Reach(), terminate_on_success=SuccessRule())
+        model = PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, device="cpu").learn(4)
+        assert [(episode["r"], episode["l"]) for episode in model.ep_info_buffer] == [(1, 1)] * 4
+        assert evaluate_policy(model, model.env, 2) == (1, 0)
+
+
+@pytest.mark.parametrize("inside", [Monitor, RecordEpisodeStatistics])
+def test_statistics_that_would_miss_an_end_by_success_are_refused(recorder: Recorder, inside: Any) -> None:
+    """With them, ``evaluate_policy`` would wait for ever for an episode's end."""
+    with pytest.raises(ValueError, match=r"^terminate_on_success: expected None with a Monitor .*; wrap in the other"):
+        single(recorder, inside(Reach()), terminate_on_success=SuccessRule())
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda client, file: single(client, Monitor(Reach(), file)),
+        lambda client, file: vector(client, monitored(monitor_dir=file)),
+        lambda client, file: vector(client, VecMonitor(rendered(), file)),
+    ],
+    ids=["one environment", "a vector", "a VecMonitor"],
+)
+def test_a_file_with_the_environment_s_rewards_is_told(
+    recorder: Recorder, tmp_path: Path, make: Callable[[RewardClient, str], Any]
+) -> None:
+    told = r"env: expected no Monitor inside that writes a file, .*; write \w+\(RewardModel\w+\(...\), filename\)"
+    with pytest.warns(UserWarning, match=told):
+        make(recorder, str(tmp_path / "own")).close()
+    assert pickle.loads(pickle.dumps(WritingMonitor)) is WritingMonitor  # a SubprocVecEnv sends it to its processes
+
+
+def test_gymnasium_s_statistics_inside_show_the_reward_model_s_rewards(recorder: Recorder) -> None:
+    env = single(recorder, RecordEpisodeStatistics(CodedEnv()))
+    env.reset()
+    steps = [env.step(0) for _ in range(3)]
+    assert steps[-1][4]["episode"]["r"] == sum(float(step[1]) for step in steps)
+    assert steps[-1][4]["episode"]["l"] == 3
+
+
+INSIDE: dict[str, Callable[[AutoresetMode], Any]] = {
+    "each environment": lambda mode: SyncVectorEnv(
+        [lambda: RecordEpisodeStatistics(CodedEnv(0, (3,))), lambda: RecordEpisodeStatistics(CodedEnv(1, (4,)))],
+        autoreset_mode=mode,
+    ),
+    "the vector": lambda mode: RecordVectorStatistics(
+        SyncVectorEnv([lambda: CodedEnv(0, (3,)), lambda: CodedEnv(1, (4,))], autoreset_mode=mode)
+    ),
+}
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("inside", INSIDE.values(), ids=INSIDE)
+def test_statistics_inside_a_vector_show_the_reward_model_s_rewards(
+    recorder: Recorder, inside: Callable[[AutoresetMode], Any], mode: AutoresetMode
+) -> None:
+    options = RewardOptions(sampling="all", frames_from="pixels")
+    env = RewardModelVectorWrapper(inside(mode), recorder, TASK, options)
+    env.reset()
+    returns, num_ended = np.zeros(2), 0
+    for _ in range(12):
+        _, rewards, terminations, truncations, infos = env.step(np.zeros(2, int))
+        returns += rewards
+        for index in np.flatnonzero(terminations | truncations).tolist():
+            told = infos if "episode" in infos else infos["final_info"]
+            assert told["episode"]["r"][index] == pytest.approx(returns[index], abs=1e-5)
+            assert told["episode"]["l"][index] == 3 + index
+            returns[index], num_ended = 0, num_ended + 1
+    assert num_ended >= 5
+
+
+SILENT: dict[str, Callable[[], Any]] = {
+    "the vector": lambda: VectorWrapper(INSIDE["the vector"](AutoresetMode.DISABLED)),
+    "each environment": lambda: INSIDE["each environment"](AutoresetMode.DISABLED),
+    "each environment, in a process": lambda: AsyncVectorEnv(
+        [lambda: RecordEpisodeStatistics(CodedEnv())], autoreset_mode=AutoresetMode.DISABLED
+    ),
+}
+
+
+@pytest.mark.parametrize("inside", SILENT.values(), ids=SILENT)
+def test_statistics_inside_a_vector_that_would_miss_an_end_by_success_are_refused(
+    recorder: Recorder, inside: Callable[[], Any]
+) -> None:
+    options = RewardOptions(frames_from="pixels", terminate_on_success=SuccessRule())
+    remedy = r"wrap in the other order: RecordEpisodeStatistics\(RewardModelVectorWrapper\(...\)\)$"
+    with (
+        closing(inside()) as env,
+        pytest.raises(ValueError, match=rf"^terminate_on_success: expected None .*; {remedy}"),
+    ):
+        RewardModelVectorWrapper(env, recorder, TASK, options)

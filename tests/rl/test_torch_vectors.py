@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: MIT
+"""Rewards for vectors whose observations and rewards are torch tensors, and for batches of environments in one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import batch_space
+
+from coded_env import SIZE_PX, CodedEnv, Recorder
+from rfm_client import InvalidSampleError
+from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
+
+TASKS = ["task 0", "task 1"]
+LENGTHS = (3,), (4, 1, 2)  # steps of the episodes of each environment, in turn
+NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
+
+
+class OnDevice(torch.Tensor):
+    """A tensor as if on a GPU: numpy cannot read it."""
+
+    def __array__(self, *_args: Any, **_options: Any) -> Any:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu()")
+
+    def numpy(self, **_options: Any) -> Any:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu()")
+
+    def cpu(self, *_args: Any) -> torch.Tensor:
+        return self.as_subclass(torch.Tensor)
+
+
+def on_device(array: Any) -> OnDevice:
+    return torch.tensor(np.asarray(array)).as_subclass(OnDevice)
+
+
+class TensorVector(SyncVectorEnv):
+    """What it returns are tensors; with SAME_STEP as ManiSkillVectorEnv returns them.
+
+    silent: leave out the last observations
+    """
+
+    def __init__(self, mode: AutoresetMode, *, silent: bool = False) -> None:
+        super().__init__([partial(CodedEnv, *each) for each in enumerate(LENGTHS)], autoreset_mode=mode)
+        self.render_mode = "rgb_array"
+        self.silent = silent
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        if self.metadata["autoreset_mode"] is SAME_STEP:
+            options = None  # which it does not read
+        observations, infos = super().reset(seed=seed, options=options)
+        return {"pixels": on_device(observations["pixels"])}, infos
+
+    def step(self, actions: Any) -> Any:
+        assert isinstance(actions, torch.Tensor)
+        observations, rewards, terminations, truncations, infos = super().step(actions.cpu().numpy())
+        final = infos.pop("final_obs", None)
+        if final is not None and not self.silent:
+            shown = [observations["pixels"][n] if each is None else each["pixels"] for n, each in enumerate(final)]
+            infos["final_observation"] = {"pixels": on_device(np.stack(shown))}
+            infos["_final_observation"] = on_device(infos.pop("_final_obs"))
+        told = {"pixels": on_device(observations["pixels"])}, on_device(rewards > 0)  # as a sparse reward of ManiSkill
+        return *told, on_device(terminations), on_device(truncations), infos
+
+    def render(self) -> Any:
+        return on_device(super().render())
+
+
+@pytest.fixture
+def recorder() -> Iterator[Recorder]:
+    with Recorder() as client:
+        yield client
+
+
+def rolled(env: Any, mode: AutoresetMode, actions: Any) -> list[tuple[Any, ...]]:
+    env.reset()
+    told = []
+    for _ in range(9):
+        told.append(env.step(actions))
+        ended = np.flatnonzero([bool(end) for end in told[-1][2] | told[-1][3]])
+        if ended.size and mode is DISABLED:
+            env.reset(options={"reset_mask": [number in ended for number in range(2)]})
+    return told
+
+
+SHOWN = [(NEXT_STEP, "pixels"), (NEXT_STEP, None), (SAME_STEP, "pixels"), (DISABLED, "pixels"), (DISABLED, None)]
+
+
+@pytest.mark.parametrize(("mode", "source"), SHOWN)
+def test_tensors_are_paid_as_arrays_would_be(mode: AutoresetMode, source: str | None) -> None:
+    options = RewardOptions(sampling="all", frames_from=source, mode="delta", add_to_env_reward=True)
+    arrays = SyncVectorEnv([partial(CodedEnv, *each) for each in enumerate(LENGTHS)], autoreset_mode=mode)
+    with Recorder() as left, Recorder() as right:
+        expected = rolled(RewardModelVectorWrapper(arrays, left, TASKS, options), mode, np.zeros(2, int))
+        env = RewardModelVectorWrapper(TensorVector(mode), right, TASKS, options)
+        told = rolled(env, mode, on_device([0, 0]))
+    assert right.calls == left.calls
+    for step, wanted in zip(told, expected, strict=True):
+        assert [type(each) for each in step[1:4]] == [OnDevice] * 3
+        assert [each.dtype for each in step[1:4]] == [torch.float32, torch.bool, torch.bool]
+        for each, array in zip(step[1:4], wanted[1:4], strict=True):
+            np.testing.assert_allclose(each.cpu().numpy(), array, atol=1e-6)
+        of_model, wanted_of_model = step[4].get("final_info", step[4]), wanted[4].get("final_info", wanted[4])
+        np.testing.assert_array_equal(of_model["reward_model"]["progress"], wanted_of_model["reward_model"]["progress"])
+
+
+class IntegerEnds(gym.vector.VectorWrapper):
+    """Says 0 and 1 of an episode's end."""
+
+    def step(self, actions: Any) -> Any:
+        observations, rewards, terminations, truncations, infos = super().step(actions)
+        return observations, rewards, terminations.astype(int), truncations.astype(int), infos
+
+
+@pytest.mark.parametrize("mode", [NEXT_STEP, SAME_STEP, DISABLED])
+def test_ends_that_are_integers_are_paid_as_booleans_would_be(mode: AutoresetMode) -> None:
+    def told(*wrappers: Any) -> Any:
+        env: Any = SyncVectorEnv([partial(CodedEnv, *each) for each in enumerate(LENGTHS)], autoreset_mode=mode)
+        for wrapper in wrappers:
+            env = wrapper(env)
+        with Recorder() as client:
+            env = RewardModelVectorWrapper(env, client, TASKS, RewardOptions(sampling="all", frames_from="pixels"))
+            return [step[1:4] for step in rolled(env, mode, np.zeros(2, int))], client.calls
+
+    (steps, calls), (expected, expected_calls) = told(IntegerEnds), told()
+    assert calls == expected_calls
+    np.testing.assert_array_equal(steps, expected)
+    assert {step[1].dtype for step in steps} == {np.dtype(bool)}
+
+
+def test_a_success_ends_an_episode_of_a_tensor_vector(recorder: Recorder) -> None:
+    options = RewardOptions(frames_from="pixels", terminate_on_success=SuccessRule(threshold=0.0))
+    env = RewardModelVectorWrapper(TensorVector(DISABLED), recorder, TASKS, options)
+    env.reset()
+    terminations = env.step(on_device([0, 0]))[2]
+    assert isinstance(terminations, OnDevice)
+    assert terminations.tolist() == [True, True]
+
+
+def test_a_vector_that_claims_to_reset_but_does_not_is_refused(recorder: Recorder) -> None:
+    options = RewardOptions(sampling="all", frames_from="pixels")
+    env = RewardModelVectorWrapper(TensorVector(SAME_STEP, silent=True), recorder, TASKS, options)
+    env.reset()
+    with pytest.raises(InvalidSampleError, match=r"^infos: expected final_obs .*NEXT_STEP, or .*auto_reset=True$"):
+        for _ in range(3):
+            env.step(on_device([0, 0]))
+
+
+def test_a_partial_reset_that_a_vector_does_not_read_is_refused(recorder: Recorder) -> None:
+    options = RewardOptions(sampling="all", frames_from="pixels")
+    env = RewardModelVectorWrapper(TensorVector(SAME_STEP), recorder, TASKS, options)
+    env.reset()
+    with pytest.raises(ValueError, match=r"^options: expected a reset of all environments, got env_idx; ManiSkill"):
+        env.reset(options={"env_idx": torch.tensor([0])})
+    env.step(on_device([0, 0]))
+    with pytest.raises(ValueError, match=r"^reset_mask: expected a vector that takes it .*; reset all environments$"):
+        env.reset(options={"reset_mask": [True, False]})
+    with pytest.raises(ResetNeeded):
+        env.step(on_device([0, 0]))
+    env.reset()
+    env.step(on_device([0, 0]))
+
+
+class Batch(gym.Env[Any, Any]):
+    """A batch of environments that is one environment, as in ManiSkill and Isaac Lab."""
+
+    single_observation_space = gym.spaces.Dict({"pixels": gym.spaces.Box(0, 255, (SIZE_PX, SIZE_PX, 3), np.uint8)})
+
+    def __init__(self, num_envs: int) -> None:
+        self.num_envs, self.render_mode = num_envs, "rgb_array"
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = gym.spaces.Discrete(2)
+
+
+class Unbatched(gym.Wrapper[Any, Any, Any, Any]):
+    """The only environment of a batch, as CPUGymWrapper of ManiSkill gives it."""
+
+    def __init__(self, env: Batch) -> None:
+        super().__init__(env)
+        self.observation_space = env.single_observation_space
+
+
+@pytest.mark.parametrize("wrapper", [RewardModelWrapper, RewardModelVectorWrapper])
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_a_batch_of_environments_in_one_is_refused_with_the_remedy(
+    recorder: Recorder, wrapper: Any, num_envs: int
+) -> None:
+    message = (
+        r"^env: expected a gymnasium \w+, got an Env that is a batch .*\.Batch; ManiSkill: .*Isaac Lab .*episodes\("
+    )
+    with pytest.raises(TypeError, match=message):
+        wrapper(gym.wrappers.TimeLimit(Batch(num_envs), 5), recorder, TASKS[0])
+
+
+def test_the_only_environment_of_a_batch_is_taken(recorder: Recorder) -> None:
+    only = gym.wrappers.FlattenObservation(Unbatched(Batch(1)))
+    assert RewardModelWrapper(only, recorder, TASKS[0]).unwrapped.num_envs == 1  # type: ignore[attr-defined]
