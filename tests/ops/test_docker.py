@@ -51,7 +51,7 @@ MOUNTED = re.compile(r"--mount=type=bind,source=([^,\s]+),target=(/source[^,\s]+
 HASHES = re.compile(r"( --hash=sha256:[0-9a-f]{64})+")
 STEP = re.compile(r"/source/docker/install\.sh ([a-z]+ /.*)$", re.MULTILINE)
 VARIABLE = re.compile(r"\$\{(\w+):-(.*?)\}")
-DISTRIBUTIONS = {"rfm-client", "rfm-gateway", "rfm-triton"}
+DISTRIBUTIONS = {"rfm-client", "rfm-gateway", "rfm-page", "rfm-triton"}
 NOT_FOR_SERVING = {"pip", "pytest", "ruff", "mypy", "nvidia-pytriton", "matplotlib", "gymnasium", "hypothesis"}
 UNAVAILABLE = 3
 SYSTEM_PATH = "/usr/local/bin:/usr/bin:/bin"

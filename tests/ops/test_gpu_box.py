@@ -44,7 +44,7 @@ BIN = Path(sys.executable).parent
 NAME, IP = "localhost", "127.0.0.1"  # the box, as clients call it in these tests
 CALLER, LATER = "alice", "bob"
 PORTS = {"grpc": 8001, "http": 8000, "gateway": 8100, "proxy": 8443}  # in the guide and its files
-VIEWER = ROOT / "gateway" / "rfm_gateway" / "viewer" / "static"
+VIEWER = ROOT / "apps" / "page" / "rfm_page" / "static"
 VENDORED = ROOT / "apps" / "page" / "rfm_page" / "vendored"
 FRAMES = np.random.default_rng(0).integers(0, 256, (16, 256, 256, 3), np.uint8)  # 3 MiB: nginx alone takes 1 MiB
 FILMED = Trajectory(frames=FRAMES, task=clip.TASK)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Gymnasium environments with the reward of a served reward model. Needs ``pip install ./client ./apps/rl``.
+"""Gymnasium environments with the reward of a served reward model.
 
 env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
 env = RewardModelWrapper(env, partial(RewardClient, "grpc://localhost:8001"), "balance the pole")
@@ -33,6 +33,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import gymnasium
+from gymnasium.error import ResetNeeded
+
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_rl.own_rewards import (
@@ -44,12 +47,6 @@ from rfm_rl.own_rewards import (
     with_statistics,
 )
 from rfm_rl.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
-
-try:
-    import gymnasium
-    from gymnasium.error import ResetNeeded
-except ImportError as error:
-    raise ImportError("rfm_rl.gym needs gymnasium >= 1.1: pip install ./client ./apps/rl") from error
 
 INFO = "reward_model"  # key in info
 
