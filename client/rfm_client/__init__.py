@@ -36,14 +36,19 @@ from rfm_client.contract import (
     Trajectory,
     float_frames_to_uint8,
 )
+from rfm_client.contract.results import SUCCESS_THRESHOLD, unclear_answers
+from rfm_client.contract.samples import MAX_FRAME_STEPS, Float32Array, UInt8Array, as_array, checked_mask
 from rfm_client.frames.inputs import as_trajectory, load_trajectory
 
 __all__ = [
+    "MAX_FRAME_STEPS",
+    "SUCCESS_THRESHOLD",
     "AccessDeniedError",
     "AsyncRewardClient",
     "BatchTiming",
     "ClientClosedError",
     "DeadlineExceededError",
+    "Float32Array",
     "FrameScores",
     "FrameSize",
     "InferenceFailedError",
@@ -64,7 +69,11 @@ __all__ = [
     "SimilarityResult",
     "SimilaritySample",
     "Trajectory",
+    "UInt8Array",
+    "as_array",
     "as_trajectory",
+    "checked_mask",
     "float_frames_to_uint8",
     "load_trajectory",
+    "unclear_answers",
 ]

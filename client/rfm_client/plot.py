@@ -16,6 +16,8 @@ from rfm_client.contract.results import FrameScores
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+__all__ = ["plot_scores", "save"]
+
 MAX_CURVES = 40  # colours times line styles
 DOTS_PER_IN = 200
 

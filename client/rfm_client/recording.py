@@ -18,6 +18,8 @@ from rfm_client.contract.results import FrameScores
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.transport.lifetime import Closing
 
+__all__ = ["PROGRESS", "SUCCESS", "Recording", "load_rerun"]
+
 TIME = "video_time"  # timeline in seconds of the video
 FRAME = "frame"  # timeline in frames, where seconds are unknown
 IMAGE, PROGRESS, SUCCESS = "image", "progress", "success"

@@ -8,6 +8,7 @@ import importlib
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,13 @@ FOLDERS = {
     "rfm_export": "export",
     **{f"rfm_{name}": f"apps/{name}" for name in ("gateway", "labels", "page", "rl")},
 }
+APPLICATIONS = ("rfm_gateway", "rfm_labels", "rfm_page", "rfm_rl")  # which import public names alone
+PUBLIC = {  # modules, each of which lists its names in __all__
+    "rfm_client": {"", "command_line", "episodes", "frames", "options", "plot", "recording", "serving"},
+    "rfm_gateway": {"", "mounting"},
+    "rfm_labels": {"", "datasets"},
+}
+MOST_NAMES = 140  # of the client's public modules together
 # Package, module, or folder of programs -> what of ours it may import besides itself; "!": what of that it may not.
 MAY_IMPORT = {
     "rfm_client.contract": set(),
@@ -35,10 +43,8 @@ MAY_IMPORT = {
     "rfm_client.frames": {"rfm_client.contract"},
     "rfm_client.episodes": {"rfm_client", "!rfm_client.cli"},
     "rfm_client": set(),
-    "rfm_gateway": {"rfm_client"},
-    "rfm_labels": {"rfm_client"},
-    "rfm_page": {"rfm_client", "rfm_gateway.mounting", "rfm_labels"},
-    "rfm_rl": {"rfm_client"},
+    **{application: {"rfm_client"} for application in APPLICATIONS},
+    "rfm_page": {"rfm_client", "rfm_gateway", "rfm_labels"},
     "rfm.checkpoint": {"rfm.plain_yaml", "rfm_client.contract"},
     **{f"rfm.{family}": {*SHARED, *extended} for family, extended in FAMILIES.items()},
     "rfm.triton_model": {*SHARED, "rfm.parameters", "rfm.probe_request"},
@@ -102,6 +108,15 @@ def imports(file: Path) -> set[str]:
     return found
 
 
+def names_of_others(file: Path, package: str) -> Iterator[tuple[str, str]]:
+    """Module and name of everything of ours that a file imports from another package."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in {*FOLDERS} - {package}:
+            yield from ((node.module, name.name) for name in node.names)
+        elif isinstance(node, ast.Import):
+            assert not [name.name for name in node.names if name.name.partition(".")[0] in {*FOLDERS} - {package}], file
+
+
 def is_part(name: str, packages: set[str]) -> bool:
     """Whether the module is one of these packages or in one."""
     return any(name == package or name.startswith(f"{package}.") for package in packages)
@@ -117,6 +132,22 @@ def test_imports_point_the_right_way(package: str) -> None:
         allowed = {package, *MAY_IMPORT[package], *EXCEPTIONS.get(str(file.relative_to(ROOT)), set())}
         ours = {name for name in imports(file) if name.partition(".")[0] in FOLDERS}
         assert not {name for name in ours if is_part(name, forbidden) or not is_part(name, allowed)}, file
+
+
+@pytest.mark.parametrize("package", APPLICATIONS)
+def test_an_application_imports_public_names_alone(package: str) -> None:
+    for file in (ROOT / FOLDERS[package] / package).rglob("*.py"):
+        for module, name in names_of_others(file, package):
+            top, _, inner = module.partition(".")
+            assert inner in PUBLIC[top], f"{file}: {module}"
+            assert name in importlib.import_module(module).__all__, f"{file}: {module}.{name}"
+
+
+def test_the_client_has_few_public_names() -> None:
+    modules = [".".join(filter(None, ("rfm_client", inner))) for inner in PUBLIC["rfm_client"]]
+    names = [f"{module}.{name}" for module in modules for name in importlib.import_module(module).__all__]
+    assert len(modules) <= 8
+    assert len(names) <= MOST_NAMES
 
 
 def test_the_client_needs_only_light_packages() -> None:

@@ -187,7 +187,9 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
         assert "instance is broken" in served.log.read_text()
 
         deadly.touch()
-        wait_for(lambda: served.reasons().get(OTHER, "").startswith("it is left out"), 3 * PATIENCE_S)  # of starts that fail
+        wait_for(
+            lambda: served.reasons().get(OTHER, "").startswith("it is left out"), 3 * PATIENCE_S
+        )  # of starts that fail
         wait_for(lambda: served.reasons().get(MODEL) == NO_REASON)
         assert served.is_ready()
         assert np.isfinite(client.progress(trajectory(0)).progress).all()

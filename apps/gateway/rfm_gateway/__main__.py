@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import typer
 
-from rfm_client.cli.command import Command
+from rfm_client.command_line import Command
 from rfm_gateway.command import gateway
 
 if __name__ == "__main__":

@@ -18,9 +18,16 @@ from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBea
 from pydantic.json_schema import models_json_schema
 from starlette.requests import ClientDisconnect
 
-from rfm_client.async_client import AsyncRewardClient
-from rfm_client.contract import errors
-from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client import (
+    AccessDeniedError,
+    AsyncRewardClient,
+    DeadlineExceededError,
+    InferenceFailedError,
+    ModelNotFoundError,
+    RewardError,
+    ServerUnavailableError,
+)
+from rfm_client.serving import DEFAULT_MODEL
 from rfm_gateway import pages, schema
 from rfm_gateway.admission import RETRY_AFTER
 from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
@@ -47,11 +54,11 @@ _KEY_BEARER = HTTPBearer(auto_error=False)
 _REFERENCE = "#/components/schemas/{model}"
 _MODELS = (schema.EvaluateBatchRequest, schema.InvalidRequest, schema.Failure)
 _STATUS_OF = {  # HTTP status, by the client's error
-    errors.ServerUnavailableError: 503,
-    errors.ModelNotFoundError: 503,
-    errors.DeadlineExceededError: 504,
-    errors.InferenceFailedError: 502,
-    errors.AccessDeniedError: 502,  # the gateway's own credentials, not the caller's
+    ServerUnavailableError: 503,
+    ModelNotFoundError: 503,
+    DeadlineExceededError: 504,
+    InferenceFailedError: 502,
+    AccessDeniedError: 502,  # the gateway's own credentials, not the caller's
 }
 
 logger = logging.getLogger("rfm_gateway")
@@ -217,7 +224,7 @@ def _handlers() -> dict[Any, Any]:
 
         return handler
 
-    async def failed(_request: Request, error: errors.RewardError) -> JSONResponse:
+    async def failed(_request: Request, error: RewardError) -> JSONResponse:
         code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
         return JSONResponse({"detail": str(error)}, code, RETRY_AFTER if code == 503 else None)
 
@@ -229,7 +236,7 @@ def _handlers() -> dict[Any, Any]:
         TimeoutError: fixed(408, "body: expected all of it in time, got a part", Connection="close"),
         ClientDisconnect: fixed(400, "body: expected all of it, got a part"),  # the caller is gone
         CallerLeftError: fixed(CALLER_LEFT, "the caller has hung up"),  # for the log and the metrics
-        errors.RewardError: failed,
+        RewardError: failed,
         Exception: unexpected,
     }
 

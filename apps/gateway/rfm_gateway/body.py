@@ -20,8 +20,8 @@ from python_multipart.multipart import parse_options_header
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
-from rfm_client.frames.inputs import BROKEN_NPY
-from rfm_client.transport.off_loop import off_loop
+from rfm_client.frames import BROKEN_NPY
+from rfm_client.serving import off_loop
 from rfm_gateway import schema
 from rfm_gateway.admission import Turn, arriving
 

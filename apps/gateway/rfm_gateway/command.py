@@ -10,13 +10,9 @@ from typing import Annotated
 
 import typer
 
-from rfm_client.cli.command import OptionsOf, with_options
-from rfm_client.contract.addresses import is_loopback
-from rfm_client.contract.descriptors import raise_limit
-from rfm_client.contract.listening import check_free, from_here, in_url
-from rfm_client.contract.names import DEFAULT_MODEL
-from rfm_client.contract.process_log import write_log
-from rfm_client.contract.settings import ConfigError, settings_of
+from rfm_client.command_line import OptionsOf, with_options
+from rfm_client.options import ConfigError, settings_of
+from rfm_client.serving import DEFAULT_MODEL, check_free, from_here, in_url, is_loopback, raise_limit, write_log
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.installed_page import page_of
 

@@ -9,11 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from rfm_client.contract.addresses import MAX_PORT, check_certificate, split_url
-from rfm_client.contract.listening import check_free
-from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
-from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
-from rfm_client.transport.credentials import Credentials
+from rfm_client.options import ConfigError, Settings, Texts, setting
+from rfm_client.serving import GATEWAY_KEY_VARIABLE, MAX_PORT, Credentials, check_certificate, check_free, split_url
 from rfm_gateway.installed_page import page_of
 
 MIB = 2**20

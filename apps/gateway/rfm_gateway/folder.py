@@ -12,10 +12,8 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.samples import Trajectory, UInt8Array
-from rfm_client.frames.inputs import ARRAY_SUFFIXES, load_trajectory
-from rfm_client.frames.pictures import upright_picture
+from rfm_client import InvalidSampleError, Trajectory, UInt8Array
+from rfm_client.frames import ARRAY_SUFFIXES, load_trajectory, upright_picture
 from rfm_gateway.body import Decoded
 
 if TYPE_CHECKING:

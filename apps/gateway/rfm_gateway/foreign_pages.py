@@ -16,7 +16,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rfm_client.contract.addresses import is_loopback
+from rfm_client.serving import is_loopback
 from rfm_gateway.config import GatewayConfig
 
 EMBEDDED_HERE_ALONE = {"Cross-Origin-Resource-Policy": "same-origin"}  # without TLS, browsers do not say who asks

@@ -6,7 +6,7 @@ from __future__ import annotations
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rfm_client.contract.settings import ConfigError
+from rfm_client.options import ConfigError
 
 if TYPE_CHECKING:
     from fastapi import APIRouter, FastAPI

@@ -14,9 +14,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rfm_client.contract.names import PROBE_PREFIX
-from rfm_client.contract.process_log import log_requests
-from rfm_client.contract.wire import REQUEST_ID
+from rfm_client.serving import PROBE_PREFIX, REQUEST_ID, log_requests
 from rfm_gateway.admission import Room, Turn
 from rfm_gateway.config import GatewayConfig
 

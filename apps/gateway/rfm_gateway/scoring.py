@@ -13,31 +13,31 @@ from typing import Any, TypeAlias
 import numpy as np
 from fastapi.exceptions import RequestValidationError
 
-from rfm_client.async_client import AsyncRewardClient
-from rfm_client.contract.checks import first_names
-from rfm_client.contract.errors import (
+from rfm_client import (
+    AsyncRewardClient,
     DeadlineExceededError,
-    InvalidSampleError,
-    ModelNotFoundError,
-    RewardError,
-    ServerUnavailableError,
-)
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
-from rfm_client.contract.samples import (
     Float32Array,
+    InvalidSampleError,
+    ModelInfo,
+    ModelNotFoundError,
+    PreferenceResult,
     PreferenceSample,
+    ProgressResult,
     ProgressSample,
+    Result,
+    RewardError,
     Sample,
+    ServerUnavailableError,
+    SimilarityResult,
     SimilaritySample,
     Trajectory,
     UInt8Array,
     as_array,
     float_frames_to_uint8,
 )
-from rfm_client.frames.blank_frames import BlankFrames, what_is_shown
-from rfm_client.transport.deadline import Deadline
-from rfm_client.transport.off_loop import MIN_BYTES, off_loop
+from rfm_client.frames import BlankFrames, what_is_shown
+from rfm_client.options import first_names
+from rfm_client.serving import MIN_BYTES, Deadline, off_loop
 from rfm_gateway import schema
 from rfm_gateway.body import Batch, Decoded, invalid
 from rfm_gateway.folder import RequestFiles

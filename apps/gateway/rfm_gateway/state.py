@@ -9,20 +9,26 @@ from collections.abc import Callable, Sequence
 
 import anyio
 
-from rfm_client.async_client import AsyncRewardClient
-from rfm_client.contract.errors import (
+from rfm_client import (
+    AsyncRewardClient,
     DeadlineExceededError,
+    ModelInfo,
     ModelNotFoundError,
     RewardError,
     ServerError,
     ServerUnavailableError,
 )
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import PROBE_PREFIX, encoder_name, frames_name
-from rfm_client.contract.synthetic import blank_trajectory
-from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.deadline import Deadline
-from rfm_client.transport.status import Device, ServerStatus, read_status
+from rfm_client.serving import (
+    PROBE_PREFIX,
+    Credentials,
+    Deadline,
+    Device,
+    ServerStatus,
+    blank_trajectory,
+    encoder_name,
+    frames_name,
+    read_status,
+)
 from rfm_gateway import schema
 
 HEALTH_TIMEOUT_S = 3.5  # of all probes; with HEALTH_KEPT_S less than the promised 5 s

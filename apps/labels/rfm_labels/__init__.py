@@ -18,8 +18,9 @@ from rfm_labels.datasets import (
     open_dataset,
 )
 from rfm_labels.evaluation import Evaluation, LabelComparison, evaluate_labels, read_outcomes
+from rfm_labels.hdf5_tables import stored_in
 from rfm_labels.label import Report, label, label_with_ray
-from rfm_labels.label_files import EpisodeLabels, find_label_files, read_episode_labels
+from rfm_labels.label_files import Curve, EpisodeLabels, find_label_files, read_episode_labels, read_provenance
 from rfm_labels.options import LabelOptions, RayOptions, parse_episodes
 from rfm_labels.run import Watch
 from rfm_labels.scorer import CheckpointFacts, ClientScorer, Scorer
@@ -29,6 +30,7 @@ __all__ = [
     "Channels",
     "CheckpointFacts",
     "ClientScorer",
+    "Curve",
     "Dataset",
     "DatasetEpisode",
     "DatasetError",
@@ -51,5 +53,7 @@ __all__ = [
     "parse_episodes",
     "read_episode_labels",
     "read_outcomes",
+    "read_provenance",
+    "stored_in",
     "summarise",
 ]

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import TypeAlias
 
-from rfm_client.frames.blank_frames import what_is_shown
+from rfm_client.frames import what_is_shown
 from rfm_labels.datasets.faults import listed
 
 BlankCameras: TypeAlias = Mapping[str, Mapping[int, int]]  # highest value of the frames, by camera and episode

@@ -13,13 +13,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from rfm_client.contract.errors import InferenceFailedError
-from rfm_client.contract.results import ProgressResult
-from rfm_client.contract.samples import Float32Array, ProgressSample, Trajectory, UInt8Array
-from rfm_client.frames.blank_frames import BlankFrames
-from rfm_client.frames.camera_fusion import FUSES
-from rfm_client.frames.resize import resize_frames
-from rfm_client.frames.sampling import of_prefixes, prefix_samples
+from rfm_client import Float32Array, InferenceFailedError, ProgressResult, ProgressSample, Trajectory, UInt8Array
+from rfm_client.frames import FUSES, BlankFrames, of_prefixes, prefix_samples, resize_frames
 from rfm_labels.datasets.protocol import Dataset, DatasetEpisode, require
 from rfm_labels.plan import Recipe
 from rfm_labels.scorer import Scorer

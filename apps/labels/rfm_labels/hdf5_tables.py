@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rfm_client.contract.samples import Float32Array
+from rfm_client import Float32Array
 from rfm_labels.datasets.hdf5 import is_hdf5
 from rfm_labels.datasets.hdf5_attributes import attribute
 from rfm_labels.datasets.hdf5_contents import demonstrations, members_of, opened_hdf5

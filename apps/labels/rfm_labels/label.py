@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from rfm_client.contract.results import unclear_answers
+from rfm_client import unclear_answers
 from rfm_labels import blank_cameras
 from rfm_labels.cost import Cost
 from rfm_labels.datasets.hdf5 import Hdf5Dataset

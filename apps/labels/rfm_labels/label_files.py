@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.samples import Float32Array
+from rfm_client import Float32Array
 from rfm_labels.blank_cameras import BLANK_KEY, BlankCameras, from_metadata
 from rfm_labels.cost import Cost
 from rfm_labels.datasets.lerobot_rows import INFO_FILE

@@ -9,10 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias, get_args
 
-from rfm_client.contract.numbers import checked_count, checked_finite
-from rfm_client.contract.settings import ConfigError, Settings, setting
-from rfm_client.frames.camera_fusion import Fuse
-from rfm_client.frames.sampling import Rule
+from rfm_client.frames import Fuse, Rule
+from rfm_client.options import ConfigError, Settings, checked_count, checked_finite, setting
 
 Mode: TypeAlias = Literal["prefix", "whole"]
 Format: TypeAlias = Literal["progress", "signals", "hdf5"]

@@ -9,10 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.frames.camera_fusion import Fuse
-from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
-from rfm_client.frames.sampling import Sampling
+from rfm_client import InvalidSampleError
+from rfm_client.frames import ChannelOrder, Correction, Fuse, Orientation, Sampling
 from rfm_labels.datasets.faults import listed
 from rfm_labels.datasets.protocol import (
     Dataset,

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
-from rfm_client.contract.errors import RewardError
+from rfm_client import RewardError
 from rfm_labels.datasets.opening import open_dataset
 from rfm_labels.finished_episodes import Parts
 from rfm_labels.options import RayOptions

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rfm_client.contract.results import FrameScores
+from rfm_client import FrameScores
 from rfm_client.recording import PROGRESS, SUCCESS, Recording
 from rfm_labels.datasets.protocol import Dataset
 from rfm_labels.finished_episodes import Parts

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from rfm_client.contract.errors import (
+from rfm_client import (
     AccessDeniedError,
     DeadlineExceededError,
     InferenceFailedError,

@@ -7,12 +7,16 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol, cast
 
-from rfm_client.client import RewardClient
-from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.frame_size import FrameSize
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.results import ProgressResult
-from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
+from rfm_client import (
+    FrameSize,
+    InvalidSampleError,
+    ModelInfo,
+    ProgressResult,
+    ProgressSample,
+    RewardClient,
+    Trajectory,
+    UInt8Array,
+)
 from rfm_labels.datasets.protocol import digest_of
 
 IDENTITY = ("weights_digest", "settings_digest", "computation")  # equal if scores are

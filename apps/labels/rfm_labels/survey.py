@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
-from rfm_client.contract.errors import RewardError
+from rfm_client import RewardError
 from rfm_labels.datasets.protocol import Dataset, DatasetEpisode, FaultsError, chosen_cameras, require
 from rfm_labels.options import LabelOptions
 from rfm_labels.plan import chosen_numbers

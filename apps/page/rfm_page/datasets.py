@@ -16,13 +16,18 @@ import av
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.settings import ConfigError
-from rfm_client.frames.video_decoding import VideoError, video_stream
-from rfm_labels.datasets.lerobot import LeRobotDataset
-from rfm_labels.datasets.lerobot_rows import INFO_FILE, Info
-from rfm_labels.datasets.lerobot_tasks import TASK_COLUMN
-from rfm_labels.datasets.protocol import DatasetEpisode, DatasetError, TaskOverride
-from rfm_labels.datasets.video_frames import Span
+from rfm_client.frames import VideoError, video_stream
+from rfm_client.options import ConfigError
+from rfm_labels.datasets import (
+    INFO_FILE,
+    TASK_COLUMN,
+    DatasetEpisode,
+    DatasetError,
+    Info,
+    LeRobotDataset,
+    Span,
+    TaskOverride,
+)
 from rfm_page.links import check_links, links_in
 from rfm_page.shown import ShownDataset
 

@@ -18,13 +18,10 @@ import av
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.contract.settings import ConfigError
-from rfm_labels.datasets.hdf5 import Hdf5Dataset
-from rfm_labels.datasets.hdf5_contents import opened_hdf5
-from rfm_labels.datasets.protocol import DatasetEpisode, DatasetError, TaskOverride, chosen_cameras
-from rfm_labels.hdf5_tables import stored_in
-from rfm_labels.label_files import find_label_files
+from rfm_client import UInt8Array
+from rfm_client.options import ConfigError
+from rfm_labels import find_label_files, stored_in
+from rfm_labels.datasets import DatasetEpisode, DatasetError, Hdf5Dataset, TaskOverride, chosen_cameras, opened_hdf5
 from rfm_page.links import check_links
 from rfm_page.shown import ShownDataset
 

@@ -25,7 +25,7 @@ from fastapi.exceptions import RequestValidationError
 from PIL import Image, UnidentifiedImageError
 from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, StringConstraints, ValidationError
 
-from rfm_client.transport.off_loop import off_loop
+from rfm_client.serving import off_loop
 from rfm_gateway.mounting import BodyLimits, field_errors
 
 MOST_BODY_BYTES = 4 * 2**20

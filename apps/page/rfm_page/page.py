@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from fastapi import APIRouter, FastAPI
 
-from rfm_client.contract.settings import ConfigError
+from rfm_client.options import ConfigError
 from rfm_gateway.mounting import GatewayConfig, Surroundings, add_page
 from rfm_page.dataset_routes import dataset_routes
 from rfm_page.live import live_routes
@@ -45,7 +45,7 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
     if not config.dataset:
         return []
     try:
-        from rfm_labels.datasets.hdf5 import is_hdf5
+        from rfm_labels.datasets import is_hdf5
         from rfm_page.datasets import ShownLeRobot
         from rfm_page.hdf5_datasets import ShownHdf5
     except ModuleNotFoundError as error:

@@ -21,12 +21,8 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, Field, StringConstraints, ValidationError
 from starlette.datastructures import UploadFile
 
-from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.samples import MAX_FRAME_STEPS, Trajectory
-from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
-from rfm_client.frames.sampling import Rule, Sampling
-from rfm_client.frames.video import frame_times_s, read_video
+from rfm_client import MAX_FRAME_STEPS, InvalidSampleError, ModelInfo, Trajectory
+from rfm_client.frames import ChannelOrder, Correction, Orientation, Rule, Sampling, frame_times_s, read_video
 from rfm_gateway.mounting import Decoded, field_errors, invalid
 
 DEFAULT_FPS = 3.0  # the default of rfm-client score

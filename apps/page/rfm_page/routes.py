@@ -24,18 +24,29 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.datastructures import UploadFile
 
-from rfm_client.async_client import AsyncRewardClient
-from rfm_client.contract.errors import InvalidSampleError, ModelNotFoundError, RewardError
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import DEFAULT_MODEL, frames_name
-from rfm_client.contract.results import PreferenceResult, ProgressResult
-from rfm_client.contract.samples import ProgressSample, Trajectory
-from rfm_client.frames.blank_frames import BlankFrames
-from rfm_client.frames.fit_to_checkpoint import fitted
-from rfm_client.frames.orientation import CHANNEL_ORDERS, ORIENTATIONS
-from rfm_client.frames.sampling import RULES, Rule, Sampling, prefix_samples, trained_rule
-from rfm_client.transport.off_loop import off_loop
-from rfm_client.transport.status import read_status
+from rfm_client import (
+    AsyncRewardClient,
+    InvalidSampleError,
+    ModelInfo,
+    ModelNotFoundError,
+    PreferenceResult,
+    ProgressResult,
+    ProgressSample,
+    RewardError,
+    Trajectory,
+)
+from rfm_client.frames import (
+    CHANNEL_ORDERS,
+    ORIENTATIONS,
+    RULES,
+    BlankFrames,
+    Rule,
+    Sampling,
+    fitted,
+    prefix_samples,
+    trained_rule,
+)
+from rfm_client.serving import DEFAULT_MODEL, frames_name, off_loop, read_status
 from rfm_gateway.mounting import Decoded, GatewayConfig, Surroundings, invalid, while_connected
 from rfm_page.numbers import numbers_or_null
 from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest

@@ -17,18 +17,19 @@ import numpy as np
 import numpy.typing as npt
 from fastapi import HTTPException
 
-from rfm_client.contract.results import SUCCESS_THRESHOLD
-from rfm_client.frames.orientation import CHANNEL_ORDERS, ORIENTATIONS, Correction
-from rfm_labels.datasets.protocol import Dataset, DatasetEpisode, DatasetError, unused_cameras
-from rfm_labels.hdf5_tables import stored_in
-from rfm_labels.label_files import (
+from rfm_client import SUCCESS_THRESHOLD
+from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, Correction
+from rfm_labels import (
     Curve,
     EpisodeLabels,
+    Summary,
     find_label_files,
     read_episode_labels,
     read_provenance,
+    stored_in,
+    summarise,
 )
-from rfm_labels.summary import Summary, summarise
+from rfm_labels.datasets import Dataset, DatasetEpisode, DatasetError, unused_cameras
 from rfm_page.numbers import numbers_or_null
 
 _SUMMARIES_AT_A_TIME = 8  # summaries in memory

@@ -36,8 +36,8 @@ from typing import Any
 import gymnasium
 from gymnasium.error import ResetNeeded
 
-from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InvalidSampleError
+from rfm_client import InvalidSampleError
+from rfm_client.options import require
 from rfm_rl.own_rewards import (
     RETURNS,
     WritingMonitor,

@@ -15,10 +15,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 
-from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.samples import as_array, checked_mask
-from rfm_client.episodes.steps import copied
+from rfm_client import InvalidSampleError, as_array, checked_mask
+from rfm_client.episodes import copied
+from rfm_client.options import require
 from rfm_rl.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind, tasks_of
 from rfm_rl.own_rewards import RETURNS, correct_statistics, refuse_statistics
 from rfm_rl.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions

@@ -27,15 +27,13 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from rfm_client.contract.checks import require
-from rfm_client.contract.numbers import checked_count, checked_share
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.resize import as_jpeg, load_pillow
-from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.lifetime import Closing
+from rfm_client import UInt8Array
+from rfm_client.frames import as_jpeg, load_pillow
+from rfm_client.options import checked_count, checked_share, require
+from rfm_client.serving import Closing, Credentials
 
 if TYPE_CHECKING:
-    from rfm_client.episodes.steps import StepScore
+    from rfm_client.episodes import StepScore
 
 PATH = "/live/reports"
 REPORT_EVERY_S = 0.25

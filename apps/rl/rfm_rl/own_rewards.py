@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
-from rfm_client.episodes.steps import SuccessRule
+from rfm_client.episodes import SuccessRule
 from rfm_rl.rewards import Info, RewardedEpisode
 
 RELABELS = "compute_reward"  # method of an environment that rewards a step for another goal

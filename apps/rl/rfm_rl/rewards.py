@@ -13,17 +13,10 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from rfm_client.client import RewardClient
-from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InvalidSampleError, RewardError
-from rfm_client.contract.frame_size import FrameSize
-from rfm_client.contract.numbers import checked_count, checked_finite
-from rfm_client.contract.results import ProgressResult
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, SuccessRule
-from rfm_client.frames.camera_fusion import Fuse
-from rfm_client.frames.orientation import ChannelOrder, Orientation
-from rfm_client.frames.sampling import Rule
+from rfm_client import FrameSize, InvalidSampleError, ProgressResult, RewardClient, RewardError, UInt8Array
+from rfm_client.episodes import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, SuccessRule
+from rfm_client.frames import ChannelOrder, Fuse, Orientation, Rule
+from rfm_client.options import checked_count, checked_finite, require
 from rfm_rl.live import LiveView
 
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]

@@ -17,9 +17,9 @@ import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.episodes.steps import copied
+from rfm_client import InvalidSampleError
+from rfm_client.episodes import copied
+from rfm_client.options import require
 from rfm_rl.gym import DEFAULTS, INFO, LOST, check_frame_source, tasks_of
 from rfm_rl.gym_vector import check_differ
 from rfm_rl.own_rewards import (

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rfm_client.cli.command import OptionsOf, with_options
-from rfm_client.cli.options import OutputOptions
-from rfm_client.cli.show import number, print_tables, table
+from rfm_client.command_line import OptionsOf, OutputOptions, number, print_tables, table, with_options
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -14,12 +14,19 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import typer
 
-from rfm_client.cli.command import ExitCode, report, with_options
-from rfm_client.cli.options import CredentialsGiven, ServerOptions, credentials_of
-from rfm_client.cli.show import print_tables, table
-from rfm_client.contract.errors import RewardError
-from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
-from rfm_client.frames.orientation import CHANNEL_ORDERS, ORIENTATIONS, Channels, Orient
+from rfm_client import RewardError
+from rfm_client.command_line import (
+    CredentialsGiven,
+    ExitCode,
+    ServerOptions,
+    credentials_of,
+    print_tables,
+    report,
+    table,
+    with_options,
+)
+from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, Channels, Orient
+from rfm_client.options import ConfigError, Settings, Texts, setting
 from rfm_labels import blank_cameras
 from rfm_labels.commands.progress_bar import ProgressBar, Say
 from rfm_labels.datasets.faults import listed

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
-from rfm_client.contract.errors import RewardError
+from rfm_client import RewardError
 from rfm_labels.datasets.protocol import DatasetEpisode
 from rfm_labels.run import Watch
 

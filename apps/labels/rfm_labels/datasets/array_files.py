@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
-from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.samples import Trajectory, UInt8Array
-from rfm_client.frames.inputs import load_trajectory
+from rfm_client import InvalidSampleError, Trajectory, UInt8Array
+from rfm_client.frames import load_trajectory
 from rfm_labels.datasets.episode_files import Contents, EpisodeFiles
 from rfm_labels.datasets.protocol import DatasetEpisode, DatasetError, require
 from rfm_labels.datasets.video_frames import video_identity

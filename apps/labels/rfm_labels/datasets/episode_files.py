@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rfm_client.contract.errors import RewardError
-from rfm_client.frames.orientation import Corrections
+from rfm_client import RewardError
+from rfm_client.frames import Corrections
 from rfm_labels.datasets.protocol import (
     Dataset,
     DatasetEpisode,

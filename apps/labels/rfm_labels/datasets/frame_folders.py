@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.pictures import pillow
+from rfm_client import UInt8Array
+from rfm_client.frames import pillow
 from rfm_labels.datasets.episode_files import EpisodeFiles, in_natural_order
 from rfm_labels.datasets.frame_names import in_order_of_numbers
 from rfm_labels.datasets.protocol import DatasetEpisode, DatasetError, digest_of, require

@@ -14,10 +14,9 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from rfm_client.contract.checks import first_names
-from rfm_client.contract.errors import RewardError
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.orientation import Corrections, Orientation
+from rfm_client import RewardError, UInt8Array
+from rfm_client.frames import Corrections, Orientation
+from rfm_client.options import first_names
 from rfm_labels.datasets.hdf5_attributes import (
     DOCUMENTS,
     attribute,

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rfm_client.contract.checks import first_names
+from rfm_client.options import first_names
 from rfm_labels.datasets.hdf5_layouts import foreign_layout
 from rfm_labels.datasets.protocol import DatasetError, require
 

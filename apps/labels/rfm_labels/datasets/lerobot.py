@@ -14,12 +14,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rfm_client.contract.checks import first_names
-from rfm_client.contract.numbers import checked_positive
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.orientation import Corrections
-from rfm_client.frames.pictures import pillow
-from rfm_client.frames.video_decoding import decoder
+from rfm_client import UInt8Array
+from rfm_client.frames import Corrections, decoder, pillow
+from rfm_client.options import checked_positive, first_names
 from rfm_labels.datasets import lerobot_v21, lerobot_v30
 from rfm_labels.datasets.faults import listed
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows

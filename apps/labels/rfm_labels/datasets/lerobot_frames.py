@@ -18,7 +18,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.frames.video_decoding import Packets
+from rfm_client.frames import Packets
 from rfm_labels.datasets.protocol import DatasetError
 from rfm_labels.datasets.video_frames import Times
 

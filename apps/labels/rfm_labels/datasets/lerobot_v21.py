@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from rfm_client.contract.numbers import checked_count
+from rfm_client.options import checked_count
 from rfm_labels.datasets.lerobot_rows import Entry, Info
 from rfm_labels.datasets.lerobot_tasks import by_number
 from rfm_labels.datasets.protocol import DatasetError, require

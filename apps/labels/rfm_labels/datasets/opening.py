@@ -9,10 +9,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from rfm_client.contract.checks import first_names
-from rfm_client.contract.hub_access import HubError, cached_snapshot
-from rfm_client.frames.inputs import ARRAY_SUFFIXES
-from rfm_client.frames.orientation import Channels, Corrections, Orient
+from rfm_client.frames import ARRAY_SUFFIXES, Channels, Corrections, HubError, Orient, cached_snapshot
+from rfm_client.options import first_names
 from rfm_labels.datasets.array_files import ArrayFiles
 from rfm_labels.datasets.episode_files import (
     TABLES,

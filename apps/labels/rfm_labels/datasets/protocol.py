@@ -16,11 +16,10 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from rfm_client.contract import checks
-from rfm_client.contract.errors import RewardError
-from rfm_client.contract.samples import Trajectory, UInt8Array
-from rfm_client.contract.tasks import is_blank
-from rfm_client.frames.orientation import Correction, Corrections, Orientation, PerCamera, Value
+from rfm_client import RewardError, Trajectory, UInt8Array
+from rfm_client.frames import Correction, Corrections, Orientation, PerCamera, Value
+from rfm_client.options import is_blank
+from rfm_client.options import require as require_that
 from rfm_labels.datasets.camera_names import word_of_no_colours
 from rfm_labels.datasets.faults import fault_lines
 
@@ -61,7 +60,7 @@ class FaultsError(DatasetError):
 
 def require(where: object, condition: bool, expected: str, got: object) -> None:
     """Raise DatasetError unless the condition holds."""
-    checks.require(where, condition, expected, got, DatasetError)
+    require_that(where, condition, expected, got, DatasetError)
 
 
 @dataclass(frozen=True)

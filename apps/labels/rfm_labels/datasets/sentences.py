@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from rfm_client.contract.checks import first_names
+from rfm_client.options import first_names
 
 
 def is_identifier(task: str) -> bool:

@@ -7,26 +7,27 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames import pictures
+from rfm_client import UInt8Array
+from rfm_client.frames import PictureError, exif_turn, opened_picture
+from rfm_client.frames import decoded_picture as pixels_of
 from rfm_labels.datasets.protocol import DatasetError
 
 
 def decoded_picture(where: str, picture: bytes | Path) -> UInt8Array:
     """Return the pixels of a picture, or of its file, uint8 [H, W, 3], upright by EXIF. Raises DatasetError."""
     with _errors_at(where):
-        return pictures.decoded_picture(pictures.opened_picture(picture))
+        return pixels_of(opened_picture(picture))
 
 
 def check_picture(where: str, picture: bytes | Path) -> None:
     """Raise DatasetError unless a picture, or its file, has 8-bit colours. Only the header is read."""
     with _errors_at(where):
-        pictures.opened_picture(picture).close()
+        opened_picture(picture).close()
 
 
 def turn_mark(picture: bytes | Path) -> str:
     """Return a text for ``Dataset.identity`` if EXIF data turn a picture, as earlier labels did not; else ""."""
-    orientation = pictures.exif_turn(picture)
+    orientation = exif_turn(picture)
     return "" if orientation is None else f" EXIF {orientation}"
 
 
@@ -34,5 +35,5 @@ def turn_mark(picture: bytes | Path) -> str:
 def _errors_at(where: str) -> Iterator[None]:
     try:
         yield
-    except pictures.PictureError as error:
+    except PictureError as error:
         raise DatasetError.at(where, error.expected, error.got) from error

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.video_decoding import (
+from rfm_client import UInt8Array
+from rfm_client.frames import (
     DAMAGED,
     UNDAMAGED,
     Packets,

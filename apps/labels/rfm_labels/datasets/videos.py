@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.lerobot_videos import check_local_video
-from rfm_client.frames.video_decoding import decoder
+from rfm_client import UInt8Array
+from rfm_client.frames import check_local_video, decoder
 from rfm_labels.datasets.episode_files import Contents, EpisodeFiles
 from rfm_labels.datasets.protocol import DatasetEpisode, chosen_cameras, require
 from rfm_labels.datasets.video_frames import Span, decode, video_identity, video_packets

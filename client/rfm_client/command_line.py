@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: MIT
+"""Parts of ``rfm-client`` commands: options, errors on one line, exit codes, tables. Applications build on it.
+
+Needs ``rfm-client[cli]``.
+"""
+
+from rfm_client.cli.command import Command, ExitCode, OptionsOf, report, with_options
+from rfm_client.cli.options import CredentialsGiven, OutputOptions, ServerOptions, credentials_of
+from rfm_client.cli.show import number, print_tables, table
+
+__all__ = [
+    "Command",
+    "CredentialsGiven",
+    "ExitCode",
+    "OptionsOf",
+    "OutputOptions",
+    "ServerOptions",
+    "credentials_of",
+    "number",
+    "print_tables",
+    "report",
+    "table",
+    "with_options",
+]

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: MIT
+"""Declare settings of a command or a configuration file, and check values. Applications build on it."""
+
+from rfm_client.contract.checks import first_names, require
+from rfm_client.contract.numbers import checked_count, checked_finite, checked_positive, checked_share
+from rfm_client.contract.settings import ConfigError, Settings, Texts, setting, settings_of
+from rfm_client.contract.tasks import is_blank
+
+__all__ = [
+    "ConfigError",
+    "Settings",
+    "Texts",
+    "checked_count",
+    "checked_finite",
+    "checked_positive",
+    "checked_share",
+    "first_names",
+    "is_blank",
+    "require",
+    "setting",
+    "settings_of",
+]
