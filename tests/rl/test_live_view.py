@@ -32,8 +32,8 @@ from gateways import poll
 from live_reports import Taker, picture, taking
 from reference_server import Served
 from rfm_client import RewardClient, ServerUnavailableError
-from rfm_client.episodes import StepScore, SuccessRule, live
-from rfm_rl import LiveView, RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
+from rfm_client.episodes import StepScore, SuccessRule
+from rfm_rl import LiveView, RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, live
 
 
 @pytest.fixture

@@ -45,11 +45,6 @@ class ShownLeRobot(ShownDataset):
     @classmethod
     def open(cls, folder: str) -> ShownLeRobot:
         """Open the dataset in a folder. Raises ConfigError for any other folder, or links out of it."""
-        try:
-            import pyarrow  # noqa: F401
-        except ImportError:
-            expected = "expected pyarrow, which reads datasets, got none: pip install ./client ./apps/labels"
-            raise ConfigError("dataset", expected) from None
         if not (Path(folder) / INFO_FILE).is_file():
             expected = f"expected the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file, got {folder}"
             raise ConfigError("dataset", expected)

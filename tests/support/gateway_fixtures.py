@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A Triton with three small models, and a gateway for each."""
+"""Fixtures of the gateway and its page: a Triton with three small models, a gateway for each, a browser."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def tiny_network() -> RewindTransformer:
     torch.manual_seed(0)
     return RewindTransformer(TINY_CONFIG)
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Triton]:
     folder = tmp_path_factory.mktemp("gateway_triton")
     repository, checkpoint = folder / "model_repository", folder / "two_wide"
@@ -62,7 +62,7 @@ def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfo
     assert set(SHARED_MEMORY.glob(ours)) <= regions
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """The one browser of all tests of the page."""
     with chromium(tmp_path_factory.mktemp("downloads")) as started:
