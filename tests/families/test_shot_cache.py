@@ -189,7 +189,10 @@ def test_a_frame_that_comes_many_times_is_brought_to_size_once(name: str) -> Non
     """Or one large frame, named thousands of times, would take all memory."""
     cached, plain = of_both(name)
     frames = frames_of(13, 2)[[0, 1, 1, 0, 1, 1]]
-    prepared = cached.prepare(named(cached, frames, frames[:2]))
+    sample = named(cached, frames, frames[:2])
+    assert sample.trajectory.named is not None
+    assert len({id(pixels) for _, pixels in sample.trajectory.named}) == 2
+    prepared = cached.prepare(sample)
     cached.work_ahead(prepared)
     (row,) = prepared.rows
     assert len(row.videos[0].ready.pixels) == 2
