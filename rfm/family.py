@@ -14,7 +14,6 @@ from rfm.config import ExportConfig
 from rfm.config import VideoPrompt as VideoPrompt
 from rfm.config import Weights as Weights
 from rfm_client.contract import FrameSize, RewardError, Sample
-from rfm_client.contract.frame_refs import EncoderSampleRefs
 from rfm_client.contract.samples import EncoderSample, Float32Array
 
 if TYPE_CHECKING:
@@ -194,14 +193,14 @@ class FrameEncoders(Protocol):
 
     def encode(
         self,
-        samples: Sequence[EncoderSample | EncoderSampleRefs],
+        samples: Sequence[EncoderSample],
         execution: Execution,
         cache: FeatureCache[Float32Array] | None,
     ) -> list[EncoderSample | RewardError]:
         """Return each sample with embeddings of its frames and task, or its error.
 
         execution: the costs are added to it
-        cache: of embeddings; None: no cache, and no samples with frame references
+        cache: of embeddings; None: no cache, and no samples with named frames
         """
 
 

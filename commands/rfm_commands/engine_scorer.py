@@ -24,7 +24,7 @@ from rfm.engine.execution import Execution
 from rfm.family import Checkpoint, FrameEncoders, config_fields
 from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import EncoderSample, UInt8Array
-from rfm_export.verify import device_named
+from rfm_export.source import device_named
 from rfm_labels import CheckpointFacts
 
 

@@ -8,29 +8,42 @@ frames is the model ``<name>_frames`` alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
+from pathlib import Path
 
 from tritonclient.grpc import model_config_pb2 as pb
 
+from rfm.checkpoint.provenance import settings_digest, weights_digest
 from rfm.config import ExportConfig
 from rfm.family import Description, EncodersDescription
 from rfm.launch.repository_folder import CONFIG_FILE, MODEL_FILE
-from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER, GRAPHS_PARAMETER
+from rfm.parameters import (
+    CHECKPOINT_FOLDER,
+    DTYPE_PARAMETER,
+    FAMILY_PARAMETER,
+    FEATURE_CACHE_PARAMETER,
+    GRAPHS_PARAMETER,
+)
 from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
 from rfm_client.contract.model_info import (
+    DIGEST_PARAMETER,
     FRAME_SIZE_PARAMETER,
     FRAMES_PER_VALUE_PARAMETER,
     KIND_PARAMETER,
     LACKS_PARAMETER,
     MAX_FRAMES_PARAMETER,
+    NETWORK_PARAMETER,
+    REVISION_PARAMETER,
+    SETTINGS_DIGEST_PARAMETER,
+    SOURCE_PARAMETER,
     TRAINED_PADDING_PARAMETER,
     WHOLE_EPISODE_PARAMETER,
 )
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_client.contract.synthetic import blank_trajectory
-from rfm_export.about import about_encoders
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
 
 WARMUP_FOLDER = "warmup"
@@ -85,6 +98,21 @@ class Version:
     family: str
     about: Mapping[str, str]
 
+    def checkpoint_folder(self, description: Description, repository: Path) -> Path:
+        """Return the folder of the checkpoint's files."""
+        return repository / scorer_name(description, self.settings.name) / str(self.number) / CHECKPOINT_FOLDER
+
+    def encoders_folder(self, repository: Path) -> Path:
+        """Return the folder of the encoders' files."""
+        return repository / encoder_name(self.settings.name) / str(self.number)
+
+
+def generated_files(models: Sequence[GeneratedModel], repository: Path) -> dict[str, bytes]:
+    """Return contents of generated files by path, with digests of the weights in ``repository``."""
+    for model in models:
+        _record_digests(model.config, model.version, repository)
+    return {path: content for model in models for path, content in model.files().items()}
+
 
 def scorer_name(description: Description, name: str) -> str:
     """Return the name of the model with the checkpoint, for an export as ``name``."""
@@ -114,7 +142,7 @@ def generated_models(
         models[0].config.parameters[GRAPHS_PARAMETER].string_value = "true"
     if encoders is None or widths is None:
         return models
-    inputs, about = wire.encoder_inputs(by_digest=has_one_cache), about_encoders(encoders, version.about)
+    inputs, about = wire.encoder_inputs(by_digest=has_one_cache), _about_encoders(encoders, version.about)
     encoder = Interface(encoder_name(name), inputs, wire.encoder_outputs(*widths), about)
     of_encoder = replace(version, settings=replace(settings, instances=1)) if cache_mib else version
     models.append(_python_model(encoder, "rfm_encoder", of_encoder, [_encoder_warmup()], keeps=True))
@@ -166,3 +194,21 @@ def _warmups(description: Description) -> list[Warmup]:
 
 def _encoder_warmup() -> Warmup:
     return Warmup("frames", wire.encode_frames(blank_trajectory(None, task=WARMUP_TASK)))
+
+
+def _about_encoders(encoders: EncodersDescription, of_scorer: Mapping[str, str]) -> dict[str, str]:
+    """Return the parameters of encoders, exported with a scorer of these parameters."""
+    return {
+        **{name: of_scorer[name] for name in (SOURCE_PARAMETER, REVISION_PARAMETER)},
+        NETWORK_PARAMETER: json.dumps({"class": encoders.network_class}),
+    }
+
+
+def _record_digests(config: pb.ModelConfig, version: int, repository: Path) -> None:
+    """Set the digests of a version's weights and settings in ``repository``; an ensemble has those of its parts."""
+    parts = [step.model_name for step in config.ensemble_scheduling.step] or [config.name]
+    folders = [repository / part / str(version) for part in parts]
+    kinds = [pb.ModelInstanceGroup.Kind.Name(group.kind) for group in config.instance_group]
+    told = {"dtype": config.parameters[DTYPE_PARAMETER].string_value, "kinds": kinds} if kinds else {}
+    config.parameters[DIGEST_PARAMETER].string_value = weights_digest(folders)
+    config.parameters[SETTINGS_DIGEST_PARAMETER].string_value = settings_digest(folders, told)

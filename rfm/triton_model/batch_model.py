@@ -29,7 +29,6 @@ from rfm.triton_model.shared_memory import close_to_other_users
 from rfm.triton_model.watchdog import Watchdog
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
-from rfm_client.contract.frame_refs import EncoderSampleRefs
 from rfm_client.contract.model_info import (
     COMPUTATION_PARAMETER,
     DIGEST_PARAMETER,
@@ -292,8 +291,7 @@ def _located(error: RewardError, index: int, count: int) -> RewardError:
 def _sample_types(input_names: Sequence[str]) -> list[str]:
     """Return the sample types that a model with these inputs scores."""
     of_samples = wire.SAMPLE_TYPE in input_names
-    kinds = {name: not issubclass(kind, (EncoderSample, EncoderSampleRefs)) for kind, name in SAMPLE_TYPES.items()}
-    return [name for name, is_sample in kinds.items() if is_sample == of_samples]
+    return [name for kind, name in SAMPLE_TYPES.items() if issubclass(kind, EncoderSample) != of_samples]
 
 
 def _checkpoint(settings: Mapping[str, str]) -> dict[str, str]:

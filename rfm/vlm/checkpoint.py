@@ -53,7 +53,6 @@ from rfm.vlm.lerobot import LEROBOT_BACKBONE, check_bins, is_lerobot, lerobot_ru
 from rfm.vlm.lora import (
     Scaling,
     adapted,
-    base_of_adapter,
     changed_by,
     check_inside,
     has_adapter,
@@ -75,7 +74,7 @@ from rfm.vlm.processor import (
 from rfm.vlm.prompts import OF_AN_OLD_RUN
 from rfm.vlm.rounded import fit
 from rfm.vlm.rounding import FLAG, decision, kind_of, read_published, read_unrounded_config, round_layers
-from rfm.vlm.run_config import RunConfig, decisions_of
+from rfm.vlm.run_config import RunConfig, base_of_adapter, decisions_of
 from rfm.vlm.video_prompt import decided
 from rfm.vlm.work import flop
 from rfm_client.contract import Sample

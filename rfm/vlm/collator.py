@@ -28,10 +28,9 @@ from rfm.vlm.network import VlmConfig
 from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, Chat, TrajectoryPart, Visual, question
 from rfm.vlm.qwen import Box, plan, positions
 from rfm.vlm.row import Spans, VlmRow
-from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo, named_frames
+from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo
 from rfm.vlm.video_prompt import WRAPPED
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
-from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs
 
 SECONDS_PER_GROUP = 1  # upstream's value for videos of Qwen2.5-VL
 TOKENS_PER_SECOND = 4  # transformers' default for Qwen2.5-VL
@@ -60,13 +59,10 @@ class VlmCollator:
         """Number of frames in a temporal patch."""
         return 1 if self.config.multi_image else FRAMES_PER_GROUP
 
-    def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
-        """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it.
-
-        sample: with the pixels of all its frames
-        """
+    def rows(self, sample: Sample) -> list[VlmRow]:
+        """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
         check_type(sample, self.config)
-        frame_steps = sample.frame_steps if isinstance(sample, (ProgressSample, ProgressSampleRefs)) else 0
+        frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
         videos = tuple(video_of(trajectory, frame_steps) for trajectory in sample.trajectories)
         self._check_task(sample.trajectories[0].task)
         row = self._row(sample, videos)
@@ -132,7 +128,7 @@ class VlmCollator:
         )
         return self._with_pixels(batch, rows)
 
-    def _row(self, sample: Sample | ProgressSampleRefs, videos: tuple[VlmVideo, ...]) -> VlmRow:
+    def _row(self, sample: Sample, videos: tuple[VlmVideo, ...]) -> VlmRow:
         parts: list[str | Visual] = []
         for part in question(sample, progress_in_preference=self.config.progress_in_preference):
             parts += self._frame_parts(videos[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
@@ -344,10 +340,11 @@ class QwenCollator(VlmCollator):
         )
 
 
-def video_of(trajectory: Trajectory | TrajectoryRefs, frame_steps: int) -> VlmVideo:
+def video_of(trajectory: Trajectory, frame_steps: int) -> VlmVideo:
     """Return the video of a trajectory's frames. Raises InvalidSampleError for embeddings."""
-    if isinstance(trajectory, TrajectoryRefs):
-        return VlmVideo.of(named_frames(trajectory), frame_steps, trajectory.digests)
+    if trajectory.named is not None:
+        digests, frames = zip(*trajectory.named, strict=True)
+        return VlmVideo.of(frames, frame_steps, digests)
     if trajectory.frames is None:
         raise InvalidSampleError.at("video_embeddings", "frames (this checkpoint reads raw frames)", "embeddings")
     return VlmVideo.of(trajectory.frames, frame_steps)

@@ -16,8 +16,8 @@ from reward_models import ROOT
 from rfm import families
 from rfm.config import ExportConfig
 from rfm_export import check, export
-from rfm_export.batches import saturating_samples, with_batch_size
 from rfm_export.pbtxt import parse
+from rfm_export.source import saturating_samples, with_batch_size
 from vlm import BFLOAT16, load
 
 QWEN3_4B = {  # Qwen3-VL-4B-Instruct

@@ -26,7 +26,7 @@ from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm_client.contract import wire
 from rfm_commands.cli import app
 from rfm_export import ExportDiffersError, ExportError
-from rfm_export.about import origin_of
+from rfm_export.source import origin_of
 
 EMBEDDINGS = goldens.config("c1_t1_disc10")
 FRAMES = goldens.config("enc_c1_t1_disc10")

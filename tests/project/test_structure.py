@@ -8,7 +8,8 @@ import importlib
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -36,12 +37,23 @@ PUBLIC = {  # modules, each of which lists its names in __all__
     "rfm_labels": {"", "datasets"},
 }
 MOST_NAMES = 149  # of the client's public modules together
+# Part of the client -> the parts below it, which alone it may import.
+CLIENT: dict[str, set[str]] = {
+    "contract": set(),
+    "transport": {"contract"},
+    "frames": {"contract"},
+    "scoring": {"contract", "transport", "frames"},
+    "episodes": {"contract", "transport", "frames", "scoring"},
+    "async_client": {"contract", "transport", "frames", "scoring", "episodes"},
+    "client": {"contract", "transport", "frames", "scoring", "episodes", "async_client"},
+    "options": {"contract"},
+    "plot": {"contract"},
+    "recording": {"contract", "transport"},
+    "serving": {"contract", "transport"},
+}  # the rest, which all others leave alone: cli and command_line
 # Package, module, or folder of programs -> what of ours it may import besides itself; "!": what of that it may not.
 MAY_IMPORT = {
-    "rfm_client.contract": set(),
-    "rfm_client.transport": {"rfm_client.contract"},
-    "rfm_client.frames": {"rfm_client.contract"},
-    "rfm_client.episodes": {"rfm_client", "!rfm_client.cli"},
+    **{f"rfm_client.{part}": {f"rfm_client.{lower}" for lower in lowers} for part, lowers in CLIENT.items()},
     "rfm_client": set(),
     **{application: {"rfm_client"} for application in APPLICATIONS},
     "rfm_page": {"rfm_client", "rfm_gateway", "rfm_labels"},
@@ -117,6 +129,21 @@ def names_of_others(file: Path, package: str) -> Iterator[tuple[str, str]]:
             assert not [name.name for name in node.names if name.name.partition(".")[0] in {*FOLDERS} - {package}], file
 
 
+def _modules_imported(file: Path, known: Collection[str]) -> Iterator[str]:
+    """Those of the known modules that a file imports, or imports names from."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            named = (f"{node.module}.{name.name}" for name in node.names)
+            yield from (name if name in known else str(node.module) for name in named)
+        elif isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+
+
+def _module(file: Path) -> str:
+    """Dotted name of a file, whose path is relative to what Python searches."""
+    return ".".join(file.with_suffix("").parts).removesuffix(".__init__")
+
+
 def is_part(name: str, packages: set[str]) -> bool:
     """Whether the module is one of these packages or in one."""
     return any(name == package or name.startswith(f"{package}.") for package in packages)
@@ -132,6 +159,15 @@ def test_imports_point_the_right_way(package: str) -> None:
         allowed = {package, *MAY_IMPORT[package], *EXCEPTIONS.get(str(file.relative_to(ROOT)), set())}
         ours = {name for name in imports(file) if name.partition(".")[0] in FOLDERS}
         assert not {name for name in ours if is_part(name, forbidden) or not is_part(name, allowed)}, file
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_no_modules_import_each_other(package: str) -> None:
+    """Not even for types: modules in a circle can only be read, tested and changed together."""
+    root = ROOT / FOLDERS[package]
+    files = {_module(file.relative_to(root)): file for file in (root / package).rglob("*.py")}
+    needs = {module: {*_modules_imported(file, files)} - {module} for module, file in files.items()}
+    TopologicalSorter(needs).prepare()  # raises CycleError, which shows a circle
 
 
 @pytest.mark.parametrize("package", APPLICATIONS)

@@ -32,7 +32,6 @@ from rfm_client.contract import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract.frame_refs import EncoderSampleRefs, TrajectoryRefs
 from rfm_client.contract.samples import EncoderSample
 
 MODEL_TYPE = "redness"
@@ -84,23 +83,17 @@ class Palette:
 
     def encode(
         self,
-        samples: Sequence[EncoderSample | EncoderSampleRefs],
+        samples: Sequence[EncoderSample],
         execution: Execution,
         cache: FeatureCache | None = None,
     ) -> list[EncoderSample | RewardError]:
         return [self._encoded(sample) for sample in samples]
 
-    def _encoded(self, sample: EncoderSample | EncoderSampleRefs) -> EncoderSample:
+    def _encoded(self, sample: EncoderSample) -> EncoderSample:
         letters = np.full(1, len(sample.trajectories[0].task), np.float32)
-        colours = [_frames(each).mean(axis=(1, 2)).astype(np.float32) for each in sample.trajectories]
+        colours = [each.positions.mean(axis=(1, 2)).astype(np.float32) for each in sample.trajectories]
         videos = [self.scale.cpu().numpy() * colour for colour in colours]
         return EncoderSample(tuple(Trajectory(video_embeddings=video, text_embedding=letters) for video in videos))
-
-
-def _frames(trajectory: Trajectory | TrajectoryRefs) -> np.ndarray:
-    if isinstance(trajectory, TrajectoryRefs):
-        return np.stack([trajectory.pixels[digest] for digest in trajectory.digests])
-    return trajectory.positions
 
 
 @dataclass(frozen=True)

@@ -9,16 +9,18 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.results import Result
 from rfm_client.contract.samples import checked_mask
 from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, StepScores, copied
-from rfm_client.episodes.windows import EpisodeFrame
+from rfm_client.episodes.windows import EpisodeFrame, Window
 from rfm_client.frames.sampling import Sampling
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.lifetime import AsyncClosing, Closing, OneProcess
@@ -26,8 +28,17 @@ from rfm_client.transport.lifetime import AsyncClosing, Closing, OneProcess
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from rfm_client.async_client import AsyncRewardClient
     from rfm_client.transport.loop_thread import LoopThread
+
+
+class WindowClient(Protocol):
+    """What episodes ask of an AsyncRewardClient."""
+
+    async def score_windows(self, windows: Sequence[Window], *, timeout_s: float | None) -> list[Result | RewardError]:
+        """Return the progress result or error of each window."""
+
+    async def model_info(self, *, frames: bool, timeout_s: float | None) -> ModelInfo:
+        """Return the description of the served model, with ``frames`` of the model for raw frames."""
 
 
 class AsyncEpisodes(AsyncClosing, OneProcess):
@@ -41,7 +52,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
     """
 
     def __init__(
-        self, client: AsyncRewardClient, tasks: Sequence[str], options: EpisodeOptions, timeout_s: float | None = None
+        self, client: WindowClient, tasks: Sequence[str], options: EpisodeOptions, timeout_s: float | None = None
     ) -> None:
         require("episodes", len(tasks) > 0, "at least one", "none")
         self._client, self._options, self._timeout_s = client, options, timeout_s
@@ -158,7 +169,7 @@ class AsyncEpisode(AsyncClosing, OneProcess):
     """One episode that grows, for asyncio. ``AsyncRewardClient.episode`` builds it. An async context manager."""
 
     def __init__(
-        self, client: AsyncRewardClient, task: str, options: EpisodeOptions, timeout_s: float | None = None
+        self, client: WindowClient, task: str, options: EpisodeOptions, timeout_s: float | None = None
     ) -> None:
         self._episodes = AsyncEpisodes(client, [task], options, timeout_s)
         self._open: asyncio.Task[StepScore] | None = None

@@ -20,7 +20,6 @@ import numpy as np
 
 from rfm_client.contract import wire
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
-from rfm_client.contract.frame_refs import TrajectoryRefs, frame_digest
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, check_task
@@ -42,7 +41,7 @@ class EpisodeFrame:
     @cached_property
     def digest(self) -> bytes:
         """Digest by which a server knows the frame. The first call takes about 2 ms a megabyte."""
-        return frame_digest(self.pixels)
+        return wire.frame_digest(self.pixels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +71,9 @@ class Window:
         return ProgressSample(Trajectory(frames=np.stack([frame.pixels for frame in self.frames]), task=self.task))
 
     @property
-    def named(self) -> TrajectoryRefs:
-        """The frames' digests and the task, without pixels."""
-        return TrajectoryRefs(tuple(frame.digest for frame in self.frames), {}, self.task)
+    def digests(self) -> list[bytes]:
+        """The digest of each frame."""
+        return [frame.digest for frame in self.frames]
 
 
 class _Server:
@@ -192,7 +191,8 @@ class WindowScorer:
     ) -> Sequence[ProgressResult]:
         request_id = next(call.request_ids)
         num_bytes = _padded_bytes(len(windows), len(sent), sent[0].nbytes if sent else 0)
-        tensors = partial(wire.encode_refs, [window.named for window in windows], sent)
+        videos, tasks = [window.digests for window in windows], [window.task for window in windows]
+        tensors = partial(wire.encode_refs, videos, tasks, sent)
         try:
             answer = await self._scorer.infer(self._model, num_bytes, tensors, outputs, call, request_id)
         except RewardError as error:
