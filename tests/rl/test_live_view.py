@@ -32,8 +32,8 @@ from gateways import poll
 from live_reports import Taker, picture, taking
 from reference_server import Served
 from rfm_client import RewardClient, ServerUnavailableError
-from rfm_client.episodes import StepScore, SuccessRule, live
-from rfm_rl import LiveView, RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
+from rfm_client.episodes import StepScore, SuccessRule
+from rfm_rl import LiveView, RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, live
 
 
 @pytest.fixture
@@ -293,7 +293,7 @@ def test_episodes_of_a_vector_environment_are_reported_and_end_with_their_last_s
             env.step(np.array([0, 1]))
         if mode is not AutoresetMode.SAME_STEP:  # which has reset them
             env.reset()
-        client.failing = len(client.calls) + 2
+        client.server.failing = len(client.calls) + 2
         for _ in range(2):
             env.step(np.array([0, 1]))
         with pytest.raises(ServerUnavailableError):
