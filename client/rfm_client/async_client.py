@@ -20,6 +20,7 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import Part, encoder_name, frames_name
+from rfm_client.contract.numbers import checked_count
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes
@@ -129,7 +130,8 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         env: number of its environment, which errors name as ``envs[3]``; None: the only one
         options: fields of EpisodeOptions. Raises ValueError for contradictory options
         """
-        steps = Steps(task, EpisodeOptions(**options), env or 0, "" if env is None else f"envs[{env}]")
+        where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
+        steps = Steps(task, EpisodeOptions(**options), env or 0, where)
         return AsyncEpisode(AsyncEpisodes(self._steps, self._call, [steps]))
 
     def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> AsyncEpisodes:

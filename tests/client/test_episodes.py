@@ -445,6 +445,30 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+KEPT: dict[str, tuple[dict[str, Any], Any, str]] = {
+    "no frame": ({}, None, r"^envs\[3\]\.frame: expected one to score, got none yet$"),
+    "no task": ({"task": " "}, video(0, 1)[0], r"^envs\[3\]\.task: expected a task sentence"),
+    "no camera": ({"cameras": ["a"]}, video(0, 1)[0], r"^envs\[3\]\.frame: .* the cameras \['a'\], got ndarray$"),
+    "another camera": (
+        {"cameras": ["a"]},
+        {"b": video(0, 1)[0]},
+        r"^envs\[3\]\.frame: expected frames of the cameras \['a'\], got frames of \['b'\]$",
+    ),
+    "env": ({"env": "3"}, video(0, 1)[0], "^env: expected a whole number, got '3'$"),
+}
+
+
+@pytest.mark.parametrize(("given", "frame", "message"), KEPT.values(), ids=KEPT)
+def test_a_frame_that_cannot_be_kept_or_scored_is_refused_with_its_environment(
+    client: RewardClient, given: dict[str, Any], frame: Any, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        episode = client.episode(**{"task": TASK, "env": 3, "frames": 4, **given})
+        if frame is not None:
+            episode.keep(frame)
+        client.score_episodes([episode])
+
+
 @pytest.mark.parametrize(("given", "message"), REFUSED.values(), ids=REFUSED)
 def test_what_cannot_be_right_is_refused(client: RewardClient, given: dict[str, Any], message: str) -> None:
     given = {"task": TASK, "frame": video(0, 1)[0], "frames": 4, **given}

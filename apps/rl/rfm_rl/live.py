@@ -28,6 +28,7 @@ from typing import Any, TypeAlias
 from urllib.parse import urlsplit
 
 import numpy as np
+from PIL import Image
 
 from rfm_client import UInt8Array
 from rfm_client.episodes import StepScore, SuccessRule
@@ -93,7 +94,7 @@ class LiveView(AbstractContextManager["LiveView"]):
 
     A context manager. It can be pickled: each process then reports by itself. A forked process reports nothing, and
     logs a warning.
-    Raises ValueError for unusable arguments, ImportError without Pillow (``rfm-client[resize]``).
+    Raises ValueError for unusable arguments.
     """
 
     def __init__(
@@ -107,7 +108,6 @@ class LiveView(AbstractContextManager["LiveView"]):
         headers: Mapping[str, str] | None = None,
         api_key: str | None = None,
     ) -> None:
-        _pillow()
         self.name = name
         self._url = url
         self._credentials = Credentials(ca_file, client_certificate, client_key, headers or {}, api_key)
@@ -293,17 +293,9 @@ def report_body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
     return json.dumps({"episodes": list(episodes.values()), "frames": pictures}, allow_nan=False).encode()
 
 
-def _pillow() -> Any:
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError('making frames smaller needs Pillow: pip install "./client[resize]"') from error
-    return Image
-
-
 def _jpeg(frame: UInt8Array) -> bytes:
     """A frame, uint8 [H, W, 3], as a JPEG file with at most LONGEST_PX pixels on its longer side."""
-    image = _pillow().fromarray(frame)
+    image = Image.fromarray(frame)
     image.thumbnail((LONGEST_PX, LONGEST_PX))
     file = io.BytesIO()
     image.save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)  # full resolution of colours

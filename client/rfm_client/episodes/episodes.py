@@ -20,7 +20,7 @@ from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import checked_mask
 from rfm_client.episodes.options import StepScore, StepScores
 from rfm_client.episodes.scorer import Asked, StepScorer
-from rfm_client.episodes.steps import Frame, Steps, copied
+from rfm_client.episodes.steps import Frame, Steps, check_cameras, copied
 from rfm_client.scoring.call import Call, CallOptions
 from rfm_client.transport.lifetime import AsyncClosing, Closing, OneProcess
 from rfm_client.transport.loop_thread import LoopThread
@@ -112,10 +112,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
     def _given(self, frames: Any, indices: Sequence[int]) -> dict[int, Any]:
         """The new frame of each of these episodes; with cameras, a dict of frames."""
         cameras = self._options.cameras
-        names = sorted(frames) if isinstance(frames, Mapping) else []
-        expected = f"the cameras {list(cameras)}" if cameras else "one camera (cameras=... names several)"
-        got = f"frames of {names}" if names else type(frames).__name__
-        require("frames", names == sorted(cameras), f"frames of {expected}", got, InvalidSampleError)
+        check_cameras("frames", frames, cameras)
         of_cameras = {f"frames[{camera!r}]": frames[camera] for camera in cameras} or {"frames": frames}
         for where, each in of_cameras.items():
             count = len(each) if hasattr(each, "__len__") else type(each).__name__

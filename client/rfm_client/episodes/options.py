@@ -154,14 +154,15 @@ class EpisodeOptions:
         Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one for all frames, as cameras names none"
-        for given in (self._given.orient, self._given.channels):
+        for given in (Orient.of(self.orient), Channels.of(self.channels)):
             unknown = [repr(camera) for camera in given.cameras if camera not in self.cameras]
             require(given.NAME, not unknown, expected, ", ".join(unknown))
 
     @property
     def corrections(self) -> list[Correction]:
         """Correction of each camera's frames, in the order of the cameras."""
-        return [self._given.of(camera) for camera in self.cameras or ("",)]
+        given = Corrections(Orient.of(self.orient), Channels.of(self.channels))
+        return [given.of(camera) for camera in self.cameras or ("",)]
 
     def sampling_for(self, info: ModelInfo) -> Sampling:
         """Return the rule with its number of frames for a checkpoint.
@@ -170,7 +171,3 @@ class EpisodeOptions:
         """
         info.check_scores_prefixes()
         return Sampling.of(self.sampling, self.frames, info.max_frames, trained_padding=info.trained_padding)
-
-    @property
-    def _given(self) -> Corrections:
-        return Corrections(Orient.of(self.orient), Channels.of(self.channels))

@@ -81,13 +81,12 @@ class StepScorer:
         asked_s: start of the caller's wait, by ``time.perf_counter``
         """
         info = await self.model_info(call)
-        prefixes = [steps.options.sampling_for(info).prefix(step) for steps, step in asked]
-        shown = [steps.windows(prefix) for (steps, _), prefix in zip(asked, prefixes, strict=True)]
-        outcomes = iter(await self._all_outcomes([each for windows in shown for each in windows], info, call))
+        shown = [steps.windows(step, info) for steps, step in asked]
+        outcomes = iter(await self._all_outcomes([each for _, windows in shown for each in windows], info, call))
         ms = (time.perf_counter() - asked_s) * 1e3
         scores = [
             steps.score(step, prefix, list(islice(outcomes, len(windows))), ms)
-            for (steps, step), prefix, windows in zip(asked, prefixes, shown, strict=True)
+            for (steps, step), (prefix, windows) in zip(asked, shown, strict=True)
         ]
         for (steps, _), score in zip(asked, scores, strict=True):
             steps.report(score)

@@ -15,6 +15,7 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.frame_refs import TrajectoryRefs, frame_digest
 from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, as_array, check_task
 from rfm_client.episodes.options import EpisodeOptions, StepReport, StepScore
@@ -107,10 +108,11 @@ class Steps:
         size: size to which frames shrink; None: no change
         """
         cameras = self.options.cameras
-        given = {f"frame[{camera!r}]": frame[camera] for camera in cameras} if cameras else {"frame": frame}
-        firsts = self._frames[0] if self._frames else (None,) * len(given)
         kept = []
         try:
+            check_cameras("frame", frame, cameras)
+            given = {f"frame[{camera!r}]": frame[camera] for camera in cameras} or {"frame": frame}
+            firsts = self._frames[0] if self._frames else (None,) * len(given)
             for (where, each), correction, first in zip(given.items(), self._corrections, firsts, strict=True):
                 pixels = correction.applied(checked_frame(each, where))
                 if size is not None:
@@ -145,10 +147,18 @@ class Steps:
         """Remove a frame again, as if it had never been added."""
         self._frames.remove(frame)
 
-    def windows(self, prefix: Prefix) -> list[Window]:
-        """Return each camera's window: its sampled frames, and the task. Raises InvalidSampleError for a wrong task."""
-        shown = [self._frames[index] for index in prefix.indices]
-        return [Window(of_camera, self.task, self) for of_camera in zip(*shown, strict=True)]
+    def windows(self, step: int, info: ModelInfo) -> tuple[Prefix, list[Window]]:
+        """Return how a step is sampled, and each camera's window: its sampled frames, and the task.
+
+        Raises InvalidSampleError without a frame or for a wrong task; ValueError as ``EpisodeOptions.sampling_for``.
+        """
+        prefix = self.options.sampling_for(info).prefix(max(step, 0))
+        try:
+            require("frame", step >= 0, "one to score", "none yet", InvalidSampleError)
+            shown = [self._frames[index] for index in prefix.indices]
+            return prefix, [Window(of_camera, self.task, self) for of_camera in zip(*shown, strict=True)]
+        except InvalidSampleError as error:
+            raise self._located(error) from None
 
     def score(self, step: int, prefix: Prefix, outcomes: Sequence[Result | RewardError], ms: float) -> StepScore:
         """Return the score of a step from the outcomes of its ``windows``.
@@ -201,6 +211,14 @@ def _fault_of(pixels: Sequence[UInt8Array]) -> str:
         return f"pictures that change, got {len(pixels)} {_STILL if newest.any() else _BLACK}"
     told = BlankFrames(pixels).told if is_blank(newest) else ""
     return told and f"pictures that show something, got {told}, {len(pixels)} in a row"
+
+
+def check_cameras(where: str, frames: Any, cameras: Sequence[str]) -> None:
+    """Raise InvalidSampleError unless ``frames`` is a dict by these cameras; without cameras, if it is a dict."""
+    names = sorted(frames) if isinstance(frames, Mapping) else []
+    expected = f"the cameras {list(cameras)}" if cameras else "one camera (cameras=... names several)"
+    got = f"frames of {names}" if names else type(frames).__name__
+    require(where, names == sorted(cameras), f"frames of {expected}", got, InvalidSampleError)
 
 
 def checked_frame(frame: Any, where: str) -> UInt8Array:
