@@ -20,7 +20,7 @@ from rfm_client.frames.orientation import (
     Value,
 )
 from rfm_client.frames.pictures import PictureError, decoded_picture, exif_turn, opened_picture, pillow, upright_picture
-from rfm_client.frames.resize import as_jpeg, load_pillow, resize_frames
+from rfm_client.frames.resize import resize_frames
 from rfm_client.frames.sampling import RULES, Rule, Sampling, of_prefixes, prefix_samples, trained_rule
 from rfm_client.frames.video import frame_times_s, read_video
 from rfm_client.frames.video_decoding import (
@@ -62,7 +62,6 @@ __all__ = [
     "Upright",
     "Value",
     "VideoError",
-    "as_jpeg",
     "cached_snapshot",
     "check_local_video",
     "decoded_picture",
@@ -72,7 +71,6 @@ __all__ = [
     "frame_times_s",
     "import_av",
     "judged",
-    "load_pillow",
     "load_trajectory",
     "of_prefixes",
     "opened_picture",

@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import numpy as np
 
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import UInt8Array
-
-JPEG_QUALITY = 85
 
 
 def load_pillow() -> Any:
@@ -21,15 +18,6 @@ def load_pillow() -> Any:
     except ImportError as error:
         raise ImportError('making frames smaller needs Pillow: pip install "./client[resize]"') from error
     return Image
-
-
-def as_jpeg(frame: UInt8Array, longest_px: int) -> bytes:
-    """Return a frame, uint8 [H, W, 3], as a JPEG file with at most ``longest_px`` pixels on its longer side."""
-    image = load_pillow().fromarray(frame)
-    image.thumbnail((longest_px, longest_px))
-    file = io.BytesIO()
-    image.save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)  # full resolution of colours
-    return file.getvalue()
 
 
 def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Progress requests that send only the frames that the server lacks.
+"""Scores of steps, by progress requests that send only the frames that the server lacks.
 
 A server may lack more frames than expected: it restarted, dropped frames, or is another server. Then it refuses, and
 all pixels are sent. In both cases the answer equals that for a ``ProgressSample`` of the same frames.
@@ -9,20 +9,22 @@ from __future__ import annotations
 
 import asyncio
 import random
+import time
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
-from itertools import groupby
+from functools import partial
+from itertools import groupby, islice
+from typing import TypeAlias
 from weakref import WeakKeyDictionary
-
-import numpy as np
 
 from rfm_client.contract import wire
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
+from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import ProgressResult, Result
-from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, check_task
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.episodes.options import StepScore
+from rfm_client.episodes.steps import Steps, Window
 from rfm_client.scoring.call import Call
 from rfm_client.scoring.samples import SampleScorer, for_each
 from rfm_client.transport.off_loop import off_loop
@@ -32,48 +34,7 @@ MAX_REMEMBERED = 2**17  # digests of sent frames; the oldest are forgotten
 _OUTPUTS = (wire.PROGRESS, wire.SUCCESS)
 
 
-@dataclass(frozen=True, eq=False)
-class EpisodeFrame:
-    """A frame, uint8 [H, W, 3], that must not change, and its digest."""
-
-    pixels: UInt8Array
-
-    @cached_property
-    def digest(self) -> bytes:
-        """Digest by which a server knows the frame. The first call takes about 2 ms a megabyte."""
-        return wire.frame_digest(self.pixels)
-
-
-@dataclass(frozen=True, eq=False)
-class Window:
-    """Frames of one size with their task, to be scored for progress. Raises InvalidSampleError for an invalid task.
-
-    episode: identifies the episode of the frames; all windows of an episode go to one server
-    """
-
-    frames: tuple[EpisodeFrame, ...]
-    task: str
-    episode: object
-
-    def __post_init__(self) -> None:
-        check_task(self.task)
-        if not self.task.strip():
-            raise InvalidSampleError.at("task", "a task sentence with frames", repr(self.task))
-
-    @property
-    def num_bytes(self) -> int:
-        """Bytes of all its frames."""
-        return sum(frame.pixels.nbytes for frame in self.frames)
-
-    @property
-    def sample(self) -> ProgressSample:
-        """The window as a sample, with all pixels. Raises InvalidSampleError."""
-        return ProgressSample(Trajectory(frames=np.stack([frame.pixels for frame in self.frames]), task=self.task))
-
-    @property
-    def digests(self) -> list[bytes]:
-        """The digest of each frame."""
-        return [frame.digest for frame in self.frames]
+Asked: TypeAlias = tuple[Steps, int]  # an episode, and the number of the step to score
 
 
 class _Server:
@@ -98,8 +59,8 @@ class _Server:
             self._sent.pop(digest, None)
 
 
-class WindowScorer:
-    """Scores windows for one client, in its event loop. A new episode goes to the server with the fewest episodes.
+class StepScorer:
+    """Scores steps for one client, in its event loop. A new episode goes to the server with the fewest episodes.
 
     model: name of the exported model
     """
@@ -110,12 +71,28 @@ class WindowScorer:
         self._servers = [_Server(number) for number in range(num_servers)]
         self._server_of: WeakKeyDictionary[object, _Server] = WeakKeyDictionary()  # of each episode that goes on
 
-    async def outcomes(self, windows: Sequence[Window], call: Call) -> list[Result | RewardError]:
-        """Return the result or error of each window."""
-        try:
-            info = await self._scorer.model_info(self._model, call.deadline)
-        except RewardError as error:
-            return for_each(error, len(windows))
+    async def model_info(self, call: Call) -> ModelInfo:
+        """Return the description of the model that scores windows. Raises RewardError."""
+        return await self._scorer.model_info(self._model, call.deadline)
+
+    async def scores(self, asked: Sequence[Asked], call: Call, asked_s: float) -> list[StepScore]:
+        """Return and report the score of each step, from as few requests as possible. Raises RewardError, ValueError.
+
+        asked_s: start of the caller's wait, by ``time.perf_counter``
+        """
+        info = await self.model_info(call)
+        shown = [steps.windows(step, info) for steps, step in asked]
+        outcomes = iter(await self._all_outcomes([each for _, windows in shown for each in windows], info, call))
+        ms = (time.perf_counter() - asked_s) * 1e3
+        scores = [
+            steps.score(step, prefix, list(islice(outcomes, len(windows))), ms)
+            for (steps, step), (prefix, windows) in zip(asked, shown, strict=True)
+        ]
+        for (steps, _), score in zip(asked, scores, strict=True):
+            steps.report(score)
+        return scores
+
+    async def _all_outcomes(self, windows: Sequence[Window], info: ModelInfo, call: Call) -> list[Result | RewardError]:
         self._scorer.tell_of_length(max((len(window.frames) for window in windows), default=0), info)
         if not info.by_digest:
             return await self._whole(windows, call)
