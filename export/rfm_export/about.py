@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Parameters of a model's configuration that tell clients which checkpoint it serves."""
+"""Complete the description of a checkpoint with its origin, network and digests."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,61 +17,50 @@ from rfm.checkpoint.hub import commit_of
 from rfm.checkpoint.provenance import is_folder, license_of, settings_digest, source_name, weights_digest
 from rfm.checkpoint.run_config import find_run_config
 from rfm.checkpoint.weights import num_values
-from rfm.family import NETWORK, Checkpoint, EncodersDescription, config_fields
+from rfm.family import NETWORK, Checkpoint, config_fields
 from rfm.parameters import DTYPE_PARAMETER
-from rfm_client.contract.model_info import (
-    COMPUTATION_PARAMETER,
-    DIGEST_PARAMETER,
-    LICENSE_PARAMETER,
-    NETWORK_PARAMETER,
-    REVISION_PARAMETER,
-    RUN_CONFIG_PARAMETER,
-    SETTINGS_DIGEST_PARAMETER,
-    SOURCE_PARAMETER,
-    WEIGHTS_DIFFERENCE_PARAMETER,
-)
+from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description, Origin
 
-# Facts from the source and from measurements of the export, which the exported files lack.
-_OF_ORIGIN = (
-    *(SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER, LICENSE_PARAMETER),
-    *(COMPUTATION_PARAMETER, WEIGHTS_DIFFERENCE_PARAMETER),
-)
 _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for example hub_token, wandb_api_key
 
 
-def origin_of(source: str | Path, folder: Path) -> dict[str, str]:
-    """Return the checkpoint's origin as parameters by name: source, commit, training run's config.yaml, licence.
+def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
+    """Return the checkpoint's origin: source, commit, training run's config.yaml, licence.
 
     The source of a folder is the end of its path. config.yaml becomes JSON without secrets.
 
     source: as the user named it
     folder: the checkpoint's files, from the Hub in a snapshot named by its commit
+    computation: as in ``Origin``
     """
-    revision = "" if is_folder(source) else commit_of(folder)
     file = find_run_config(folder)
-    of_run = {} if file is None else {RUN_CONFIG_PARAMETER: json.dumps(_public(read_run_config(file)))}
-    license = license_of(folder)
-    of_card = {} if license is None else {LICENSE_PARAMETER: license}
-    return {SOURCE_PARAMETER: source_name(source), REVISION_PARAMETER: revision, **of_run, **of_card}
+    return Origin(
+        source=source_name(source),
+        revision=None if is_folder(source) else commit_of(folder),
+        license=license_of(folder),
+        run_config={} if file is None else _public(read_run_config(file)),
+        computation=computation,
+    )
 
 
-def origin_in(config: pb.ModelConfig) -> dict[str, str]:
-    """Return the origin in an exported configuration, as ``origin_of`` does."""
-    told = {name: config.parameters[name].string_value for name in _OF_ORIGIN if name in config.parameters}
-    return {SOURCE_PARAMETER: "", REVISION_PARAMETER: "", **told}
+def origin_in(description: Description) -> Origin:
+    """Return the origin in an exported description."""
+    return Origin(**{each.name: getattr(description, each.name) for each in fields(Origin)})
 
 
-def about(checkpoint: Checkpoint, origin: Mapping[str, str]) -> dict[str, str]:
-    """Return parameters by name, without the digests of weights and settings, whose files do not exist yet."""
-    return {**origin, NETWORK_PARAMETER: json.dumps(_network(checkpoint))}
+def described(checkpoint: Checkpoint, origin: Origin) -> Description:
+    """Return the checkpoint's description without the digests of weights and settings, whose files do not exist yet."""
+    return replace(checkpoint.description, **vars(origin), network=_network(checkpoint))
 
 
-def about_encoders(encoders: EncodersDescription, of_scorer: Mapping[str, str]) -> dict[str, str]:
-    """Return the parameters of encoders, exported with a scorer of these parameters."""
-    return {
-        **{name: of_scorer[name] for name in (SOURCE_PARAMETER, REVISION_PARAMETER)},
-        NETWORK_PARAMETER: json.dumps({"class": encoders.network_class}),
-    }
+def described_encoders(encoders: Description, origin: Origin) -> Description:
+    """Return the description of encoders, exported with a scorer of this origin."""
+    return replace(encoders, source=origin.source, revision=origin.revision)
+
+
+def description_in(config: pb.ModelConfig) -> Description:
+    """Return the description in an exported configuration. Raises ValueError."""
+    return Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value)
 
 
 def record_digests(config: pb.ModelConfig, version: int, repository: Path) -> None:
@@ -81,8 +69,10 @@ def record_digests(config: pb.ModelConfig, version: int, repository: Path) -> No
     folders = [repository / part / str(version) for part in parts]
     kinds = [pb.ModelInstanceGroup.Kind.Name(group.kind) for group in config.instance_group]
     told = {"dtype": config.parameters[DTYPE_PARAMETER].string_value, "kinds": kinds} if kinds else {}
-    config.parameters[DIGEST_PARAMETER].string_value = weights_digest(folders)
-    config.parameters[SETTINGS_DIGEST_PARAMETER].string_value = settings_digest(folders, told)
+    found = replace(
+        description_in(config), weights_digest=weights_digest(folders), settings_digest=settings_digest(folders, told)
+    )
+    config.parameters[DESCRIPTION_PARAMETER].string_value = found.to_json()
 
 
 def _public(value: Any) -> Any:
@@ -105,7 +95,7 @@ def _network(checkpoint: Checkpoint) -> dict[str, Any]:
     for name, count in num_values(checkpoint.parts[NETWORK]).items():
         parameters[name.partition(".")[0]] += count
     return {
-        "class": checkpoint.description.network_class,
+        **checkpoint.description.network,
         "config": config_fields(checkpoint.config),
         "parameters": dict(sorted(parameters.items())),  # as in the exported file, whose tensors are in another order
     }

@@ -55,8 +55,8 @@ def typical_sample(checkpoint: Checkpoint) -> ProgressSample:
     """Return a progress sample with the frames of training, else TYPICAL_FRAMES."""
     description = checkpoint.description
     num_frames = description.trained_frames or TYPICAL_FRAMES
-    if description.max_frames is not None:
-        num_frames = min(num_frames, description.max_frames)
+    if description.network_frames is not None:
+        num_frames = min(num_frames, description.network_frames)
     size_px = (TYPICAL_PX, TYPICAL_PX)
     random = np.random.default_rng(0)
     return ProgressSample(random_trajectory(random, num_frames, description.widths, task=TYPICAL_TASK, size_px=size_px))

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,12 +21,20 @@ from rfm.checkpoint.run_config import find_run_config
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.engine.computation import computation
-from rfm.family import Checkpoint, Description, Family, FrameEncoders, Options
+from rfm.family import Checkpoint, Family, FrameEncoders, Options
+from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import CHECKPOINT_FOLDER, FAMILY_PARAMETER
 from rfm_client.contract import wire
-from rfm_client.contract.model_info import COMPUTATION_PARAMETER, WEIGHTS_DIFFERENCE_PARAMETER
+from rfm_client.contract.description import Description, Origin
 from rfm_client.contract.names import encoder_name, frames_name
-from rfm_export.about import about, origin_in, origin_of, record_digests
+from rfm_export.about import (
+    described,
+    described_encoders,
+    description_in,
+    origin_in,
+    origin_of,
+    record_digests,
+)
 from rfm_export.batches import with_batch_size
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_name
@@ -59,7 +67,7 @@ class _Source:
     family: Family
     checkpoint: Checkpoint
     encoders: FrameEncoders | None
-    origin: Mapping[str, str]
+    origin: Origin
     decisions: Sequence[Decision] = ()
     full: Callable[[], Checkpoint] | None = None
 
@@ -92,15 +100,15 @@ def export(
     loaded = _load(source, settings, family, say)
     _check_graphs(settings, loaded.checkpoint.description)
     settings = with_batch_size(settings, loaded.checkpoint, say)
-    described = loaded.encoders.description if loaded.encoders is not None else None
+    description = described(loaded.checkpoint, loaded.origin)
+    of_encoders = None if loaded.encoders is None else described_encoders(loaded.encoders.description, loaded.origin)
     names = [settings.name, encoder_name(settings.name), frames_name(settings.name)]
     with alone(repository), staging(repository, names) as staged:
-        version = _version(loaded, settings, next_version(repository, names))
-        models = generated_models(loaded.checkpoint.description, described, version)
+        version = Version(next_version(repository, names), settings, _num_gpus(settings), loaded.family.name)
+        models = generated_models(description, of_encoders, version)
         _check_replaceable(repository, models, settings)
         if (differs := _difference(loaded, version, named, say)) is not None:
-            version = replace(version, about={**version.about, WEIGHTS_DIFFERENCE_PARAMETER: differs})
-            models = generated_models(loaded.checkpoint.description, described, version)
+            models = generated_models(replace(description, weights_difference=differs), of_encoders, version)
         with _needing_disk(repository):
             _stage(loaded, models, version, staged)
         _verify(loaded, version, staged, named, say)
@@ -137,11 +145,11 @@ def _load(source: str | Path, settings: ExportConfig, family: str | None, say: S
         say(note)
     told = [] if settings.dtype is None else [Decision("served_dtype", settings.dtype, "--dtype")]
     computed = computation(checkpoint, settings.torch_dtype, on_gpu=_num_gpus(settings) > 0)
-    told.append(Decision(COMPUTATION_PARAMETER, computed, "installed PyTorch"))
-    origin = {**origin_of(source, folder), COMPUTATION_PARAMETER: computed}
+    told.append(Decision("computation", computed, "installed PyTorch"))
     full = (
         None if options.weights is None else partial(families.load_from, folder, kind, replace(options, weights=None))
     )
+    origin = origin_of(source, folder, computed)
     return _Source(kind, checkpoint, encoders, origin, [*checkpoint.decisions(), *told], full)
 
 
@@ -188,7 +196,7 @@ def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, 
         (staged / path).write_bytes(content)
 
 
-def _difference(source: _Source, version: Version, named: torch.device | None, say: Say) -> str | None:
+def _difference(source: _Source, version: Version, named: torch.device | None, say: Say) -> float | None:
     """Return the largest difference that rounding the weights makes to progress; None: nothing is rounded."""
     full = None if source.full is None else source.full()
     if full is None or full.config.weights is not None:
@@ -200,7 +208,7 @@ def _difference(source: _Source, version: Version, named: torch.device | None, s
     with needing_room(device):
         largest = largest_difference(partial(engine, full), partial(engine, source.checkpoint), samples)
     say(f"--weights {kind}: progress differs by at most {largest:.2g} from the full checkpoint's, on noise")
-    return f"{largest:.2g}"
+    return float(f"{largest:.2g}")
 
 
 def _verify(source: _Source, version: Version, staged: Path, named: torch.device | None, say: Say) -> None:
@@ -243,6 +251,10 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     """Return a line for each generated file that an export would now write differently. Raises ExportError."""
     scorer = settings.name if (repository / settings.name).exists() else frames_name(settings.name)
     config = _read_config(repository, scorer)
+    try:
+        origin = origin_in(description_in(config))
+    except ValueError as error:
+        raise ExportError(f"{repository / scorer / CONFIG_FILE}: {error}; export again") from error
     versions = config.version_policy.specific.versions
     if not versions:
         raise ExportError(f"{repository / scorer}: expected a configuration that names its versions, got none")
@@ -252,9 +264,10 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     checkpoint = family.load(folder, Options())
     settings = with_batch_size(settings, checkpoint, _nobody)
     encoders = repository / encoder_name(settings.name) / str(number)
-    described = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
-    version = _version(_Source(family, checkpoint, None, origin_in(config)), settings, number)
-    models = generated_models(checkpoint.description, described, version)
+    of_encoders = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
+    of_encoders = None if of_encoders is None else described_encoders(of_encoders, origin)
+    version = Version(number, settings, _num_gpus(settings), family.name)
+    models = generated_models(described(checkpoint, origin), of_encoders, version)
     differences = []
     for path, content in _generated(models, repository).items():
         if not (repository / path).is_file():
@@ -269,11 +282,6 @@ def _generated(models: Sequence[GeneratedModel], repository: Path) -> dict[str, 
     for model in models:
         record_digests(model.config, model.version, repository)
     return {path: content for model in models for path, content in model.files().items()}
-
-
-def _version(source: _Source, settings: ExportConfig, number: int) -> Version:
-    about_checkpoint = about(source.checkpoint, source.origin)
-    return Version(number, settings, _num_gpus(settings), source.family.name, about_checkpoint)
 
 
 def _num_gpus(settings: ExportConfig) -> int:

@@ -12,7 +12,7 @@ import torch
 
 from rfm.engine import Engine, Outcome
 from rfm.engine.graphs import PLAIN_CALLS
-from rfm.family import NETWORK, Checkpoint, Description
+from rfm.family import NETWORK, Checkpoint
 from rfm_client.contract import (
     FrameScores,
     InvalidSampleError,
@@ -26,6 +26,7 @@ from rfm_client.contract import (
     SimilaritySample,
     Trajectory,
 )
+from rfm_client.contract.description import Description
 from rfm_client.contract.synthetic import Widths, random_trajectory
 from rfm_export.errors import ExportDiffersError, ExportError
 
@@ -97,7 +98,7 @@ def probes(description: Description, *, with_encoders: bool, seed: int = 0) -> l
     samples: list[Sample] = []
     for widths in (description.widths, None) if with_encoders else (description.widths,):
         for num_frames in PROBE_FRAMES:
-            length = min(num_frames, description.max_frames or num_frames)
+            length = min(num_frames, description.network_frames or num_frames)
             samples.append(ProgressSample(make(length, widths)))
             if not description.needs_whole_episode:
                 samples.append(ProgressSample(make(length, widths), frame_steps=PROBE_FRAME_STEPS))

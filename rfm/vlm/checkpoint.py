@@ -32,7 +32,7 @@ from rfm.checkpoint.provenance import Decision
 from rfm.checkpoint.run_config import check_progress
 from rfm.checkpoint.weights import check_shapes, has_head, read_weights
 from rfm.engine.feature_cache import FeatureCache
-from rfm.family import NETWORK, Description, Options, config_fields
+from rfm.family import NETWORK, Options, config_fields
 from rfm.vlm.backbone import (
     BACKBONES,
     LORA_INSIDE,
@@ -79,6 +79,7 @@ from rfm.vlm.run_config import RunConfig, decisions_of
 from rfm.vlm.video_prompt import decided
 from rfm.vlm.work import flop
 from rfm_client.contract import Sample
+from rfm_client.contract.description import Description
 
 LORA = "lora"  # key in VlmCheckpoint.parts: the factors that change the network's weights
 SETTINGS = "rfm"  # key in an exported config.json: this project's fields
@@ -110,19 +111,18 @@ class VlmCheckpoint:
     def description(self) -> Description:
         """The checkpoint's inputs and outputs."""
         return Description(
-            network_class=VlmRewardModel.__name__,
-            widths=None,
-            progress_bins=self.config.progress_bins,
-            has_similarity=self.config.has_similarity,
+            kind="RFM or Robometer",
+            network={"class": VlmRewardModel.__name__},
+            progress_bins=self.config.progress_bins if self.config.progress_bins > 1 else None,
             trained_frames=self.config.trained_frames,
             frame_size=frame_size(self.config),
             frames_per_value=1 if self.config.multi_image else FRAMES_PER_GROUP,
+            has_preference=self.config.has_preference,
+            has_success=self.config.has_success,
+            has_similarity=self.config.has_similarity,
             keeps_features=self.config.family != SMOL,
             uses_graphs=self.config.family != SMOL,
             is_large=True,
-            has_preference=self.config.has_preference,
-            has_success=self.config.has_success,
-            kind="RFM or Robometer",
         )
 
     @property

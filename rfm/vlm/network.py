@@ -74,7 +74,7 @@ class VlmConfig(BackboneConfig):
     average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
     progress_in_preference: prompts for preference also ask for progress
     size_px: height and width to which every frame is resized first; None: resizing starts from each frame's size
-    trained_frames: as in ``rfm.family.Description``
+    trained_frames: as in ``rfm_client.contract.description.Description``
     """
 
     multi_image: bool
