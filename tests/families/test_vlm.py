@@ -16,6 +16,7 @@ import torch
 import goldens
 from engines import TRANSFORMERS, load_engine
 from reference_server import Served
+from rfm import families
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.engine.layers import progress_from_logits
@@ -82,7 +83,7 @@ BFLOAT16_CASES = goldens.config(BFLOAT16).cases()
 
 def engine_in_bfloat16() -> tuple[Engine, VlmPredictor]:
     config = goldens.config(BFLOAT16)
-    engine = Engine.from_checkpoint(config.checkpoint, **config.sources, dtype=torch.bfloat16)
+    engine = Engine.of(families.load(config.checkpoint, **config.sources), dtype=torch.bfloat16)
     assert isinstance(engine.predictor, VlmPredictor)
     return engine, engine.predictor
 

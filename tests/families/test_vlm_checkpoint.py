@@ -14,20 +14,18 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from google.protobuf import text_format
 from safetensors.torch import load_file, save_file
-from tritonclient.grpc import model_config_pb2 as pb
 
 import goldens
 import rfm_export
 import spoilt
 from engines import load_engine, serve_config
+from repositories import description_of
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
 from rfm.vlm.checkpoint import VlmCheckpoint
 from rfm_client import ProgressSample, Result, RewardError
-from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER
 from spoilt import Spoil, in_json, settings, text, text_settings, weights
 from vlm import PLAIN, assert_close, load, video
 
@@ -67,7 +65,7 @@ def run(section: str, **changes: Any) -> Spoil:
 
 
 def scores(folder: Path, name: str, **sources: str) -> Result:
-    (result,) = Engine.from_checkpoint(folder, **goldens.config(name).sources | sources).evaluate([SAMPLE])
+    (result,) = Engine.of(families.load(folder, **goldens.config(name).sources | sources)).evaluate([SAMPLE])
     assert not isinstance(result, RewardError), result
     return result
 
@@ -384,7 +382,7 @@ def test_a_video_run_of_transformers_5_is_told_about_its_positions(
 def test_a_processor_of_another_model_is_refused() -> None:
     other = str(goldens.config(ADAPTER).base_model)
     with pytest.raises(CheckpointError, match=r"expected a tokenizer of 451 tokens .*, got 447"):
-        Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=other)
+        Engine.of(families.load(goldens.config(PLAIN).checkpoint, base_model=other))
 
 
 def test_eight_special_tokens_tell_an_old_run(copied: Callable[[str], Path]) -> None:
@@ -485,8 +483,7 @@ def test_clients_are_told_no_size_that_is_ignored(copied: Callable[[str], Path],
     folder = copied(PLAIN)
     IGNORED["a size for images"][1](folder)
     rfm_export.export(folder, tmp_path / "repository", serve_config(goldens.config(PLAIN)))
-    text = (tmp_path / "repository" / "rfm_frames" / "config.pbtxt").read_text()
-    assert text_format.Parse(text, pb.ModelConfig()).parameters[FRAME_SIZE_PARAMETER].string_value == ""
+    assert description_of(tmp_path / "repository" / "rfm_frames").frame_size is None
 
 
 DECIDED = {

@@ -19,6 +19,7 @@ from transformers.models.qwen2_5_vl.configuration_qwen2_5_vl import Qwen2_5_VLVi
 
 import goldens
 from engines import TRANSFORMERS, load_engine
+from rfm import families
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.engine.pixels import Normalisation
@@ -96,7 +97,7 @@ BFLOAT16_BOUND = 0.02
 def test_bfloat16_on_a_gpu_is_near_float32_on_the_cpu() -> None:
     config = goldens.config(BFLOAT16)
     samples = [sample for case in config.cases() for sample in case.samples()]
-    engine = Engine.from_checkpoint(config.checkpoint, **config.sources, device="cuda")
+    engine = Engine.of(families.load(config.checkpoint, **config.sources), device="cuda")
     expected, together = load_engine(BFLOAT16).evaluate(samples), engine.evaluate(samples)
     alone = [engine.evaluate([sample])[0] for sample in samples]
     for left, right in [*zip(expected, together, strict=True), *zip(alone, together, strict=True)]:
@@ -114,7 +115,7 @@ def test_a_gpu_gives_the_cpu_s_numbers_in_float32(name: str) -> None:
     samples: list[Sample] = [ProgressSample(video(seed, 5, 84, 112)) for seed in range(3)]
     samples += [PreferenceSample(video(4, 2, 64, 96), video(5, 3, 64, 64)), ProgressSample(video(6, 4, 60, 60), 3)]
     expected = load_engine(name).evaluate(samples)
-    engine = Engine.from_checkpoint(config.checkpoint, **config.sources, device="cuda", dtype=torch.float32)
+    engine = Engine.of(families.load(config.checkpoint, **config.sources), device="cuda", dtype=torch.float32)
     for left, right in zip(expected, engine.evaluate(samples), strict=True):
         assert_close(left, right, 1e-5)
 
@@ -123,7 +124,7 @@ def test_a_gpu_gives_the_cpu_s_numbers_in_float32(name: str) -> None:
 def test_the_host_waits_for_a_gpu_once_a_batch() -> None:
     """PyTorch itself tells of each time that the host waits; to read the scores, it must."""
     config = goldens.config(BFLOAT16)
-    engine = Engine.from_checkpoint(config.checkpoint, **config.sources, device="cuda")
+    engine = Engine.of(families.load(config.checkpoint, **config.sources), device="cuda")
     samples: list[Sample] = [ProgressSample(video(seed, 5, 84, 112)) for seed in range(3)]
     engine.evaluate(samples)
     prepared = [engine.prepare(sample) for sample in samples]
