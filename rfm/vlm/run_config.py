@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rfm.checkpoint.content import ADAPTER_CONFIG, NETWORK_CONFIG, RUN_CONFIG, CheckpointError, read_run_config, shown
 from rfm.checkpoint.provenance import OF_UPSTREAM, OF_WEIGHTS, TRAINED_WITH_PADDING, Decision, file_name, source_name
 from rfm.checkpoint.run_config import find_run_config, frame_count
-from rfm.vlm.backbone import QWEN_2_5, SMOL
+from rfm.vlm.backbone import QWEN_2_5
 from rfm.vlm.network import VlmConfig
 
 if TYPE_CHECKING:
@@ -121,13 +121,13 @@ class RunConfig:
             ),
         }
 
-    def size_px(self, family: str, multi_image: bool) -> tuple[int, int] | None:
+    def size_px(self, multi_image: bool) -> tuple[int, int] | None:
         """Return height and width to which every frame is resized first; None: resizing starts from each frame's size.
 
         None for images, for which all upstream versions with a frame_pool_attn ignore the keys.
         Raises CheckpointError.
         """
-        if family == SMOL or multi_image:
+        if multi_image:
             return None
         keys = ("resized_height", "resized_width")
         for key in keys:

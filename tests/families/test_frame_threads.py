@@ -29,7 +29,7 @@ from vlm import PLAIN, assert_close, load, video
 
 THREE = FrameThreads(3)
 ASKED = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
-MODELS = [PLAIN, "q25_video_avg_disc10", "smol_mean_disc10", "roboreward", "topreward", "topreward-robometer"]
+MODELS = [PLAIN, "q25_video_avg_disc10", "roboreward", "topreward", "topreward-robometer"]
 SIZES = [(5, 56, 84), (7, 256, 256), (3, 340, 500), (1, 64, 64)]  # frames, height, width
 
 
