@@ -48,7 +48,7 @@ WRONG = {
     "a text for a number": ('{"text_dim": "32"}', r"text_dim: expected int or null, got '32'"),
     "null for a number": ('{"frames_per_value": null}', r"frames_per_value: expected int, got None"),
     "a list for an object": ('{"network": []}', r"network: expected Mapping, got \[\]"),
-    "an unknown size": ('{"frame_size": "any"}', r"frame_size: expected 'shortest PX', .*, got 'any'"),
+    "an unknown size": ('{"frame_size": "any"}', r"frame_size: expected 'shortest PX' or .*, got 'any'"),
 }
 
 
