@@ -16,14 +16,24 @@ from rfm import families
 from rfm.checkpoint.provenance import Decision, write
 from rfm.config import ExportConfig
 from rfm.family import Options
+from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import CHECKPOINT_FOLDER, FAMILY_PARAMETER
 from rfm_client.contract import wire
-from rfm_client.contract.model_info import WEIGHTS_DIFFERENCE_PARAMETER
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.errors import ExportError
-from rfm_export.layout import GeneratedModel, Version, generated_files, generated_models
+from rfm_export.layout import GeneratedModel, Version, description_in, generated_files, generated_models
 from rfm_export.publish import alone, next_version, publish, read_config, staging
-from rfm_export.source import Say, Source, about, num_gpus, origin_in, read_for_export, read_source, with_batch_size
+from rfm_export.source import (
+    Say,
+    Source,
+    described,
+    described_encoders,
+    num_gpus,
+    origin_in,
+    read_for_export,
+    read_source,
+    with_batch_size,
+)
 from rfm_export.verify import compare
 
 
@@ -54,17 +64,16 @@ def export(
     Raises CheckpointError, ExportError.
     """
     read = read_for_export(source, settings, family, device, say, other_machine=other_machine)
-    described = None if read.encoders is None else read.encoders.description
     names = [settings.name, encoder_name(settings.name), frames_name(settings.name)]
     with alone(repository), staging(repository, names) as staged:
-        version = Version(next_version(repository, names), read.settings, read.num_gpus, read.family.name, read.about)
-        models = generated_models(read.checkpoint.description, described, version)
+        version = Version(next_version(repository, names), read.settings, read.num_gpus, read.family.name)
+        models = generated_models(read.description, read.of_encoders, version)
         _check_replaceable(repository, models, settings)
         with _needing_disk(repository):
             _save(read, version, staged)
         if (difference := compare(read, version, staged, say)) is not None:
-            version = replace(version, about={**version.about, WEIGHTS_DIFFERENCE_PARAMETER: difference})
-            models = generated_models(read.checkpoint.description, described, version)
+            description = replace(read.description, weights_difference=difference)
+            models = generated_models(description, read.of_encoders, version)
         with _needing_disk(repository):
             publish(repository, staged, models)
     return version.number
@@ -106,6 +115,10 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     """Return a line for each generated file that an export would now write differently. Raises ExportError."""
     scorer = settings.name if (repository / settings.name).exists() else frames_name(settings.name)
     config = _read_config(repository, scorer)
+    try:
+        origin = origin_in(description_in(config))
+    except ValueError as error:
+        raise ExportError(f"{repository / scorer / CONFIG_FILE}: {error}; export again") from error
     versions = config.version_policy.specific.versions
     if not versions:
         raise ExportError(f"{repository / scorer}: expected a configuration that names its versions, got none")
@@ -115,9 +128,10 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     checkpoint = family.load(folder, Options())
     settings = with_batch_size(settings, checkpoint, _nobody)
     encoders = repository / encoder_name(settings.name) / str(number)
-    described = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
-    version = Version(number, settings, num_gpus(settings), family.name, about(checkpoint, origin_in(config)))
-    models = generated_models(checkpoint.description, described, version)
+    of_encoders = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
+    of_encoders = None if of_encoders is None else described_encoders(of_encoders, origin)
+    version = Version(number, settings, num_gpus(settings), family.name)
+    models = generated_models(described(checkpoint, origin), of_encoders, version)
     differences = []
     for path, content in generated_files(models, repository).items():
         if not (repository / path).is_file():

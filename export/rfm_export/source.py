@@ -9,19 +9,17 @@ end, and leaves nothing to the other GPUs.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm import families
 from rfm.checkpoint.content import read_run_config
@@ -31,17 +29,9 @@ from rfm.checkpoint.run_config import find_run_config
 from rfm.checkpoint.weights import num_values
 from rfm.config import ExportConfig
 from rfm.engine.computation import computation
-from rfm.family import NETWORK, Checkpoint, Description, Family, FrameEncoders, Options, config_fields
+from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, config_fields
 from rfm_client.contract import ProgressSample
-from rfm_client.contract.model_info import (
-    COMPUTATION_PARAMETER,
-    LICENSE_PARAMETER,
-    NETWORK_PARAMETER,
-    REVISION_PARAMETER,
-    RUN_CONFIG_PARAMETER,
-    SOURCE_PARAMETER,
-    WEIGHTS_DIFFERENCE_PARAMETER,
-)
+from rfm_client.contract.description import Description, Origin
 from rfm_client.contract.synthetic import random_trajectory
 from rfm_export.errors import ExportError
 
@@ -53,11 +43,6 @@ TYPICAL_FRAMES, TYPICAL_PX = 8, 224
 TYPICAL_TASK = "put the red block in the bowl"
 _TERA = 1e12
 
-# Facts from the source and from measurements of the export, which the exported files lack.
-_OF_ORIGIN = (
-    *(SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER, LICENSE_PARAMETER),
-    *(COMPUTATION_PARAMETER, WEIGHTS_DIFFERENCE_PARAMETER),
-)
 _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for example hub_token, wandb_api_key
 
 
@@ -65,7 +50,7 @@ _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for
 class Source:
     """The checked input of an export.
 
-    about: parameters of the models, without digests of weights and settings, whose files do not exist yet
+    description, of_encoders: of the checkpoint and of its encoders, without digests, whose files do not exist yet
     settings: with a ``max_batch_size``
     num_gpus: that serve the export; 0: the CPU
     device: for the comparison of scores, as the user names it; None: the default
@@ -76,7 +61,8 @@ class Source:
     family: Family
     checkpoint: Checkpoint
     encoders: FrameEncoders | None
-    about: Mapping[str, str]
+    description: Description
+    of_encoders: Description | None
     settings: ExportConfig
     num_gpus: int
     device: torch.device | None = None
@@ -111,13 +97,15 @@ def read_source(source: str | Path, settings: ExportConfig, family: str | None, 
     told = [] if settings.dtype is None else [Decision("served_dtype", settings.dtype, "--dtype")]
     gpus = num_gpus(settings)
     computed = computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0)
-    told.append(Decision(COMPUTATION_PARAMETER, computed, "installed PyTorch"))
-    of_models = about(checkpoint, {**origin_of(source, folder), COMPUTATION_PARAMETER: computed})
+    told.append(Decision("computation", computed, "installed PyTorch"))
+    origin = origin_of(source, folder, computed)
+    of_encoders = None if encoders is None else described_encoders(encoders.description, origin)
     full = (
         None if options.weights is None else partial(families.load_from, folder, kind, replace(options, weights=None))
     )
     decisions = [*checkpoint.decisions(), *told]
-    return Source(kind, checkpoint, encoders, of_models, settings, gpus, None, decisions, full)
+    description = described(checkpoint, origin)
+    return Source(kind, checkpoint, encoders, description, of_encoders, settings, gpus, None, decisions, full)
 
 
 def device_named(name: str) -> torch.device:
@@ -186,38 +174,45 @@ def typical_sample(checkpoint: Checkpoint) -> ProgressSample:
     """Return a progress sample with the frames of training, else TYPICAL_FRAMES."""
     description = checkpoint.description
     num_frames = description.trained_frames or TYPICAL_FRAMES
-    if description.max_frames is not None:
-        num_frames = min(num_frames, description.max_frames)
+    if description.network_frames is not None:
+        num_frames = min(num_frames, description.network_frames)
     size_px = (TYPICAL_PX, TYPICAL_PX)
     random = np.random.default_rng(0)
     return ProgressSample(random_trajectory(random, num_frames, description.widths, task=TYPICAL_TASK, size_px=size_px))
 
 
-def origin_of(source: str | Path, folder: Path) -> dict[str, str]:
-    """Return the checkpoint's origin as parameters by name: source, commit, training run's config.yaml, licence.
+def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
+    """Return the checkpoint's origin: source, commit, training run's config.yaml, licence.
 
     The source of a folder is the end of its path. config.yaml becomes JSON without secrets.
 
     source: as the user named it
     folder: the checkpoint's files, from the Hub in a snapshot named by its commit
+    computation: as in ``Origin``
     """
-    revision = "" if is_folder(source) else commit_of(folder)
     file = find_run_config(folder)
-    of_run = {} if file is None else {RUN_CONFIG_PARAMETER: json.dumps(_public(read_run_config(file)))}
-    license = license_of(folder)
-    of_card = {} if license is None else {LICENSE_PARAMETER: license}
-    return {SOURCE_PARAMETER: source_name(source), REVISION_PARAMETER: revision, **of_run, **of_card}
+    return Origin(
+        source=source_name(source),
+        revision=None if is_folder(source) else commit_of(folder),
+        license=license_of(folder),
+        run_config={} if file is None else _public(read_run_config(file)),
+        computation=computation,
+    )
 
 
-def origin_in(config: pb.ModelConfig) -> dict[str, str]:
-    """Return the origin in an exported configuration, as ``origin_of`` does."""
-    told = {name: config.parameters[name].string_value for name in _OF_ORIGIN if name in config.parameters}
-    return {SOURCE_PARAMETER: "", REVISION_PARAMETER: "", **told}
+def origin_in(description: Description) -> Origin:
+    """Return the origin in an exported description."""
+    return Origin(**{each.name: getattr(description, each.name) for each in fields(Origin)})
 
 
-def about(checkpoint: Checkpoint, origin: Mapping[str, str]) -> dict[str, str]:
-    """Return parameters by name, without the digests of weights and settings, whose files do not exist yet."""
-    return {**origin, NETWORK_PARAMETER: json.dumps(_network(checkpoint))}
+def described(checkpoint: Checkpoint, origin: Origin) -> Description:
+    """Return the checkpoint's description without the digests of weights and settings, whose files do not exist yet."""
+    return replace(checkpoint.description, **vars(origin), network=_network(checkpoint))
+
+
+def described_encoders(encoders: Description, origin: Origin) -> Description:
+    """Return the description of encoders, exported with a scorer of this origin."""
+    return replace(encoders, source=origin.source, revision=origin.revision)
 
 
 def _public(value: Any) -> Any:
@@ -240,7 +235,7 @@ def _network(checkpoint: Checkpoint) -> dict[str, Any]:
     for name, count in num_values(checkpoint.parts[NETWORK]).items():
         parameters[name.partition(".")[0]] += count
     return {
-        "class": checkpoint.description.network_class,
+        **checkpoint.description.network,
         "config": config_fields(checkpoint.config),
         "parameters": dict(sorted(parameters.items())),  # as in the exported file, whose tensors are in another order
     }

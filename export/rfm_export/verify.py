@@ -15,7 +15,7 @@ import torch
 from rfm import families
 from rfm.engine import Engine, Outcome
 from rfm.engine.graphs import PLAIN_CALLS
-from rfm.family import NETWORK, Checkpoint, Description, Options
+from rfm.family import NETWORK, Checkpoint, Options
 from rfm_client.contract import (
     FrameScores,
     InvalidSampleError,
@@ -29,6 +29,7 @@ from rfm_client.contract import (
     SimilaritySample,
     Trajectory,
 )
+from rfm_client.contract.description import Description
 from rfm_client.contract.synthetic import Widths, random_trajectory
 from rfm_export.errors import ExportDiffersError, ExportError
 from rfm_export.layout import Version
@@ -42,17 +43,17 @@ PROBE_FRAME_STEPS = 2
 WORKING_ROOM = 1.5  # times the weights' bytes, for weights and a pass over a few small samples
 
 
-def compare(source: Source, version: Version, staged: Path, say: Say) -> str | None:
+def compare(source: Source, version: Version, staged: Path, say: Say) -> float | None:
     """Raise ExportDiffersError unless the staged weights give the checkpoint's scores.
 
-    Return the largest difference that rounding the weights makes to progress, as text; None: nothing is rounded.
+    Return the largest difference that rounding the weights makes to progress; None: nothing is rounded.
     """
     difference = _difference(source, say)
     _compare_staged(source, version, staged, say)
     return difference
 
 
-def _difference(source: Source, say: Say) -> str | None:
+def _difference(source: Source, say: Say) -> float | None:
     """Return the largest difference that rounding the weights makes to progress; None: nothing is rounded."""
     full = None if source.full is None else source.full()
     if full is None or full.config.weights is not None:
@@ -64,7 +65,7 @@ def _difference(source: Source, say: Say) -> str | None:
     with needing_room(device):
         largest = largest_difference(partial(engine, full), partial(engine, source.checkpoint), samples)
     say(f"--weights {kind}: progress differs by at most {largest:.2g} from the full checkpoint's, on noise")
-    return f"{largest:.2g}"
+    return float(f"{largest:.2g}")
 
 
 def _compare_staged(source: Source, version: Version, staged: Path, say: Say) -> None:
@@ -142,7 +143,7 @@ def probes(description: Description, *, with_encoders: bool, seed: int = 0) -> l
     samples: list[Sample] = []
     for widths in (description.widths, None) if with_encoders else (description.widths,):
         for num_frames in PROBE_FRAMES:
-            length = min(num_frames, description.max_frames or num_frames)
+            length = min(num_frames, description.network_frames or num_frames)
             samples.append(ProgressSample(make(length, widths)))
             if not description.needs_whole_episode:
                 samples.append(ProgressSample(make(length, widths), frame_steps=PROBE_FRAME_STEPS))

@@ -8,12 +8,10 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, TypeAlias, cast
 
 import torch
 
-from rfm import families
 from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
 from rfm.engine.device import memory_errors
 from rfm.engine.execution import Execution
@@ -22,7 +20,7 @@ from rfm.engine.finite import finite
 from rfm.engine.graphs import CudaCapture, Graphs
 from rfm.engine.layers import keep_float32
 from rfm.engine.predictor import GraphedPredictor, Predictor, RowScores, of_prefixes
-from rfm.family import Checkpoint, FrameEncoders, VideoPrompt, Weights
+from rfm.family import Checkpoint, FrameEncoders
 from rfm_client.contract import (
     BatchTiming,
     InvalidSampleError,
@@ -82,49 +80,6 @@ class Engine:
         self.graphs = graphs
         if graphs is not None:
             cast("GraphedPredictor[Any, Any]", predictor).use_graphs(graphs)
-
-    @classmethod
-    def from_checkpoint(
-        cls,
-        source: str | Path,
-        *,
-        family: str | None = None,
-        encoders: FrameEncoders | None = None,
-        base_model: str | None = None,
-        reward_model: str | None = None,
-        video_prompt: VideoPrompt | None = None,
-        strict_answers: bool = False,
-        weights: Weights | None = None,
-        device: str | torch.device = "cpu",
-        dtype: torch.dtype | None = None,
-        token_budget: int = DEFAULT_TOKEN_BUDGET,
-        max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
-        feature_cache_mib: int = 0,
-        cuda_graphs: bool = False,
-    ) -> Engine:
-        """Return the engine for a checkpoint's folder or Hugging Face id.
-
-        source, family, base_model to weights: as in ``rfm.families.load``; others: as in ``of`` and the class
-        Raises CheckpointError.
-        """
-        return cls.of(
-            families.load(
-                source,
-                family=family,
-                base_model=base_model,
-                reward_model=reward_model,
-                video_prompt=video_prompt,
-                strict_answers=strict_answers,
-                weights=weights,
-            ),
-            encoders=encoders,
-            device=device,
-            dtype=dtype,
-            token_budget=token_budget,
-            max_sample_tokens=max_sample_tokens,
-            feature_cache_mib=feature_cache_mib,
-            cuda_graphs=cuda_graphs,
-        )
 
     @classmethod
     def of(

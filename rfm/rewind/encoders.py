@@ -25,7 +25,6 @@ from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache, digests_of, get_or_make
 from rfm.engine.layers import as_tensor, speed_up
 from rfm.engine.threads import IN_TURN, FrameThreads
-from rfm.family import EncodersDescription
 from rfm.rewind.pretrained import (
     IMAGE_MODELS,
     TEXT_MODELS,
@@ -35,6 +34,7 @@ from rfm.rewind.pretrained import (
     load_tokenizer,
 )
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
+from rfm_client.contract.description import Description
 from rfm_client.contract.samples import EncoderSample, Float32Array, NamedFrame, UInt8Array
 
 IMAGE_ENCODER_FOLDER = "image_encoder"  # in an exported version of a model with encoders
@@ -94,16 +94,16 @@ class Encoders:
         self.tokenizer.save_pretrained(text_folder)
 
     @classmethod
-    def describe(cls, folder: Path) -> EncodersDescription:
+    def describe(cls, folder: Path) -> Description:
         """Return the description of the encoders that ``save`` wrote into ``folder``, without loading them."""
         file = folder / IMAGE_ENCODER_FOLDER / PREPROCESSOR_CONFIG
         preprocessor = ImagePreprocessor.from_config(read_json(file), str(file))
-        return EncodersDescription(cls.__name__, preprocessor.frame_size)
+        return Description(network={"class": cls.__name__}, frame_size=preprocessor.frame_size)
 
     @property
-    def description(self) -> EncodersDescription:
+    def description(self) -> Description:
         """The export's record of these encoders."""
-        return EncodersDescription(type(self).__name__, self.preprocessor.frame_size)
+        return Description(network={"class": type(self).__name__}, frame_size=self.preprocessor.frame_size)
 
     def to(self, device: torch.device) -> Encoders:
         """Move both encoders to ``device``, and return them."""

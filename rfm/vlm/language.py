@@ -31,7 +31,7 @@ from rfm.vlm.collator import (
     VIDEO_PAD,
     VISION_END,
     VISION_START,
-    QwenCollator,
+    VlmCollator,
     expanded,
     timed_groups,
     video_of,
@@ -99,7 +99,7 @@ class LanguageNetwork(nn.Module):
         return LanguageOutput(self.lm_head(hidden[batch.query_rows, batch.query_tokens]), made)
 
 
-class LanguageCollator(QwenCollator):
+class LanguageCollator(VlmCollator):
     """The collator of prompts with one video, each temporal patch behind its time."""
 
     def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:

@@ -200,8 +200,8 @@ _NO_EMBEDDING = (
     "lost with the run; save the whole model where it was trained (save_model() of the trainer), or the adapter with "
     "save_pretrained(..., save_embedding_layers=True)"
 )
-# In names of SmolVLM's weights, of LoRA factors of embeddings, and of an embedding that PEFT saves in two ways at once.
-_OTHER = re.compile(r"\.(text_model|lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
+# In names of LoRA factors of embeddings, and of an embedding that PEFT saves in two ways at once.
+_OTHER = re.compile(r"\.(lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
 _PARTS = ("model.language_model.", "model.visual.")  # in names of an adapter around all of them
 
 

@@ -19,7 +19,7 @@ from rfm.engine.layers import progress_from_logits, speed_up
 from rfm.engine.predictor import RowScores, no_success, of_rows, part_of
 from rfm.engine.threads import FrameThreads
 from rfm.vlm.batch import Layout, VlmBatch
-from rfm.vlm.collator import QwenCollator, VlmCollator
+from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.network import VlmOutput
 from rfm.vlm.row import VlmRow
@@ -67,7 +67,7 @@ class VlmPredictor:
         if longest > self._max_tokens:
             expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"
             raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
-        if not (self.makes_trees and isinstance(self.collator, QwenCollator)):
+        if not self.makes_trees:
             return rows
         return trees(rows, self.collator.visual_pad, are_images=self.collator.config.multi_image)
 
@@ -146,7 +146,7 @@ class VlmPredictor:
     def _keep(self, rows: Sequence[VlmRow], layout: Layout | None, made: torch.Tensor | None) -> None:
         """Cache each video's frames and its new features; skip a video that is larger than the cache.
 
-        layout: of a Qwen backbone's shots; None: nothing can be cached
+        layout: of the shots; None: nothing can be cached
         """
         if self.cache is None or layout is None:
             return

@@ -24,7 +24,7 @@ from rfm.checkpoint.content import (
 )
 from rfm.checkpoint.provenance import OF_UPSTREAM, OF_WEIGHTS, TRAINED_WITH_PADDING, Decision, file_name, source_name
 from rfm.checkpoint.run_config import find_run_config, frame_count
-from rfm.vlm.backbone import DEQUANTIZED, QWEN_2_5, SMOL
+from rfm.vlm.backbone import DEQUANTIZED, QWEN_2_5
 from rfm.vlm.lora import MERGE, Scaling
 from rfm.vlm.network import VlmConfig
 
@@ -129,13 +129,13 @@ class RunConfig:
             ),
         }
 
-    def size_px(self, family: str, multi_image: bool) -> tuple[int, int] | None:
+    def size_px(self, multi_image: bool) -> tuple[int, int] | None:
         """Return height and width to which every frame is resized first; None: resizing starts from each frame's size.
 
         None for images, for which all upstream versions with a frame_pool_attn ignore the keys.
         Raises CheckpointError.
         """
-        if family == SMOL or multi_image:
+        if multi_image:
             return None
         keys = ("resized_height", "resized_width")
         for key in keys:

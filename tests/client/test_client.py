@@ -376,7 +376,7 @@ def test_a_model_without_a_description_is_scored() -> None:
 
 
 @pytest.mark.parametrize(
-    "more", [{"max_frames": None}, {"needs_whole_episode": True}], ids=["unknown", "whole episodes"]
+    "more", [{"trained_frames": None}, {"needs_whole_episode": True}], ids=["unknown", "whole episodes"]
 )
 def test_a_checkpoint_without_a_limit_of_training_gets_no_line(
     caplog: pytest.LogCaptureFixture, more: dict[str, Any]

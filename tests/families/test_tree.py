@@ -34,7 +34,7 @@ def sample(num_frames: int, height: int = 64, width: int = 64, frame_steps: int 
 
 
 def topreward(settings: str = "", **options: Any) -> Engine:
-    return Engine.from_checkpoint(str(CHECKPOINT), reward_model=f"topreward{settings}", **options)
+    return Engine.of(families.load(str(CHECKPOINT), reward_model=f"topreward{settings}"), **options)
 
 
 def robometer(name: str = "q3_tok_disc10", **options: Any) -> Engine:

@@ -63,7 +63,7 @@ MAY_IMPORT = {
     "rfm.triton_model": {*SHARED, "rfm.parameters", "rfm.probe_request"},
     "rfm.launch": {"rfm.config", "rfm.parameters", "rfm_client.contract"},
     "rfm.supervise": {"rfm.launch", "rfm.probe_request", "rfm_client.contract"},
-    "rfm.engine": {"rfm", "!rfm.launch", "!rfm.supervise", "!rfm.triton_model", "rfm_client.contract"},
+    "rfm.engine": {"rfm.checkpoint", "rfm.config", "rfm.family", "rfm_client.contract"},  # no family, not rfm.families
     "rfm": {"rfm_client.contract"},
     "rfm_export": {"rfm", "rfm_client.contract"},
     "rfm_commands": {"rfm", "rfm_client", "rfm_export", "rfm_gateway", "rfm_labels"},

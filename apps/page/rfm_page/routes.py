@@ -133,7 +133,8 @@ def viewer_routes(surroundings: Surroundings) -> APIRouter:
         yield _event("video", **about, blank=blank or None)
         try:
             sample = ProgressSample(video.trajectory)
-            fit = await asyncio.to_thread(fitted, sample, asked.info, subsample=False, resize=asked.question.resize)
+            size = asked.info.frame_size if asked.question.resize else None
+            fit = await asyncio.to_thread(fitted, sample, None, size)
             async with new_client(model=asked.question.model) as client:
                 async for points in _curve(client, fit.sample.trajectories[0], asked):
                     version = points["model_version"]

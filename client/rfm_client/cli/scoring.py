@@ -235,7 +235,7 @@ def fitted_to(
     info = client.model_info(frames=sample.trajectory.frames is not None)
     limits = (video.max_frames, info.max_frames if video.subsample and not samples_prefixes else None)
     limit = min((frames for frames in limits if frames is not None), default=None)
-    return fitted(sample, replace(info, max_frames=limit), subsample=True, resize=video.resize)
+    return fitted(sample, limit, info.frame_size if video.resize else None)
 
 
 def _evaluate(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from rfm import families
 from rfm.engine import Engine, Outcome, Prepared
 from rfm.engine.execution import Execution
 from rfm.parameters import (
@@ -27,9 +28,8 @@ class TritonPythonModel(BatchModel[Sample, Result]):
     """An instance: an engine on a device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
-        self.engine = Engine.from_checkpoint(
-            version / CHECKPOINT_FOLDER,
-            family=settings.get(FAMILY_PARAMETER),  # older configurations do not name it
+        self.engine = Engine.of(
+            families.load(version / CHECKPOINT_FOLDER, family=settings[FAMILY_PARAMETER]),
             device=device,
             dtype=getattr(torch, settings[DTYPE_PARAMETER]) if settings[DTYPE_PARAMETER] else None,
             token_budget=int(settings[BUDGET_PARAMETER]),

@@ -22,7 +22,7 @@ class TritonPythonModel(BatchModel[EncoderSample, EncoderSample]):
     """An instance: a pair of encoders on a device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
-        self.encoders = families.encoders_of(settings.get(FAMILY_PARAMETER)).load(version).to(device)
+        self.encoders = families.encoders_of(settings[FAMILY_PARAMETER]).load(version).to(device)
         cache_mib = int(settings.get(FEATURE_CACHE_PARAMETER) or 0)
         self.cache = FeatureCache[Float32Array](cache_mib * BYTES_PER_MIB) if cache_mib else None
         self.max_frames = int(settings.get(SAMPLE_TOKENS_PARAMETER) or DEFAULT_SAMPLE_TOKENS)
