@@ -9,12 +9,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rfm_export.about import description_in
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
 from commands import running
 from rfm_client.contract.description import Description
-from rfm_export.layout import CONFIG_FILE
+from rfm_export.layout import CONFIG_FILE, description_in
 from rfm_export.pbtxt import parse, render
 
 

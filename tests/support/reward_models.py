@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from google.protobuf import text_format
-from rfm_export.about import description_in
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
 from paths import GOLDEN
 from rfm_client import ProgressSample, Trajectory
 from rfm_client.contract.description import DESCRIPTION_PARAMETER
+from rfm_export.layout import description_in
 
 ROOT = Path(os.environ.get("RFM_REWARD_MODELS") or GOLDEN / "reward_models")
 BASE = ROOT / "bases" / "q3"
