@@ -19,6 +19,7 @@ import uuid
 import weakref
 from collections import deque
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from functools import partial
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from pathlib import Path
@@ -30,7 +31,7 @@ import numpy as np
 from rfm_client import UInt8Array
 from rfm_client.frames import as_jpeg, load_pillow
 from rfm_client.options import checked_count, checked_share, require
-from rfm_client.serving import Closing, Credentials
+from rfm_client.serving import Credentials
 
 if TYPE_CHECKING:
     from rfm_client.episodes import StepScore
@@ -80,7 +81,7 @@ class LiveEpisode:
         self._reporter.end(self._about)
 
 
-class LiveView(Closing):
+class LiveView(AbstractContextManager["LiveView"]):
     """The tab Live of a gateway's page, for episodes: ``client.episode(task, live=LiveView("http://robot:8100"))``.
 
     A view serves any number of episodes and clients, with at most four reports a second in all. It reports the scores
@@ -132,6 +133,9 @@ class LiveView(Closing):
     def close(self) -> None:
         """End the episodes. Return after the last report, or after two seconds. Later steps are not reported."""
         self._reporter.close()
+
+    def __exit__(self, *_raised: object) -> None:
+        self.close()
 
     def __reduce__(self) -> tuple[object, ...]:
         return partial(LiveView, self._url, name=self.name, **self._credentials.options), ()

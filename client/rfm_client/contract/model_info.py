@@ -100,6 +100,11 @@ class ModelInfo:
         """``video_dim`` and ``text_dim``; None: the model reads raw frames and writes scores."""
         return None if self.video_dim is None or self.text_dim is None else (self.video_dim, self.text_dim)
 
+    @property
+    def scores_whole_prefixes(self) -> bool:
+        """True if the FastAPI evaluation server shows the model all frames of a prefix (RoboReward), else four."""
+        return (self.kind or "").startswith("RoboReward")
+
     def check_scores_prefixes(self) -> None:
         """Raise InvalidSampleError for a model that cannot score while an episode runs."""
         if self.needs_whole_episode:

@@ -12,7 +12,11 @@ DEFAULT_MODEL = "rfm"  # scores embeddings; the names of the other models derive
 PROBE_PREFIX = "rfm-probe"  # of the request ids of probes, which a model's metrics leave out
 
 ADMIN_KEY_VARIABLE = "RFM_ADMIN_KEY"
-GATEWAY_KEY_VARIABLE = "RFM_GATEWAY_API_KEY"
+
+
+def names_of(model: str) -> dict[Part, str]:
+    """Return the names of all models of a checkpoint that was exported as ``model``."""
+    return {"embeddings": model, "encoder": encoder_name(model), "frames": frames_name(model)}
 
 
 def encoder_name(model: str) -> str:

@@ -19,6 +19,7 @@ from tritonclient.utils import InferenceServerException
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
+from rfm_client.contract.names import frames_name
 from rfm_client.contract.proxies import grpc_proxy, open_url
 from rfm_client.transport.connection import grpc_options
 from rfm_client.transport.credentials import Credentials
@@ -28,6 +29,7 @@ METRICS_PORT = 8002
 METRICS_OPTION = "--metrics-url"
 DEVICE_METRICS = "nv_cpu_utilization, nv_gpu_utilization, nv_*_memory_*_bytes"
 _PROCESSOR = "CPU"
+_FRAMES = frames_name("")  # end of the names of models for raw frames
 PENDING_METRIC = "nv_inference_pending_request_count"
 
 _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_total_bytes)")
@@ -158,6 +160,12 @@ class ServerStatus:
     metrics_url: str
     metrics_error: str | None
     devices: tuple[Device, ...]
+
+    @property
+    def checkpoints(self) -> list[str]:
+        """Names of the exported checkpoints whose model for raw frames is ready, in alphabetical order."""
+        ready = {model.name for model in self.models if model.state == "READY"}
+        return sorted(name.removesuffix(_FRAMES) for name in ready if name.endswith(_FRAMES))
 
 
 @dataclass(frozen=True)
