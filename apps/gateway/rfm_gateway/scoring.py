@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -43,9 +44,7 @@ from rfm_gateway.observe import within
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
-_WHOLE = Sampling("all")  # shows all frames of a prefix
-
-_TEXT_FRAME_PX = 32  # of the blank frame that is sent with a task to get only the task's embedding
+_BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the embedding of the task
 _SIDES = {  # the gateway's fields, by the client's names
     "first": "chosen_trajectory",
     "second": "rejected_trajectory",
@@ -75,8 +74,8 @@ class Evaluator:
         ServerError.
         """
         with self._limits.decoding() as take:
-            files = RequestFiles(self._folder, take)
-            return await within(self._limits.timeout_s, self._evaluate(batch, files, request_id))
+            scoring = self._evaluate(batch, RequestFiles(self._folder, take), request_id)
+            return await within(self._limits.timeout_s, scoring)
 
     async def _evaluate(self, batch: Batch, files: RequestFiles, request_id: str) -> schema.EvaluateBatchAnswer:
         embeddings, frames = await self._served(batch.samples)
@@ -87,7 +86,7 @@ class Evaluator:
         num_bytes = batch.num_bytes if self._folder is None else None  # files may be large
         samples = await off_loop(num_bytes, conversion.samples, batch.samples)
         asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
-        flat = list(chain.from_iterable(asked))
+        flat = chain.from_iterable(asked)
         outcomes = iter(await self._client.evaluate(flat, return_errors=True, request_id=request_id))
         results = _results([list(islice(outcomes, len(of_sample))) for of_sample in asked])
         group = 1 if frames is None or batch.use_frame_steps else await self._frames_per_value(results)
@@ -98,9 +97,8 @@ class Evaluator:
         info = await self._client.model_info(frames=True)
         unknown = {str(result.model_version) for result in results} - set(info.versions)
         if info.versions and unknown:
-            got = ", ".join(sorted(unknown))
-            expected = f"model_version: expected one of {', '.join(info.versions)}"
-            raise ServerUnavailableError(f"{expected}, got {got}: the checkpoint is being replaced, try again")
+            fault = f"model_version: expected one of {', '.join(info.versions)}, got {', '.join(sorted(unknown))}"
+            raise ServerUnavailableError(f"{fault}: the checkpoint is being replaced, try again")
         return info.frames_per_value
 
     async def _served(self, samples: Sequence[schema.Sample]) -> tuple[ModelInfo | None, ModelInfo | None]:
@@ -120,26 +118,23 @@ class Evaluator:
         return embeddings, frames
 
     async def _model_info(self, *, frames: bool) -> ModelInfo | None:
-        try:
+        with suppress(ModelNotFoundError):
             return await self._client.model_info(frames=frames)
-        except ModelNotFoundError:
-            return None
+        return None
 
     async def _texts(self, samples: Sequence[schema.Sample], request_id: str) -> Mapping[str, Text]:
         """Return embeddings by task, for tasks without an embedding; empty without an encoder."""
         firsts = [next(iter(sample.named_trajectories.values())) for sample in samples]
         unread = [first.task for first in firsts if first.has_embeddings and first.text_embedding is None]
         tasks = {task for task in unread if task and task.strip()}
-        try:
+        with suppress(ModelNotFoundError):
             texts = await asyncio.gather(*(self._text(task, request_id) for task in tasks))
             return dict(zip(tasks, texts, strict=True))
-        except ModelNotFoundError:
-            return {}
+        return {}
 
     async def _text(self, task: str, request_id: str) -> Text:
-        blank = np.zeros((1, _TEXT_FRAME_PX, _TEXT_FRAME_PX, 3), np.uint8)
         try:
-            encoded = await self._client.encode(Trajectory(frames=blank, task=task), request_id=request_id)
+            encoded = await self._client.encode(Trajectory(frames=_BLANK, task=task), request_id=request_id)
         except InvalidSampleError as error:  # of this task alone
             return error
         assert encoded.text_embedding is not None
@@ -150,7 +145,7 @@ class Evaluator:
 class _Conversion:
     """Conversion of one request's samples.
 
-    embedding_model, frame_model: the served models that score them; None: not served
+    embedding_model, frame_model: models that score them; None: not served, or unused
     texts: embeddings by task
     frame_steps: frames to which each prefix of a progress sample is sampled; 0: no dense mode
     """
@@ -190,9 +185,8 @@ class _Conversion:
                 raise error.inside(name) from None
         if isinstance(sample, schema.ProgressInput):
             return ProgressSample(trajectories[0], frame_steps=self.frame_steps)
-        if isinstance(sample, schema.PreferenceInput):
-            return PreferenceSample(*trajectories)
-        return SimilaritySample(*trajectories)
+        kind = PreferenceSample if isinstance(sample, schema.PreferenceInput) else SimilaritySample
+        return kind(*trajectories)
 
     def _of_embeddings(self, given: schema.TrajectoryInput, needs_text: bool) -> Trajectory:
         video, text = given.video_embeddings, given.text_embedding
@@ -211,7 +205,7 @@ class _Conversion:
             if array is not None and width not in (None, array.shape[-1]):
                 raise InvalidSampleError.at(where, f"[{'T, ' * (array.ndim - 1)}{width}]", str(list(array.shape)))
         if trajectory.text_embedding is None and needs_text:
-            got = "neither" if not (given.task and given.task.strip()) else "a task, and no encoder is served"
+            got = "a task, and no encoder is served" if given.task and given.task.strip() else "neither"
             raise InvalidSampleError.at("text_embedding", "an embedding, or a task to encode", got)
         return trajectory
 
@@ -230,11 +224,10 @@ class _Conversion:
 
 def _log_blank_samples(samples: Sequence[Sample]) -> None:
     shown = [(index, t.frames) for index, sample in enumerate(samples) for t in sample.trajectories]
-    found = [(index, BlankFrames(frames)) for index, frames in shown if frames is not None]
-    blank = [(index, frames) for index, frames in found if frames.told]
+    blank = [(index, found) for index, t in shown if t is not None and (found := BlankFrames(t)).told]
     if blank:
         names = first_names(dict.fromkeys(index for index, _ in blank), 12)
-        told = max((frames for _, frames in blank), key=lambda frames: frames.highest or 0).told
+        told = max((found for _, found in blank), key=lambda found: found.highest or 0).told
         logger.warning("samples %s: %s: their scores mean nothing", names, told)
 
 
@@ -251,15 +244,15 @@ def _results(outcomes: Sequence[Sequence[Result | RewardError]]) -> list[Result]
 
     Raises RequestValidationError that lists all invalid samples, else the first error.
     """
-    of_each = [[outcome for outcome in of_sample if isinstance(outcome, RewardError)] for of_sample in outcomes]
-    failed = {index: errors[0] for index, errors in enumerate(of_each) if errors}
+    outcome_of = ((index, each) for index, of_sample in enumerate(outcomes) for each in reversed(of_sample))
+    failed = {index: error for index, error in outcome_of if isinstance(error, RewardError)}  # each sample's first
     unfit = {index: error for index, error in failed.items() if isinstance(error, InvalidSampleError)}
     if unfit:
         raise _refused(unfit)
     for error in failed.values():
         raise error
-    results = [cast("list[Result]", of_sample) for of_sample in outcomes]
-    return [each[0] if len(each) == 1 else of_prefixes(cast("list[ProgressResult]", each), _WHOLE) for each in results]
+    results, whole = [cast("list[Result]", of_sample) for of_sample in outcomes], Sampling("all")
+    return [each[0] if len(each) == 1 else of_prefixes(cast("list[ProgressResult]", each), whole) for each in results]
 
 
 def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:
@@ -281,16 +274,13 @@ def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: 
     preferences = [result.preference for result in results if isinstance(result, PreferenceResult)]
     similarities = [result.similarity for result in results if isinstance(result, SimilarityResult)]
     similar = [sample for sample in samples if isinstance(sample, schema.SimilarityInput)]
-    success = [result.success[::group] for result in progress]
     answer = schema.EvaluateBatchAnswer()
     if progress:
-        answer.outputs_progress = schema.ProgressOutputs.model_construct(
-            progress_pred=[result.progress[::group].tolist() for result in progress]
-        )
-    if progress and all(np.isfinite(values).all() for values in success):
-        answer.outputs_success = schema.SuccessOutputs.model_construct(
-            success_probs=[values.tolist() for values in success]
-        )
+        values = [result.progress[::group].tolist() for result in progress]
+        answer.outputs_progress = schema.ProgressOutputs.model_construct(progress_pred=values)
+    if progress and all(np.isfinite(result.success[::group]).all() for result in progress):
+        values = [result.success[::group].tolist() for result in progress]
+        answer.outputs_success = schema.SuccessOutputs.model_construct(success_probs=values)
     if preferences:
         answer.outputs_preference = schema.PreferenceOutputs.model_construct(
             predictions=[int(preference > PREFERRED) for preference in preferences],
