@@ -92,14 +92,19 @@ class GatewayConfig(Settings):
         """Address that the gateway listens on."""
         return ListenAddress(self.host or DEFAULT_HOST, self.port or DEFAULT_PORT)
 
-    def client(self, model: str | None = None) -> AsyncRewardClient:
+    @property
+    def checkpoint(self) -> str:
+        """Name under which the checkpoint was exported."""
+        return self.model or DEFAULT_MODEL
+
+    def client(self, checkpoint: str | None = None) -> AsyncRewardClient:
         """Return a client of Triton. Raises ValueError for a malformed URL or unusable files.
 
-        model: name of an exported checkpoint; None: the gateway's
+        checkpoint: name of another export; None: the gateway's
         """
         return AsyncRewardClient(
             self.triton_url,
-            model=model or self.model or DEFAULT_MODEL,
+            model=checkpoint or self.checkpoint,
             timeout_s=self.timeout_s,
             retry=False,  # the caller gets the error at once, and may retry
             max_in_flight=self.max_in_flight,

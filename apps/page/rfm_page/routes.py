@@ -63,13 +63,12 @@ def viewer_routes(host: PageHost) -> APIRouter:
     """Return the page's endpoints for videos. The evaluation server has no such endpoints."""
     config, limits, metrics = host.config, host.limits, host.metrics
     router = APIRouter(include_in_schema=False)
-    default_model = config.client().model_names["embeddings"]
 
     @router.get("/viewer/served")
     async def served() -> Response:
         models = [_told_of(name, info) for name, info in await _infos(config)]
         rules = [{"name": rule, "frames": _frames_of(rule)} for rule in get_args(Rule)]
-        about = {"models": models, "model": default_model, "rules": rules}
+        about = {"models": models, "model": config.checkpoint, "rules": rules}
         about |= {"orientations": get_args(Orientation), "channel_orders": get_args(ChannelOrder)}
         return JSONResponse({**about, "fps": DEFAULT_FPS, "url": config.triton_url})
 
@@ -92,7 +91,7 @@ def viewer_routes(host: PageHost) -> APIRouter:
         Raises RequestValidationError, HTTPException and RewardError.
         """
         async with limits.form(request) as (fields, uploads):
-            question = VideoRequest.of(fields, default_model)
+            question = VideoRequest.of(fields, config.checkpoint)
             async with config.client(question.model) as client:
                 info = await client.model_info(frames=True)
             sampling = question.sampling(info)
