@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from fastapi import APIRouter, FastAPI
+from fastapi.params import Depends
 
 from rfm_client.options import ConfigError
 from rfm_gateway.body import BodyLimits, field_errors, invalid
@@ -29,11 +30,11 @@ INSTALL = "pip install ./client ./apps/gateway ./apps/page"
 class PageHost:
     """The gateway that serves a page.
 
-    guards: FastAPI's dependencies that refuse requests without the gateway's key
+    guards: refuse requests without the gateway's key
     """
 
     app: FastAPI
-    guards: Sequence[Any]
+    guards: Sequence[Depends]
     config: GatewayConfig
     limits: BodyLimits
     metrics: GatewayMetrics
