@@ -18,7 +18,7 @@ from rfm_client.contract.errors import (
     RewardError,
 )
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import DEFAULT_MODEL, PROBE_PREFIX, Part, frames_name, names_of
+from rfm_client.contract.names import DEFAULT_MODEL, PROBE_PREFIX, Part, encoder_name, frames_name
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.synthetic import blank_trajectory
@@ -215,7 +215,8 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     @property
     def model_names(self) -> dict[Part, str]:
         """Names of the checkpoint's models on the server, whether they are served or not."""
-        return names_of(self._model)
+        name = self._model
+        return {"embeddings": name, "encoder": encoder_name(name), "frames": frames_name(name)}
 
     async def model_info(
         self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None

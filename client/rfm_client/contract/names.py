@@ -14,11 +14,6 @@ PROBE_PREFIX = "rfm-probe"  # of the request ids of probes, which a model's metr
 ADMIN_KEY_VARIABLE = "RFM_ADMIN_KEY"
 
 
-def names_of(model: str) -> dict[Part, str]:
-    """Return the names of all models of a checkpoint that was exported as ``model``."""
-    return {"embeddings": model, "encoder": encoder_name(model), "frames": frames_name(model)}
-
-
 def encoder_name(model: str) -> str:
     """Return the name of the encoder whose embeddings ``model`` scores."""
     return f"{model}_encoder"
