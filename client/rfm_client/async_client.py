@@ -19,10 +19,11 @@ from rfm_client.contract.errors import (
     RewardError,
 )
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import Part, encoder_name, frames_name
+from rfm_client.contract.names import PROBE_PREFIX, Part, encoder_name, frames_name
 from rfm_client.contract.numbers import checked_count
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.contract.synthetic import blank_trajectory
 from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes
 from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
 from rfm_client.episodes.scorer import Asked, StepScorer
@@ -160,6 +161,10 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         """
         return await self._scorer.embeddings(trajectory, self._call({"timeout_s": timeout_s, "request_id": request_id}))
 
+    async def probe(self, model: ModelInfo, *, timeout_s: float | None = None) -> None:
+        """Score a blank sample, which the server's metrics leave out. Raises RewardError if that fails."""
+        await self.progress(blank_trajectory(model.widths), timeout_s=timeout_s, request_id=PROBE_PREFIX)
+
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
         """True if a server answers and has the model ready, for embeddings or for raw frames."""
         left_s = self._deadline(timeout_s).remaining_s()
@@ -175,6 +180,12 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
                 why = await self._why_unready()
                 raise DeadlineExceededError(f"{self._servers}: {names}: not ready within {timeout_s:g} s{why}")
             await asyncio.sleep(READY_POLL_S)
+
+    @property
+    def model_names(self) -> dict[Part, str]:
+        """Names of the checkpoint's models on the server, whether they are served or not."""
+        name = self.model
+        return {"embeddings": name, "encoder": encoder_name(name), "frames": frames_name(name)}
 
     async def model_info(
         self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None
@@ -194,13 +205,8 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         Raises RewardError if no server answers.
         """
         deadline = self._deadline(timeout_s)
-        names: dict[Part, str] = {
-            "embeddings": self.model,
-            "encoder": encoder_name(self.model),
-            "frames": frames_name(self.model),
-        }
         told: dict[Part, list[ModelInfo]] = {}
-        for part, name in names.items():
+        for part, name in self.model_names.items():
             with suppress(ModelNotFoundError):
                 told[part] = await self._servers.model_infos(name, deadline)
         return told

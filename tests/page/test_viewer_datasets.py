@@ -22,12 +22,12 @@ import pytest
 from pyarrow import parquet
 
 from gateway_requests import failure
-from gateways import inside
+from gateways import free_port, inside
 from labelling import LEROBOT, BrightnessScorer
 from pictures import TURNS, turn
 from rfm_client.contract.settings import ConfigError
 from rfm_client.frames.orientation import Channels, Orient
-from rfm_gateway.config import GatewayConfig
+from rfm_gateway import GatewayConfig, check_gateway
 from rfm_labels import LabelOptions, label, open_dataset
 from rfm_labels.datasets.lerobot import LeRobotDataset
 from rfm_labels.options import Format
@@ -372,5 +372,6 @@ def test_a_folder_that_is_no_dataset_is_refused_at_start(tmp_path: Path, name: s
 def test_a_missing_package_names_the_mend(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rfm_labels.datasets", None)
     message = "dataset: expected the package rfm_labels.datasets, which reads it, got none: pip install ./apps/labels"
+    config = GatewayConfig(free_port(), triton="grpc://robot:8001", dataset=(str(LEROBOT / "toy_v21"),))
     with pytest.raises(ConfigError, match=message):
-        GatewayConfig(triton="grpc://robot:8001", dataset=(str(LEROBOT / "toy_v21"),)).check({})
+        check_gateway(config, {})

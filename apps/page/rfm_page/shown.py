@@ -11,14 +11,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
 from fastapi import HTTPException
 
 from rfm_client import SUCCESS_THRESHOLD
-from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, Correction
+from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_labels import (
     Curve,
     EpisodeLabels,
@@ -30,7 +30,8 @@ from rfm_labels import (
     summarise,
 )
 from rfm_labels.datasets import Dataset, DatasetEpisode, DatasetError, unused_cameras
-from rfm_page.numbers import numbers_or_null
+
+Read = TypeVar("Read")
 
 _SUMMARIES_AT_A_TIME = 8  # summaries in memory
 
@@ -73,6 +74,14 @@ class ShownDataset(ABC):
     @abstractmethod
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
         """Return an episode's video as an MP4 file. take: as of ``video``. Raises DatasetError."""
+
+    def read(self, reading: Callable[[ShownDataset], Read]) -> Read:
+        """Check the dataset, then read from it. Raises HTTPException 500 with the fault of a broken dataset."""
+        try:
+            self.check()
+            return reading(self)
+        except DatasetError as error:
+            raise HTTPException(500, self._without_folder(str(error))) from None
 
     @property
     def about(self) -> dict[str, Any]:
@@ -121,7 +130,7 @@ class ShownDataset(ABC):
                 for camera in cameras:
                     self.dataset.check(episode, camera)
             except DatasetError as error:
-                found[str(episode.index)] = self.without_folder(str(error))
+                found[str(episode.index)] = self._without_folder(str(error))
         return found
 
     def curves(self, number: int, labels: str | None) -> dict[str, Any]:
@@ -145,7 +154,7 @@ class ShownDataset(ABC):
             raise HTTPException(404, f"camera: expected one of {len(self.cameras)} with videos, got {camera}")
         return self.mp4(self._episode(number), self.cameras[camera], take)
 
-    def without_folder(self, message: str) -> str:
+    def _without_folder(self, message: str) -> str:
         """Return a message without the folder's path, for users on other machines."""
         return message.replace(str(self.root), self.dataset.source)
 
@@ -173,7 +182,8 @@ class ShownDataset(ABC):
         told = read_provenance(file)
         orient = told.get("orientations", {}).get(camera)  # labels of version 0.1.0 have none
         order = told.get("channels", {}).get(camera)
-        return Correction(orient if orient in ORIENTATIONS else "none", order if order in CHANNEL_ORDERS else "rgb")
+        is_known = orient in get_args(Orientation), order in get_args(ChannelOrder)
+        return Correction(orient if is_known[0] else "none", order if is_known[1] else "rgb")
 
     def _name_of(self, file: Path) -> str:
         return file.relative_to(self.root).as_posix()
@@ -187,14 +197,14 @@ def _summary(file: Path, _changed_ns: int) -> Summary:
 def _rows(summary: Summary) -> list[dict[str, Any]]:
     """Return a row of the summary for each episode."""
     columns: dict[str, Sequence[Any]] = {
-        "final_progress": numbers_or_null(summary.final_progress.tolist()),
-        "backwards": numbers_or_null(summary.backwards.tolist()),
+        "final_progress": summary.final_progress.tolist(),
+        "backwards": summary.backwards.tolist(),
     }
     if summary.best_success is not None and summary.last_success is not None:
-        columns["best_success"] = numbers_or_null(summary.best_success.tolist())
-        columns["last_success"] = numbers_or_null(summary.last_success.tolist())
+        columns["best_success"] = summary.best_success.tolist()
+        columns["last_success"] = summary.last_success.tolist()
     if summary.disagreement is not None:
-        columns["disagreement"] = numbers_or_null(summary.disagreement.tolist())
+        columns["disagreement"] = summary.disagreement.tolist()
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
@@ -212,5 +222,5 @@ def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dic
         if labelled is not None:
             of_all = np.full(num_frames, np.nan)
             of_all[frames] = labelled
-            scores[name] = numbers_or_null(of_all.tolist())
+            scores[name] = of_all.tolist()
     return scores
