@@ -9,6 +9,7 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import cache, partial
+from tokenize import TokenError
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,7 +21,6 @@ from python_multipart.multipart import parse_options_header
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
-from rfm_client.frames import BROKEN_NPY
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
 from rfm_gateway.admission import Turn, arriving
@@ -32,6 +32,7 @@ MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files
 MAX_ERRORS = 1000  # listed in an answer
 
 _format: Any = np.lib.format  # numpy declares no types for it
+_BROKEN_NPY = (ValueError, TypeError, LookupError, SyntaxError, TokenError, MemoryError, RecursionError)  # its errors
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _STEPS_FIELD = "use_frame_steps"
@@ -219,7 +220,7 @@ def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
     upload.file.seek(0)
     try:
         array: np.ndarray[Any, Any] = _format.read_array(upload.file, allow_pickle=False)
-    except BROKEN_NPY as error:
+    except _BROKEN_NPY as error:
         raise ValueError(f"expected a .npy file, got: {error}") from None
     if array.dtype.kind not in "biuf":
         raise ValueError(f"expected a .npy file of numbers, got {array.dtype}")

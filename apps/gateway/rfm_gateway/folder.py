@@ -12,8 +12,8 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from rfm_client import InvalidSampleError, Trajectory, UInt8Array
-from rfm_client.frames import ARRAY_SUFFIXES, load_trajectory, upright_picture
+from rfm_client import InvalidSampleError, Trajectory, UInt8Array, load_trajectory
+from rfm_client.frames import ARRAY_SUFFIXES, Picture
 from rfm_gateway.body import Decoded
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class RequestFiles:
             with self._image(name, f"frames.{index}") as image:
                 if image.height * image.width != num_pixels:  # known before it is decoded
                     raise others
-                pixels = np.asarray(upright_picture(image).convert("RGB"))
+                pixels = Picture(image).pixels()
             if index == 0:
                 frames = np.empty((len(names), *pixels.shape), np.uint8)
             if pixels.shape != frames.shape[1:]:

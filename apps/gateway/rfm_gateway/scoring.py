@@ -35,7 +35,7 @@ from rfm_client import (
     as_array,
     float_frames_to_uint8,
 )
-from rfm_client.frames import BlankFrames, what_is_shown
+from rfm_client.frames import BlankFrames
 from rfm_client.options import first_names
 from rfm_client.serving import MIN_BYTES, Deadline, off_loop
 from rfm_gateway import schema
@@ -284,7 +284,7 @@ def _log_blank_samples(samples: Sequence[Sample]) -> None:
             if highest is not None:
                 blank[index] = max(highest, blank.get(index, 0))
     if blank:
-        names, told = first_names(blank, 12), what_is_shown(max(blank.values()))
+        names, told = first_names(blank, 12), BlankFrames.described(max(blank.values()))
         logger.warning("samples %s: %s: their scores mean nothing", names, told)
 
 

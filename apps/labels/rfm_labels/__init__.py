@@ -8,15 +8,7 @@ with RewardClient("grpc://localhost:8001") as client:
     report = label(open_dataset("my_dataset"), ClientScorer(client), LabelOptions(cameras=("top",)))
 """
 
-from rfm_labels.datasets import (
-    Channels,
-    Dataset,
-    DatasetEpisode,
-    DatasetError,
-    Orient,
-    iter_episodes,
-    open_dataset,
-)
+from rfm_labels.datasets import Dataset, DatasetEpisode, DatasetError, iter_episodes, open_dataset
 from rfm_labels.evaluation import Evaluation, LabelComparison, evaluate_labels, read_outcomes
 from rfm_labels.hdf5_tables import stored_in
 from rfm_labels.label import Report, label, label_with_ray
@@ -27,7 +19,6 @@ from rfm_labels.scorer import CheckpointFacts, ClientScorer, Scorer
 from rfm_labels.summary import Summary, summarise
 
 __all__ = [
-    "Channels",
     "CheckpointFacts",
     "ClientScorer",
     "Curve",
@@ -38,7 +29,6 @@ __all__ = [
     "Evaluation",
     "LabelComparison",
     "LabelOptions",
-    "Orient",
     "RayOptions",
     "Report",
     "Scorer",

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import TypeAlias
 
-from rfm_client.frames import what_is_shown
+from rfm_client.frames import BlankFrames
 from rfm_labels.datasets.faults import listed
 
 BlankCameras: TypeAlias = Mapping[str, Mapping[int, int]]  # highest value of the frames, by camera and episode
@@ -45,5 +45,5 @@ def lines(blank: BlankCameras, num_episodes: int) -> list[str]:
         ranges = listed(sorted(highest)).split(",")
         some = ",".join(ranges[:_MOST_LISTED]) + ",..." * (len(ranges) > _MOST_LISTED)
         which = f"{len(highest)} of {num_episodes} episodes ({some})"
-        told.append(f"{camera}: {what_is_shown(max(highest.values()))}, in {which}: {advice}")
+        told.append(f"{camera}: {BlankFrames.described(max(highest.values()))}, in {which}: {advice}")
     return told

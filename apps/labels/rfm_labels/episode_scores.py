@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from traceback import clear_frames
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from rfm_client import Float32Array, InferenceFailedError, ProgressResult, ProgressSample, Trajectory, UInt8Array
-from rfm_client.frames import FUSES, BlankFrames, of_prefixes, prefix_samples, resize_frames
-from rfm_labels.datasets.protocol import Dataset, DatasetEpisode, require
+from rfm_client.frames import BlankFrames, resize_frames
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
+from rfm_labels.datasets.faults import require
 from rfm_labels.plan import Recipe
 from rfm_labels.scorer import Scorer
 
@@ -113,7 +114,7 @@ def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: Dataset
         if name == SUCCESS and all(np.isnan(score).all() for score in scores):
             continue
         _check_numbers(name, scores, episode)
-        fuse = np.max if name == UNCLEAR else FUSES[recipe.fuse]
+        fuse: Any = np.max if name == UNCLEAR else getattr(np, recipe.fuse)  # mean, min or max
         columns[name] = np.asarray(fuse(np.stack(scores), axis=0), np.float32)
         if len(by_camera) > 1:
             columns |= {f"{name}.{camera}": score for camera, score in zip(by_camera, scores, strict=True)}
@@ -125,11 +126,10 @@ def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Calla
         (result,) = scorer.evaluate([ProgressSample(trajectory)])
         return result
     results: list[ProgressResult] = []
-    samples = prefix_samples(trajectory, recipe.sampling)
-    for together in _by_bytes(samples):
+    for together in _by_bytes(recipe.sampling.samples(trajectory)):
         go_on()
         results += scorer.evaluate(together)
-    return of_prefixes(results, recipe.sampling)
+    return recipe.sampling.joined(results)
 
 
 def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], None]) -> Iterator[UInt8Array]:

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_labels.datasets.lerobot_rows import column_types, read_table
-from rfm_labels.datasets.lerobot_v21 import EPISODES_FILE, json_lines
-from rfm_labels.datasets.protocol import DatasetError, require
+from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
 from rfm_labels.episode_scores import PROGRESS, SUCCESS
 from rfm_labels.hdf5_tables import full_path
 from rfm_labels.label_files import PROGRESS_ENDING, read_cost, read_label_table

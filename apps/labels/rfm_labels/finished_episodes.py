@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from rfm_labels import blank_cameras
-from rfm_labels.datasets.protocol import DatasetError, require
+from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.episode_scores import Columns
 from rfm_labels.plan import Item, Plan
 

@@ -15,9 +15,8 @@ from typing import Any
 
 from rfm_labels.blank_cameras import BLANK_KEY, from_metadata
 from rfm_labels.cost import Cost
-from rfm_labels.datasets.hdf5_attributes import attribute
-from rfm_labels.datasets.hdf5_contents import opened_hdf5
-from rfm_labels.datasets.protocol import require
+from rfm_labels.datasets.faults import require
+from rfm_labels.datasets.hdf5_contents import attribute, opened_hdf5
 from rfm_labels.episode_scores import SCORES, Columns
 from rfm_labels.finished_episodes import IDENTITY, whole_file
 from rfm_labels.hdf5_tables import BLANK, COST, EPISODES, PROVENANCE, columns_in

@@ -4,26 +4,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from rfm_client import unclear_answers
+from rfm_client.options import first_names
 from rfm_labels import blank_cameras
 from rfm_labels.cost import Cost
+from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset, DatasetEpisode
+from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.hdf5 import Hdf5Dataset
 from rfm_labels.datasets.opening import open_dataset
-from rfm_labels.datasets.protocol import (
-    SIGNALS_FOLDER,
-    Dataset,
-    DatasetEpisode,
-    DatasetError,
-    require,
-    unused_cameras,
-)
-from rfm_labels.datasets.sentences import identifiers_told
 from rfm_labels.episode_scores import UNCLEAR
 from rfm_labels.finished_episodes import IDENTITY, Parts
 from rfm_labels.hdf5_labels import Hdf5Labels, check_room, hdf5_labels
@@ -181,7 +175,7 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     cameras, faults = dataset.cameras_in(chosen_numbers(dataset, replace(options, shard=None)))
     unused = {
         name: f"{word} by name or mark, without colours; --cameras includes it"
-        for name, word in unused_cameras(dataset, cameras).items()
+        for name, word in dataset.unused_cameras(cameras).items()
     }
     turned = [f"orient: {name} {turn} (asked for)" for name, turn in recipe.orientations.items() if name not in told]
     swapped = [f"channels: {name} {order} (asked for)" for name, order in recipe.channels.items()]
@@ -201,7 +195,24 @@ def _tasks_told(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[st
     elif given.text is not None:
         num_given = sum(any(task == given.text for task, _ in episode.stretches) for episode in episodes)
         lines.append(f"tasks: {len(episodes) - num_given} episodes keep their own sentence, {num_given} get --task")
-    return lines + identifiers_told(task for episode in episodes for task, _ in episode.stretches)
+    return lines + _identifiers_told(task for episode in episodes for task, _ in episode.stretches)
+
+
+def _is_identifier(task: str) -> bool:
+    """True if a task is a single word of ASCII, such as ``PnPCupToDrawerClose`` or ``pick_place_cup``."""
+    return task.isascii() and len(task.split()) == 1
+
+
+def _identifiers_told(tasks: Iterable[str]) -> list[str]:
+    """Return a line that lists single-word tasks; empty if all tasks are sentences."""
+    known = dict.fromkeys(tasks)
+    found = [task for task in known if _is_identifier(task)]
+    if not found:
+        return []
+    remedy = "--task with --override-task gives all episodes a sentence, --task-column reads another column (LeRobot)"
+    return [
+        f"tasks: {len(found)} of {len(known)} are a single word, not a sentence ({first_names(found, 3)}); {remedy}"
+    ]
 
 
 @dataclass(frozen=True)

@@ -26,19 +26,12 @@ import numpy.typing as npt
 from rfm_client import Float32Array
 from rfm_labels.blank_cameras import BLANK_KEY, BlankCameras, from_metadata
 from rfm_labels.cost import Cost
-from rfm_labels.datasets.lerobot_rows import INFO_FILE
-from rfm_labels.datasets.protocol import SIGNALS_FOLDER, DatasetError, require
+from rfm_labels.datasets.dataset import SIGNALS_FOLDER
+from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.lerobot_meta import INFO_FILE
 from rfm_labels.episode_scores import LOG_PROB, PROGRESS, SUCCESS, UNCLEAR, Columns
 from rfm_labels.finished_episodes import IDENTITY, whole_file
-from rfm_labels.hdf5_tables import (
-    BLANK,
-    COST,
-    PROVENANCE,
-    find_in_hdf5,
-    of_hdf5,
-    read_attribute,
-    read_hdf5_table,
-)
+from rfm_labels.hdf5_tables import BLANK, COST, PROVENANCE, find_in_hdf5, of_hdf5, read_attribute, read_hdf5_table
 from rfm_labels.labelled_before import LabelFile, parsed_object
 from rfm_labels.plan import Item, Plan
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from rfm_labels.blank_cameras import BlankCameras
 from rfm_labels.cost import Cost
-from rfm_labels.datasets.faults import listed
-from rfm_labels.datasets.protocol import Dataset, DatasetError, require
+from rfm_labels.datasets.dataset import Dataset
+from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.episode_scores import SCORES, Columns
 from rfm_labels.finished_episodes import Parts
 from rfm_labels.plan import Item, Plan, make_plan

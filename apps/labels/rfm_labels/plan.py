@@ -11,14 +11,9 @@ from typing import Any
 
 from rfm_client import InvalidSampleError
 from rfm_client.frames import ChannelOrder, Correction, Fuse, Orientation, Sampling
-from rfm_labels.datasets.faults import listed
-from rfm_labels.datasets.protocol import (
-    Dataset,
-    DatasetEpisode,
-    chosen_cameras,
-    digest_of,
-    require,
-)
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
+from rfm_labels.datasets.faults import listed, require
+from rfm_labels.datasets.stored_files import digest_of
 from rfm_labels.options import LabelOptions, Mode
 from rfm_labels.scorer import CheckpointFacts
 
@@ -54,7 +49,7 @@ class Recipe:
         another mode than ``whole`` with a checkpoint that needs the whole episode.
         """
         numbers = chosen_numbers(dataset, replace(options, shard=None))
-        cameras = chosen_cameras(dataset, options.cameras, numbers)
+        cameras = dataset.chosen_cameras(options.cameras, numbers)
         require(dataset.source, bool(cameras), "at least one camera", "none")
         if checkpoint.needs_whole_episode and options.mode != "whole":
             why = "of this model, whose scores are relative to the whole episode"

@@ -11,7 +11,7 @@ import numpy as np
 
 from rfm_client import FrameScores
 from rfm_client.recording import PROGRESS, SUCCESS, Recording
-from rfm_labels.datasets.protocol import Dataset
+from rfm_labels.datasets.dataset import Dataset
 from rfm_labels.finished_episodes import Parts
 from rfm_labels.plan import Item, Plan
 

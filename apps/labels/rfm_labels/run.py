@@ -20,7 +20,7 @@ from rfm_client import (
     ServerUnavailableError,
 )
 from rfm_labels.cost import Cost
-from rfm_labels.datasets.protocol import Dataset, DatasetEpisode
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.episode_scores import FrameMemory, episode_scores
 from rfm_labels.finished_episodes import Parts
 from rfm_labels.plan import Item, Plan

@@ -17,7 +17,7 @@ from rfm_client import (
     Trajectory,
     UInt8Array,
 )
-from rfm_labels.datasets.protocol import digest_of
+from rfm_labels.datasets.stored_files import digest_of
 
 IDENTITY = ("weights_digest", "settings_digest", "computation")  # equal if scores are
 

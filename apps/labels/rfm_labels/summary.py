@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client import SUCCESS_THRESHOLD
-from rfm_labels.datasets.protocol import require
+from rfm_labels.datasets.faults import require
 from rfm_labels.episode_scores import PROGRESS, SUCCESS
 from rfm_labels.label_files import read_label_table
 

@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from rfm_client import RewardError
-from rfm_labels.datasets.protocol import Dataset, DatasetEpisode, FaultsError, chosen_cameras, require
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
+from rfm_labels.datasets.faults import FaultsError, require
 from rfm_labels.options import LabelOptions
 from rfm_labels.plan import chosen_numbers
 
@@ -30,7 +31,7 @@ def all_faults(dataset: Dataset, options: LabelOptions) -> Iterator[None]:
 def check_episodes(dataset: Dataset, options: LabelOptions) -> None:
     """Check the tables and frames of all chosen episodes, without decoding. Raises FaultsError, DatasetError."""
     numbers = chosen_numbers(dataset, replace(options, shard=None))
-    cameras = chosen_cameras(dataset, options.cameras, numbers)
+    cameras = dataset.chosen_cameras(options.cameras, numbers)
     faults: dict[int, RewardError] = {}
     before: list[DatasetEpisode] = []
     for number in numbers:

@@ -16,7 +16,7 @@ import av
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.frames import VideoError, video_stream
+from rfm_client.frames import FrameFileError, Video
 from rfm_client.options import ConfigError
 from rfm_labels.datasets import (
     INFO_FILE,
@@ -92,10 +92,7 @@ def _cut(span: Span, take: Callable[[int], object]) -> bytes:
     """
     clip = io.BytesIO()
     try:
-        with av.open(
-            str(span.file), format="mov"
-        ) as video:  # without format=, FFmpeg would open the files in a play list
-            stream = video_stream(video)
+        with Video(span.video.file, "mov").opened() as (video, stream):  # another format may name other files
             packets = _packets(video, stream, span, take)
             zero = min(packet.pts for packet in packets if packet.pts * stream.time_base > _begin_s(span))
             with av.open(clip, "w", format="mp4") as copy:
@@ -105,7 +102,7 @@ def _cut(span: Span, take: Callable[[int], object]) -> bytes:
                     packet.dts -= zero
                     packet.stream = written
                     copy.mux(packet)
-    except VideoError as error:
+    except FrameFileError as error:
         raise span.error(error.expected, error.got) from error
     except (av.FFmpegError, OSError) as error:
         raise span.error("a video of the episode", error.strerror or str(error)) from error

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from rfm_client import UInt8Array
 from rfm_client.options import ConfigError
 from rfm_labels import find_label_files, stored_in
-from rfm_labels.datasets import DatasetEpisode, DatasetError, Hdf5Dataset, TaskOverride, chosen_cameras, opened_hdf5
+from rfm_labels.datasets import DatasetEpisode, DatasetError, Hdf5Dataset, TaskOverride, opened_hdf5
 from rfm_page.links import check_links
 from rfm_page.shown import ShownDataset
 
@@ -59,7 +59,7 @@ class ShownHdf5(ShownDataset):
     @property
     def cameras(self) -> Sequence[str]:
         """The cameras that are labelled without a choice."""
-        return chosen_cameras(self.dataset, ())
+        return self.dataset.chosen_cameras()
 
     @property
     def fps(self) -> float:

@@ -16,7 +16,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import anyio
 import numpy as np
@@ -35,17 +35,7 @@ from rfm_client import (
     RewardError,
     Trajectory,
 )
-from rfm_client.frames import (
-    CHANNEL_ORDERS,
-    ORIENTATIONS,
-    RULES,
-    BlankFrames,
-    Rule,
-    Sampling,
-    fitted,
-    prefix_samples,
-    trained_rule,
-)
+from rfm_client.frames import BlankFrames, ChannelOrder, Orientation, Rule, Sampling, resize_frames
 from rfm_client.serving import DEFAULT_MODEL, frames_name, off_loop, read_status
 from rfm_gateway.mounting import Decoded, GatewayConfig, Surroundings, invalid, while_connected
 from rfm_page.numbers import numbers_or_null
@@ -81,9 +71,9 @@ def viewer_routes(surroundings: Surroundings) -> APIRouter:
     @router.get("/viewer/served")
     async def served() -> Response:
         models = [_told_of(name, info) for name, info in await _infos(config, new_client)]
-        rules = [{"name": rule, "frames": _frames_of(rule)} for rule in RULES]
+        rules = [{"name": rule, "frames": _frames_of(rule)} for rule in get_args(Rule)]
         about = {"models": models, "model": default_model, "rules": rules}
-        about |= {"orientations": list(ORIENTATIONS), "channel_orders": list(CHANNEL_ORDERS)}
+        about |= {"orientations": get_args(Orientation), "channel_orders": get_args(ChannelOrder)}
         return JSONResponse({**about, "fps": DEFAULT_FPS, "url": config.triton_url})
 
     @router.post("/viewer/score")
@@ -132,10 +122,12 @@ def viewer_routes(surroundings: Surroundings) -> APIRouter:
         about = {"num_frames": num_frames, "times_s": times_s, "sampled_frames": asked.sampling.frames}
         yield _event("video", **about, blank=blank or None)
         try:
-            sample = ProgressSample(video.trajectory)
-            fit = await asyncio.to_thread(fitted, sample, asked.info, subsample=False, resize=asked.question.resize)
+            trajectory, size = video.trajectory, asked.info.frame_size if asked.question.resize else None
+            if size is not None:
+                frames = await asyncio.to_thread(resize_frames, trajectory.positions, size)
+                trajectory = Trajectory(frames=frames, task=trajectory.task)
             async with new_client(model=asked.question.model) as client:
-                async for points in _curve(client, fit.sample.trajectories[0], asked):
+                async for points in _curve(client, trajectory, asked):
                     version = points["model_version"]
                     metrics.samples.labels("progress").inc(len(points["progress"]))
                     yield _event("scores", **points)
@@ -171,7 +163,7 @@ async def _infos(config: GatewayConfig, new_client: Callable[..., AsyncRewardCli
 
 
 def _told_of(name: str, info: ModelInfo) -> dict[str, Any]:
-    rule = trained_rule(info.trained_padding)
+    rule = Sampling.of(None, 1, None, trained_padding=info.trained_padding).rule
     about = {"name": name, "max_frames": info.max_frames, "rule": rule}
     return {**about, "versions": list(info.versions), "source": info.source}
 
@@ -197,7 +189,7 @@ async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Aske
     sampling, frames = asked.sampling, trajectory.frames
     sample_bytes = max(sampling.frames or 0, len(frames)) * math.prod(frames.shape[1:])
     most = max(min(MOST_PREFIXES, MOST_BYTES // sample_bytes), 1)
-    samples, first, count = prefix_samples(trajectory, sampling), 0, 1
+    samples, first, count = sampling.samples(trajectory), 0, 1
 
     def following() -> list[ProgressSample]:
         return list(itertools.islice(samples, count))

@@ -11,14 +11,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 import numpy.typing as npt
 from fastapi import HTTPException
 
 from rfm_client import SUCCESS_THRESHOLD
-from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, Correction
+from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_labels import (
     Curve,
     EpisodeLabels,
@@ -29,7 +29,7 @@ from rfm_labels import (
     stored_in,
     summarise,
 )
-from rfm_labels.datasets import Dataset, DatasetEpisode, DatasetError, unused_cameras
+from rfm_labels.datasets import Dataset, DatasetEpisode, DatasetError
 from rfm_page.numbers import numbers_or_null
 
 _SUMMARIES_AT_A_TIME = 8  # summaries in memory
@@ -83,12 +83,12 @@ class ShownDataset(ABC):
     def table(self, labels: str | None) -> dict[str, Any]:
         """Return a row for each episode, with a summary of its labels.
 
-        ``unused`` has what each camera shows instead of colours, as in ``unused_cameras``; null: it shows colours.
+        ``unused`` has what each camera shows instead of colours (``Dataset.unused_cameras``); null: colours.
         """
         file = self._labels(labels)
         status = None if file is None else stored_in(file).stat()
         summary = None if file is None or status is None else _summary(file, status.st_mtime_ns)
-        unused = unused_cameras(self.dataset, self.dataset.cameras)
+        unused = self.dataset.unused_cameras(self.dataset.cameras)
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
         return {
             "labels": None if file is None else self._name_of(file),
@@ -114,7 +114,7 @@ class ShownDataset(ABC):
     def faults(self) -> dict[str, str]:
         """Return the fault of each episode that cannot be labelled now, by number, as ``rfm-client label`` tells it."""
         found = {}
-        unused = unused_cameras(self.dataset, self.cameras)
+        unused = self.dataset.unused_cameras(self.cameras)
         cameras = [camera for camera in self.cameras if camera not in unused]
         for episode in self.dataset.episodes:
             try:
@@ -173,7 +173,9 @@ class ShownDataset(ABC):
         told = read_provenance(file)
         orient = told.get("orientations", {}).get(camera)  # labels of version 0.1.0 have none
         order = told.get("channels", {}).get(camera)
-        return Correction(orient if orient in ORIENTATIONS else "none", order if order in CHANNEL_ORDERS else "rgb")
+        return Correction(
+            orient if orient in get_args(Orientation) else "none", order if order in get_args(ChannelOrder) else "rgb"
+        )
 
     def _name_of(self, file: Path) -> str:
         return file.relative_to(self.root).as_posix()

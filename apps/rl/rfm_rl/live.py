@@ -28,7 +28,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from rfm_client import UInt8Array
-from rfm_client.frames import as_jpeg, load_pillow
+from rfm_client.frames import as_jpeg
 from rfm_client.options import checked_count, checked_share, require
 from rfm_client.serving import Closing, Credentials
 
@@ -107,7 +107,7 @@ class LiveView(Closing):
         headers: Mapping[str, str] | None = None,
         api_key: str | None = None,
     ) -> None:
-        load_pillow()
+        as_jpeg(np.zeros((1, 1, 3), np.uint8), 1)  # without Pillow, fail here
         self.name = name
         self._url = url
         self._credentials = Credentials(ca_file, client_certificate, client_key, headers or {}, api_key)

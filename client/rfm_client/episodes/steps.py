@@ -26,7 +26,7 @@ from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
 from rfm_client.episodes.windows import EpisodeFrame, Window
 from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW, BlankFrames, is_black, is_blank
 from rfm_client.frames.camera_fusion import FUSES, Fuse
-from rfm_client.frames.orientation import ChannelOrder, Channels, Correction, Corrections, Orient, Orientation
+from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.resize import resize_frames
 from rfm_client.frames.sampling import Prefix, Rule, Sampling, of_frames
 
@@ -124,14 +124,15 @@ class EpisodeOptions:
         Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one for all frames, as cameras names none"
-        for given in (self._given.orient, self._given.channels):
-            unknown = [repr(camera) for camera in given.cameras if camera not in self.cameras]
-            require(given.NAME, not unknown, expected, ", ".join(unknown))
+        for name, given in (("orient", self.orient), ("channels", self.channels)):
+            unknown = [] if isinstance(given, str) else [repr(each) for each in given if each not in cameras]
+            require(name, not unknown, expected, ", ".join(unknown))
+        self.corrections  # noqa: B018  raises ValueError for an unknown value
 
     @property
     def corrections(self) -> list[Correction]:
         """Correction of each camera's frames, in the order of the cameras."""
-        return [self._given.of(camera) for camera in self.cameras or ("",)]
+        return [Correction.of(camera, self.orient, self.channels) for camera in self.cameras or ("",)]
 
     def sampling_for(self, info: ModelInfo) -> Sampling:
         """Return the rule with its number of frames for a checkpoint.
@@ -140,10 +141,6 @@ class EpisodeOptions:
         """
         info.check_scores_prefixes()
         return Sampling.of(self.sampling, self.frames, info.max_frames, trained_padding=info.trained_padding)
-
-    @property
-    def _given(self) -> Corrections:
-        return Corrections(Orient.of(self.orient), Channels.of(self.channels))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import typer
 
@@ -25,21 +25,16 @@ from rfm_client.command_line import (
     table,
     with_options,
 )
-from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, Channels, Orient
+from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, Texts, setting
 from rfm_labels import blank_cameras
 from rfm_labels.commands.progress_bar import ProgressBar, Say
-from rfm_labels.datasets.faults import listed
+from rfm_labels.datasets.cameras import parsed_by_camera
+from rfm_labels.datasets.dataset import Dataset, SeveralTasks
+from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import SUFFIXES
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.opening import hdf5_files, open_dataset
-from rfm_labels.datasets.protocol import (
-    Dataset,
-    FaultsError,
-    SeveralTasks,
-    UnusedTaskError,
-    require,
-)
 from rfm_labels.episode_scores import FrameMemory, episode_scores
 from rfm_labels.finished_episodes import Parts
 from rfm_labels.hdf5_tables import dataset_stem, labels_in, own_file, stored_in
@@ -55,7 +50,7 @@ from rfm_labels.summary import Summary, summarise
 from rfm_labels.survey import check_episodes
 
 _MIB = 2**20
-_OF_CAMERAS = (Orient, Channels)  # options with a value for each camera
+_OF_CAMERAS = ("orient", "channels")  # options with a value for each camera
 
 DatasetArgument = Annotated[
     str,
@@ -90,12 +85,12 @@ class EpisodeTexts(Settings):
         (),
         "Turn stored pictures upright, of all cameras or of one; may be repeated. Else as stored; LIBERO's HDF5 files "
         "flip-vertical.",
-        metavar="[CAMERA=]" + "|".join(ORIENTATIONS),
+        metavar="[CAMERA=]" + "|".join(get_args(Orientation)),
     )
     channels: Texts = setting(
         (),
         "Channel order of stored pictures, for all cameras or one; may be repeated. Default: rgb.",
-        metavar="[CAMERA=]" + "|".join(CHANNEL_ORDERS),
+        metavar="[CAMERA=]" + "|".join(get_args(ChannelOrder)),
     )
     tolerance_s: float = setting(
         TOLERANCE_S,
@@ -108,15 +103,15 @@ class EpisodeTexts(Settings):
         super().__post_init__()
         for option in _OF_CAMERAS:
             try:
-                option.parse(getattr(self, option.NAME))
+                parsed_by_camera(option, getattr(self, option))
             except ValueError as error:
-                raise ConfigError(option.NAME, str(error)) from None
+                raise ConfigError(option, str(error)) from None
 
     @property
     def opening(self) -> dict[str, Any]:
         """Arguments of ``open_dataset`` after the source."""
         given = {each.name: getattr(self, each.name) for each in fields(self)}
-        return given | {option.NAME: option.parse(given[option.NAME]) for option in _OF_CAMERAS}
+        return given | {option: parsed_by_camera(option, given[option]) for option in _OF_CAMERAS}
 
 
 @dataclass(frozen=True)
