@@ -166,7 +166,7 @@ def test_no_extra_of_the_client_names_a_distribution_of_ours() -> None:
 
 LOADS = {  # modules: what must not be loaded with them
     "rfm.engine": {"transformers", "PIL", "av", "matplotlib"},
-    "rfm_labels": {*EXTRAS, "h5py", "pyarrow", "fsspec", "ray", "torch"} - {"async_timeout"},
+    "rfm_labels": {*EXTRAS, "h5py", "pyarrow", "fsspec", "ray", "scipy", "sklearn", "torch"} - {"async_timeout"},
     "rfm_commands.cli, rfm_commands.rollout, rfm.supervise.supervisor": {"torch"},  # two seconds and 200 MB
 }
 
