@@ -8,7 +8,9 @@ with RewardClient("grpc://localhost:8001") as client:
     report = label(open_dataset("my_dataset"), ClientScorer(client), LabelOptions(cameras=("top",)))
 """
 
-from rfm_labels.datasets import Dataset, DatasetEpisode, DatasetError, iter_episodes, open_dataset
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, iter_episodes
+from rfm_labels.datasets.faults import DatasetError
+from rfm_labels.datasets.opening import open_dataset
 from rfm_labels.evaluation import Evaluation, LabelComparison, evaluate_labels, read_outcomes
 from rfm_labels.hdf5_tables import stored_in
 from rfm_labels.label import Report, label, label_with_ray

@@ -15,7 +15,7 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import JSONResponse
 
 from rfm_gateway.mounting import Decoded, while_connected
-from rfm_labels.datasets import DatasetError
+from rfm_labels import DatasetError
 
 if TYPE_CHECKING:
     from rfm_page.shown import ShownDataset

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import av
@@ -17,21 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.frames import FrameFileError, Video
-from rfm_client.options import ConfigError
-from rfm_labels.datasets import (
-    INFO_FILE,
-    TASK_COLUMN,
-    DatasetEpisode,
-    DatasetError,
-    Info,
-    LeRobotDataset,
-    Span,
-    TaskOverride,
-)
+from rfm_labels import DatasetEpisode
+from rfm_labels.datasets import LeRobotDataset, Span
 from rfm_page.links import check_links, links_in
 from rfm_page.shown import ShownDataset
-
-_AS_STORED = TaskOverride(column=TASK_COLUMN, is_needed=False)  # blank and outdated tasks are shown, too
 
 
 @dataclass(frozen=True)
@@ -41,26 +29,6 @@ class ShownLeRobot(ShownDataset):
     has_stored_pixels = True
 
     dataset: LeRobotDataset
-
-    @classmethod
-    def open(cls, folder: str) -> ShownLeRobot:
-        """Open the dataset in a folder. Raises ConfigError for any other folder, or links out of it."""
-        try:
-            import pyarrow  # noqa: F401
-        except ImportError:
-            expected = "expected pyarrow, which reads datasets, got none: pip install ./client ./apps/labels"
-            raise ConfigError("dataset", expected) from None
-        if not (Path(folder) / INFO_FILE).is_file():
-            expected = f"expected the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file, got {folder}"
-            raise ConfigError("dataset", expected)
-        root = Path(folder).resolve()
-        try:
-            half_s = 0.5 / Info.read(root).fps  # a player shows the nearest frame, too
-            shown = cls(root, root, LeRobotDataset(root, task=_AS_STORED, tolerance_s=half_s))
-            shown.check()
-            return shown
-        except DatasetError as error:
-            raise ConfigError("dataset", str(error)) from None
 
     def check(self) -> None:
         """Raise DatasetError for a link out of the folder."""

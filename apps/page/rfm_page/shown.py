@@ -21,6 +21,9 @@ from rfm_client import SUCCESS_THRESHOLD
 from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_labels import (
     Curve,
+    Dataset,
+    DatasetEpisode,
+    DatasetError,
     EpisodeLabels,
     Summary,
     find_label_files,
@@ -29,7 +32,6 @@ from rfm_labels import (
     stored_in,
     summarise,
 )
-from rfm_labels.datasets import Dataset, DatasetEpisode, DatasetError
 from rfm_page.numbers import numbers_or_null
 
 _SUMMARIES_AT_A_TIME = 8  # summaries in memory
@@ -39,8 +41,7 @@ _SUMMARIES_AT_A_TIME = 8  # summaries in memory
 class ShownDataset(ABC):
     """A dataset for the page.
 
-    root: its folder, with links resolved
-    path: its folder or file
+    dataset: as ``open_to_show`` returns it
     has_stored_pixels: True: its videos have every pixel as stored; False: they are encoded for the page
 
     Its methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
@@ -48,9 +49,17 @@ class ShownDataset(ABC):
 
     has_stored_pixels: ClassVar[bool]
 
-    root: Path
-    path: Path
     dataset: Dataset
+
+    @property
+    def root(self) -> Path:
+        """The folder, with links resolved."""
+        return self.dataset.root
+
+    @property
+    def path(self) -> Path:
+        """The folder or file."""
+        return self.root
 
     @abstractmethod
     def check(self) -> None:

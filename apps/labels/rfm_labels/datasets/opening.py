@@ -27,7 +27,8 @@ from rfm_labels.datasets.hdf5 import SUFFIXES, Hdf5Dataset, is_hdf5
 from rfm_labels.datasets.hdf5_contents import foreign_layout_of
 from rfm_labels.datasets.lerobot import LeRobotDataset
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
-from rfm_labels.datasets.lerobot_meta import INFO_FILE
+from rfm_labels.datasets.lerobot_meta import INFO_FILE, Info
+from rfm_labels.datasets.lerobot_rows import TASK_COLUMN
 from rfm_labels.datasets.task_tables import TABLES, read_table_of_tasks, table_in
 
 _HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
@@ -113,6 +114,20 @@ def _from_hub(name: str, revision: str | None, **opening: Any) -> LeRobotDataset
         raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(folder) or "none")
     commit = folder.name  # the name of a snapshot's folder
     return LeRobotDataset(folder, source=name, revision=commit, **opening)
+
+
+def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset:
+    """Return the dataset of a LeRobot folder or an HDF5 file for a viewer. Raises DatasetError.
+
+    Blank and outdated tasks are shown, too, and a row's frame is the nearest, as a player shows it.
+    """
+    path = Path(source).resolve()
+    if is_hdf5(path):
+        return Hdf5Dataset(path, task=TaskOverride(is_needed=False))
+    if not (path / INFO_FILE).is_file():
+        raise DatasetError(f"expected the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file, got {source}")
+    task = TaskOverride(column=TASK_COLUMN, is_needed=False)
+    return LeRobotDataset(path, task=task, tolerance_s=0.5 / Info.read(path).fps)
 
 
 def hdf5_files(folder: str | Path) -> list[Path]:
