@@ -24,7 +24,7 @@ from paths import ROOT
 from rfm_commands.cli import app
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset, parse_episodes
 from rfm_labels.datasets.faults import listed
-from rfm_labels.label import plan_labels
+from rfm_labels.plan import plan_labels
 from rfm_labels.ray_engine import EpisodeActor, RayJob
 
 TASK = "stack the cups"

@@ -21,9 +21,9 @@ from typer.testing import CliRunner
 from labelling import FEW, BrightnessScorer
 from rfm_client.cli.commands import app
 from rfm_labels import DatasetError, LabelOptions, Watch, evaluate_labels, label, open_dataset, read_outcomes
-from rfm_labels.cost import Cost
 from rfm_labels.evaluation import kendall, spearman
 from rfm_labels.label_files import read_cost
+from rfm_labels.metadata import Cost
 from shown_datasets import copied
 
 Curves = Mapping[int, Sequence[float]]

@@ -14,7 +14,7 @@ import pytest
 
 from labelling import BrightnessScorer, PickyScorer
 from rfm_client.contract.samples import UInt8Array
-from rfm_labels import Dataset, DatasetEpisode, LabelOptions, Report, episode_scores, label, run
+from rfm_labels import Dataset, DatasetEpisode, LabelOptions, Report, episode_scores, label, labelling
 from rfm_labels.episode_scores import FrameMemory
 
 NUM_FRAMES, SIDE = 1000, 48
@@ -88,7 +88,7 @@ BOUNDS = {
 def test_all_workers_together_hold_no_more_than_fits_or_one_video(
     output: Path, max_bytes: int, scorer: BrightnessScorer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run, "FrameMemory", functools.partial(FrameMemory, max_bytes))
+    monkeypatch.setattr(labelling, "FrameMemory", functools.partial(FrameMemory, max_bytes))
     options = LabelOptions(output=output, workers=WORKERS, frames=2)
     peak, report = peak_videos(LongVideos(output, WORKERS), options, scorer)
     assert len(report.failures) == (WORKERS if isinstance(scorer, PickyScorer) else 0)

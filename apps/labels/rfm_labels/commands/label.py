@@ -27,7 +27,6 @@ from rfm_client.command_line import (
 )
 from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, Texts, setting
-from rfm_labels import blank_cameras
 from rfm_labels.commands.progress_bar import ProgressBar, Say
 from rfm_labels.datasets.cameras import parsed_by_camera
 from rfm_labels.datasets.dataset import Dataset, SeveralTasks
@@ -36,18 +35,18 @@ from rfm_labels.datasets.hdf5 import SUFFIXES
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.opening import hdf5_files, open_dataset
 from rfm_labels.episode_scores import FrameMemory, episode_scores
-from rfm_labels.finished_episodes import Parts
 from rfm_labels.hdf5_tables import dataset_stem, labels_in, own_file, stored_in
-from rfm_labels.label import Outputs, Report, check, label_with_ray, plan_labels
-from rfm_labels.label import label as label_dataset
 from rfm_labels.label_files import read_blank
-from rfm_labels.options import LabelOptions, RayOptions
-from rfm_labels.plan import Item, Plan, selected
-from rfm_labels.ray_engine import Connect
-from rfm_labels.run import Watch
+from rfm_labels.labelling import Report
+from rfm_labels.labelling import label as label_dataset
+from rfm_labels.metadata import blank_by_camera, blank_lines
+from rfm_labels.options import LabelOptions, RayOptions, Watch
+from rfm_labels.outputs import Outputs, check
+from rfm_labels.plan import Item, Plan, check_episodes, plan_labels, selected
+from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
 from rfm_labels.summary import Summary, summarise
-from rfm_labels.survey import check_episodes
+from rfm_labels.writing import Parts
 
 _MIB = 2**20
 _OF_CAMERAS = ("orient", "channels")  # options with a value for each camera
@@ -188,9 +187,9 @@ class LabelCommand:
             self._try()
             return ExitCode.OK
         if self.options.rrd is not None:
-            from rfm_client.recording import load_rerun
+            from rfm_client.recording import Recording
 
-            load_rerun()  # a missing package must not fail after the labelling
+            Recording(self.options.rrd)  # a missing package must not fail after the labelling
             self.options.rrd.mkdir(parents=True, exist_ok=True)
         report = self._label()
         status = self._tell(report)
@@ -288,7 +287,7 @@ class LabelCommand:
 
     def _record(self, folder: Path, report: Report) -> None:
         """Record the chosen episodes, also those labelled by an earlier run."""
-        from rfm_labels.recordings import record_episodes
+        from rfm_labels.pictures import record_episodes
 
         dataset = self._dataset()
         chosen = {episode.index for episode in selected(dataset, self.labels)}
@@ -306,7 +305,7 @@ class LabelCommand:
             files = [*outputs.progress, *outputs.signals]
             path = next((file for file in files if file.exists()), files[0])
         summary = summarise(path)
-        for line in blank_cameras.lines(read_blank(path), len(summary.episodes)):
+        for line in blank_lines(read_blank(path), len(summary.episodes)):
             self.say(f"note: {line}")
         self._show(summary, path)
 
@@ -351,7 +350,7 @@ def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int, watc
     with ThreadPoolExecutor(workers) as pool:
         blank = list(pool.map(score, first))
     took_s = time.monotonic() - began_s
-    for line in blank_cameras.lines(blank_cameras.by_camera(blank), len(first)):
+    for line in blank_lines(blank_by_camera(blank), len(first)):
         watch.note(line)
     return took_s * plan.num_frames / sum(item.episode.num_frames for item in first)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Label the episodes of a plan that have no part yet, several at a time."""
+"""Label a dataset: plan, score several episodes at a time, write the label files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from rfm_client import (
     AccessDeniedError,
@@ -18,37 +19,74 @@ from rfm_client import (
     ProcessEndedError,
     RewardError,
     ServerUnavailableError,
+    unclear_answers,
 )
-from rfm_labels.cost import Cost
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
-from rfm_labels.episode_scores import FrameMemory, episode_scores
-from rfm_labels.finished_episodes import Parts
+from rfm_labels.episode_scores import UNCLEAR, FrameMemory, episode_scores
+from rfm_labels.metadata import Cost, blank_from_metadata, blank_lines
+from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
+from rfm_labels.outputs import Outputs, prepared
 from rfm_labels.plan import Item, Plan
-from rfm_labels.scorer import IDENTITY, Scorer
+from rfm_labels.scorer import DECISIVE, Scorer
+from rfm_labels.summary import Summary, summary_of
+from rfm_labels.writing import Parts
 
 _NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNotFoundError, AccessDeniedError)
 
 
-class Watch:
-    """Callbacks of a run. They do nothing here; override those that you need."""
+@dataclass(frozen=True)
+class Report:
+    """The result of a labelling run.
 
-    def note(self, text: str) -> None:
-        """Callback with a line for the user: a decision, or a warning."""
+    files: label files that were written; empty if an episode failed, or for a shard
+    failures: episodes without labels
+    parts: folder or URL of the finished episodes
+    summary: None: no file was written
+    plan: the episodes to label, and the recipe
+    """
 
-    def checking(self, num_episodes: int) -> None:
-        """Callback before the check of all episodes."""
+    files: Sequence[Path]
+    failures: Sequence[FailedEpisode]
+    parts: str
+    summary: Summary | None
+    plan: Plan
 
-    def checked(self, episode: DatasetEpisode) -> None:
-        """Callback when all frames of an episode are found."""
 
-    def begin(self, num_frames: int, num_finished: int) -> None:
-        """Callback before the first score, with the frames of the run, and those already finished."""
+def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = DEFAULTS, watch: Watch = QUIET) -> Report:
+    """Label every frame of the chosen episodes, and write the label files.
 
-    def scored(self, episode: DatasetEpisode) -> None:
-        """Callback when the episode is finished."""
+    If an episode fails, the report names it, and no label file is written. The same call then labels only the missing
+    episodes.
 
-    def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
-        """Callback when the episode has failed."""
+    Raises DatasetError, before the first score, for a contradictory dataset or a label file that this run may not
+    replace; RewardError if the scorer is gone; OSError for a full disk.
+    """
+    outputs, plan, earlier = prepared(dataset, scorer, options, watch)
+    run = Run(plan, dataset, scorer, outputs.parts, watch)
+    failures = run.finish_all(options.workers)
+    return put_together(plan, outputs, failures, run.cost or earlier, watch)
+
+
+def put_together(
+    plan: Plan, outputs: Outputs, failures: Sequence[FailedEpisode], cost: Cost | None, watch: Watch
+) -> Report:
+    """Write the label files, unless an episode failed or the run labelled only a shard."""
+    report = Report([], failures, outputs.parts.url, None, plan)
+    if failures or outputs.options.shard is not None:
+        return report
+    labels = outputs.parts.read_all(plan)
+    blank = blank_from_metadata(labels.schema.metadata)
+    for line in blank_lines(blank, len(plan.items)):
+        watch.note(line)
+    files = outputs.write(plan, labels, cost, watch)
+    if UNCLEAR in labels.column_names and (marks := labels[UNCLEAR].to_numpy()).any():
+        watch.note(f"{unclear_answers(marks)}; the column {UNCLEAR} marks them")
+    assert outputs.dataset is not None  # ``prepared`` sets it
+    num_episodes = len(outputs.dataset.numbers)
+    if len(plan.items) < num_episodes:
+        others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
+        watch.note(f"{len(plan.items)} of the dataset's {num_episodes} episodes have labels{others}")
+    return replace(report, files=files, summary=summary_of(labels))
 
 
 @dataclass(frozen=True)
@@ -85,7 +123,7 @@ class Run:
 
         Raises, once the episodes in progress have ended, RewardError if the server is gone, OSError for a full disk.
         """
-        pending = begin(self._plan, self._parts, self._watch)
+        pending = unfinished(self._plan, self._parts, self._watch)
         began_s = time.monotonic()
         with ThreadPoolExecutor(workers, thread_name_prefix="rfm-label") as pool:
             try:
@@ -134,7 +172,7 @@ class Run:
         """Stop the run and raise _StoppedError if another checkpoint is served now."""
         try:
             planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
-            for name in IDENTITY:
+            for name in DECISIVE:
                 if getattr(now, name) != getattr(planned, name):
                     raise InvalidSampleError.at(name, getattr(planned, name), getattr(now, name))
         except InvalidSampleError as error:
@@ -151,7 +189,7 @@ class Run:
             raise _StoppedError
 
 
-def begin(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
+def unfinished(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
     """Return the items without a part, and report the number of frames to ``watch``."""
     finished = parts.finished(plan.items)
     watch.begin(plan.num_frames, sum(item.episode.num_frames for item in plan.items if item.key in finished))
