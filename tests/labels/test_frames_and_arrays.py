@@ -21,7 +21,7 @@ from labelling import BrightnessScorer, brightness
 from pictures import numbered, numbers
 from rfm_client.cli.command import ExitCode
 from rfm_labels import DatasetError, LabelOptions, RayOptions, Scorer, label, open_dataset
-from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
+from rfm_labels.commands import EpisodeTexts, LabelCommand, RunOptions
 
 TASK = "stack the cups"
 COUNT = 12  # frames of an episode, so that 10.png is there

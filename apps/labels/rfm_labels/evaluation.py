@@ -19,9 +19,9 @@ import numpy.typing as npt
 
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
-from rfm_labels.episode_scores import PROGRESS, SUCCESS
 from rfm_labels.hdf5_tables import full_path
 from rfm_labels.label_files import read_cost, read_label_table
+from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.summary import BACKWARDS_BY
 from rfm_labels.writing import PROGRESS_ENDING
 

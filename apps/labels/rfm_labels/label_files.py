@@ -15,9 +15,17 @@ from rfm_client import Float32Array
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
 from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.lerobot_meta import INFO_FILE
-from rfm_labels.episode_scores import PROGRESS, SUCCESS, Columns
 from rfm_labels.hdf5_tables import BLANK, COST, PROVENANCE, find_in_hdf5, of_hdf5, read_attribute, read_hdf5_table
-from rfm_labels.metadata import BLANK_KEY, BlankCameras, Cost, blank_from_metadata, parsed_object
+from rfm_labels.metadata import (
+    BLANK_KEY,
+    PROGRESS,
+    SUCCESS,
+    BlankCameras,
+    Columns,
+    Cost,
+    blank_from_metadata,
+    parsed_object,
+)
 from rfm_labels.plan import Item, Plan, make_plan
 from rfm_labels.writing import (
     COST_KEY,
@@ -29,18 +37,17 @@ from rfm_labels.writing import (
     SIGNALS_PROVENANCE_KEY,
 )
 
+Reader: TypeAlias = Callable[[Sequence[Item]], Iterator[tuple[Item, Columns]]]
+
 _OWN_NAME = "rfm"  # default of ``LabelOptions.name``
 _PROGRESS_NAMES = ("progress", "progress_sparse", "progress_dense")
-Reader: TypeAlias = Callable[[Sequence[Item]], Iterator[tuple[Item, Columns]]]
 _OTHERS = "those of others, or of videos that have changed or were copied (--verify knows copies by their content)"
 
 
-def parquet_labels(path: Path, option: str = "--name") -> LabelFile | None:
-    """Return the labels in the file; None: no file. ``option``: the command-line option that chooses another path."""
+def parquet_labels(path: Path, option: str = "--name") -> LabelFile:
+    """Return the labels in a file. ``option``: the command-line option that chooses another path."""
     from pyarrow import ArrowException, parquet
 
-    if not path.exists():
-        return None
     try:
         metadata = parquet.read_schema(path).metadata or {}
     except (OSError, ArrowException):
@@ -106,7 +113,7 @@ def find_label_files(root: Path) -> list[Path]:
 def read_label_table(file: Path, *, episode: int | None = None) -> Any:
     """Return a label file of any format as a pyarrow Table, with the parts' column names. Raises DatasetError.
 
-    Score columns: those of ``episode_columns``, as far as the file has them.
+    Score columns: those of ``SCORES``, as far as the file has them.
 
     file: Parquet, or HDF5 as ``find_label_files`` returns it
 
@@ -192,7 +199,7 @@ def _score_columns(file: Path, names: Sequence[str]) -> dict[str, str]:
         raise DatasetError.at(file, "a column of progress", ", ".join(names))
     before = progress.removesuffix("progress")
     begins = {score: score if own is not None else before + signal for score, signal in SIGNAL_NAMES.items()}
-    columns = {}  # in the order of ``episode_columns``
+    columns = {}  # in the order of ``SCORES``
     for score, begin in begins.items():
         if (fused := progress if score == PROGRESS else begin) in names:
             columns[score] = fused

@@ -1,37 +1,44 @@
 # SPDX-License-Identifier: MIT
-"""Label a dataset: plan, score several episodes at a time, write the label files."""
+"""Label a dataset: plan, score, write the label files.
+
+Labels of the same recipe that are there stay. Others are replaced on request alone.
+"""
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from rfm_client import (
-    AccessDeniedError,
-    DeadlineExceededError,
-    InferenceFailedError,
-    InvalidSampleError,
-    ModelNotFoundError,
-    ProcessEndedError,
-    RewardError,
-    ServerUnavailableError,
     unclear_answers,
 )
-from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
-from rfm_labels.episode_scores import UNCLEAR, FrameMemory, episode_scores
-from rfm_labels.metadata import Cost, blank_from_metadata, blank_lines
-from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
-from rfm_labels.outputs import Outputs, prepared
-from rfm_labels.plan import Item, Plan
-from rfm_labels.scorer import DECISIVE, Scorer
+from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
+from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.hdf5 import Hdf5Dataset
+from rfm_labels.hdf5_labels import Hdf5Labels, check_room, hdf5_labels
+from rfm_labels.hdf5_tables import own_file
+from rfm_labels.label_files import LabelFile, parquet_labels
+from rfm_labels.metadata import SCORES, UNCLEAR, Cost, blank_from_metadata, blank_lines
+from rfm_labels.options import DEFAULTS, QUIET, Format, LabelOptions, Watch
+from rfm_labels.plan import Item, Plan, all_faults, plan_labels
+from rfm_labels.scorer import Scorer
+from rfm_labels.scoring import FailedEpisode, Run
 from rfm_labels.summary import Summary, summary_of
-from rfm_labels.writing import Parts
-
-_NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNotFoundError, AccessDeniedError)
+from rfm_labels.writing import (
+    IDENTITY,
+    PROGRESS_ENDING,
+    Parts,
+    progress_file,
+    signals_file,
+    with_totals,
+    write_sidecars,
+)
 
 
 @dataclass(frozen=True)
@@ -90,112 +97,183 @@ def put_together(
 
 
 @dataclass(frozen=True)
-class FailedEpisode:
-    """An episode without labels, and the reason."""
+class Outputs:
+    """Paths of the parts, and of the label files in the formats to write.
 
-    episode: DatasetEpisode
-    error: RewardError
+    dataset: None: only the paths of Parquet files are needed
 
+    Raises DatasetError for HDF5 labels of a dataset that is no HDF5 file.
+    """
 
-class _StoppedError(RewardError):
-    """The run is stopping; the next run labels the episode."""
+    folder: Path
+    options: LabelOptions
+    dataset: Dataset | None = None
 
-
-class Run:
-    """The labelling of a plan with threads of this process."""
-
-    def __init__(self, plan: Plan, dataset: Dataset, scorer: Scorer, parts: Parts, watch: Watch) -> None:
-        self._plan, self._dataset, self._scorer, self._parts, self._watch = plan, dataset, scorer, parts, watch
-        self._memory = FrameMemory()
-        self._stopping = threading.Event()
-        self._lock = threading.Lock()
-        self._failures: list[FailedEpisode] = []
-        self._cause: Exception | None = None
-        self._frames_scored, self._seconds = 0, 0.0
+    def __post_init__(self) -> None:
+        is_written = self.dataset is None or isinstance(self.dataset, Hdf5Dataset)
+        expected = "progress or signals for a dataset that is no HDF5 file"
+        require("format", is_written or "hdf5" not in self.options.formats, expected, "hdf5")
+        got = f"{self.dataset.kind if self.dataset else 'none'}: leave --in-place away"
+        require("in_place", is_written or not self.options.in_place, "an HDF5 file", got)
 
     @property
-    def cost(self) -> Cost | None:
-        """What ``finish_all`` scored, and its time; None: it scored nothing."""
-        return Cost(self._frames_scored, self._seconds) if self._frames_scored else None
+    def formats(self) -> Sequence[Format]:
+        """The formats to write; by default those of the dataset's kind."""
+        by_kind: Sequence[Format] = ("hdf5",) if isinstance(self.dataset, Hdf5Dataset) else ("progress", "signals")
+        return self.options.formats or by_kind
 
-    def finish_all(self, workers: int) -> list[FailedEpisode]:
-        """Label all items without a part, ``workers`` at a time, and return the failures.
+    @property
+    def progress(self) -> list[Path]:
+        """The progress file, then its alias."""
+        named = self.folder / f"{self.options.name}{PROGRESS_ENDING}"
+        alias = [self.folder / f"{self.options.alias}.parquet"] if self.options.alias else []
+        return [named, *alias] if "progress" in self.formats else []
 
-        Raises, once the episodes in progress have ended, RewardError if the server is gone, OSError for a full disk.
+    @property
+    def signals(self) -> list[Path]:
+        """The file of frame signals."""
+        return [self.folder / SIGNALS_FOLDER / f"{self.options.name}.parquet"] if "signals" in self.formats else []
+
+    @property
+    def hdf5(self) -> list[Path]:
+        """The labels' own HDF5 file, or the dataset's."""
+        if "hdf5" not in self.formats or not isinstance(self.dataset, Hdf5Dataset):
+            return []
+        own = own_file(self.folder, self.dataset.file.stem, self.options.name)
+        return [self.dataset.file if self.options.in_place else own]
+
+    @cached_property
+    def parts(self) -> Parts:
+        """The finished episodes. The first access makes their folder."""
+        return Parts(self.options.parts or str(self.folder / f".{self.options.name}_parts"))
+
+    def make_folder(self) -> None:
+        """Make the folder if it is missing. Raises DatasetError if labels cannot be written there."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if not os.access(self.folder, os.W_OK):
+                raise OSError("one that cannot be written")
+        except OSError as error:
+            got = f"{error.strerror or error}: name another one with --output"
+            raise DatasetError.at(self.folder, "a folder for the labels", got) from error
+
+    def before(self) -> list[LabelFile]:
+        """Return the label files that exist already. Raises DatasetError for an unreadable HDF5 file."""
+        named = zip(self.progress, ("--name", "--alias"), strict=False)
+        found = [parquet_labels(path, option) for path, option in named if path.exists()]
+        found += [parquet_labels(path) for path in self.signals if path.exists()]
+        in_hdf5 = [hdf5_labels(path, self.options.name) for path in self.hdf5 if path.exists()]
+        return found + [each for each in in_hdf5 if each is not None]
+
+    def write(self, plan: Plan, labels: Any, cost: Cost | None, watch: Watch) -> list[Path]:
+        """Write the labels to all files, and return their paths. Raises OSError.
+
+        labels: table of ``Parts.read_all``
+        cost: for the metadata; None: unknown
         """
-        pending = unfinished(self._plan, self._parts, self._watch)
-        began_s = time.monotonic()
-        with ThreadPoolExecutor(workers, thread_name_prefix="rfm-label") as pool:
-            try:
-                list(pool.map(self._label, pending))
-            except BaseException:
-                self._stopping.set()
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-        self._seconds = time.monotonic() - began_s
-        if self._cause is not None:
-            raise self._cause
-        return by_episode(self._failures)
-
-    def _label(self, item: Item) -> None:
+        columns = [name for name in labels.column_names if name not in IDENTITY]
+        sidecars = [progress_file(path, plan, columns, cost) for path in self.progress]
+        sidecars += [signals_file(path, plan, columns, self.options.name, cost) for path in self.signals]
         try:
-            self._go_on()
-            if not self._parts.has(item):  # another process may have finished it
-                self._score(item)
-            self._watch.scored(item.episode)
-        except _StoppedError:
-            return
-        except RewardError as error:
-            is_of_one = isinstance(error, ProcessEndedError)  # at both tries of the client
-            if isinstance(error, _NOT_ABOUT_ONE_EPISODE) and not is_of_one:
-                self._stop(error)
-                return
-            with self._lock:
-                self._failures.append(FailedEpisode(item.episode, error))
-            self._watch.failed(item.episode, error)
-        except (OSError, ImportError) as error:
-            self._stop(error)
+            write_sidecars(with_totals(labels, plan), sidecars)
+        except OSError as error:
+            remedy = f"make room, or name another folder with --output and this one's --parts {self.parts.url}"
+            raise OSError(f"{self.folder}: expected to write the labels, got {error}: {remedy}") from error
+        in_hdf5 = Hdf5Labels(plan, labels, self.options.name, cost)
+        for file in self.hdf5:
+            if self.options.in_place:
+                in_hdf5.write_in_place(file, watch.note)
+            else:
+                in_hdf5.write(file)
+        return [*(sidecar.path for sidecar in sidecars), *self.hdf5]
 
-    def _score(self, item: Item) -> None:
-        recipe, memory = self._plan.recipe, self._memory
+
+def prepared(
+    dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
+) -> tuple[Outputs, Plan, Cost | None]:
+    """Make and check the plan, and restore parts from label files. Return the cost of the labels that exist, too."""
+    outputs = Outputs(options.output or dataset.root, options, dataset)
+    if options.shard is None:
+        outputs.make_folder()
+    checked = check(plan_labels(dataset, scorer, options, watch), outputs, watch)
+    restore(checked.plan, outputs.parts, checked.before)
+    return outputs, checked.plan, earlier_cost(checked.plan, checked.before)
+
+
+@dataclass(frozen=True)
+class CheckedPlan:
+    """A plan after all frames were found.
+
+    plan: chosen episodes, and others with kept labels
+    before: existing label files
+    num_bytes: stored size by episode number
+    """
+
+    plan: Plan
+    before: Sequence[LabelFile]
+    num_bytes: Mapping[int, int]
+
+
+def check(plan: Plan, outputs: Outputs, watch: Watch = QUIET) -> CheckedPlan:
+    """Check everything that a run needs before the first score, also for labelled episodes. Write nothing.
+
+    Rows and checks may have changed since the labels were made. Raises DatasetError.
+    """
+    options, dataset = outputs.options, outputs.dataset
+    assert dataset is not None  # a run has one
+    before = outputs.before() if options.shard is None else []
+    plan = joined(plan, dataset, before, options.overwrite, watch)
+    if options.in_place:
+        for file in outputs.hdf5:
+            check_room(file, plan)
+    watch.checking(len(plan.items))
+    num_bytes = {}
+    with all_faults(dataset, options):
+        for item in plan.items:
+            num_bytes[item.episode.index] = sum(dataset.check(item.episode, camera) for camera in plan.recipe.cameras)
+            watch.checked(item.episode)
+    for line in dataset.frame_notes:
+        watch.note(line)
+    return CheckedPlan(plan, before, num_bytes)
+
+
+def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: bool, watch: Watch) -> Plan:
+    """Return the plan with all other episodes whose labels are in the files.
+
+    Raises DatasetError, without ``overwrite``, for a file whose labels would be lost or do not fit the frames.
+    """
+    known: Mapping[int, Item] = {item.episode.index: item for item in plan.items}
+    for file in files:
         try:
-            scores = episode_scores(self._dataset, item.episode, self._scorer, recipe, memory=memory, go_on=self._go_on)
-        except InferenceFailedError:  # the cause may be a new checkpoint
-            self._check_checkpoint()
-            raise
-        self._check_checkpoint()
-        self._parts.write(item, scores.columns, scores.blank)
-        with self._lock:
-            self._frames_scored += item.episode.num_frames
-
-    def _check_checkpoint(self) -> None:
-        """Stop the run and raise _StoppedError if another checkpoint is served now."""
-        try:
-            planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
-            for name in DECISIVE:
-                if getattr(now, name) != getattr(planned, name):
-                    raise InvalidSampleError.at(name, getattr(planned, name), getattr(now, name))
-        except InvalidSampleError as error:
-            self._stop(error)
-            raise _StoppedError from error
-
-    def _stop(self, cause: Exception) -> None:
-        with self._lock:
-            self._cause = self._cause or cause
-        self._stopping.set()
-
-    def _go_on(self) -> None:
-        if self._stopping.is_set():
-            raise _StoppedError
+            known = {**known, **file.check(plan, dataset, known)}
+        except DatasetError as error:
+            if not overwrite:
+                raise DatasetError(f"{error}: choose another {file.option}, or --overwrite") from error
+            lost = f"; its labels of {len(file.digests)} episodes are replaced" if file.digests else ""
+            watch.note(f"--overwrite: {error}{lost}")
+    if len(known) > len(plan.items):
+        watch.note(f"labels of {len(known) - len(plan.items)} other episodes are there, and are kept")
+    return replace(plan, items=[known[index] for index in sorted(known)])
 
 
-def unfinished(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
-    """Return the items without a part, and report the number of frames to ``watch``."""
+def earlier_cost(plan: Plan, files: Sequence[LabelFile]) -> Cost | None:
+    """Return the first cost that a file with labels of this plan tells; None: no such file does."""
+    digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
+    return next((file.cost for file in files if file.cost and digests & set(file.digests.values())), None)
+
+
+def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
+    """Write each missing part of the plan whose labels are in a file. Raises OSError."""
+    cameras = ("", *(f".{camera}" for camera in plan.recipe.cameras))
+    order = [name + camera for name in SCORES for camera in cameras]
     finished = parts.finished(plan.items)
-    watch.begin(plan.num_frames, sum(item.episode.num_frames for item in plan.items if item.key in finished))
-    return [item for item in plan.items if item.key not in finished]
-
-
-def by_episode(failures: Sequence[FailedEpisode]) -> list[FailedEpisode]:
-    """Return the failures in the order of their episodes."""
-    return sorted(failures, key=lambda failure: failure.episode.index)
+    for file in files:
+        missing = [item for item in plan.items if item.key not in finished]
+        gone = [item for item in missing if file.digests.get(item.episode.index) == item.digest]
+        for item, columns in file.read(gone) if gone else ():
+            scores = {name: columns[name] for name in order if name in columns}
+            of_all = [len(each) == item.episode.num_frames and np.isfinite(each).all() for each in scores.values()]
+            if of_all and all(of_all):
+                index = item.episode.index
+                parts.write(item, scores, {name: of[index] for name, of in file.blank.items() if index in of})
+                finished.add(item.key)

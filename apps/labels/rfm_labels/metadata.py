@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Metadata of label files: JSON, the cost of a run, and the blank cameras by episode."""
+"""What label files tell: the names of scores, JSON metadata, the cost of a run, the blank cameras by episode."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
+from rfm_client import Float32Array
 from rfm_client.frames import BlankFrames
 from rfm_labels.datasets.faults import listed
 
+Columns: TypeAlias = dict[str, Float32Array]
+PROGRESS, SUCCESS, LOG_PROB, UNCLEAR = "progress", "success", "log_prob", "unclear"
+SCORES = (PROGRESS, SUCCESS, LOG_PROB, UNCLEAR)  # in the order of columns
 BlankCameras: TypeAlias = Mapping[str, Mapping[int, int]]  # highest value of the frames, by camera and episode
 BLANK_KEY = b"rfm.blank_cameras"
+
 _MOST_LISTED = 12  # ranges of episodes in a line
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from rfm_client import FrameScores
 from rfm_client.recording import Recording
 from rfm_labels.datasets.dataset import Dataset
-from rfm_labels.episode_scores import PROGRESS, SUCCESS
 from rfm_labels.evaluation import LabelComparison
+from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.plan import Item, Plan
 from rfm_labels.summary import Summary
 from rfm_labels.writing import Parts

@@ -14,14 +14,15 @@ from typing import Any, TypeAlias
 
 from rfm_client import RewardError
 from rfm_labels.datasets.opening import open_dataset
-from rfm_labels.labelling import FailedEpisode, Report, Run, by_episode, put_together, unfinished
+from rfm_labels.labelling import Report, prepared, put_together
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, RayOptions, Watch
-from rfm_labels.outputs import prepared
 from rfm_labels.plan import Plan
 from rfm_labels.scorer import Scorer
+from rfm_labels.scoring import FailedEpisode, Run, by_episode, unfinished
 from rfm_labels.writing import Parts
 
 Connect: TypeAlias = Callable[[], AbstractContextManager[Scorer]]
+
 _BATCHES_AN_ACTOR = 4  # at least, if there are enough episodes: all actors then end at about the same time
 _ANY_CLUSTER = RayOptions()
 

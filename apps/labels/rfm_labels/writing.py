@@ -28,21 +28,32 @@ from typing import Any
 import numpy as np
 
 from rfm_labels.datasets.faults import DatasetError, require
-from rfm_labels.episode_scores import LOG_PROB, PROGRESS, SUCCESS, UNCLEAR, Columns
-from rfm_labels.metadata import Cost, blank_by_camera, blank_from_metadata, blank_to_metadata, canonical_json
+from rfm_labels.metadata import (
+    LOG_PROB,
+    PROGRESS,
+    SUCCESS,
+    UNCLEAR,
+    Columns,
+    Cost,
+    blank_by_camera,
+    blank_from_metadata,
+    blank_to_metadata,
+    canonical_json,
+)
 from rfm_labels.plan import Item, Plan
 
 IDENTITY = ("index", "episode_index", "frame_index")  # columns of every table of labels
-_DIGEST_KEY = b"rfm.digest"
-_SUFFIX = ".parquet"
 PROGRESS_ENDING = "_progress.parquet"
 PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run sees if its labels still hold
 COST_KEY = b"rfm.cost"  # apart from the provenance, which is equal for equal runs
+SIGNAL_NAMES = {PROGRESS: "progress", SUCCESS: "success_probability", LOG_PROB: "log_prob", UNCLEAR: "unclear"}
+
+_DIGEST_KEY = b"rfm.digest"
+_SUFFIX = ".parquet"
 _ROWS_AT_A_TIME = 2**17  # in a row group
 _TOTAL = "total"  # progress added up over the tasks of an episode
-SIGNAL_NAMES = {PROGRESS: "progress", SUCCESS: "success_probability", LOG_PROB: "log_prob", UNCLEAR: "unclear"}
 _DESCRIPTIONS = {
     PROGRESS: "Share of the task that is done",
     SUCCESS: "Probability that the task is done",

@@ -34,17 +34,16 @@ from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, req
 from rfm_labels.datasets.hdf5 import SUFFIXES
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.opening import hdf5_files, open_dataset
-from rfm_labels.episode_scores import FrameMemory, episode_scores
 from rfm_labels.hdf5_tables import dataset_stem, labels_in, own_file, stored_in
 from rfm_labels.label_files import read_blank
-from rfm_labels.labelling import Report
+from rfm_labels.labelling import Outputs, Report, check
 from rfm_labels.labelling import label as label_dataset
 from rfm_labels.metadata import blank_by_camera, blank_lines
 from rfm_labels.options import LabelOptions, RayOptions, Watch
-from rfm_labels.outputs import Outputs, check
 from rfm_labels.plan import Item, Plan, check_episodes, plan_labels, selected
 from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
+from rfm_labels.scoring import FrameMemory, episode_scores
 from rfm_labels.summary import Summary, summarise
 from rfm_labels.writing import Parts
 

@@ -23,8 +23,9 @@ from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.frame_names import in_order_of_numbers
 from rfm_labels.datasets.stored_files import Span, digest_of, faults_at, file_identity, turn_mark
 
-_FILES_AT_A_TIME = 4
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+_FILES_AT_A_TIME = 4
 _FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 _LEAVE_OUT = "remove it, or leave it out (--episodes)"
 

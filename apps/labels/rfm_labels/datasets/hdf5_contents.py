@@ -20,8 +20,9 @@ import numpy as np
 from rfm_client.options import first_names
 from rfm_labels.datasets.faults import DatasetError, require
 
-_DEMO = re.compile(r"demo_(\d+)")
 DOCUMENTS = ("problem_info", "env_args")  # attributes of ``data`` with a JSON object
+
+_DEMO = re.compile(r"demo_(\d+)")
 _SENTENCES = ("language_instruction", "language", "lang")  # keys of the task in problem_info and env_args
 _DEFAULT_FPS = 20.0  # robosuite's
 _BLOCKS = "%b"  # in a source's name: HDF5 then counts only the sources that exist

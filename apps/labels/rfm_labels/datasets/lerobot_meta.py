@@ -19,10 +19,11 @@ from rfm_labels.datasets.faults import DatasetError, require
 
 INFO_FILE = Path("meta", "info.json")
 VERSIONS = ("v2.0", "v2.1", "v3.0")
-_OF_PICTURES = ("info", "video_info")  # keys in a feature of a camera, by version of the writer
-_DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
 EPISODES_FILE = Path("meta", "episodes.jsonl")
 EPISODES_FOLDER = Path("meta", "episodes")
+
+_OF_PICTURES = ("info", "video_info")  # keys in a feature of a camera, by version of the writer
+_DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
 _OF_AN_EPISODE = (
     *("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"),
     *("data/chunk_index", "data/file_index"),

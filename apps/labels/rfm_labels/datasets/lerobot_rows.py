@@ -22,12 +22,13 @@ from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.lerobot_meta import Entry, Info, json_lines, number_in, read_table
 from rfm_labels.datasets.stored_files import digest_of
 
+TASK_COLUMN = "task_index"
+
 _ROW_COLUMNS = ("index", "episode_index", "frame_index", "timestamp")
 _TASKS = "tasks"  # key of the column that names the tasks
 _REGULAR_S, _FLOAT32 = 1e-4, 1e-7  # absolute and relative errors of a time stamp, a float32
 _FILES_AT_A_TIME = 4  # whose rows stay in memory
 _FOLLOW_THE_ROWS = "correct it, or follow the rows, as LeRobot's reader does: --task-column task_index"
-TASK_COLUMN = "task_index"
 _NUMBERS = re.compile(r"u?int\d+")
 _WHOLE_OR_NOT = re.compile(r"halffloat|float|double")  # numbers beside missing values
 _SENTENCES = re.compile(r"(dictionary<values=)?(large_)?string\b.*")
