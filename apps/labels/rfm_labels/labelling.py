@@ -74,6 +74,97 @@ def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = DEFAULTS, wa
     return put_together(plan, outputs, failures, run.cost or earlier, watch)
 
 
+def prepared(
+    dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
+) -> tuple[Outputs, Plan, Cost | None]:
+    """Make and check the plan, and restore parts from label files. Return the cost of the labels that exist, too."""
+    outputs = Outputs(options.output or dataset.root, options, dataset)
+    if options.shard is None:
+        outputs.make_folder()
+    checked = check(plan_labels(dataset, scorer, options, watch), outputs, watch)
+    restore(checked.plan, outputs.parts, checked.before)
+    return outputs, checked.plan, earlier_cost(checked.plan, checked.before)
+
+
+@dataclass(frozen=True)
+class CheckedPlan:
+    """A plan after all frames were found.
+
+    plan: chosen episodes, and others with kept labels
+    before: existing label files
+    num_bytes: stored size by episode number
+    """
+
+    plan: Plan
+    before: Sequence[LabelFile]
+    num_bytes: Mapping[int, int]
+
+
+def check(plan: Plan, outputs: Outputs, watch: Watch = QUIET) -> CheckedPlan:
+    """Check everything that a run needs before the first score, also for labelled episodes. Write nothing.
+
+    Rows and checks may have changed since the labels were made. Raises DatasetError.
+    """
+    options, dataset = outputs.options, outputs.dataset
+    assert dataset is not None  # a run has one
+    before = outputs.before() if options.shard is None else []
+    plan = joined(plan, dataset, before, options.overwrite, watch)
+    if options.in_place:
+        for file in outputs.hdf5:
+            check_room(file, plan)
+    watch.checking(len(plan.items))
+    num_bytes = {}
+    with all_faults(dataset, options):
+        for item in plan.items:
+            num_bytes[item.episode.index] = sum(dataset.check(item.episode, camera) for camera in plan.recipe.cameras)
+            watch.checked(item.episode)
+    for line in dataset.frame_notes:
+        watch.note(line)
+    return CheckedPlan(plan, before, num_bytes)
+
+
+def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: bool, watch: Watch) -> Plan:
+    """Return the plan with all other episodes whose labels are in the files.
+
+    Raises DatasetError, without ``overwrite``, for a file whose labels would be lost or do not fit the frames.
+    """
+    known: Mapping[int, Item] = {item.episode.index: item for item in plan.items}
+    for file in files:
+        try:
+            known = {**known, **file.check(plan, dataset, known)}
+        except DatasetError as error:
+            if not overwrite:
+                raise DatasetError(f"{error}: choose another {file.option}, or --overwrite") from error
+            lost = f"; its labels of {len(file.digests)} episodes are replaced" if file.digests else ""
+            watch.note(f"--overwrite: {error}{lost}")
+    if len(known) > len(plan.items):
+        watch.note(f"labels of {len(known) - len(plan.items)} other episodes are there, and are kept")
+    return replace(plan, items=[known[index] for index in sorted(known)])
+
+
+def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
+    """Write each missing part of the plan whose labels are in a file. Raises OSError."""
+    cameras = ("", *(f".{camera}" for camera in plan.recipe.cameras))
+    order = [name + camera for name in SCORES for camera in cameras]
+    finished = parts.finished(plan.items)
+    for file in files:
+        missing = [item for item in plan.items if item.key not in finished]
+        gone = [item for item in missing if file.digests.get(item.episode.index) == item.digest]
+        for item, columns in file.read(gone) if gone else ():
+            scores = {name: columns[name] for name in order if name in columns}
+            of_all = [len(each) == item.episode.num_frames and np.isfinite(each).all() for each in scores.values()]
+            if of_all and all(of_all):
+                index = item.episode.index
+                parts.write(item, scores, {name: of[index] for name, of in file.blank.items() if index in of})
+                finished.add(item.key)
+
+
+def earlier_cost(plan: Plan, files: Sequence[LabelFile]) -> Cost | None:
+    """Return the first cost that a file with labels of this plan tells; None: no such file does."""
+    digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
+    return next((file.cost for file in files if file.cost and digests & set(file.digests.values())), None)
+
+
 def put_together(
     plan: Plan, outputs: Outputs, failures: Sequence[FailedEpisode], cost: Cost | None, watch: Watch
 ) -> Report:
@@ -186,94 +277,3 @@ class Outputs:
             else:
                 in_hdf5.write(file)
         return [*(sidecar.path for sidecar in sidecars), *self.hdf5]
-
-
-def prepared(
-    dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
-) -> tuple[Outputs, Plan, Cost | None]:
-    """Make and check the plan, and restore parts from label files. Return the cost of the labels that exist, too."""
-    outputs = Outputs(options.output or dataset.root, options, dataset)
-    if options.shard is None:
-        outputs.make_folder()
-    checked = check(plan_labels(dataset, scorer, options, watch), outputs, watch)
-    restore(checked.plan, outputs.parts, checked.before)
-    return outputs, checked.plan, earlier_cost(checked.plan, checked.before)
-
-
-@dataclass(frozen=True)
-class CheckedPlan:
-    """A plan after all frames were found.
-
-    plan: chosen episodes, and others with kept labels
-    before: existing label files
-    num_bytes: stored size by episode number
-    """
-
-    plan: Plan
-    before: Sequence[LabelFile]
-    num_bytes: Mapping[int, int]
-
-
-def check(plan: Plan, outputs: Outputs, watch: Watch = QUIET) -> CheckedPlan:
-    """Check everything that a run needs before the first score, also for labelled episodes. Write nothing.
-
-    Rows and checks may have changed since the labels were made. Raises DatasetError.
-    """
-    options, dataset = outputs.options, outputs.dataset
-    assert dataset is not None  # a run has one
-    before = outputs.before() if options.shard is None else []
-    plan = joined(plan, dataset, before, options.overwrite, watch)
-    if options.in_place:
-        for file in outputs.hdf5:
-            check_room(file, plan)
-    watch.checking(len(plan.items))
-    num_bytes = {}
-    with all_faults(dataset, options):
-        for item in plan.items:
-            num_bytes[item.episode.index] = sum(dataset.check(item.episode, camera) for camera in plan.recipe.cameras)
-            watch.checked(item.episode)
-    for line in dataset.frame_notes:
-        watch.note(line)
-    return CheckedPlan(plan, before, num_bytes)
-
-
-def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: bool, watch: Watch) -> Plan:
-    """Return the plan with all other episodes whose labels are in the files.
-
-    Raises DatasetError, without ``overwrite``, for a file whose labels would be lost or do not fit the frames.
-    """
-    known: Mapping[int, Item] = {item.episode.index: item for item in plan.items}
-    for file in files:
-        try:
-            known = {**known, **file.check(plan, dataset, known)}
-        except DatasetError as error:
-            if not overwrite:
-                raise DatasetError(f"{error}: choose another {file.option}, or --overwrite") from error
-            lost = f"; its labels of {len(file.digests)} episodes are replaced" if file.digests else ""
-            watch.note(f"--overwrite: {error}{lost}")
-    if len(known) > len(plan.items):
-        watch.note(f"labels of {len(known) - len(plan.items)} other episodes are there, and are kept")
-    return replace(plan, items=[known[index] for index in sorted(known)])
-
-
-def earlier_cost(plan: Plan, files: Sequence[LabelFile]) -> Cost | None:
-    """Return the first cost that a file with labels of this plan tells; None: no such file does."""
-    digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
-    return next((file.cost for file in files if file.cost and digests & set(file.digests.values())), None)
-
-
-def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
-    """Write each missing part of the plan whose labels are in a file. Raises OSError."""
-    cameras = ("", *(f".{camera}" for camera in plan.recipe.cameras))
-    order = [name + camera for name in SCORES for camera in cameras]
-    finished = parts.finished(plan.items)
-    for file in files:
-        missing = [item for item in plan.items if item.key not in finished]
-        gone = [item for item in missing if file.digests.get(item.episode.index) == item.digest]
-        for item, columns in file.read(gone) if gone else ():
-            scores = {name: columns[name] for name in order if name in columns}
-            of_all = [len(each) == item.episode.num_frames and np.isfinite(each).all() for each in scores.values()]
-            if of_all and all(of_all):
-                index = item.episode.index
-                parts.write(item, scores, {name: of[index] for name, of in file.blank.items() if index in of})
-                finished.add(item.key)
