@@ -37,7 +37,7 @@ from rfm_client import (
 from rfm_client.contract import wire
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.episodes import Episode
-from rfm_client.frames.sampling import RULES, Rule, Sampling, of_prefixes, prefix_samples
+from rfm_client.frames.sampling import RULES, Rule, Sampling
 from rfm_client.transport.calls import Answer, GrpcTransport
 from rfm_client.transport.credentials import Credentials
 from rfm_serve import Serving, serving
@@ -55,8 +55,8 @@ def video(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array
 
 def offline(client: RewardClient, frames: UInt8Array, sampling: Sampling = FOUR, task: str = TASK) -> ProgressResult:
     """Each frame's score from the prefix that ends with it, all pixels sent."""
-    results = client.evaluate(list(prefix_samples(Trajectory(frames=frames, task=task), sampling)))
-    return of_prefixes([result for result in results if isinstance(result, ProgressResult)], sampling)
+    results = client.evaluate(list(sampling.samples(Trajectory(frames=frames, task=task))))
+    return sampling.joined([result for result in results if isinstance(result, ProgressResult)])
 
 
 def online(episode: Episode, frames: UInt8Array) -> tuple[list[float], list[float]]:

@@ -26,7 +26,6 @@ from gateways import free_port, inside
 from labelling import LEROBOT, BrightnessScorer
 from pictures import TURNS, turn
 from rfm_client.contract.settings import ConfigError
-from rfm_client.frames.orientation import Channels, Orient
 from rfm_gateway import GatewayConfig, check_gateway
 from rfm_labels import LabelOptions, label, open_dataset
 from rfm_labels.datasets.lerobot import LeRobotDataset
@@ -92,7 +91,7 @@ def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: 
 @pytest.mark.parametrize("form", ["progress", "signals"])
 def test_the_table_tells_how_pictures_became_upright_rgb_for_the_labels(tmp_path: Path, form: Format) -> None:
     root = copied("toy_v21", tmp_path)
-    corrected = open_dataset(root, orient=Orient.parse(["wrist=rotate180"]), channels=Channels("bgr"))
+    corrected = open_dataset(root, orient={"wrist": "rotate180"}, channels="bgr")
     label(corrected, BrightnessScorer(), LabelOptions(formats=(form,)))
     with serving(root) as get:
         front, wrist = get("/0").json()["corrections"]

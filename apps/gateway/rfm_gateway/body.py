@@ -10,6 +10,7 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, M
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
+from tokenize import TokenError
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -33,6 +34,7 @@ MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files
 MAX_ERRORS = 1000  # listed in an answer
 
 _format: Any = np.lib.format  # numpy declares no types for it
+_BROKEN_NPY = (ValueError, TypeError, LookupError, SyntaxError, TokenError, MemoryError, RecursionError)  # its errors
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _STEPS_FIELD = "use_frame_steps"
@@ -210,9 +212,7 @@ def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
     upload.file.seek(0)
     try:
         array: np.ndarray[Any, Any] = _format.read_array(upload.file, allow_pickle=False)
-    except OSError:  # of the upload's file
-        raise
-    except Exception as error:  # noqa: BLE001  numpy evaluates the header: a broken one raises errors of many classes
+    except _BROKEN_NPY as error:
         raise ValueError(f"expected a .npy file, got: {error}") from None
     if array.dtype.kind not in "biuf":
         raise ValueError(f"expected a .npy file of numbers, got {array.dtype}")

@@ -12,14 +12,12 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from rfm_client import InvalidSampleError, Trajectory, UInt8Array
-from rfm_client.frames import load_trajectory, upright_picture
+from rfm_client import InvalidSampleError, Trajectory, UInt8Array, load_trajectory
+from rfm_client.frames import ARRAY_SUFFIXES, Picture
 from rfm_gateway.body import Take
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-
-ARRAY_SUFFIXES = (".npy", ".npz")
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class RequestFiles:
             with self._image(name, f"frames.{index}") as image:
                 if image.height * image.width != num_pixels:  # known before it is decoded
                     raise others
-                pixels = np.asarray(upright_picture(image).convert("RGB"))
+                pixels = Picture(image).pixels()
             if index == 0:
                 frames = np.empty((len(names), *pixels.shape), np.uint8)
             if pixels.shape != frames.shape[1:]:

@@ -33,7 +33,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.frames import BlankFrames, Sampling, of_prefixes
+from rfm_client.frames import BlankFrames, Sampling
 from rfm_client.options import first_names
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
@@ -252,7 +252,7 @@ def _results(outcomes: Sequence[Sequence[Result | RewardError]]) -> list[Result]
     for error in failed.values():
         raise error
     results, whole = [cast("list[Result]", of_sample) for of_sample in outcomes], Sampling("all")
-    return [each[0] if len(each) == 1 else of_prefixes(cast("list[ProgressResult]", each), whole) for each in results]
+    return [each[0] if len(each) == 1 else whole.joined(cast("list[ProgressResult]", each)) for each in results]
 
 
 def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:

@@ -32,10 +32,21 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
     if not config.dataset:
         return []
     try:
-        from rfm_labels.datasets import is_hdf5
+        import pyarrow  # noqa: F401
+
+        from rfm_labels import DatasetError
+        from rfm_labels.datasets import Hdf5Dataset, open_to_show
         from rfm_page.datasets import ShownLeRobot
         from rfm_page.hdf5_datasets import ShownHdf5
     except ModuleNotFoundError as error:
         told = f"expected the package {error.name}, which reads it, got none: pip install ./apps/labels"
         raise ConfigError("dataset", told) from None
-    return [ShownHdf5.open(path) if is_hdf5(Path(path)) else ShownLeRobot.open(path) for path in config.dataset]
+    datasets: list[ShownDataset] = []
+    try:
+        for path in config.dataset:
+            dataset = open_to_show(path)
+            datasets.append(ShownHdf5(dataset) if isinstance(dataset, Hdf5Dataset) else ShownLeRobot(dataset))
+            datasets[-1].check()
+    except (DatasetError, ImportError) as error:
+        raise ConfigError("dataset", str(error)) from None
+    return datasets

@@ -35,7 +35,7 @@ from rfm_client import (
     RewardError,
     Trajectory,
 )
-from rfm_client.frames import BlankFrames, ChannelOrder, Orientation, Rule, Sampling, fitted, prefix_samples
+from rfm_client.frames import BlankFrames, ChannelOrder, Orientation, Rule, Sampling, resize_frames
 from rfm_client.serving import off_loop
 from rfm_gateway.mounting import GatewayConfig, PageHost, invalid, while_connected
 from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest
@@ -114,11 +114,12 @@ def viewer_routes(host: PageHost) -> APIRouter:
         about = {"num_frames": num_frames, "times_s": times_s, "sampled_frames": asked.sampling.frames}
         yield _event("video", **about, blank=blank or None)
         try:
-            sample = ProgressSample(video.trajectory)
-            size = asked.info.frame_size if asked.question.resize else None
-            fit = await asyncio.to_thread(fitted, sample, None, size)
+            trajectory, size = video.trajectory, asked.info.frame_size if asked.question.resize else None
+            if size is not None:
+                frames = await asyncio.to_thread(resize_frames, trajectory.positions, size)
+                trajectory = Trajectory(frames=frames, task=trajectory.task)
             async with config.client(asked.question.model) as client:
-                async for points in _curve(client, fit.sample.trajectories[0], asked):
+                async for points in _curve(client, trajectory, asked):
                     version = points["model_version"]
                     metrics.samples.labels("progress").inc(len(points["progress"]))
                     yield _event("scores", **points)
@@ -172,7 +173,7 @@ async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Aske
     sampling, frames = asked.sampling, trajectory.frames
     sample_bytes = max(sampling.frames or 0, len(frames)) * math.prod(frames.shape[1:])
     most = max(min(MOST_PREFIXES, MOST_BYTES // sample_bytes), 1)
-    samples, first, count = prefix_samples(trajectory, sampling), 0, 1
+    samples, first, count = sampling.samples(trajectory), 0, 1
 
     def following() -> list[ProgressSample]:
         return list(itertools.islice(samples, count))

@@ -21,6 +21,9 @@ from rfm_client import SUCCESS_THRESHOLD
 from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_labels import (
     Curve,
+    Dataset,
+    DatasetEpisode,
+    DatasetError,
     EpisodeLabels,
     Summary,
     find_label_files,
@@ -29,7 +32,6 @@ from rfm_labels import (
     stored_in,
     summarise,
 )
-from rfm_labels.datasets import Dataset, DatasetEpisode, DatasetError, unused_cameras
 
 Read = TypeVar("Read")
 
@@ -40,8 +42,7 @@ _SUMMARIES_AT_A_TIME = 8  # summaries in memory
 class ShownDataset(ABC):
     """A dataset for the page.
 
-    root: its folder, with links resolved
-    path: its folder or file
+    dataset: as ``open_to_show`` returns it
     has_stored_pixels: True: its videos have every pixel as stored; False: they are encoded for the page
 
     Its methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
@@ -49,9 +50,17 @@ class ShownDataset(ABC):
 
     has_stored_pixels: ClassVar[bool]
 
-    root: Path
-    path: Path
     dataset: Dataset
+
+    @property
+    def root(self) -> Path:
+        """The folder, with links resolved."""
+        return self.dataset.root
+
+    @property
+    def path(self) -> Path:
+        """The folder or file."""
+        return self.root
 
     @abstractmethod
     def check(self) -> None:
@@ -92,12 +101,12 @@ class ShownDataset(ABC):
     def table(self, labels: str | None) -> dict[str, Any]:
         """Return a row for each episode, with a summary of its labels.
 
-        ``unused`` has what each camera shows instead of colours, as in ``unused_cameras``; null: it shows colours.
+        ``unused`` has what each camera shows instead of colours (``Dataset.unused_cameras``); null: colours.
         """
         file = self._labels(labels)
         status = None if file is None else stored_in(file).stat()
         summary = None if file is None or status is None else _summary(file, status.st_mtime_ns)
-        unused = unused_cameras(self.dataset, self.dataset.cameras)
+        unused = self.dataset.unused_cameras(self.dataset.cameras)
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
         return {
             "labels": None if file is None else self._name_of(file),
@@ -123,7 +132,7 @@ class ShownDataset(ABC):
     def faults(self) -> dict[str, str]:
         """Return the fault of each episode that cannot be labelled now, by number, as ``rfm-client label`` tells it."""
         found = {}
-        unused = unused_cameras(self.dataset, self.cameras)
+        unused = self.dataset.unused_cameras(self.cameras)
         cameras = [camera for camera in self.cameras if camera not in unused]
         for episode in self.dataset.episodes:
             try:

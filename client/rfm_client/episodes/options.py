@@ -16,7 +16,7 @@ from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.contract.samples import Float32Array, UInt8Array
 from rfm_client.frames.camera_fusion import FUSES, Fuse
-from rfm_client.frames.orientation import ChannelOrder, Channels, Correction, Corrections, Orient, Orientation
+from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.sampling import Rule, Sampling
 
 
@@ -154,15 +154,15 @@ class EpisodeOptions:
         Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one for all frames, as cameras names none"
-        for given in (Orient.of(self.orient), Channels.of(self.channels)):
-            unknown = [repr(camera) for camera in given.cameras if camera not in self.cameras]
-            require(given.NAME, not unknown, expected, ", ".join(unknown))
+        for name, given in (("orient", self.orient), ("channels", self.channels)):
+            unknown = [] if isinstance(given, str) else [repr(each) for each in given if each not in cameras]
+            require(name, not unknown, expected, ", ".join(unknown))
+        self.corrections  # noqa: B018  raises ValueError for an unknown value
 
     @property
     def corrections(self) -> list[Correction]:
         """Correction of each camera's frames, in the order of the cameras."""
-        given = Corrections(Orient.of(self.orient), Channels.of(self.channels))
-        return [given.of(camera) for camera in self.cameras or ("",)]
+        return [Correction.of(camera, self.orient, self.channels) for camera in self.cameras or ("",)]
 
     def sampling_for(self, info: ModelInfo) -> Sampling:
         """Return the rule with its number of frames for a checkpoint.

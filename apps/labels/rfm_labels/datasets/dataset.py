@@ -6,7 +6,6 @@ T frames of an episode, H x W pixels.
 
 from __future__ import annotations
 
-import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,50 +16,13 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 
 from rfm_client import RewardError, Trajectory, UInt8Array
-from rfm_client.frames import Correction, Corrections, Orientation, PerCamera, Value
+from rfm_client.frames import Correction
 from rfm_client.options import is_blank
-from rfm_client.options import require as require_that
-from rfm_labels.datasets.camera_names import word_of_no_colours
-from rfm_labels.datasets.faults import fault_lines
+from rfm_labels.datasets.cameras import camera_named, word_of_no_colours
+from rfm_labels.datasets.faults import DatasetError, FaultsError, MissingTaskError, UnusedTaskError, require
 
 SIGNALS_FOLDER = "reward_signals"  # folder of labels in a dataset's folder
-
 SeveralTasks: TypeAlias = Literal["each", "first"]
-
-_CAMERA_PREFIX = "observation.images."
-
-
-class DatasetError(RewardError, ValueError):
-    """A contradictory or unreadable dataset, reported as ``where: expected X, got Y``."""
-
-    @classmethod
-    def at(cls, where: object, expected: str, got: object) -> DatasetError:
-        """Return the error at a file, or at a place in it."""
-        return cls(f"{where}: expected {expected}, got {got}")
-
-
-class MissingTaskError(DatasetError):
-    """An episode without a task."""
-
-
-class UnusedTaskError(DatasetError):
-    """A task of the caller that no episode needs."""
-
-
-class FaultsError(DatasetError):
-    """Several faults, one per line, then the options that help."""
-
-    @classmethod
-    def of(cls, faults: Mapping[int, RewardError], numbers: Sequence[int]) -> FaultsError:
-        """Return the error of these episodes. numbers: of all chosen episodes"""
-        without_task = [fault for fault in faults.values() if isinstance(fault, MissingTaskError)]
-        messages = {number: str(fault) for number, fault in faults.items()}
-        return cls("\n".join(fault_lines(messages, numbers, len(without_task))))
-
-
-def require(where: object, condition: bool, expected: str, got: object) -> None:
-    """Raise DatasetError unless the condition holds."""
-    require_that(where, condition, expected, got, DatasetError)
 
 
 @dataclass(frozen=True)
@@ -209,6 +171,37 @@ class Dataset(ABC):
         """Return ``cameras`` and ``left_out`` of these episodes alone. Raises DatasetError if they share no camera."""
         return self.cameras, self.left_out
 
+    def chosen_cameras(self, names: Iterable[str] = (), numbers: Sequence[int] | None = None) -> tuple[str, ...]:
+        """Return the cameras of these names; without names, all but those in ``unused_cameras``.
+
+        numbers: episodes that need the cameras; None: all
+
+        A name may omit LeRobot's ``observation.images.``. Raises DatasetError for an unknown camera, or if none is
+        named and none is used without.
+        """
+        cameras, left_out = self.cameras_in(self.numbers if numbers is None else numbers)
+        some = f"some of {', '.join(cameras)}"
+        chosen = []
+        for name in names:
+            camera = camera_named(name, cameras)
+            if camera is None:
+                reason = f", which is left out: {left_out[name]}" if name in left_out else ""
+                raise DatasetError.at("cameras", some, f"{name!r}{reason}")
+            chosen.append(camera)
+        unused = self.unused_cameras(cameras)
+        chosen = chosen or [camera for camera in cameras if camera not in unused]
+        kinds = " and ".join(dict.fromkeys(unused.values()))
+        require("cameras", bool(chosen or not cameras), f"{some} named: all are {kinds} cameras", "none")
+        return tuple(chosen)
+
+    def unused_cameras(self, cameras: Sequence[str]) -> Mapping[str, str]:
+        """Return which of these cameras are used only if named, and what they show instead of colours, as ``depth``.
+
+        The dataset marks a depth camera, or a word in the name of the camera says so.
+        """
+        named = {camera: word for camera in cameras if (word := word_of_no_colours(camera))}
+        return named | {camera: "depth" for camera in cameras if camera in self.depth_cameras}
+
     @abstractmethod
     def decoder(self, camera: str) -> str | None:
         """Return the library that decodes the camera's frames, with its version; None: they are stored as pixels."""
@@ -238,86 +231,18 @@ class Dataset(ABC):
         return (correction.applied(frame) for frame in self.stored_frames(episode, camera))
 
 
-def chosen_cameras(dataset: Dataset, names: Iterable[str], numbers: Sequence[int] | None = None) -> tuple[str, ...]:
-    """Return the dataset's cameras of these names; without names, all but those in ``unused_cameras``.
-
-    numbers: episodes that need the cameras; None: all
-
-    A name may omit LeRobot's ``observation.images.``. Raises DatasetError for an unknown camera, or if none is named
-    and none is used without.
-    """
-    cameras, left_out = dataset.cameras_in(dataset.numbers if numbers is None else numbers)
-    some = f"some of {', '.join(cameras)}"
-    chosen = []
-    for name in names:
-        camera = _camera_named(name, cameras)
-        if camera is None:
-            reason = f", which is left out: {left_out[name]}" if name in left_out else ""
-            raise DatasetError.at("cameras", some, f"{name!r}{reason}")
-        chosen.append(camera)
-    unused = unused_cameras(dataset, cameras)
-    chosen = chosen or [camera for camera in cameras if camera not in unused]
-    kinds = " and ".join(dict.fromkeys(unused.values()))
-    require("cameras", bool(chosen or not cameras), f"{some} named: all are {kinds} cameras", "none")
-    return tuple(chosen)
-
-
-def unused_cameras(dataset: Dataset, cameras: Sequence[str]) -> Mapping[str, str]:
-    """Return which of these cameras are used only if named, and what they show instead of colours, such as ``depth``.
-
-    The dataset marks a depth camera, or a word in the name of the camera says so.
-    """
-    named = {camera: word for camera in cameras if (word := word_of_no_colours(camera))}
-    return named | {camera: "depth" for camera in cameras if camera in dataset.depth_cameras}
-
-
-def corrections_of(
-    given: Corrections, cameras: Sequence[str], turns: Mapping[str, Orientation] | None = None
-) -> Mapping[str, Correction]:
-    """Return the correction of each camera whose frames change. Raises DatasetError for an unknown camera.
-
-    turns: orientations of cameras for which the caller gives none
-    """
-    orient, channels = _by_camera(given.orient, cameras, turns or {}), _by_camera(given.channels, cameras, {})
-    found = {camera: Correction(orient.get(camera, "none"), channels.get(camera, "rgb")) for camera in cameras}
-    return {camera: correction for camera, correction in found.items() if correction != Correction()}
-
-
-def _by_camera(given: PerCamera[Value], cameras: Sequence[str], defaults: Mapping[str, Value]) -> Mapping[str, Value]:
-    asked = dict(defaults) if given.default is None else dict.fromkeys(cameras, given.default)
-    for name, value in given.cameras.items():
-        camera = _camera_named(name, cameras)
-        if camera is None:
-            raise DatasetError.at(given.NAME, f"one of the cameras {', '.join(cameras)}", repr(name))
-        asked[camera] = value
-    return asked
-
-
-def _camera_named(name: str, cameras: Sequence[str]) -> str | None:
-    return next((known for known in cameras if known in (name, _CAMERA_PREFIX + name)), None)
-
-
 def iter_episodes(
     dataset: Dataset, cameras: Sequence[str] | None = None
 ) -> Iterator[tuple[DatasetEpisode, Mapping[str, Trajectory]]]:
     """Yield each episode with its trajectory from each camera. Raises DatasetError.
 
-    cameras: some of the dataset's; None: as ``chosen_cameras`` without names
+    cameras: some of the dataset's; None: as ``Dataset.chosen_cameras`` without names
 
     Only one episode's frames are in memory at a time.
     """
-    names = chosen_cameras(dataset, cameras or ())
+    names = dataset.chosen_cameras(cameras or ())
     for episode in dataset.episodes:
         for camera in names:
             dataset.check(episode, camera)
         videos = {camera: np.stack(list(dataset.frames(episode, camera))) for camera in names}
         yield episode, {camera: Trajectory(frames=video, task=episode.task) for camera, video in videos.items()}
-
-
-def digest_of(parts: Iterable[bytes]) -> str:
-    """Return a digest of the parts and of the bounds between them."""
-    digest = hashlib.blake2b(digest_size=16)
-    for part in parts:
-        digest.update(len(part).to_bytes(8, "little"))
-        digest.update(part)
-    return digest.hexdigest()

@@ -1,31 +1,164 @@
 # SPDX-License-Identifier: MIT
-"""Labels of one episode: decode each camera's frames once, score them, fuse the scores. T frames, H x W pixels."""
+"""Score the episodes of a plan that have no part yet, several at a time. T frames, H x W pixels.
+
+Each camera of an episode is decoded once, its frames are scored, and the scores of the cameras are fused.
+"""
 
 from __future__ import annotations
 
 import itertools
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from traceback import clear_frames
-from typing import TypeAlias
+from typing import Any
 
 import numpy as np
 
-from rfm_client import Float32Array, InferenceFailedError, ProgressResult, ProgressSample, Trajectory, UInt8Array
-from rfm_client.frames import FUSES, BlankFrames, of_prefixes, prefix_samples, resize_frames
-from rfm_labels.datasets.protocol import Dataset, DatasetEpisode, require
-from rfm_labels.plan import Recipe
-from rfm_labels.scorer import Scorer
+from rfm_client import (
+    AccessDeniedError,
+    DeadlineExceededError,
+    Float32Array,
+    InferenceFailedError,
+    InvalidSampleError,
+    ModelNotFoundError,
+    ProcessEndedError,
+    ProgressResult,
+    ProgressSample,
+    RewardError,
+    ServerUnavailableError,
+    Trajectory,
+    UInt8Array,
+)
+from rfm_client.frames import BlankFrames, resize_frames
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
+from rfm_labels.datasets.faults import require
+from rfm_labels.metadata import SCORES, SUCCESS, UNCLEAR, Columns, Cost
+from rfm_labels.options import Watch
+from rfm_labels.plan import Item, Plan, Recipe
+from rfm_labels.scorer import DECISIVE, Scorer
+from rfm_labels.writing import Parts
 
-Columns: TypeAlias = dict[str, Float32Array]
-
-PROGRESS, SUCCESS, LOG_PROB, UNCLEAR = "progress", "success", "log_prob", "unclear"
-SCORES = (PROGRESS, SUCCESS, LOG_PROB, UNCLEAR)  # in the order of columns
 FRAMES_AT_A_TIME = 64  # in a request to the encoder, as in its forward pass
 MAX_BYTES = 32 * 2**20  # of the samples in one call of the scorer
 MAX_FRAME_BYTES = 2 * 2**30  # of all workers of a process
+
+_NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNotFoundError, AccessDeniedError)
+
+
+@dataclass(frozen=True)
+class FailedEpisode:
+    """An episode without labels, and the reason."""
+
+    episode: DatasetEpisode
+    error: RewardError
+
+
+class _StoppedError(RewardError):
+    """The run is stopping; the next run labels the episode."""
+
+
+class Run:
+    """The labelling of a plan with threads of this process."""
+
+    def __init__(self, plan: Plan, dataset: Dataset, scorer: Scorer, parts: Parts, watch: Watch) -> None:
+        self._plan, self._dataset, self._scorer, self._parts, self._watch = plan, dataset, scorer, parts, watch
+        self._memory = FrameMemory()
+        self._stopping = threading.Event()
+        self._lock = threading.Lock()
+        self._failures: list[FailedEpisode] = []
+        self._cause: Exception | None = None
+        self._frames_scored, self._seconds = 0, 0.0
+
+    @property
+    def cost(self) -> Cost | None:
+        """What ``finish_all`` scored, and its time; None: it scored nothing."""
+        return Cost(self._frames_scored, self._seconds) if self._frames_scored else None
+
+    def finish_all(self, workers: int) -> list[FailedEpisode]:
+        """Label all items without a part, ``workers`` at a time, and return the failures.
+
+        Raises, once the episodes in progress have ended, RewardError if the server is gone, OSError for a full disk.
+        """
+        pending = unfinished(self._plan, self._parts, self._watch)
+        began_s = time.monotonic()
+        with ThreadPoolExecutor(workers, thread_name_prefix="rfm-label") as pool:
+            try:
+                list(pool.map(self._label, pending))
+            except BaseException:
+                self._stopping.set()
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        self._seconds = time.monotonic() - began_s
+        if self._cause is not None:
+            raise self._cause
+        return by_episode(self._failures)
+
+    def _label(self, item: Item) -> None:
+        try:
+            self._go_on()
+            if not self._parts.has(item):  # another process may have finished it
+                self._score(item)
+            self._watch.scored(item.episode)
+        except _StoppedError:
+            return
+        except RewardError as error:
+            is_of_one = isinstance(error, ProcessEndedError)  # at both tries of the client
+            if isinstance(error, _NOT_ABOUT_ONE_EPISODE) and not is_of_one:
+                self._stop(error)
+                return
+            with self._lock:
+                self._failures.append(FailedEpisode(item.episode, error))
+            self._watch.failed(item.episode, error)
+        except (OSError, ImportError) as error:
+            self._stop(error)
+
+    def _score(self, item: Item) -> None:
+        recipe, memory = self._plan.recipe, self._memory
+        try:
+            scores = episode_scores(self._dataset, item.episode, self._scorer, recipe, memory=memory, go_on=self._go_on)
+        except InferenceFailedError:  # the cause may be a new checkpoint
+            self._check_checkpoint()
+            raise
+        self._check_checkpoint()
+        self._parts.write(item, scores.columns, scores.blank)
+        with self._lock:
+            self._frames_scored += item.episode.num_frames
+
+    def _check_checkpoint(self) -> None:
+        """Stop the run and raise _StoppedError if another checkpoint is served now."""
+        try:
+            planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
+            for name in DECISIVE:
+                if getattr(now, name) != getattr(planned, name):
+                    raise InvalidSampleError.at(name, getattr(planned, name), getattr(now, name))
+        except InvalidSampleError as error:
+            self._stop(error)
+            raise _StoppedError from error
+
+    def _stop(self, cause: Exception) -> None:
+        with self._lock:
+            self._cause = self._cause or cause
+        self._stopping.set()
+
+    def _go_on(self) -> None:
+        if self._stopping.is_set():
+            raise _StoppedError
+
+
+def unfinished(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
+    """Return the items without a part, and report the number of frames to ``watch``."""
+    finished = parts.finished(plan.items)
+    watch.begin(plan.num_frames, sum(item.episode.num_frames for item in plan.items if item.key in finished))
+    return [item for item in plan.items if item.key not in finished]
+
+
+def by_episode(failures: Sequence[FailedEpisode]) -> list[FailedEpisode]:
+    """Return the failures in the order of their episodes."""
+    return sorted(failures, key=lambda failure: failure.episode.index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +246,7 @@ def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: Dataset
         if name == SUCCESS and all(np.isnan(score).all() for score in scores):
             continue
         _check_numbers(name, scores, episode)
-        fuse = np.max if name == UNCLEAR else FUSES[recipe.fuse]
+        fuse: Any = np.max if name == UNCLEAR else getattr(np, recipe.fuse)  # mean, min or max
         columns[name] = np.asarray(fuse(np.stack(scores), axis=0), np.float32)
         if len(by_camera) > 1:
             columns |= {f"{name}.{camera}": score for camera, score in zip(by_camera, scores, strict=True)}
@@ -125,11 +258,10 @@ def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Calla
         (result,) = scorer.evaluate([ProgressSample(trajectory)])
         return result
     results: list[ProgressResult] = []
-    samples = prefix_samples(trajectory, recipe.sampling)
-    for together in _by_bytes(samples):
+    for together in _by_bytes(recipe.sampling.samples(trajectory)):
         go_on()
         results += scorer.evaluate(together)
-    return of_prefixes(results, recipe.sampling)
+    return recipe.sampling.joined(results)
 
 
 def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], None]) -> Iterator[UInt8Array]:
