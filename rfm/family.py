@@ -113,8 +113,7 @@ class Description:
     frame_size: the size to which the checkpoint resizes each raw frame; None: it depends on the frame
     frames_per_value: consecutive frames with one score
     keeps_features: it can cache features of frames, and then takes samples with frame references
-    has_log_prob: progress comes with a log-probability of each frame
-    marks_unclear: progress comes with a mark of each frame whose written answer is unclear
+    more_scores: scores of frames that it gives beside progress, success and progress bins: fields of ``FrameScores``
     needs_whole_episode: its scores are relative to the whole episode, so dense mode and online use are refused
     may_not_answer: its answer may hold no score, also on blank frames; so it gets no warm-up, because Triton does not
         load a model whose warm-up fails
@@ -138,8 +137,7 @@ class Description:
     is_large: bool = False
     has_preference: bool = True
     has_success: bool = True
-    has_log_prob: bool = False
-    marks_unclear: bool = False
+    more_scores: tuple[str, ...] = ()
     needs_whole_episode: bool = False
     may_not_answer: bool = False
     kind: str = ""

@@ -104,7 +104,7 @@ def generated_models(
     # A frame reference needs the cache that holds the frame, but Triton chooses the instance: so only one may exist.
     has_one_cache = cache_mib > 0 and version.num_gpus <= 1
     bins = description.progress_bins if description.progress_bins > 1 else None
-    outputs = wire.score_outputs(bins, has_log_prob=description.has_log_prob, marks_unclear=description.marks_unclear)
+    outputs = wire.score_outputs(bins, description.more_scores)
     inputs = wire.frame_inputs(by_digest=keeps and has_one_cache) if widths is None else wire.embedding_inputs(*widths)
     about = {**_limits(description, description.frame_size), **version.about}
     scorer = Interface(scorer_name(description, name), inputs, outputs, about)

@@ -52,7 +52,7 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
             has_preference=False,
             has_success=False,
             may_not_answer=not self.config.is_expected,
-            marks_unclear=not self.config.is_expected,
+            more_scores=() if self.config.is_expected else ("unclear",),
             kind="RoboReward, expected value of the score" if self.config.is_expected else "RoboReward",
         )
 

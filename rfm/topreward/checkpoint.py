@@ -68,7 +68,7 @@ class TopRewardCheckpoint(LanguageCheckpoint):
             asks_in_words=True,
             has_preference=False,
             has_success=False,
-            has_log_prob=True,
+            more_scores=("log_prob",),
             needs_whole_episode=True,
             kind=f"TOPReward, as {'LeRobot' if self.config.variant == 'lerobot' else 'Robometer'} computes it",
         )

@@ -297,14 +297,17 @@ def _prefixes(sample: Sample) -> list[Sample]:
 
 
 def _joined(outcomes: Sequence[Result | RewardError]) -> Result | RewardError:
-    """Return the last score of each prefix, or the first error; a single outcome as it is."""
+    """Return the last scores of each prefix, or the first error; a single outcome as it is.
+
+    Raises InferenceFailedError if several versions of the checkpoint answered.
+    """
     if len(outcomes) == 1:
         return outcomes[0]
-    results = [outcome for outcome in outcomes if isinstance(outcome, ProgressResult)]
-    if len(results) < len(outcomes):
-        return next(outcome for outcome in outcomes if isinstance(outcome, RewardError))
-    progress, success = (np.array([getattr(each, name)[-1] for each in results]) for name in ("progress", "success"))
-    return ProgressResult(progress=progress, success=success, model_version=results[-1].model_version)
+    error = next((outcome for outcome in outcomes if isinstance(outcome, RewardError)), None)
+    if error is not None:
+        return error
+    newest = slice(-1, None)
+    return ProgressResult.of_parts([each.at(newest) for each in outcomes if isinstance(each, ProgressResult)])
 
 
 def _has_embeddings(trajectory: schema.TrajectoryInput) -> bool:

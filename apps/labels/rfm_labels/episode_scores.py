@@ -13,7 +13,16 @@ from typing import TypeAlias
 
 import numpy as np
 
-from rfm_client import Float32Array, InferenceFailedError, ProgressResult, ProgressSample, Trajectory, UInt8Array
+from rfm_client import (
+    FRAME_SCORES,
+    Float32Array,
+    FrameScores,
+    InferenceFailedError,
+    ProgressResult,
+    ProgressSample,
+    Trajectory,
+    UInt8Array,
+)
 from rfm_client.frames import FUSES, BlankFrames, of_prefixes, prefix_samples, resize_frames
 from rfm_labels.datasets.protocol import Dataset, DatasetEpisode, require
 from rfm_labels.plan import Recipe
@@ -21,8 +30,8 @@ from rfm_labels.scorer import Scorer
 
 Columns: TypeAlias = dict[str, Float32Array]
 
-PROGRESS, SUCCESS, LOG_PROB, UNCLEAR = "progress", "success", "log_prob", "unclear"
-SCORES = (PROGRESS, SUCCESS, LOG_PROB, UNCLEAR)  # in the order of columns
+PROGRESS, SUCCESS = "progress", "success"
+SCORES = {name: score for name, score in FRAME_SCORES.items() if not score.is_per_bin}  # in the order of columns
 FRAMES_AT_A_TIME = 64  # in a request to the encoder, as in its forward pass
 MAX_BYTES = 32 * 2**20  # of the samples in one call of the scorer
 MAX_FRAME_BYTES = 2 * 2**30  # of all workers of a process
@@ -76,8 +85,8 @@ def episode_scores(
 ) -> EpisodeScores:
     """Return the scores of an episode, and its cameras that show nothing. Raises RewardError.
 
-    Columns: ``progress``, and ``success``, ``log_prob`` and ``unclear`` (1: unclear, of any camera) if the checkpoint
-    gives them. Several cameras add ``progress.<camera>`` and so on.
+    Columns: ``progress``, and each other score of ``SCORES`` that the checkpoint gives; a mark is 1 if a camera's is.
+    Several cameras add ``progress.<camera>`` and so on.
 
     memory: shared by all workers, for the frames of one camera at a time; unused if the checkpoint encodes frames
     go_on: called between requests; its exception ends the episode
@@ -105,15 +114,14 @@ def episode_scores(
 
 def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: DatasetEpisode, recipe: Recipe) -> Columns:
     columns: Columns = {}
-    for name in SCORES:
-        parts = [[getattr(result, name) for result in results] for results in by_camera.values()]
-        if parts[0][0] is None:
-            continue
-        scores = [np.concatenate(of_camera).astype(np.float32, copy=False) for of_camera in parts]
-        if name == SUCCESS and all(np.isnan(score).all() for score in scores):
+    cameras = [FrameScores.joined(results).arrays for results in by_camera.values()]
+    for name, about in SCORES.items():
+        scores = [np.asarray(of_camera.get(name, ()), np.float32) for of_camera in cameras]
+        is_unknown = about.may_be_unknown and all(np.isnan(score).all() for score in scores)
+        if is_unknown or not any(name in of_camera for of_camera in cameras):
             continue
         _check_numbers(name, scores, episode)
-        fuse = np.max if name == UNCLEAR else FUSES[recipe.fuse]
+        fuse = np.max if about.mark else FUSES[recipe.fuse]
         columns[name] = np.asarray(fuse(np.stack(scores), axis=0), np.float32)
         if len(by_camera) > 1:
             columns |= {f"{name}.{camera}": score for camera, score in zip(by_camera, scores, strict=True)}

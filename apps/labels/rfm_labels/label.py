@@ -10,7 +10,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from rfm_client import unclear_answers
 from rfm_labels import blank_cameras
 from rfm_labels.cost import Cost
 from rfm_labels.datasets.hdf5 import Hdf5Dataset
@@ -24,7 +23,7 @@ from rfm_labels.datasets.protocol import (
     unused_cameras,
 )
 from rfm_labels.datasets.sentences import identifiers_told
-from rfm_labels.episode_scores import UNCLEAR
+from rfm_labels.episode_scores import SCORES
 from rfm_labels.finished_episodes import IDENTITY, Parts
 from rfm_labels.hdf5_labels import Hdf5Labels, check_room, hdf5_labels
 from rfm_labels.hdf5_tables import own_file
@@ -302,8 +301,9 @@ def _put_together(
     for line in blank_cameras.lines(blank, len(plan.items)):
         watch.note(line)
     files = outputs.write(plan, labels, cost, watch)
-    if UNCLEAR in labels.column_names and (marks := labels[UNCLEAR].to_numpy()).any():
-        watch.note(f"{unclear_answers(marks)}; the column {UNCLEAR} marks them")
+    for name, score in SCORES.items():
+        if name in labels.column_names and (told := score.told(labels[name].to_numpy())):
+            watch.note(f"{told}; the column {name} marks them")
     assert outputs.dataset is not None  # ``_begin`` sets it
     num_episodes = len(outputs.dataset.numbers)
     if len(plan.items) < num_episodes:

@@ -28,7 +28,7 @@ from rfm_labels.blank_cameras import BLANK_KEY, BlankCameras, from_metadata
 from rfm_labels.cost import Cost
 from rfm_labels.datasets.lerobot_rows import INFO_FILE
 from rfm_labels.datasets.protocol import SIGNALS_FOLDER, DatasetError, require
-from rfm_labels.episode_scores import LOG_PROB, PROGRESS, SUCCESS, UNCLEAR, Columns
+from rfm_labels.episode_scores import PROGRESS, SCORES, SUCCESS, Columns
 from rfm_labels.finished_episodes import IDENTITY, whole_file
 from rfm_labels.hdf5_tables import (
     BLANK,
@@ -52,13 +52,7 @@ _ROWS_AT_A_TIME = 2**17  # in a row group
 _OWN_NAME = "rfm"  # default of ``LabelOptions.name``
 _PROGRESS_NAMES = ("progress", "progress_sparse", "progress_dense")
 _TOTAL = "total"  # progress added up over the tasks of an episode
-_SIGNAL_NAMES = {PROGRESS: "progress", SUCCESS: "success_probability", LOG_PROB: "log_prob", UNCLEAR: "unclear"}
-_DESCRIPTIONS = {
-    PROGRESS: "Share of the task that is done",
-    SUCCESS: "Probability that the task is done",
-    LOG_PROB: "Logarithm of the probability that the frames so far complete the task",
-    UNCLEAR: "1 where the model's written answer states no single whole score",
-}
+_SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability"}
 
 
 @dataclass(frozen=True)
@@ -139,11 +133,12 @@ def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
 
 
 def _descriptor(column: str) -> dict[str, Any]:
-    score, _, camera = column.partition(".")
+    name, _, camera = column.partition(".")
+    score = SCORES[name]
     return {
-        "description": _DESCRIPTIONS[score] + (f", seen by {camera}" if camera else ""),
-        "direction": "lower" if score == UNCLEAR else "higher",
-        "bounds": [None, 0.0] if score == LOG_PROB else [0.0, 1.0],
+        "description": score.meaning + (f", seen by {camera}" if camera else ""),
+        "direction": "higher" if score.higher_is_better else "lower",
+        "bounds": [*score.bounds],
         "unit": None,
         "missing_values": "forbidden",
         "allow_nan": False,  # the same in another revision of the proposal

@@ -248,7 +248,7 @@ def _evaluate(
     # Of an episode as a whole, all frames are shown at once.
     if prefix.sampling is None or (info.needs_whole_episode and prefix.sampling == "all"):
         asked = replace(sent, frame_steps=prefix.frame_steps)
-        (result,) = client.evaluate([asked], log_prob=info.has_log_prob)
+        (result,) = client.evaluate([asked], all_scores=True)
         return cast(ProgressResult, with_frame_indices(result, fit.frame_indices))
     info.check_scores_prefixes()
     try:
@@ -258,7 +258,7 @@ def _evaluate(
     samples = prefix_samples(sent.trajectory, sampling)
     results: list[Result] = []
     while part := list(itertools.islice(samples, PREFIXES_AT_A_TIME)):
-        results += client.evaluate(part)
+        results += client.evaluate(part, all_scores=True)
     told = of_prefixes(cast("list[ProgressResult]", results), sampling)
     return cast(ProgressResult, with_frame_indices(told, fit.frame_indices))
 

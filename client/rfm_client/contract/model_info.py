@@ -11,6 +11,7 @@ from typing import Any
 from rfm_client.contract import wire
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.results import FRAME_SCORES
 
 MAX_FRAMES_PARAMETER = "max_frames"  # parameters of config.pbtxt; empty: unknown
 FRAME_SIZE_PARAMETER = "frame_size"
@@ -55,8 +56,7 @@ class ModelInfo:
     kind: name of the reward model, such as TOPReward; None: unknown
     license: licence of the weights, by the checkpoint's model card or config.json; None: unknown
     lacks: which of success, preference and similarity the checkpoint does not give; None: unknown
-    has_log_prob: True if it gives log-probabilities (``log_prob=True`` of a call)
-    marks_unclear: True if its results mark unclear written answers (``unclear``)
+    scores: names of the scores of frames that it gives, which are fields of ``FrameScores``
     needs_whole_episode: True if its scores are relative to the whole episode, so it cannot score while one runs
     weights_difference: largest difference of progress from the full checkpoint's, which the export measured on noise
         when it rounded weights; None: not measured
@@ -84,8 +84,7 @@ class ModelInfo:
     kind: str | None = None
     license: str | None = None
     lacks: tuple[str, ...] | None = None
-    has_log_prob: bool = False
-    marks_unclear: bool = False
+    scores: tuple[str, ...] = ()
     needs_whole_episode: bool = False
     weights_difference: float | None = None
 
@@ -143,8 +142,7 @@ class ModelInfo:
             kind=parameters.get(KIND_PARAMETER) or None,
             license=parameters.get(LICENSE_PARAMETER) or None,
             lacks=tuple(filter(None, lacks.split(","))) if lacks is not None else None,
-            has_log_prob=wire.LOG_PROB in last_dims,
-            marks_unclear=wire.UNCLEAR in last_dims,
+            scores=tuple(name for name in FRAME_SCORES if name in last_dims),
             needs_whole_episode=parameters.get(WHOLE_EPISODE_PARAMETER) == "true",
             weights_difference=float(difference) if difference else None,
         )

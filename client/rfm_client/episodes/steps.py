@@ -28,7 +28,7 @@ from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW, BlankFrames, is_blac
 from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.orientation import ChannelOrder, Channels, Correction, Corrections, Orient, Orientation
 from rfm_client.frames.resize import resize_frames
-from rfm_client.frames.sampling import Prefix, Rule, Sampling, of_frames
+from rfm_client.frames.sampling import Prefix, Rule, Sampling
 
 _BLACK = (
     "black ones in a row: simulators in one process can blacken each other's pictures; give each a process of its own"
@@ -269,7 +269,7 @@ class EpisodeFrames:
         for outcome in outcomes:
             if isinstance(outcome, RewardError):
                 raise self.located(outcome)
-        shown = [of_frames(result, prefix) for result in cast("Sequence[ProgressResult]", outcomes)]
+        shown = [result.at(prefix.frame_slots) for result in cast("Sequence[ProgressResult]", outcomes)]
         fuse, rule = FUSES[self._options.fuse], self._options.success
         fused = FrameScores(
             progress=fuse([each.progress for each in shown], axis=0),
