@@ -142,7 +142,7 @@ def test_unclear_answers_are_marked(asked: Served, protocol: str, is_old: bool) 
             assert marks == [None] * 3
         else:
             assert marks == [[True] * 2, [True] * 2, [False] * 4]
-        assert client.model_info(frames=True).marks_unclear is not is_old
+        assert ("unclear" in client.model_info(frames=True).scores) is not is_old
     assert first.last_progress == 1.0
 
 
@@ -150,7 +150,8 @@ class Newer(GrpcTransport):
     """Tells of marks that the server's export does not have, as a description of before a rollback does."""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        return replace(await super().model_info(model, timeout_s), marks_unclear=True)
+        info = await super().model_info(model, timeout_s)
+        return replace(info, scores=(*info.scores, "unclear"))
 
 
 def test_a_client_goes_on_when_an_older_export_takes_the_place_of_a_newer(asked: Served) -> None:
@@ -241,8 +242,8 @@ def test_the_description_tells_what_is_given(asked: Served) -> None:
     assert {name: info.needs_whole_episode for name, info in infos.items()} == {
         "top": True, "baseline": True, "robo": False,
     }  # fmt: skip
-    assert infos["top"].has_log_prob
-    assert not infos["robo"].has_log_prob
+    assert infos["top"].scores == ("progress", "success", "log_prob")
+    assert infos["robo"].scores == ("progress", "success", "progress_logits", "unclear")
     assert infos["robo"].progress_bins == 5
     assert infos["baseline"].max_frames == 64
     assert infos["top"].lacks == ("preference", "similarity", "success")
