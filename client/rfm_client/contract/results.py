@@ -37,7 +37,8 @@ class Score:
     Its output tensor, JSON key and column of labels have the field's name. The tensor is FP32.
 
     meaning: a phrase for label files
-    asked: when a client asks for it: of every model; of each model that gives it; or with an option of a call
+    asked: when a client asks for it: always; of each model for raw frames that gives it (for embeddings: with
+        ``all_scores``); or with an option of a call
     may_be_unknown: NaN at all frames if the checkpoint does not predict it
     is_per_bin: [T, K], and neither in JSON nor in labels; else [T]
     mark: what True says about a frame, as a clause; empty: numbers, not marks

@@ -160,7 +160,8 @@ class SampleScorer:
         asked = wire.outputs_for(samples)
         more: set[str] = set()
         try:
-            if asks_given:
+            # For embeddings, the description would cost a request; no such model gives more unasked.
+            if asks_given and (call.all_scores or samples[0].trajectories[0].frames is not None):
                 given = await self._given(model, call.deadline)
                 more = {*wire.outputs_for(samples, given, all_scores=call.all_scores)} - {*asked, *call.outputs}
             answer = await self.infer(model, size, tensors, (*asked, *call.outputs, *more), call, request_id)
