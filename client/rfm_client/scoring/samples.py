@@ -157,14 +157,12 @@ class SampleScorer:
         """
         request_id = next(call.request_ids)
         size, tensors = padded_bytes(samples), partial(wire.encode_samples, samples)
-        asked = wire.outputs_for(samples)
-        more: set[str] = set()
+        asked: tuple[str, ...] = (*wire.outputs_for(samples), *call.outputs)
+        more: list[str] = []
         try:
-            # For embeddings, the description would cost a request; no such model gives more unasked.
-            if asks_given and (call.all_scores or samples[0].trajectories[0].frames is not None):
-                given = await self._given(model, call.deadline)
-                more = {*wire.outputs_for(samples, given, all_scores=call.all_scores)} - {*asked, *call.outputs}
-            answer = await self.infer(model, size, tensors, (*asked, *call.outputs, *more), call, request_id)
+            given = await self._given(model, samples, call) if asks_given else ()
+            more = [name for name in wire.outputs_for(samples, given, all_scores=call.all_scores) if name not in asked]
+            answer = await self.infer(model, size, tensors, (*asked, *more), call, request_id)
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
             error.request_id = request_id
@@ -178,10 +176,12 @@ class SampleScorer:
         alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))
         return [outcome for (outcome,) in alone]
 
-    async def _given(self, model: str, deadline: Deadline) -> tuple[str, ...]:
+    async def _given(self, model: str, samples: Sequence[Sample], call: Call) -> tuple[str, ...]:
         """Names of the scores that the model gives, as its description says. Raises RewardError."""
+        if samples[0].trajectories[0].frames is None and not call.all_scores:
+            return ()  # the description would cost a request, and models of embeddings give no more unasked
         try:
-            return (await self.model_info(model, deadline)).scores
+            return (await self.model_info(model, call.deadline)).scores
         except (ModelNotFoundError, InferenceFailedError):  # the request itself decides
             return ()
 
