@@ -83,8 +83,9 @@ def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str, mo
     engine = Engine.from_checkpoint(str(TOP), reward_model=NAMES[model][1])
     with asked.client(model, protocol) as client:
         results = client.evaluate(samples, log_prob=True)
-        plain = client.evaluate(samples)
-    for result, without, expected in zip(results, plain, engine.evaluate(samples), strict=True):
+        plain, full = client.evaluate(samples), client.evaluate(samples, all_scores=True)
+    for result, without, every, expected in zip(results, plain, full, engine.evaluate(samples), strict=True):
+        assert isinstance(every, ProgressResult)
         assert isinstance(result, ProgressResult)
         assert isinstance(without, ProgressResult)
         assert isinstance(expected, ProgressResult)
@@ -92,6 +93,8 @@ def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str, mo
         np.testing.assert_allclose(result.log_prob, expected.log_prob, rtol=0, atol=2e-5)
         np.testing.assert_allclose(result.progress, expected.progress, rtol=0, atol=1e-4)
         assert without.log_prob is None
+        assert every.log_prob is not None
+        np.testing.assert_allclose(every.log_prob, expected.log_prob, rtol=0, atol=2e-5)
         assert np.isnan(result.success).all()
 
 
