@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,7 @@ class BatchTiming:
     forward_ms: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Score:
     """One array of ``FrameScores``: how it travels, and how files and labels show it.
 
@@ -62,12 +62,9 @@ class Score:
         return f"{count} of {len(values)} frames: {self.mark}" if count else ""
 
 
-_SCORE = "score"  # key of a field's Score
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameScores:
-    """Scores of each frame of one trajectory. All that a score needs elsewhere is derived from its ``Score`` here.
+    """Scores of each frame of one trajectory. Everything else that knows a score derives it from its ``Score``.
 
     progress: float32 [T], share of the task done, 0..1
     success: float32 [T], probability that the task is done; NaN throughout: the checkpoint does not predict it
@@ -78,35 +75,26 @@ class FrameScores:
     frame_indices: int64 [T], indices of the scored frames in the trajectory; None: all frames
     """
 
-    progress: Float32Array = field(metadata={_SCORE: Score(meaning="Share of the task that is done", asked="always")})
-    success: Float32Array = field(
-        metadata={_SCORE: Score(meaning="Probability that the task is done", asked="always", may_be_unknown=True)}
-    )
-    progress_logits: Float32Array | None = field(
-        default=None,
-        metadata={_SCORE: Score(meaning="Raw scores of the progress bins", is_per_bin=True, bounds=(None, None))},
-    )
-    log_prob: Float32Array | None = field(
-        default=None,
-        metadata={
-            _SCORE: Score(
-                meaning="Logarithm of the probability that the frames so far complete the task", bounds=(None, 0.0)
-            )
-        },
-    )
-    unclear: npt.NDArray[np.bool_] | None = field(
-        default=None,
-        metadata={
-            _SCORE: Score(
-                meaning="1 where the model's written answer states no single whole score",
-                asked="if given",
-                mark="the model's written answer states no single whole score (as 1.5, 3/5, or two scores), so progress"
-                " may be misread; --strict-answers refuses these",
-                higher_is_better=False,
-                is_newer=True,
-            )
-        },
-    )
+    progress: Annotated[Float32Array, Score("Share of the task that is done", asked="always")]
+    success: Annotated[Float32Array, Score("Probability that the task is done", asked="always", may_be_unknown=True)]
+    progress_logits: Annotated[
+        Float32Array | None, Score("Raw scores of the progress bins", is_per_bin=True, bounds=(None, None))
+    ] = None
+    log_prob: Annotated[
+        Float32Array | None,
+        Score("Logarithm of the probability that the frames so far complete the task", bounds=(None, 0.0)),
+    ] = None
+    unclear: Annotated[
+        npt.NDArray[np.bool_] | None,
+        Score(
+            "1 where the model's written answer states no single whole score",
+            asked="if given",
+            mark="the model's written answer states no single whole score (as 1.5, 3/5, or two scores), so progress may"
+            " be misread; --strict-answers refuses these",
+            higher_is_better=False,
+            is_newer=True,
+        ),
+    ] = None
     frame_indices: npt.NDArray[np.int64] | None = None
 
     @property
@@ -163,7 +151,9 @@ class FrameScores:
 
 
 FRAME_SCORES: Mapping[str, Score] = {
-    each.name: each.metadata[_SCORE] for each in fields(FrameScores) if _SCORE in each.metadata
+    name: about
+    for name, hint in get_type_hints(FrameScores, include_extras=True).items()
+    for about in getattr(hint, "__metadata__", ())
 }
 
 
