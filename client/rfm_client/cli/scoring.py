@@ -84,9 +84,7 @@ class Source:
 
     def times_of(self, scores: FrameScores) -> Times | None:
         """Return the scored frames' times in the video, float64 [T]; None: unknown."""
-        if self.times_s is None or scores.frame_indices is None:
-            return self.times_s
-        return self.times_s[scores.frame_indices]
+        return None if self.times_s is None else self.times_s[scores.scored_frames]
 
     def panel(self, title: str, scores: FrameScores) -> Panel:
         """Return the source's panel of a plot."""
