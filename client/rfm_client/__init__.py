@@ -11,6 +11,7 @@ with RewardClient("grpc://localhost:8001") as client:
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.client import RewardClient
 from rfm_client.contract import (
+    FRAME_SCORES,
     AccessDeniedError,
     BatchTiming,
     ClientClosedError,
@@ -36,11 +37,12 @@ from rfm_client.contract import (
     Trajectory,
     float_frames_to_uint8,
 )
-from rfm_client.contract.results import SUCCESS_THRESHOLD, unclear_answers
+from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
 from rfm_client.frames.inputs import as_trajectory, load_trajectory
 
 __all__ = [
+    "FRAME_SCORES",
     "SUCCESS_THRESHOLD",
     "AccessDeniedError",
     "AsyncRewardClient",
@@ -73,5 +75,4 @@ __all__ = [
     "as_trajectory",
     "float_frames_to_uint8",
     "load_trajectory",
-    "unclear_answers",
 ]

@@ -63,7 +63,7 @@ def plot_scores(
     positions = [each for each in times_s if each is not None]
     has_times = len(positions) == len(results)
     if not has_times:
-        positions = [_frames(result) for result in results]
+        positions = [result.scored_frames.astype(np.float64) for result in results]
     has_success = not all(np.isnan(result.success).all() for result in results)
     heights_in = [_HEIGHT_IN, _SUCCESS_IN] if has_success else [_HEIGHT_IN]
     with matplotlib.style.context(["default", _STYLE]):
@@ -90,11 +90,6 @@ def save(figure: Figure, file: Path | str) -> None:
     with matplotlib.rc_context({"pdf.fonttype": 42}), warnings.catch_warnings():  # TrueType, which journals accept
         warnings.filterwarnings("ignore", message="Glyph")  # letters that the font lacks are drawn as boxes
         figure.savefig(file, dpi=DOTS_PER_IN)
-
-
-def _frames(result: FrameScores) -> npt.NDArray[np.float64]:
-    scored = np.arange(len(result.progress)) if result.frame_indices is None else result.frame_indices
-    return scored.astype(np.float64)
 
 
 def _shortened(name: str) -> str:

@@ -60,7 +60,6 @@ class Recording(Closing):
         videos: by camera, T frames, uint8 [H, W, 3]; a single camera's name is empty; empty for embeddings
         times_s: float64 [T], times of the frames in the video; None: unknown
         """
-        scored = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
         curves = {curve: getattr(scores, curve) for curve in _COLOURS if not np.isnan(getattr(scores, curve)).all()}
         with self._lock:
             self._open()
@@ -73,7 +72,7 @@ class Recording(Closing):
                     self._set_time(index, times_s)
                     image = self._rerun.Image(frame).compress(jpeg_quality=JPEG_QUALITY)
                     self._log((*entity, IMAGE, *filter(None, [camera])), image)
-            for position, index in enumerate(scored.tolist()):
+            for position, index in enumerate(scores.scored_frames.tolist()):
                 self._set_time(index, times_s)
                 for curve, values in curves.items():
                     self._log((*entity, curve), self._rerun.Scalars(float(values[position])))

@@ -22,7 +22,7 @@ from rfm.engine import Engine
 from rfm.engine.computation import computation
 from rfm.engine.execution import Execution
 from rfm.family import Checkpoint, FrameEncoders, config_fields
-from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
+from rfm_client import FRAME_SCORES, ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import EncoderSample, UInt8Array
 from rfm_export.source import device_named
 from rfm_labels import CheckpointFacts
@@ -47,7 +47,8 @@ class EngineScorer:
         self._encoders = self._checkpoint.encoders()
         told = {"device": on.type, **{name: _named(value) for name, value in options.items()}}
         told |= {} if dtype is None else {"dtype": str(dtype)}
-        told |= {"marks_unclear": True} if self._checkpoint.description.marks_unclear else {}
+        newer = [name for name in self._checkpoint.description.more_scores if FRAME_SCORES[name].is_newer]
+        told |= {f"marks_{name}": True for name in newer}  # as in ``ClientScorer``
         folders = _folders(source, options)
         computed = computation(self._checkpoint, dtype, on_gpu=on.type != "cpu")
         self._facts = replace(_facts(source, self._checkpoint, self._encoders, folders, told), computation=computed)
@@ -99,7 +100,6 @@ def _facts(
         encodes=encoders is not None,
         is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
         trained_padding=description.trained_padding,
-        has_log_prob=description.has_log_prob,
         needs_whole_episode=description.needs_whole_episode,
         weights=getattr(checkpoint.config, "weights", None),
     )

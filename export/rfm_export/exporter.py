@@ -18,7 +18,7 @@ from rfm.config import ExportConfig
 from rfm.family import Options
 from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import CHECKPOINT_FOLDER, FAMILY_PARAMETER
-from rfm_client.contract import wire
+from rfm_client.contract import FRAME_SCORES, wire
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, description_in, generated_files, generated_models
@@ -151,8 +151,8 @@ def _read_config(repository: Path, name: str) -> Any:
 def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], settings: ExportConfig) -> None:
     """Raise ExportError for a model that would lose inputs or outputs, on which its clients rely.
 
-    A model may gain an optional input, and marks of unclear answers, which clients need not know. It may lose the input
-    of frames' digests, without which clients send pixels.
+    A model may gain an optional input, and a score that is newer than some exports (``Score.is_newer``), which clients
+    need not know. It may lose the input of frames' digests, without which clients send pixels.
     """
     names = {model.name for model in models}
     for name in (settings.name, encoder_name(settings.name), frames_name(settings.name)):
@@ -169,7 +169,8 @@ def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], setti
         known, kept = ({tensor.name for tensor in config.input} for config in (there, model.config))
         inputs = [tensor for tensor in model.config.input if tensor.name in known or not tensor.optional]
         asked = [tensor for tensor in there.input if tensor.name in kept or tensor.name != wire.FRAME_DIGESTS]
-        given = {wire.UNCLEAR} - {tensor.name for tensor in there.output}
+        newer = {name for name, score in FRAME_SCORES.items() if score.is_newer}
+        given = newer - {tensor.name for tensor in there.output}
         outputs = [tensor for tensor in model.config.output if tensor.name not in given]
         for kind, before, after in (("input", asked, inputs), ("output", there.output, outputs)):
             if list(before) != list(after):

@@ -112,9 +112,7 @@ def generated_models(description: Description, encoders: Description | None, ver
     keeps = description.keeps_features and cache_mib > 0 and settings.instances == 1
     # A frame reference needs the cache that holds the frame, but Triton chooses the instance: so only one may exist.
     has_one_cache = cache_mib > 0 and version.num_gpus <= 1
-    outputs = wire.score_outputs(
-        description.progress_bins, has_log_prob=description.has_log_prob, marks_unclear=description.marks_unclear
-    )
+    outputs = wire.score_outputs(description.progress_bins, description.more_scores)
     inputs = wire.frame_inputs(by_digest=keeps and has_one_cache) if widths is None else wire.embedding_inputs(*widths)
     scorer = Interface(scorer_name(description, name), inputs, outputs, description)
     version = replace(version, settings=settings)

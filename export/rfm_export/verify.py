@@ -17,19 +17,16 @@ from rfm.engine import Engine, Outcome
 from rfm.engine.graphs import PLAIN_CALLS
 from rfm.family import NETWORK, Checkpoint, Options
 from rfm_client.contract import (
-    FrameScores,
     InvalidSampleError,
-    PreferenceResult,
     PreferenceSample,
-    ProgressResult,
     ProgressSample,
     RewardError,
     Sample,
-    SimilarityResult,
     SimilaritySample,
     Trajectory,
 )
 from rfm_client.contract.description import Description
+from rfm_client.contract.results import answer, trajectory_scores
 from rfm_client.contract.synthetic import Widths, random_trajectory
 from rfm_export.errors import ExportDiffersError, ExportError
 from rfm_export.layout import Version
@@ -184,7 +181,8 @@ def largest_difference(full: Callable[[], Engine], rounded: Callable[[], Engine]
     """
     scores = [make().evaluate(samples) for make in (full, rounded)]
     pairs = [pair for pair in zip(*scores, strict=True) if not any(isinstance(each, RewardError) for each in pair)]
-    frames = [frame for pair in pairs for frame in zip(*map(_trajectories, pair), strict=True)]
+    scored = [map(trajectory_scores, pair) for pair in pairs]
+    frames = [frame for before, after in scored for frame in zip(before.values(), after.values(), strict=True)]
     return max((float(np.abs(after.progress - before.progress).max()) for before, after in frames), default=0.0)
 
 
@@ -220,25 +218,5 @@ def _numbers(index: int, whose: str, outcome: Outcome) -> npt.NDArray[np.float64
     """All scores of a probe, concatenated."""
     if isinstance(outcome, RewardError):
         raise ExportDiffersError(f"probe {index}: expected scores of {whose}, got: {outcome}") from outcome
-    of_pair: list[float] = []
-    if isinstance(outcome, PreferenceResult):
-        of_pair = [outcome.preference]
-    elif isinstance(outcome, SimilarityResult):
-        of_pair = [outcome.similarity]
-    return np.concatenate([of_pair, *map(_of_frames, _trajectories(outcome))])
-
-
-def _trajectories(outcome: Outcome) -> Sequence[FrameScores]:
-    """Return the scores of each trajectory of a result."""
-    if isinstance(outcome, ProgressResult):
-        return [outcome]
-    if isinstance(outcome, PreferenceResult):
-        return [outcome.first, outcome.second]
-    assert isinstance(outcome, SimilarityResult)  # no error, by the callers
-    return [outcome.reference, outcome.other]
-
-
-def _of_frames(scores: FrameScores) -> npt.NDArray[np.float64]:
-    others = [each.ravel() for each in (scores.progress_logits, scores.log_prob, scores.unclear) if each is not None]
-    numbers: npt.NDArray[np.float64] = np.concatenate([scores.progress, scores.success, *others]).astype(np.float64)
-    return numbers
+    arrays = [array.ravel() for scores in trajectory_scores(outcome).values() for array in scores.arrays.values()]
+    return np.concatenate([[*answer(outcome).values()], *arrays], dtype=np.float64)

@@ -4,18 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from rfm_client.contract import (
-    FrameScores,
-    InferenceFailedError,
-    PreferenceResult,
-    ProgressResult,
-    Result,
-    RewardError,
-)
-from rfm_client.contract.samples import Float32Array
+from rfm_client.contract import FRAME_SCORES, InferenceFailedError, Result, RewardError
+from rfm_client.contract.results import answer, trajectory_scores
 
 
 def finite(outcomes: Sequence[Result | RewardError], *, has_success: bool) -> list[Result | RewardError]:
@@ -37,19 +32,12 @@ def finite(outcomes: Sequence[Result | RewardError], *, has_success: bool) -> li
     ]
 
 
-def _scores(result: Result, has_success: bool) -> Iterator[Float32Array]:
-    """Yield the result's scores, float32 [N] each."""
-    if isinstance(result, ProgressResult):
-        frames: tuple[FrameScores, ...] = (result,)
-    elif isinstance(result, PreferenceResult):
-        frames = (result.first, result.second)
-        yield np.array([result.preference], np.float32)
-    else:
-        frames = (result.reference, result.other)
-        yield np.array([result.similarity], np.float32)
-    for scores in frames:
-        yield scores.progress
-        if has_success:
-            yield scores.success
-        if scores.log_prob is not None:
-            yield scores.log_prob
+def _scores(result: Result, has_success: bool) -> Iterator[npt.NDArray[Any]]:
+    """Yield the result's scores, [N] each."""
+    if of_pair := answer(result):
+        yield np.array([*of_pair.values()], np.float32)
+    for scores in trajectory_scores(result).values():
+        for name, array in scores.arrays.items():
+            score = FRAME_SCORES[name]
+            if not score.is_per_bin and (has_success or not score.may_be_unknown):
+                yield array

@@ -129,16 +129,8 @@ def of_rows(sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
 
 def of_prefixes(rows: Sequence[RowScores]) -> FrameScores:
     """Return the scores of the last frame of each prefix."""
-    frames = [
-        vars(row.frames[0]) if row.is_of_prefixes else vars(part_of(row.frames[0], slice(-1, None))) for row in rows
-    ]
-    there = [name for name, scores in frames[0].items() if scores is not None]
-    return FrameScores(**{name: np.concatenate([scores[name] for scores in frames]) for name in there})
-
-
-def part_of(scores: FrameScores, index: slice | npt.NDArray[np.intp]) -> FrameScores:
-    """Return the scores at ``index`` of each array."""
-    return FrameScores(**{name: each[index] for name, each in vars(scores).items() if each is not None})
+    newest = slice(-1, None)
+    return FrameScores.joined([row.frames[0] if row.is_of_prefixes else row.frames[0].at(newest) for row in rows])
 
 
 def prefix_indices(num_frames: int, frame_steps: int) -> npt.NDArray[np.int64]:

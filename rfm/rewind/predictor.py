@@ -15,14 +15,7 @@ import torch
 
 from rfm.engine.execution import Execution
 from rfm.engine.layers import as_tensor
-from rfm.engine.predictor import (
-    RowScores,
-    check_type,
-    frame_scores,
-    of_rows,
-    part_of,
-    prefix_indices,
-)
+from rfm.engine.predictor import RowScores, check_type, frame_scores, of_rows, prefix_indices
 from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer, rounded_up
 from rfm_client.contract import (
     FrameScores,
@@ -203,10 +196,10 @@ class RewindPredictor:
         start = 0
         for row in rows:
             middle, end = start + row.num_first, start + row.num_first + row.num_second
-            of_trajectories = [part_of(frames, slice(start, middle))]
+            of_trajectories = [frames.at(slice(start, middle))]
             query = None
             if row.second is not None:
-                of_trajectories.append(part_of(frames, slice(middle, end)))
+                of_trajectories.append(frames.at(slice(middle, end)))
                 query = next(questions)[0 if row.is_similarity else 1]
             scored.append(RowScores(of_trajectories, query))
             start = end

@@ -62,7 +62,7 @@ class TopRewardCheckpoint(LanguageCheckpoint):
             kind=f"TOPReward, as {'LeRobot' if self.config.variant == 'lerobot' else 'Robometer'} computes it",
             network={"class": LanguageNetwork.__name__},
             network_frames=self.config.max_frames,
-            has_log_prob=True,
+            more_scores=("log_prob",),
             needs_whole_episode=True,
             asks_in_words=True,
             keeps_features=True,

@@ -41,7 +41,8 @@ class TopRewardPredictor(VlmPredictor):
         """Return the scores of an episode's frames: progress is 0 at the least likely prefix, 1 at the likeliest."""
         num_frames = sample.trajectories[0].num_frames
         prefixes = self._config.prefixes(num_frames)
-        log_probs = np.concatenate([_log_prob(row) for row in rows])
+        log_probs = FrameScores.joined([row.frames[0] for row in rows]).log_prob
+        assert log_probs is not None  # by ``score``
         progress = self._progress(log_probs, num_frames)
         frames = np.arange(1, num_frames + 1)
         progress, log_prob = (
@@ -66,9 +67,3 @@ class TopRewardPredictor(VlmPredictor):
 def _unjoined(log_probs: Float32Array) -> FrameScores:
     unknown = np.full_like(log_probs, np.nan)  # progress is known once all rows are
     return FrameScores(progress=unknown, success=unknown, log_prob=log_probs)
-
-
-def _log_prob(row: RowScores) -> Float32Array:
-    log_prob = row.frames[0].log_prob
-    assert log_prob is not None  # by ``score``
-    return log_prob

@@ -16,7 +16,7 @@ from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.graphs import Graphs
 from rfm.engine.layers import progress_from_logits, speed_up
-from rfm.engine.predictor import RowScores, no_success, of_rows, part_of
+from rfm.engine.predictor import RowScores, no_success, of_rows
 from rfm.engine.threads import FrameThreads
 from rfm.vlm.batch import Layout, VlmBatch
 from rfm.vlm.collator import VlmCollator
@@ -111,12 +111,12 @@ class VlmPredictor:
         for row in rows:
             if row.packs:
                 prefixes = slice(read, read + len(row.leaves) + 1)
-                of_rows.append(RowScores([part_of(scores, prefixes)], is_of_prefixes=True))
+                of_rows.append(RowScores([scores.at(prefixes)], is_of_prefixes=True))
                 read = prefixes.stop
                 continue
             frames = []
             for spans, video in zip(row.spans, row.videos, strict=True):
-                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), video.num_shown))
+                frames.append(self._per_frame(scores.at(slice(read, read + len(spans))), video.num_shown))
                 read += len(spans)
             query = None
             if row.query is not None:
@@ -170,7 +170,7 @@ class VlmPredictor:
         """Return the scores of each frame; in video mode both frames of a temporal patch share its score."""
         if self.network.config.multi_image:
             return scores
-        return part_of(scores, np.arange(num_frames) // FRAMES_PER_GROUP)
+        return scores.at(np.arange(num_frames) // FRAMES_PER_GROUP)
 
 
 def _read(output: VlmOutput) -> tuple[FrameScores, list[float], list[float], bool]:

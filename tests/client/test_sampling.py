@@ -13,11 +13,12 @@ import pytest
 
 import goldens
 from client_commands import MODEL, TASK, ask, assert_scores, invoke
+from every_score import assert_same_scores, every_score
 from paths import GOLDEN
 from reference_server import Served
-from rfm_client import ProgressSample, Trajectory
+from rfm_client import FrameScores, ProgressResult, ProgressSample, Trajectory
 from rfm_client.frames.inputs import load_trajectory
-from rfm_client.frames.sampling import RULES, Sampling, thinned
+from rfm_client.frames.sampling import RULES, Rule, Sampling, of_prefixes, thinned
 
 VECTORS = GOLDEN / "sampling-vectors.json"
 ELSEWHERE = goldens.ROOT.parent / VECTORS.name  # beside the further reference cases, where there are some
@@ -56,6 +57,16 @@ def test_each_rule_shows_the_frames_that_the_original_takes(file: Path) -> None:
             assert unpadded.tolist() == indices[: min(t + 1, sampling.frames or 0)], (sampling, t)
     assert {rule for rule, _ in seen} == set(RULES) - {"all", "rint"}
     assert len(seen) == 3 * 6 + 2
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_scores_of_prefixes_keep_all_that_the_model_gives(rule: Rule) -> None:
+    sampling = Sampling(rule, None if rule in ("all", "rewind_pad16_online", "rewind_pad16_offline") else 3)
+    prefixes = [sampling.prefix(t) for t in range(20)]
+    results = [every_score(t, len(prefix.indices)) for t, prefix in enumerate(prefixes)]
+    whole = of_prefixes([ProgressResult(**vars(result), model_version="1") for result in results], sampling)
+    newest = [result.at(np.array([prefix.read])) for result, prefix in zip(results, prefixes, strict=True)]
+    assert_same_scores(whole, FrameScores.joined(newest))
 
 
 READ = {

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from rfm_client import FrameScores, InferenceFailedError, PreferenceResult
+from every_score import assert_same_scores, every_score
+from rfm_client import FRAME_SCORES, FrameScores, InferenceFailedError, PreferenceResult, ProgressResult
 
 VOTES: dict[str, tuple[list[float], int, float, bool]] = {
     "the last frame": ([0.1, 0.9], 1, 0.5, True),
@@ -32,6 +35,37 @@ def test_progress_becomes_a_reward() -> None:
     scores = FrameScores(progress=progress, success=progress)
     assert scores.last_progress == 0.375
     np.testing.assert_array_equal(scores.progress_deltas, np.array([0, 0.25, -0.125], np.float32))
+
+
+def test_frames_can_be_taken_and_joined_without_loss_of_a_score() -> None:
+    scores = every_score(0, 5)
+    assert scores.arrays.keys() == FRAME_SCORES.keys()
+    parts = [scores.at(slice(0, 2)), scores.at(slice(2, 3)), scores.at(np.array([3, 4]))]
+    assert_same_scores(FrameScores.joined(parts), scores)
+    assert_same_scores(scores.at(np.array([1, 1])), FrameScores.joined([parts[0].at(slice(1, None))] * 2))
+
+
+def test_frames_that_are_taken_keep_their_indices() -> None:
+    scores = replace(every_score(0, 3), frame_indices=np.array([0, 5, 9]))
+    assert scores.at(slice(1, None)).scored_frames.tolist() == [5, 9]
+    assert every_score(0, 3).scored_frames.tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("name", [name for name, score in FRAME_SCORES.items() if score.asked != "always"])
+def test_parts_of_which_some_lack_a_score_are_not_joined(name: str) -> None:
+    parts = [every_score(seed, 2) for seed in range(3)]
+    parts[1] = replace(parts[1], **{name: None})  # type: ignore[arg-type]
+    with pytest.raises(InferenceFailedError, match=f"^{name}: expected it for all 3 parts .* got it for 2"):
+        FrameScores.joined(parts)
+
+
+def test_parts_of_an_answer_are_of_one_version() -> None:
+    parts = [ProgressResult(**vars(every_score(seed, 1)), model_version="3") for seed in range(2)]
+    whole = ProgressResult.of_parts(parts)
+    assert whole.model_version == "3"
+    assert_same_scores(whole, FrameScores.joined(parts))
+    with pytest.raises(InferenceFailedError, match="model_version: expected one for all frames, got 2, 3: ask again"):
+        ProgressResult.of_parts([*parts, replace(parts[0], model_version="2")])
 
 
 @pytest.mark.parametrize("name", ["last_progress", "progress_deltas", "succeeded"])

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import goldens
+from every_score import NUM_BINS, assert_same_scores, every_score
 from rfm_client import (
+    FRAME_SCORES,
     BatchTiming,
-    FrameScores,
     InferenceFailedError,
     InvalidSampleError,
     PreferenceResult,
@@ -27,7 +28,8 @@ from rfm_client import (
 from rfm_client.contract import wire
 from rfm_client.contract.samples import EncoderSample
 
-OUTPUTS = [spec.name for spec in wire.score_outputs(4)]
+OF_SOME = [name for name, score in FRAME_SCORES.items() if score.asked != "always" and not score.is_per_bin]
+OUTPUTS = [spec.name for spec in wire.score_outputs(NUM_BINS, OF_SOME)]
 TIMING = BatchTiming(1.5, 2.5)
 
 
@@ -42,17 +44,6 @@ def embedded(seed: int, num_frames: int) -> Trajectory:
 def filmed(seed: int, num_frames: int) -> Trajectory:
     frames = np.random.default_rng(seed).integers(1, 256, (num_frames, 6, 4, 3), np.uint8)
     return Trajectory(frames=frames, task=f"lift cup {seed}")
-
-
-def scores(seed: int, num_frames: int) -> FrameScores:
-    random = np.random.default_rng(seed)
-    progress, success = random.random((2, num_frames), np.float32)
-    return FrameScores(progress=progress, success=success, progress_logits=random.random((num_frames, 4), np.float32))
-
-
-def assert_same_scores(got: FrameScores, wanted: FrameScores) -> None:
-    for name in ("progress", "success", "progress_logits"):
-        np.testing.assert_array_equal(getattr(got, name), getattr(wanted, name))
 
 
 @pytest.mark.parametrize("make", [embedded, filmed])
@@ -85,11 +76,11 @@ def results() -> tuple[list[Sample], list[Result]]:
         PreferenceSample(embedded(1, 1), embedded(2, 4)),
         SimilaritySample(embedded(3, 3), embedded(4, 1)),
     ]
-    first = scores(0, 2)
+    first = every_score(0, 2)
     return samples, [
         ProgressResult(**vars(first), timing=TIMING),
-        PreferenceResult(preference=0.25, first=scores(1, 1), second=scores(2, 4), timing=TIMING),
-        SimilarityResult(similarity=-3.5, reference=scores(3, 3), other=scores(4, 1)),
+        PreferenceResult(preference=0.25, first=every_score(1, 1), second=every_score(2, 4), timing=TIMING),
+        SimilarityResult(similarity=-3.5, reference=every_score(3, 3), other=every_score(4, 1)),
     ]
 
 
@@ -98,7 +89,7 @@ def test_results_arrive_as_they_were() -> None:
     tensors = wire.encode_results(sent, 5, OUTPUTS)
     assert {name: list(array.shape) for name, array in tensors.items()} == {
         "progress": [3, 5], "success": [3, 5], "preference": [3, 1], "similarity": [3, 1], "timing_ms": [3, 2],
-        "progress_logits": [3, 5, 4],
+        "progress_logits": [3, 5, 4], **{name: [3, 5] for name in OF_SOME},
     }  # fmt: skip
     assert all(array.dtype == np.float32 for array in tensors.values())
     assert np.isnan(tensors["preference"][:, 0]).tolist() == [True, False, True]

@@ -7,9 +7,10 @@ import asyncio
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from gateway_requests import filmed, progress
-from rfm_client import AsyncRewardClient
+from rfm_client import AsyncRewardClient, InferenceFailedError
 from rfm_client.contract.model_info import ModelInfo
 from rfm_gateway.body import Batch, BodyLimits
 from rfm_gateway.config import MIB, GatewayConfig
@@ -41,5 +42,25 @@ def test_values_are_those_of_the_version_that_answers() -> None:
             np.testing.assert_allclose(first.outputs_progress.progress_pred, [[0.1] * NUM_FRAMES], rtol=1e-6)
             np.testing.assert_allclose(second.outputs_progress.progress_pred, [[0.9] * (NUM_FRAMES // 2)], rtol=1e-6)
             assert (await state.model_info()).model_version == V2.version
+
+    asyncio.run(ask())
+
+
+class Baseline(Rollout):
+    """A server of RoboReward that takes one sample a request. The gateway shows it each prefix of an episode."""
+
+    async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
+        return replace(await super().model_info(model, timeout_s), kind="RoboReward", max_batch_size=1)
+
+
+def test_prefixes_that_several_versions_scored_are_no_curve() -> None:
+    async def ask() -> None:
+        async with AsyncRewardClient("", transports=[Baseline(after=1)], retry=False) as client:
+            batch = Batch(SAMPLES.validate_python([progress(filmed(1, NUM_FRAMES, size_px=8))], context={}), True)
+            with pytest.raises(InferenceFailedError, match="model_version: expected one for all frames, got "):
+                await Evaluator(client, 60.0).evaluate(batch, "request")
+            answer = await Evaluator(client, 60.0).evaluate(batch, "request")
+            assert answer.outputs_progress is not None
+            assert len(answer.outputs_progress.progress_pred[0]) == NUM_FRAMES
 
     asyncio.run(ask())

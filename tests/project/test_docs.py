@@ -30,7 +30,7 @@ from paths import ROOT
 from rfm.launch.triton_server import Endpoints
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.cli.commands import app
-from rfm_client.contract import wire
+from rfm_client.contract import FRAME_SCORES, wire
 from rfm_client.contract.settings import Setting, settings_of
 from rfm_commands.cli import app as rfm
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
@@ -257,7 +257,7 @@ def options(command: Command) -> Iterator[Parameter]:
 
 def test_every_tensor_of_the_contract_is_documented() -> None:
     contract = CONTRACT.read_text()
-    specs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(), *wire.score_outputs(10))
+    specs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(), *wire.score_outputs(10, FRAME_SCORES))
     for spec in specs:
         assert f"| `{spec.name}` |" in contract
 

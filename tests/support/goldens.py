@@ -28,6 +28,7 @@ from rfm_client import (
     Trajectory,
     float_frames_to_uint8,
 )
+from rfm_client.contract.results import trajectory_scores
 
 # RFM_GOLDENS names a folder with more cases of the same layout; without it the tests need nothing but this repository.
 ROOT = Path(os.environ.get("RFM_GOLDENS") or GOLDEN)
@@ -285,9 +286,7 @@ def check(result: Result, expected: Expected, tolerances: tuple[float, float]) -
 
 
 def frame_scores(result: Result) -> list[FrameScores]:
-    if isinstance(result, ProgressResult):
-        return [result]
-    return [result.first, result.second] if isinstance(result, PreferenceResult) else [result.reference, result.other]
+    return [*trajectory_scores(result).values()]
 
 
 def sigmoid(logits: Any) -> Any:

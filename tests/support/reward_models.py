@@ -71,6 +71,6 @@ def as_before_marks(file: Path) -> None:
     config = text_format.Parse(file.read_text(), ModelConfig())
     (index,) = (index for index, output in enumerate(config.output) if output.name == "unclear")
     del config.output[index]
-    described = replace(description_in(config), marks_unclear=False)
+    described = replace(description_in(config), more_scores=())
     config.parameters[DESCRIPTION_PARAMETER].string_value = described.to_json()
     file.write_text(text_format.MessageToString(config))

@@ -84,8 +84,9 @@ def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str, mo
     engine = Engine.of(families.load(str(TOP), reward_model=NAMES[model][1]))
     with asked.client(model, protocol) as client:
         results = client.evaluate(samples, log_prob=True)
-        plain = client.evaluate(samples)
-    for result, without, expected in zip(results, plain, engine.evaluate(samples), strict=True):
+        plain, full = client.evaluate(samples), client.evaluate(samples, all_scores=True)
+    for result, without, every, expected in zip(results, plain, full, engine.evaluate(samples), strict=True):
+        assert isinstance(every, ProgressResult)
         assert isinstance(result, ProgressResult)
         assert isinstance(without, ProgressResult)
         assert isinstance(expected, ProgressResult)
@@ -93,6 +94,8 @@ def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str, mo
         np.testing.assert_allclose(result.log_prob, expected.log_prob, rtol=0, atol=2e-5)
         np.testing.assert_allclose(result.progress, expected.progress, rtol=0, atol=1e-4)
         assert without.log_prob is None
+        assert every.log_prob is not None
+        np.testing.assert_allclose(every.log_prob, expected.log_prob, rtol=0, atol=2e-5)
         assert np.isnan(result.success).all()
 
 
@@ -143,7 +146,7 @@ def test_unclear_answers_are_marked(asked: Served, protocol: str, is_old: bool) 
             assert marks == [None] * 3
         else:
             assert marks == [[True] * 2, [True] * 2, [False] * 4]
-        assert client.model_info(frames=True).marks_unclear is not is_old
+        assert ("unclear" in client.model_info(frames=True).scores) is not is_old
     assert first.last_progress == 1.0
 
 
@@ -151,7 +154,8 @@ class Newer(GrpcTransport):
     """Tells of marks that the server's export does not have, as a description of before a rollback does."""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        return replace(await super().model_info(model, timeout_s), marks_unclear=True)
+        info = await super().model_info(model, timeout_s)
+        return replace(info, more_scores=(*info.more_scores, "unclear"))
 
 
 def test_a_client_goes_on_when_an_older_export_takes_the_place_of_a_newer(asked: Served) -> None:
@@ -242,8 +246,8 @@ def test_the_description_tells_what_is_given(asked: Served) -> None:
     assert {name: info.needs_whole_episode for name, info in infos.items()} == {
         "top": True, "baseline": True, "robo": False,
     }  # fmt: skip
-    assert infos["top"].has_log_prob
-    assert not infos["robo"].has_log_prob
+    assert infos["top"].scores == ("progress", "success", "log_prob")
+    assert infos["robo"].scores == ("progress", "success", "progress_logits", "unclear")
     assert infos["robo"].progress_bins == 5
     assert infos["baseline"].max_frames == 64
     assert infos["top"].lacks == ("preference", "similarity", "success")

@@ -33,7 +33,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.frames import BlankFrames, Sampling
+from rfm_client.frames import BlankFrames
 from rfm_client.options import first_names
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
@@ -251,8 +251,15 @@ def _results(outcomes: Sequence[Sequence[Result | RewardError]]) -> list[Result]
         raise _refused(unfit)
     for error in failed.values():
         raise error
-    results, whole = [cast("list[Result]", of_sample) for of_sample in outcomes], Sampling("all")
-    return [each[0] if len(each) == 1 else whole.joined(cast("list[ProgressResult]", each)) for each in results]
+    return [_joined(cast("list[Result]", of_sample)) for of_sample in outcomes]
+
+
+def _joined(results: Sequence[Result]) -> Result:
+    """Return the last scores of each prefix; a single result as it is. Raises InferenceFailedError."""
+    if len(results) == 1:
+        return results[0]
+    newest = slice(-1, None)
+    return ProgressResult.of_parts([each.at(newest) for each in results if isinstance(each, ProgressResult)])
 
 
 def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:

@@ -15,16 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from rfm_client import (
-    unclear_answers,
-)
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.hdf5 import Hdf5Dataset
 from rfm_labels.hdf5_labels import Hdf5Labels, check_room, hdf5_labels
 from rfm_labels.hdf5_tables import own_file
 from rfm_labels.label_files import LabelFile, parquet_labels
-from rfm_labels.metadata import SCORES, UNCLEAR, Cost, blank_from_metadata, blank_lines
+from rfm_labels.metadata import SCORES, Cost, blank_from_metadata, blank_lines
 from rfm_labels.options import DEFAULTS, QUIET, Format, LabelOptions, Watch
 from rfm_labels.plan import Item, Plan, all_faults, plan_labels
 from rfm_labels.scorer import Scorer
@@ -177,8 +174,9 @@ def put_together(
     for line in blank_lines(blank, len(plan.items)):
         watch.note(line)
     files = outputs.write(plan, labels, cost, watch)
-    if UNCLEAR in labels.column_names and (marks := labels[UNCLEAR].to_numpy()).any():
-        watch.note(f"{unclear_answers(marks)}; the column {UNCLEAR} marks them")
+    for name, score in SCORES.items():
+        if name in labels.column_names and (told := score.told(labels[name].to_numpy())):
+            watch.note(f"{told}; the column {name} marks them")
     assert outputs.dataset is not None  # ``prepared`` sets it
     num_episodes = len(outputs.dataset.numbers)
     if len(plan.items) < num_episodes:

@@ -8,13 +8,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
-from rfm_client import Float32Array
+from rfm_client import FRAME_SCORES, Float32Array
 from rfm_client.frames import BlankFrames
 from rfm_labels.datasets.faults import listed
 
 Columns: TypeAlias = dict[str, Float32Array]
-PROGRESS, SUCCESS, LOG_PROB, UNCLEAR = "progress", "success", "log_prob", "unclear"
-SCORES = (PROGRESS, SUCCESS, LOG_PROB, UNCLEAR)  # in the order of columns
+PROGRESS, SUCCESS = "progress", "success"
+SCORES = {name: score for name, score in FRAME_SCORES.items() if not score.is_per_bin}  # in the order of columns
 BlankCameras: TypeAlias = Mapping[str, Mapping[int, int]]  # highest value of the frames, by camera and episode
 BLANK_KEY = b"rfm.blank_cameras"
 

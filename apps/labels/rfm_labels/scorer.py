@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Protocol, cast
 
 from rfm_client import (
+    FRAME_SCORES,
     FrameSize,
     InvalidSampleError,
     ModelInfo,
@@ -35,7 +36,6 @@ class CheckpointFacts:
     encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
     is_causal: True if no frame's score depends on later frames
     trained_padding: True if training padded shorter trajectories, or if unknown
-    has_log_prob: True if results have log-probabilities
     needs_whole_episode: True if scores are relative to the whole episode
     weights: form of rounded weights, whose scores are not the full checkpoint's; None: not rounded
     """
@@ -49,7 +49,6 @@ class CheckpointFacts:
     encodes: bool
     is_causal: bool
     trained_padding: bool = True
-    has_log_prob: bool = False
     needs_whole_episode: bool = False
     computation: str | None = None
     weights: str | None = None
@@ -80,19 +79,18 @@ class ClientScorer:
 
     def __init__(self, client: RewardClient) -> None:
         self._client = client
-        self._has_log_prob = False
 
     def checkpoint(self) -> CheckpointFacts:
         """Return the facts from the servers. Raises RewardError, also if the servers have different checkpoints."""
         infos = self._client.model_infos()
         digests: list[object] = [_digests(told) for told in infos.values()]
         info = infos["frames"][0] if "frames" in infos else self._client.model_info(frames=True)
-        digests += ["marks_unclear"] * info.marks_unclear  # labels without this column cannot be joined with its own
+        # Labels without the column of a newer score cannot be joined with its own. The first such score was a mark.
+        digests += [f"marks_{name}" for name in info.scores if FRAME_SCORES[name].is_newer]
         if info.weights_digest is None:
             raise InvalidSampleError.at(
                 f"model {info.name}", "a weights_digest, as exports have since version 0.1.0", "none: export it again"
             )
-        self._has_log_prob = info.has_log_prob
         embedded = infos["embeddings"][0] if "embeddings" in infos else None
         network = info.network if embedded is None else embedded.network
         return CheckpointFacts(
@@ -105,7 +103,6 @@ class ClientScorer:
             encodes=embedded is not None,
             is_causal=network.get("config", {}).get("causal_mask") is True,
             trained_padding=info.trained_padding,
-            has_log_prob=info.has_log_prob,
             needs_whole_episode=info.needs_whole_episode,
             computation=info.computation,
             weights=info.weights,
@@ -117,7 +114,7 @@ class ClientScorer:
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
         """Return the result of each sample. Raises RewardError for the first failure."""
-        return cast("list[ProgressResult]", self._client.evaluate(samples, log_prob=self._has_log_prob))
+        return cast("list[ProgressResult]", self._client.evaluate(samples, all_scores=True))
 
 
 def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:

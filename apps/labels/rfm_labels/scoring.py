@@ -22,6 +22,7 @@ from rfm_client import (
     AccessDeniedError,
     DeadlineExceededError,
     Float32Array,
+    FrameScores,
     InferenceFailedError,
     InvalidSampleError,
     ModelNotFoundError,
@@ -36,7 +37,7 @@ from rfm_client import (
 from rfm_client.frames import BlankFrames, resize_frames
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import require
-from rfm_labels.metadata import SCORES, SUCCESS, UNCLEAR, Columns, Cost
+from rfm_labels.metadata import SCORES, Columns, Cost
 from rfm_labels.options import Watch
 from rfm_labels.plan import Item, Plan, Recipe
 from rfm_labels.scorer import DECISIVE, Scorer
@@ -209,8 +210,8 @@ def episode_scores(
 ) -> EpisodeScores:
     """Return the scores of an episode, and its cameras that show nothing. Raises RewardError.
 
-    Columns: ``progress``, and ``success``, ``log_prob`` and ``unclear`` (1: unclear, of any camera) if the checkpoint
-    gives them. Several cameras add ``progress.<camera>`` and so on.
+    Columns: ``progress``, and each other score of ``SCORES`` that the checkpoint gives; a mark is 1 if a camera's is.
+    Several cameras add ``progress.<camera>`` and so on.
 
     memory: shared by all workers, for the frames of one camera at a time; unused if the checkpoint encodes frames
     go_on: called between requests; its exception ends the episode
@@ -238,15 +239,14 @@ def episode_scores(
 
 def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: DatasetEpisode, recipe: Recipe) -> Columns:
     columns: Columns = {}
-    for name in SCORES:
-        parts = [[getattr(result, name) for result in results] for results in by_camera.values()]
-        if parts[0][0] is None:
-            continue
-        scores = [np.concatenate(of_camera).astype(np.float32, copy=False) for of_camera in parts]
-        if name == SUCCESS and all(np.isnan(score).all() for score in scores):
+    cameras = [FrameScores.joined(results).arrays for results in by_camera.values()]
+    for name, about in SCORES.items():
+        scores = [np.asarray(of_camera.get(name, ()), np.float32) for of_camera in cameras]
+        is_unknown = about.may_be_unknown and all(np.isnan(score).all() for score in scores)
+        if is_unknown or not any(name in of_camera for of_camera in cameras):
             continue
         _check_numbers(name, scores, episode)
-        fuse: Any = np.max if name == UNCLEAR else getattr(np, recipe.fuse)  # mean, min or max
+        fuse: Any = np.max if about.mark else getattr(np, recipe.fuse)  # mean, min or max
         columns[name] = np.asarray(fuse(np.stack(scores), axis=0), np.float32)
         if len(by_camera) > 1:
             columns |= {f"{name}.{camera}": score for camera, score in zip(by_camera, scores, strict=True)}

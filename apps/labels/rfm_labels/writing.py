@@ -29,10 +29,9 @@ import numpy as np
 
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.metadata import (
-    LOG_PROB,
     PROGRESS,
+    SCORES,
     SUCCESS,
-    UNCLEAR,
     Columns,
     Cost,
     blank_by_camera,
@@ -48,18 +47,12 @@ PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run sees if its labels still hold
 COST_KEY = b"rfm.cost"  # apart from the provenance, which is equal for equal runs
-SIGNAL_NAMES = {PROGRESS: "progress", SUCCESS: "success_probability", LOG_PROB: "log_prob", UNCLEAR: "unclear"}
+SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability"}
 
 _DIGEST_KEY = b"rfm.digest"
 _SUFFIX = ".parquet"
 _ROWS_AT_A_TIME = 2**17  # in a row group
 _TOTAL = "total"  # progress added up over the tasks of an episode
-_DESCRIPTIONS = {
-    PROGRESS: "Share of the task that is done",
-    SUCCESS: "Probability that the task is done",
-    LOG_PROB: "Logarithm of the probability that the frames so far complete the task",
-    UNCLEAR: "1 where the model's written answer states no single whole score",
-}
 
 
 class Parts:
@@ -256,11 +249,12 @@ def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
 
 
 def _descriptor(column: str) -> dict[str, Any]:
-    score, _, camera = column.partition(".")
+    name, _, camera = column.partition(".")
+    score = SCORES[name]
     return {
-        "description": _DESCRIPTIONS[score] + (f", seen by {camera}" if camera else ""),
-        "direction": "lower" if score == UNCLEAR else "higher",
-        "bounds": [None, 0.0] if score == LOG_PROB else [0.0, 1.0],
+        "description": score.meaning + (f", seen by {camera}" if camera else ""),
+        "direction": "higher" if score.higher_is_better else "lower",
+        "bounds": [*score.bounds],
         "unit": None,
         "missing_values": "forbidden",
         "allow_nan": False,  # the same in another revision of the proposal

@@ -18,7 +18,6 @@ from functools import partial
 from typing import Any, cast, get_args
 
 import anyio
-import numpy as np
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic_core import to_json
@@ -168,7 +167,7 @@ async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Aske
     assert trajectory.frames is not None
     if asked.info.needs_whole_episode:
         (whole,) = await client.evaluate([ProgressSample(trajectory)], request_id=asked.request_id)
-        yield _points(0, [cast(ProgressResult, whole)], [slice(None)])
+        yield _points(0, [cast(ProgressResult, whole)])
         return
     sampling, frames = asked.sampling, trajectory.frames
     sample_bytes = max(sampling.frames or 0, len(frames)) * math.prod(frames.shape[1:])
@@ -180,21 +179,19 @@ async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Aske
 
     while part := await off_loop(count * sample_bytes, following):
         results = cast("list[ProgressResult]", await client.evaluate(part, request_id=asked.request_id))
-        yield _points(first, results, [sampling.prefix(t).read for t in range(first, first + len(part))])
+        reads = [sampling.prefix(t).read for t in range(first, first + len(part))]
+        yield _points(first, [result.at(slice(t, t + 1)) for result, t in zip(results, reads, strict=True)])
         first, count = first + len(part), min(2 * count, most)
 
 
-def _points(first: int, results: Sequence[ProgressResult], reads: Sequence[int | slice]) -> dict[str, Any]:
-    """Return the points of a curve from frame ``first`` on. reads: index of the points in each result"""
-    progress, success = (
-        np.concatenate([np.atleast_1d(getattr(r, name)[read]) for r, read in zip(results, reads, strict=True)])
-        for name in ("progress", "success")
-    )
+def _points(first: int, parts: Sequence[ProgressResult]) -> dict[str, Any]:
+    """Return the points of a curve from frame ``first`` on. Raises InferenceFailedError for several versions."""
+    points = ProgressResult.of_parts(parts)
     return {
         "first": first,
-        "progress": progress.tolist(),
-        "success": success.tolist(),
-        "model_version": results[-1].model_version,
+        "progress": points.progress.tolist(),
+        "success": points.success.tolist(),
+        "model_version": points.model_version,
     }
 
 

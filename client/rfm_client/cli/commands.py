@@ -38,7 +38,7 @@ from rfm_client.cli.synthetic import SyntheticSamples, are_frames, write_perf_an
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.names import frames_name
-from rfm_client.contract.results import unclear_answers
+from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.settings import ConfigError
 from rfm_client.plot import save
 
@@ -104,8 +104,8 @@ def score(
         result = outcome.result
         _report_subsampled(outcome.name, len(result.progress), outcome.num_frames)
         _report_blank(outcome.name, outcome.blank)
-        if result.unclear is not None and result.unclear.any():
-            report(f"note: {outcome.name}: {unclear_answers(result.unclear)}")
+        for told in filter(None, (FRAME_SCORES[name].told(each) for name, each in result.arrays.items())):
+            report(f"note: {outcome.name}: {told}")
         if arrays:
             np.save(arrays[number], np.stack([result.progress, result.success], axis=1))  # NaN: not predicted
         if output.prints_tables:

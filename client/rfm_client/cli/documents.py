@@ -14,7 +14,15 @@ from rfm_client.cli.comparing import Comparison
 from rfm_client.cli.options import PrefixOptions, ServerOptions, VideoOptions
 from rfm_client.cli.scoring import Outcome, Scored, Times
 from rfm_client.contract.errors import RewardError
-from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
+from rfm_client.contract.results import (
+    FRAME_SCORES,
+    FrameScores,
+    PreferenceResult,
+    ProgressResult,
+    Result,
+    answer,
+    trajectory_scores,
+)
 from rfm_client.transport.status import ServerStatus
 
 SIDES = ("first", "second")  # of a comparison
@@ -82,23 +90,15 @@ def result_document(result: Result, times_s: Sequence[Times | None] = (None, Non
     version = {"model_version": result.model_version}
     if isinstance(result, ProgressResult):
         return {**version, **frame_document(result, times_s[0])}
-    if isinstance(result, PreferenceResult):
-        answer, names = {"preference": result.preference}, SIDES
-    else:
-        answer, names = {"similarity": result.similarity}, ("reference", "other")
-    scores = {name: frame_document(getattr(result, name), t) for name, t in zip(names, times_s, strict=True)}
-    return {**version, **answer, **scores}
+    of_both = zip(trajectory_scores(result).items(), times_s, strict=True)
+    return {**version, **answer(result), **{name: frame_document(scores, times) for (name, scores), times in of_both}}
 
 
 def frame_document(scores: FrameScores, times_s: Times | None) -> dict[str, Any]:
     """Return the scores of each frame; ``frame_indices`` count the frames that were read."""
-    indices = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
     return {
-        "progress": _or_null(scores.progress),
-        "success": _or_null(scores.success),
-        **({} if scores.log_prob is None else {"log_prob": scores.log_prob.tolist()}),
-        **({} if scores.unclear is None else {"unclear": scores.unclear.tolist()}),
-        "frame_indices": indices.tolist(),
+        **{name: _or_null(each) for name, each in scores.arrays.items() if not FRAME_SCORES[name].is_per_bin},
+        "frame_indices": scores.scored_frames.tolist(),
         "frame_times_s": None if times_s is None else times_s.tolist(),
     }
 
@@ -139,6 +139,6 @@ def _error(error: Exception, message: str) -> dict[str, Any]:
     return {"error": message, "error_type": type(error).__name__}
 
 
-def _or_null(scores: npt.NDArray[np.float32]) -> list[float] | None:
-    """The scores as float64 of the same value; None if the checkpoint does not predict them."""
+def _or_null(scores: npt.NDArray[Any]) -> list[Any] | None:
+    """The marks, or the numbers as float64 of the same value; None if the checkpoint does not predict them."""
     return None if np.isnan(scores).all() else scores.tolist()

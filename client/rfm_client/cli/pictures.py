@@ -56,7 +56,7 @@ class Panel:
         frames: uint8 [N, H, W, 3], all N frames that were read; None: embeddings
         times_s: float64 [N], times of these frames; None: unknown
         """
-        scored = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
+        scored = scores.scored_frames
         positions = scored.astype(np.float64) if times_s is None else times_s[scored]
         shown = np.unique(np.linspace(0, len(scored) - 1, STRIP_FRAMES).round().astype(int))
         strip = None if frames is None else frames[scored[shown]]

@@ -84,9 +84,7 @@ class Source:
 
     def times_of(self, scores: FrameScores) -> Times | None:
         """Return the scored frames' times in the video, float64 [T]; None: unknown."""
-        if self.times_s is None or scores.frame_indices is None:
-            return self.times_s
-        return self.times_s[scores.frame_indices]
+        return None if self.times_s is None else self.times_s[scores.scored_frames]
 
     def panel(self, title: str, scores: FrameScores) -> Panel:
         """Return the source's panel of a plot."""
@@ -248,7 +246,7 @@ def _evaluate(
     # Of an episode as a whole, all frames are shown at once.
     if prefix.sampling is None or (info.needs_whole_episode and prefix.sampling == "all"):
         asked = replace(sent, frame_steps=prefix.frame_steps)
-        (result,) = client.evaluate([asked], log_prob=info.has_log_prob)
+        (result,) = client.evaluate([asked], all_scores=True)
         return cast(ProgressResult, with_frame_indices(result, fit.frame_indices))
     info.check_scores_prefixes()
     try:
@@ -258,7 +256,7 @@ def _evaluate(
     samples = sampling.samples(sent.trajectory)
     results: list[Result] = []
     while part := list(itertools.islice(samples, PREFIXES_AT_A_TIME)):
-        results += client.evaluate(part)
+        results += client.evaluate(part, all_scores=True)
     told = sampling.joined(cast("list[ProgressResult]", results))
     return cast(ProgressResult, with_frame_indices(told, fit.frame_indices))
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
+from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, trajectory_scores
 from rfm_client.transport.status import DEVICE_METRICS, Device, ServerStatus
 
 if TYPE_CHECKING:
@@ -138,17 +138,16 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
     """Return a table with a row for each trajectory: its sample's answer, and the scores of its last frame."""
     shown = []
     for name, result in rows:
-        scored: tuple[tuple[str, FrameScores], ...]
         if isinstance(result, ProgressResult):
-            answer, scored = f"{len(result.progress)} frames", (("", result),)
+            told = f"{len(result.progress)} frames"
         elif isinstance(result, PreferenceResult):
-            answer = f"P(first) = {result.preference:.4f}"
-            scored = (": first", result.first), (": second", result.second)
+            told = f"P(first) = {result.preference:.4f}"
         else:
-            answer = f"similarity = {result.similarity:.4f}"
-            scored = (": reference", result.reference), (": other", result.other)
-        for (role, frames), told in zip(scored, (answer, ""), strict=False):
-            shown.append((f"{name}{role}", told, number(frames.progress[-1]), number(frames.success[-1])))
+            told = f"similarity = {result.similarity:.4f}"
+        for role, frames in trajectory_scores(result).items():
+            row = ": ".join(filter(None, (name, role)))
+            shown.append((row, told, number(frames.progress[-1]), number(frames.success[-1])))
+            told = ""
     return table(title, ("sample", "answer", "progress at the end", "success at the end"), shown)
 
 

@@ -16,6 +16,7 @@ from rfm_client.contract.errors import (
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import (
+    FRAME_SCORES,
     BatchTiming,
     FrameScores,
     PreferenceResult,
@@ -33,6 +34,7 @@ from rfm_client.contract.samples import (
 )
 
 __all__ = [
+    "FRAME_SCORES",
     "AccessDeniedError",
     "BatchTiming",
     "ClientClosedError",

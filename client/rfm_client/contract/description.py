@@ -53,8 +53,9 @@ class Description(Origin):
     frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
     frames_per_value: consecutive frames that share a score; 2 if a vision-language model reads trajectories as videos
     has_preference, has_success, has_similarity: True if the checkpoint gives these scores
-    has_log_prob: True if it gives log-probabilities (``log_prob=True`` of a call)
-    marks_unclear: True if its results mark unclear written answers (``unclear``)
+    more_scores: names of the scores of frames that it gives beside progress, success and progress bins: fields of
+        ``FrameScores``
+    scores_whole_prefixes: True if the FastAPI evaluation server shows the model all frames of a prefix, else four
     may_not_answer: True if its answer may hold no score, also on blank frames. It then gets no warm-up, because Triton
         does not load a model whose warm-up fails
     needs_whole_episode: True if its scores are relative to the whole episode, so it cannot score while one runs
@@ -80,8 +81,8 @@ class Description(Origin):
     has_preference: bool = False
     has_success: bool = False
     has_similarity: bool = False
-    has_log_prob: bool = False
-    marks_unclear: bool = False
+    more_scores: tuple[str, ...] = ()
+    scores_whole_prefixes: bool = False
     may_not_answer: bool = False
     needs_whole_episode: bool = False
     asks_in_words: bool = False
@@ -100,6 +101,12 @@ class Description(Origin):
     def max_frames(self) -> int | None:
         """Most frames of a trajectory: the smaller limit of training and network; None: both unknown."""
         return min((each for each in (self.trained_frames, self.network_frames) if each is not None), default=None)
+
+    @property
+    def scores(self) -> tuple[str, ...]:
+        """Names of the scores of frames that the model gives: fields of ``FrameScores``."""
+        bins = () if self.progress_bins is None else ("progress_logits",)
+        return ("progress", *["success"] * self.has_success, *bins, *self.more_scores)
 
     @property
     def lacks(self) -> tuple[str, ...]:
@@ -136,6 +143,7 @@ def _read(name: str, value: Any, kind: Any) -> Any:
     parts = tuple(typing.get_origin(part) or part for part in (typing.get_args(kind) if is_union else (kind,)))
     try:
         read = FrameSize.parse(value) if FrameSize in parts and isinstance(value, str) else value
+        read = tuple(read) if tuple in parts and isinstance(read, list) else read
     except ValueError as error:
         raise ValueError(f"parameter {DESCRIPTION_PARAMETER}: {error}") from None
     if not isinstance(read, parts):

@@ -28,11 +28,6 @@ class ModelInfo(Description):
     by_digest: bool = False
     instances: int = 1
 
-    @property
-    def scores_whole_prefixes(self) -> bool:
-        """True if the FastAPI evaluation server shows the model all frames of a prefix (RoboReward), else four."""
-        return (self.kind or "").startswith("RoboReward")
-
     def check_scores_prefixes(self) -> None:
         """Raise InvalidSampleError for a model that cannot score while an episode runs."""
         if self.needs_whole_episode:

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,11 @@ from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import Float32Array
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 SUCCESS_THRESHOLD = 0.5
+PAIR_SCORES = ("preference", "similarity")  # of two trajectories
 EVEN = 0.5  # preference for neither trajectory
 
 
@@ -25,9 +30,41 @@ class BatchTiming:
     forward_ms: float
 
 
+@dataclass(frozen=True)
+class Score:
+    """One array of ``FrameScores``: how it travels, and how files and labels show it.
+
+    Its output tensor, JSON key and column of labels have the field's name. The tensor is FP32.
+
+    meaning: a phrase for label files
+    asked: when a client asks for it: always; of each model for raw frames that gives it (for embeddings: with
+        ``all_scores``); or with an option of a call
+    may_be_unknown: NaN at all frames if the checkpoint does not predict it
+    is_per_bin: [T, K], and neither in JSON nor in labels; else [T]
+    mark: what True says about a frame, as a clause; empty: numbers, not marks
+    bounds: smallest and largest value; None: no bound
+    higher_is_better: False: lower values are better
+    is_newer: exports of its family exist that lack it, so a served model may gain it
+    """
+
+    meaning: str
+    asked: Literal["always", "if given", "on request"] = "on request"
+    may_be_unknown: bool = False
+    is_per_bin: bool = False
+    mark: str = ""
+    bounds: tuple[float | None, float | None] = (0.0, 1.0)
+    higher_is_better: bool = True
+    is_newer: bool = False
+
+    def told(self, values: npt.NDArray[Any]) -> str:
+        """Return a line about the marked frames among ``values``, [T]; empty: none is marked."""
+        count = np.count_nonzero(values) if self.mark else 0
+        return f"{count} of {len(values)} frames: {self.mark}" if count else ""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameScores:
-    """Scores of each frame of one trajectory.
+    """Scores of each frame of one trajectory. Everything else that knows a score derives it from its ``Score``.
 
     progress: float32 [T], share of the task done, 0..1
     success: float32 [T], probability that the task is done; NaN throughout: the checkpoint does not predict it
@@ -38,12 +75,56 @@ class FrameScores:
     frame_indices: int64 [T], indices of the scored frames in the trajectory; None: all frames
     """
 
-    progress: Float32Array
-    success: Float32Array
-    progress_logits: Float32Array | None = None
-    log_prob: Float32Array | None = None
-    unclear: npt.NDArray[np.bool_] | None = None
+    progress: Annotated[Float32Array, Score("Share of the task that is done", asked="always")]
+    success: Annotated[Float32Array, Score("Probability that the task is done", asked="always", may_be_unknown=True)]
+    progress_logits: Annotated[
+        Float32Array | None, Score("Raw scores of the progress bins", is_per_bin=True, bounds=(None, None))
+    ] = None
+    log_prob: Annotated[
+        Float32Array | None,
+        Score("Logarithm of the probability that the frames so far complete the task", bounds=(None, 0.0)),
+    ] = None
+    unclear: Annotated[
+        npt.NDArray[np.bool_] | None,
+        Score(
+            "1 where the model's written answer states no single whole score",
+            asked="if given",
+            mark="the model's written answer states no single whole score (as 1.5, 3/5, or two scores), so progress may"
+            " be misread; --strict-answers refuses these",
+            higher_is_better=False,
+            is_newer=True,
+        ),
+    ] = None
     frame_indices: npt.NDArray[np.int64] | None = None
+
+    @property
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """The scores that are there, by name."""
+        return {name: scores for name in FRAME_SCORES if (scores := getattr(self, name)) is not None}
+
+    @property
+    def scored_frames(self) -> npt.NDArray[np.int64]:
+        """int64 [T], indices of the scored frames in the trajectory, also if all are scored."""
+        return np.arange(len(self.progress)) if self.frame_indices is None else self.frame_indices
+
+    def at(self, index: slice | npt.NDArray[np.integer[Any]]) -> Self:
+        """Return the scores of the frames at ``index``."""
+        kept = {} if self.frame_indices is None else {"frame_indices": self.frame_indices}
+        return replace(self, **{name: each[index] for name, each in {**self.arrays, **kept}.items()})
+
+    @staticmethod
+    def joined(parts: Sequence[FrameScores]) -> FrameScores:
+        """Return the scores of the frames of all parts, in order.
+
+        Raises InferenceFailedError if some parts have a score that others lack.
+        """
+        of_parts = [part.arrays for part in parts]
+        for name in FRAME_SCORES:
+            count = sum(name in arrays for arrays in of_parts)
+            if count not in (0, len(parts)):
+                expected = f"it for all {len(parts)} parts of the answer, or for none"
+                raise InferenceFailedError(f"{name}: expected {expected}, got it for {count}: ask again")
+        return FrameScores(**{name: np.concatenate([arrays[name] for arrays in of_parts]) for name in of_parts[0]})
 
     @property
     def last_progress(self) -> float:
@@ -69,6 +150,13 @@ class FrameScores:
         return bool(2 * np.count_nonzero(votes) > len(votes))
 
 
+FRAME_SCORES: Mapping[str, Score] = {
+    name: about
+    for name, hint in get_type_hints(FrameScores, include_extras=True).items()
+    for about in getattr(hint, "__metadata__", ())
+}
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProgressResult(FrameScores):
     """Answer to a ProgressSample: the scores of its trajectory's frames.
@@ -78,6 +166,18 @@ class ProgressResult(FrameScores):
 
     timing: BatchTiming | None = None
     model_version: str | None = None
+
+    @classmethod
+    def of_parts(cls, parts: Sequence[ProgressResult]) -> ProgressResult:
+        """Return one result for the frames of all parts, as ``FrameScores.joined``, without ``timing``.
+
+        Raises InferenceFailedError if several versions of the checkpoint answered.
+        """
+        versions = sorted({str(part.model_version) for part in parts})
+        if len(versions) > 1:
+            got = ", ".join(versions)
+            raise InferenceFailedError(f"model_version: expected one for all frames, got {got}: ask again")
+        return cls(**vars(cls.joined(parts)), model_version=parts[-1].model_version)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -131,14 +231,19 @@ class SimilarityResult:
     model_version: str | None = None
 
 
-def unclear_answers(unclear: npt.NDArray[Any]) -> str:
-    """Return a line about marks of unclear answers, [T]."""
-    count = f"{np.count_nonzero(unclear)} of {len(unclear)} frames"
-    why = "states no single whole score (as 1.5, 3/5, or two scores)"
-    return f"{count}: the model's written answer {why}, so progress may be misread; --strict-answers refuses these"
-
-
 Result: TypeAlias = ProgressResult | PreferenceResult | SimilarityResult
+
+
+def trajectory_scores(result: Result) -> dict[str, FrameScores]:
+    """Return the scores of each trajectory by its name in the result; a single trajectory's name is empty."""
+    if isinstance(result, ProgressResult):
+        return {"": result}
+    return {name: value for name, value in vars(result).items() if isinstance(value, FrameScores)}
+
+
+def answer(result: Result) -> dict[str, float]:
+    """Return the preference or similarity by name; empty for a ProgressResult."""
+    return {name: value for name, value in vars(result).items() if name in PAIR_SCORES}
 
 
 def _preferred(preference: float) -> Literal["first", "second"] | None:

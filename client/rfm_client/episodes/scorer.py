@@ -31,7 +31,6 @@ from rfm_client.transport.off_loop import off_loop
 
 MAX_NEW_BYTES = 3 * 2**20  # of a request's frames: the server prepares a request while the next is sent
 MAX_REMEMBERED = 2**17  # digests of sent frames; the oldest are forgotten
-_OUTPUTS = (wire.PROGRESS, wire.SUCCESS)
 
 
 Asked: TypeAlias = tuple[Steps, int]  # an episode, and the number of the step to score
@@ -100,7 +99,7 @@ class StepScorer:
         await off_loop(num_new, lambda: [frame.digest for window in windows for frame in window.frames])
         outcomes: dict[int, Result | RewardError] = {}
         parts = list(self._parts(windows, info.max_batch_size))
-        outputs = (*_OUTPUTS, *[wire.UNCLEAR] * info.marks_unclear)
+        outputs = wire.outputs_for((), info.scores)
         asked = (self._outcomes([windows[index] for index in part], outputs, call) for part in parts)
         answered = await asyncio.gather(*asked)
         for part, of_part in zip(parts, answered, strict=True):

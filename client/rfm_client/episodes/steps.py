@@ -22,7 +22,7 @@ from rfm_client.episodes.options import EpisodeOptions, StepReport, StepScore
 from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW, BlankFrames, is_black, is_blank
 from rfm_client.frames.camera_fusion import FUSES
 from rfm_client.frames.resize import resize_frames
-from rfm_client.frames.sampling import Prefix, of_frames
+from rfm_client.frames.sampling import Prefix
 
 _BLACK = (
     "black ones in a row: simulators in one process can blacken each other's pictures; give each a process of its own"
@@ -168,7 +168,7 @@ class Steps:
         for outcome in outcomes:
             if isinstance(outcome, RewardError):
                 raise self._located(outcome)
-        shown = [of_frames(result, prefix) for result in cast("Sequence[ProgressResult]", outcomes)]
+        shown = [result.at(prefix.frame_slots) for result in cast("Sequence[ProgressResult]", outcomes)]
         fuse, rule = FUSES[self.options.fuse], self.options.success
         fused = FrameScores(
             progress=fuse([each.progress for each in shown], axis=0),

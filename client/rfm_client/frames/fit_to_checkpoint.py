@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
-from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
+from rfm_client.contract.results import ProgressResult, Result, trajectory_scores
 from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, with_trajectories
 from rfm_client.frames.resize import resize_frames
 from rfm_client.frames.sampling import FrameIndices, taken, thinned
@@ -70,11 +71,6 @@ def with_frame_indices(result: Result, indices: Sequence[FrameIndices | None]) -
         return result
     if isinstance(result, ProgressResult):
         return replace(result, frame_indices=indices[0])
-    first, second = indices
-    if isinstance(result, PreferenceResult):
-        return replace(result, first=_of_frames(result.first, first), second=_of_frames(result.second, second))
-    return replace(result, reference=_of_frames(result.reference, first), other=_of_frames(result.other, second))
-
-
-def _of_frames(scores: FrameScores, indices: FrameIndices | None) -> FrameScores:
-    return replace(scores, frame_indices=indices)
+    of_both = zip(trajectory_scores(result).items(), indices, strict=True)
+    changed: dict[str, Any] = {name: replace(scores, frame_indices=kept) for (name, scores), kept in of_both}
+    return replace(result, **changed)

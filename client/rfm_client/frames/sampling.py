@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.contract.numbers import checked_count
 from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
@@ -127,17 +126,9 @@ class Sampling:
 
         Raises InferenceFailedError for results of several versions of the checkpoint.
         """
-        versions = sorted({str(result.model_version) for result in results})
-        if len(versions) > 1:
-            told = ", ".join(versions)
-            raise InferenceFailedError(f"model_version: expected one for all frames, got {told}: ask again")
-        read = [(result, self.prefix(t).read) for t, result in enumerate(results)]
-        marks = [result.unclear[slot] for result, slot in read if result.unclear is not None]
-        return ProgressResult(
-            progress=np.array([result.progress[slot] for result, slot in read], np.float32),
-            success=np.array([result.success[slot] for result, slot in read], np.float32),
-            unclear=np.array(marks) if len(marks) == len(results) else None,
-            model_version=results[-1].model_version,
+        reads = (self.prefix(t).read for t in range(len(results)))
+        return ProgressResult.of_parts(
+            [result.at(slice(read, read + 1)) for result, read in zip(results, reads, strict=True)]
         )
 
 
@@ -155,13 +146,6 @@ def taken(trajectory: Trajectory, indices: FrameIndices) -> Trajectory:
         return replace(trajectory, frames=trajectory.frames[indices])
     assert trajectory.video_embeddings is not None  # a Trajectory has frames or embeddings
     return replace(trajectory, video_embeddings=trajectory.video_embeddings[indices])
-
-
-def of_frames(result: ProgressResult, prefix: Prefix) -> ProgressResult:
-    """Return the scores of the frames that the rule shows, each once, without padding."""
-    slots = prefix.frame_slots
-    unclear = None if result.unclear is None else result.unclear[slots]
-    return replace(result, progress=result.progress[slots], success=result.success[slots], unclear=unclear)
 
 
 def _rint(t: int, frames: int) -> FrameIndices:

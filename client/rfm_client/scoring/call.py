@@ -20,6 +20,7 @@ class CallOptions(TypedDict, total=False):
     timeout_s: longest time of the call; None: the client's
     logits: True: add the raw scores of the progress bins (discrete checkpoints only)
     log_prob: True: add the log-probability of each frame (TOPReward only)
+    all_scores: True: add each score of frames that the model gives, but for ``logits``
     timing: True: add the server's time for the batch
     subsample: True: score at most ``ModelInfo.max_frames`` frames of a trajectory, evenly spaced from first to last, as
         in training; the result's ``frame_indices`` lists them
@@ -31,6 +32,7 @@ class CallOptions(TypedDict, total=False):
     timeout_s: float | None
     logits: bool
     log_prob: bool
+    all_scores: bool
     timing: bool
     subsample: bool
     resize: bool
@@ -40,7 +42,7 @@ class CallOptions(TypedDict, total=False):
 class Call:
     """Values that the requests of one call share. Raises ValueError for an invalid request id.
 
-    outputs: outputs beside the scores of the samples
+    outputs: outputs that options ask for by name
     request_ids: an id for each request
     server: number of the server to ask first; None: the least busy
     """
@@ -53,6 +55,7 @@ class Call:
         *,
         logits: bool = False,
         log_prob: bool = False,
+        all_scores: bool = False,
         timing: bool = False,
         subsample: bool = False,
         resize: bool = False,
@@ -63,12 +66,9 @@ class Call:
         prefix = request_id or secrets.token_hex(_ID_BYTES)
         self.deadline = deadline
         self.request_ids = (f"{prefix}-{number}" for number in itertools.count(1))
-        self.outputs = (
-            *[wire.PROGRESS_LOGITS] * logits,
-            *[wire.LOG_PROB] * log_prob,
-            *[wire.TIMING_MS] * timing,
-        )
-        self.subsample, self.resize = subsample, resize
+        options = {wire.PROGRESS_LOGITS: logits, "log_prob": log_prob, wire.TIMING_MS: timing}
+        self.outputs = tuple(name for name, is_asked in options.items() if is_asked)
+        self.all_scores, self.subsample, self.resize = all_scores, subsample, resize
 
     def at(self, server: int) -> Call:
         """Return a copy of the call that asks this server first."""

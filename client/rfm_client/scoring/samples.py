@@ -150,25 +150,26 @@ class SampleScorer:
         return zip(group, itertools.chain(*answered), strict=True)
 
     async def _request(
-        self, model: str, samples: Sequence[Sample], call: Call, *, asks_marks: bool = True
+        self, model: str, samples: Sequence[Sample], call: Call, *, asks_given: bool = True
     ) -> Sequence[Outcome]:
         """Send one request. An invalid sample fails the whole request; then send each sample alone.
 
-        asks_marks: True: ask for the marks of unclear answers, if the model has them
+        asks_given: True: ask for the scores that only some models give, as the model's description says
         """
         request_id = next(call.request_ids)
         size, tensors = padded_bytes(samples), partial(wire.encode_samples, samples)
-        marks = asks_marks and samples[0].trajectories[0].frames is not None
+        asked: tuple[str, ...] = (*wire.outputs_for(samples), *call.outputs)
+        more: list[str] = []
         try:
-            marks = marks and await self._marks_unclear(model, call.deadline)
-            outputs = (*wire.outputs_for(samples), *call.outputs, *[wire.UNCLEAR] * marks)
-            answer = await self.infer(model, size, tensors, outputs, call, request_id)
+            given = await self._given(model, samples, call) if asks_given else ()
+            more = [name for name in wire.outputs_for(samples, given, all_scores=call.all_scores) if name not in asked]
+            answer = await self.infer(model, size, tensors, (*asked, *more), call, request_id)
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
             error.request_id = request_id
-            if marks and wire.UNCLEAR in str(error):  # the server has an older export now
+            if any(name in str(error) for name in more):  # the server has an older export now
                 self._infos.pop(model, None)
-                return await self._request(model, samples, call, asks_marks=False)
+                return await self._request(model, samples, call, asks_given=False)
             if len(samples) == 1:
                 return [error]
         except RewardError as error:
@@ -176,12 +177,14 @@ class SampleScorer:
         alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))
         return [outcome for (outcome,) in alone]
 
-    async def _marks_unclear(self, model: str, deadline: Deadline) -> bool:
-        """True if the model marks unclear answers, as its description says. Raises RewardError."""
+    async def _given(self, model: str, samples: Sequence[Sample], call: Call) -> tuple[str, ...]:
+        """Names of the scores that the model gives, as its description says. Raises RewardError."""
+        if samples[0].trajectories[0].frames is None and not call.all_scores:
+            return ()  # the description would cost a request, and models of embeddings give no more unasked
         try:
-            return (await self.model_info(model, deadline)).marks_unclear
+            return (await self.model_info(model, call.deadline)).scores
         except (ModelNotFoundError, InferenceFailedError):  # the request itself decides
-            return False
+            return ()
 
     async def infer(
         self,

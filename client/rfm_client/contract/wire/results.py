@@ -11,36 +11,35 @@ import numpy.typing as npt
 
 from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.contract.results import (
+    FRAME_SCORES,
+    PAIR_SCORES,
     BatchTiming,
     FrameScores,
     PreferenceResult,
     ProgressResult,
     Result,
     SimilarityResult,
+    trajectory_scores,
 )
 from rfm_client.contract.samples import Float32Array, PreferenceSample, ProgressSample, Sample, SimilaritySample
-from rfm_client.contract.wire.specs import (
-    LOG_PROB,
-    PREFERENCE,
-    PROGRESS,
-    PROGRESS_LOGITS,
-    SIMILARITY,
-    SUCCESS,
-    TIMING_MS,
-    UNCLEAR,
-    Tensors,
-    pad_stack,
-)
-
-# Outputs [B, P, ...] and [B, 1], named as the fields of FrameScores and of results.
-_OF_FRAMES, _OF_SAMPLES = (PROGRESS, SUCCESS, PROGRESS_LOGITS, LOG_PROB, UNCLEAR), (PREFERENCE, SIMILARITY)
+from rfm_client.contract.wire.specs import PREFERENCE, SIMILARITY, TIMING_MS, Tensors, pad_stack
 
 
-def outputs_for(samples: Sequence[Sample]) -> tuple[str, ...]:
-    """Return the names of the scores that these samples ask for. Others would be NaN, and cost their transfer."""
+def outputs_for(samples: Sequence[Sample], given: Collection[str] = (), *, all_scores: bool = False) -> tuple[str, ...]:
+    """Return the names of the scores that these samples ask for. Others would be NaN, and cost their transfer.
+
+    given: scores of frames that the model gives, as its description says
+    all_scores: True: also those that an option of a call asks for, but not those of progress bins
+    """
     kinds = set(map(type, samples))
     asked_by = {PREFERENCE: PreferenceSample, SIMILARITY: SimilaritySample}
-    return (PROGRESS, SUCCESS, *(name for name, kind in asked_by.items() if kind in kinds))
+    of_frames = [
+        name
+        for name, score in FRAME_SCORES.items()
+        if score.asked == "always"
+        or (name in given and (score.asked == "if given" or (all_scores and not score.is_per_bin)))
+    ]
+    return (*of_frames, *(name for name, kind in asked_by.items() if kind in kinds))
 
 
 def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
@@ -53,8 +52,8 @@ def decode_results(
 ) -> list[Result]:
     """Return the results of the samples of one request, which ``model_version`` answered.
 
-    Raises InferenceFailedError if the answer lacks a score: a missing reward is not 0 or NaN. Only success may be NaN,
-    at all frames: then the checkpoint does not predict it.
+    Raises InferenceFailedError if the answer lacks a score: a missing reward is not 0 or NaN. Only a score that a
+    checkpoint need not predict (success) may be NaN, at all frames.
     """
     return [_decode_result(tensors, row, sample, model_version) for row, sample in enumerate(samples)]
 
@@ -68,23 +67,16 @@ def decode_progress(
 
 
 def _encoded(name: str, results: Sequence[Result], num_positions: int) -> Float32Array:
-    if name in _OF_FRAMES:
-        rows = [[np.asarray(getattr(s, name), np.float32) for s in _frame_scores(result)] for result in results]
+    if name in FRAME_SCORES:
+        trajectories = [trajectory_scores(result).values() for result in results]
+        rows = [[np.asarray(getattr(each, name), np.float32) for each in of_result] for of_result in trajectories]
         return pad_stack(rows, num_positions, fill=np.nan)
-    if name in _OF_SAMPLES:
+    if name in PAIR_SCORES:
         return np.array([[getattr(result, name, np.nan)] for result in results], np.float32)
     if name == TIMING_MS:
         timings = [result.timing or BatchTiming(np.nan, np.nan) for result in results]
         return np.array([[timing.collate_ms, timing.forward_ms] for timing in timings], np.float32)
     raise KeyError(name)
-
-
-def _frame_scores(result: Result) -> tuple[FrameScores, ...]:
-    if isinstance(result, ProgressResult):
-        return (result,)
-    if isinstance(result, PreferenceResult):
-        return (result.first, result.second)
-    return (result.reference, result.other)
 
 
 def _decode_result(
@@ -108,11 +100,12 @@ def _timing(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> BatchTiming | 
 
 
 def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: slice) -> FrameScores:
-    there = [name for name in _OF_FRAMES if name in {PROGRESS, SUCCESS, *tensors}]
-    scores: dict[str, Any] = {name: _present(tensors, name, row, positions, may_lack=name == SUCCESS) for name in there}
-    if UNCLEAR in scores:
-        scores[UNCLEAR] = scores[UNCLEAR] > 0
-    return FrameScores(**scores)
+    given: dict[str, Any] = {
+        name: _present(tensors, name, row, positions, may_lack=score.may_be_unknown)
+        for name, score in FRAME_SCORES.items()
+        if name in tensors or score.asked == "always"
+    }
+    return FrameScores(**{name: part > 0 if FRAME_SCORES[name].mark else part for name, part in given.items()})
 
 
 def _present(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Literal, TypeAlias
@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.samples import UInt8Array
 
 Tensors: TypeAlias = dict[str, npt.NDArray[Any]]
@@ -32,8 +33,6 @@ SUCCESS = "success"
 PREFERENCE = "preference"
 SIMILARITY = "similarity"
 PROGRESS_LOGITS = "progress_logits"
-LOG_PROB = "log_prob"
-UNCLEAR = "unclear"
 TIMING_MS = "timing_ms"
 
 REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # ids that a request may have
@@ -110,26 +109,22 @@ def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
     )
 
 
-def score_outputs(
-    progress_bins: int | None, *, has_log_prob: bool = False, marks_unclear: bool = False
-) -> tuple[TensorSpec, ...]:
+def score_outputs(progress_bins: int | None, more: Collection[str] = ()) -> tuple[TensorSpec, ...]:
     """Return the outputs of a reward model.
 
     progress_bins: K of a discrete checkpoint; None: continuous
-    has_log_prob: with TOPReward's log-probability of each frame
-    marks_unclear: with marks of frames whose written answer is unclear
+    more: scores of frames that the model gives beside those of every model, and of progress bins
     """
-    scores: tuple[TensorSpec, ...] = (
-        TensorSpec(PROGRESS, "FP32", (VARIABLE,)),
-        TensorSpec(SUCCESS, "FP32", (VARIABLE,)),
+    of_every_model = [name for name, score in FRAME_SCORES.items() if score.asked == "always"]
+    of_bins = [name for name, score in FRAME_SCORES.items() if score.is_per_bin and progress_bins is not None]
+    return (
+        *(TensorSpec(name, "FP32", (VARIABLE,)) for name in of_every_model),
         TensorSpec(PREFERENCE, "FP32", (1,)),
         TensorSpec(SIMILARITY, "FP32", (1,)),
         TensorSpec(TIMING_MS, "FP32", (2,)),
+        *(TensorSpec(name, "FP32", (VARIABLE, progress_bins or 1)) for name in of_bins),
+        *(TensorSpec(name, "FP32", (VARIABLE,)) for name in FRAME_SCORES if name in more),
     )
-    if progress_bins is not None:
-        scores = (*scores, TensorSpec(PROGRESS_LOGITS, "FP32", (VARIABLE, progress_bins)))
-    more = [*[LOG_PROB] * has_log_prob, *[UNCLEAR] * marks_unclear]
-    return (*scores, *(TensorSpec(name, "FP32", (VARIABLE,)) for name in more))
 
 
 def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
