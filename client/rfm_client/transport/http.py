@@ -41,7 +41,6 @@ class HttpClient:
         self._session = aiohttp.ClientSession(
             connector=aiohttp.TCPConnector(limit=0, **secure),
             timeout=aiohttp.ClientTimeout(),  # none: the caller has a deadline
-            auto_decompress=False,
             headers={**_AS_IT_IS, **credentials.shown},
         )
 
