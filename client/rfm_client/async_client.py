@@ -14,6 +14,7 @@ from rfm_client.contract.errors import (
     DeadlineExceededError,
     InferenceFailedError,
     InvalidSampleError,
+    InvalidValueError,
     ModelNotFoundError,
     RewardError,
 )
@@ -166,7 +167,7 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         """
         tasks = [task] * num if isinstance(task, str) else list(task)
         if len(tasks) != num:
-            raise ValueError(f"task: expected one for each of {num} episodes, got {len(tasks)}")
+            raise InvalidValueError.at("task", f"one for each of {num} episodes", len(tasks))
         return AsyncEpisodes(self, tasks, EpisodeOptions(**options), timeout_s)
 
     async def score_windows(

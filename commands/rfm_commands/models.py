@@ -21,7 +21,7 @@ from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApi
 from rfm_client.cli.command import Given, OptionsOf, with_options
 from rfm_client.cli.options import CredentialFiles
 from rfm_client.contract.settings import Settings, setting
-from rfm_commands.command import RfmCommand, fail
+from rfm_commands.command import RfmCommand
 from rfm_commands.rollout import Rollout, check_files, models_of, previous_version
 
 SECURE = "grpcs://"
@@ -46,10 +46,7 @@ class AdministeredServer(Settings):
         files: given after the subcommand; they win over those before it
         """
         before: CredentialFiles = context.obj
-        try:
-            credentials = replace(before, **files).read()
-        except ValueError as error:
-            fail(str(error))
+        credentials = replace(before, **files).read()
         if credentials.uses_tls and not self.url.startswith(SECURE):
             raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {self.url}")
         options = credentials.grpc_options(self.url.partition(":")[0])

@@ -16,6 +16,7 @@ import yaml
 from safetensors import SafetensorError, safe_open
 
 from rfm.plain_yaml import read_yaml
+from rfm_client.contract.errors import LocatedError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -61,7 +62,7 @@ _short.maxstring = _short.maxother = 100
 _MAX_LISTED = 20
 
 
-class CheckpointError(Exception):
+class CheckpointError(LocatedError):
     """A checkpoint that cannot be loaded: the file, its fault and the remedy."""
 
 

@@ -14,6 +14,7 @@ import stat
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 
+from rfm_client.contract.errors import LocatedError
 from rfm_client.contract.names import ADMIN_KEY_VARIABLE
 
 VARIABLE = ADMIN_KEY_VARIABLE
@@ -26,7 +27,7 @@ _RANDOM_BYTES = 32
 _VISIBLE = re.compile("[!-~]*")  # characters that a header can carry unchanged
 
 
-class AdminKeyError(Exception):
+class AdminKeyError(LocatedError):
     """An unusable key. The message names its source and the expected form, never the key."""
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from rfm.config import DEFAULT_HOST, ServeConfig
 from rfm.launch.installation import ServerStartError
 from rfm_client.contract.addresses import check_authorities, check_certificate, is_loopback
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.listening import check_free, in_url
 
 PORTS = range(20_000, 32_000)  # below the ports that Linux gives to outgoing connections
@@ -36,11 +37,11 @@ class GrpcTls:
     def check(self) -> None:
         """Check the files. Raises ServerStartError."""
         try:
-            check_certificate(self.certificate, self.key, "grpc_certificate, grpc_key")
+            check_certificate(self.certificate, self.key, "grpc_certificate")
             if self.client_ca is not None:
                 check_authorities(self.client_ca, "grpc_client_ca")
-        except ValueError as error:
-            raise ServerStartError(str(error)) from None
+        except InvalidValueError as error:
+            raise ServerStartError.like(error) from None
 
     def arguments(self) -> list[str]:
         """Return arguments of tritonserver for gRPC with TLS."""
@@ -117,8 +118,8 @@ class Endpoints:
         for name, host, port in listening:
             try:
                 check_free(host, port, name, port_option=f"--{name.lower()}-port")
-            except ValueError as error:
-                raise ServerStartError(str(error)) from None
+            except InvalidValueError as error:
+                raise ServerStartError.like(error) from None
 
 
 def check_version(host: str, version: str, *, accepted: bool) -> None:

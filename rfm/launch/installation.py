@@ -16,6 +16,8 @@ import sysconfig
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rfm_client.contract.errors import LocatedError
+
 EXECUTABLE = "tritonserver"
 WHEEL = "nvidia-pytriton"
 WHEEL_VERSION = "2.51.0"  # Triton's version in it
@@ -23,11 +25,11 @@ _BACKEND_FILES = ("libtriton_python.so", "triton_python_backend_utils.py")
 _STUB = "triton_python_backend_stub"
 
 
-class ServerStartError(Exception):
+class ServerStartError(LocatedError):
     """tritonserver cannot start. Its message is one line. model: the model at fault; None: no model"""
 
-    def __init__(self, reason: str, model: str | None = None) -> None:
-        super().__init__(reason)
+    def __init__(self, problem: str, where: object = "", model: str | None = None) -> None:
+        super().__init__(problem, where)
         self.model = model
 
 

@@ -19,6 +19,7 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 from rfm.launch.admin_key import VARIABLE, grpc_metadata
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
+from rfm_client.contract.errors import InvalidValueError, LocatedError
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.wire import Tensors
 
@@ -38,7 +39,7 @@ _NOT_LOADED = "not loaded"  # this project's name for a missing state
 _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
 
 
-class RepositoryApiError(Exception):
+class RepositoryApiError(LocatedError):
     """A failed request of the repository API, with the reason."""
 
 
@@ -73,8 +74,8 @@ class RepositoryApi:
     def __init__(self, url: str, admin_key: str | None, options: Mapping[str, Any] | None = None) -> None:
         try:
             scheme, address = split_url(url)
-        except ValueError as error:
-            raise RepositoryApiError(str(error)) from None
+        except InvalidValueError as error:
+            raise RepositoryApiError.like(error) from None
         if scheme not in ("grpc", "grpcs"):
             raise RepositoryApiError(
                 f"url: expected grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port, got {url}"

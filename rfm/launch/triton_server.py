@@ -246,7 +246,7 @@ class TritonServer:
             failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in models]
             if failed:
                 reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
-                raise _failed(f"models: expected all to be ready, got {reasons}{_remedy(reasons)}", failed[0].name)
+                raise _failed(f"expected all to be ready, got {reasons}{_remedy(reasons)}", failed[0].name)
             check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
             return
         kind = SpoiltStartError if status == -signal.SIGABRT else ServerStartError
@@ -265,9 +265,9 @@ class TritonServer:
             status, text = answer.result()
         except NO_ANSWER as error:
             model = name if self.exit_status is None else None  # else Triton itself has ended
-            raise ServerStartError(f"models: expected {name} to load, got: {error}", model) from error
+            raise ServerStartError(f"expected {name} to load, got: {error}", "models", model) from error
         if status != HTTPStatus.OK:
-            raise _failed(f"models: expected {name} to load, got: {text}", name)
+            raise _failed(f"expected {name} to load, got: {text}", name)
 
     def _pause(self, processes: ModelProcesses, ends_s: float) -> None:
         """Wait for POLL_S. Kill Triton and raise SpoiltStartError if a model process is dead, or after ``ends_s``."""
@@ -277,7 +277,7 @@ class TritonServer:
             return
         self.kill()
         model, why = found or (UNKNOWN, f"no answer in {LOAD_S:g} s")
-        raise SpoiltStartError(f"models: expected {model or 'each'} to load, got: {why}", model or None)
+        raise SpoiltStartError(f"expected {model or 'each'} to load, got: {why}", "models", model or None)
 
     def _arguments(self, models: Sequence[str]) -> list[str]:
         return [
@@ -299,8 +299,8 @@ class TritonServer:
         return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE, **of_models}
 
 
-def _failed(reason: str, model: str) -> ServerStartError:
-    return (SpoiltStartError if re.search(_DIED, reason) else ServerStartError)(reason, model)
+def _failed(problem: str, model: str) -> ServerStartError:
+    return (SpoiltStartError if re.search(_DIED, problem) else ServerStartError)(problem, "models", model)
 
 
 def _remedy(reasons: str) -> str:

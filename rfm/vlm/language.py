@@ -47,7 +47,7 @@ from rfm.vlm.rounded import fit
 from rfm.vlm.row import VlmRow
 from rfm.vlm.video import Indices, VlmVideo
 from rfm.vlm.work import flop
-from rfm_client.contract import InvalidSampleError, ProgressSample, Sample
+from rfm_client.contract import ProgressSample, Sample
 from rfm_client.contract.frame_refs import ProgressSampleRefs
 
 SETTINGS, REWARD_MODEL = "rfm", "reward_model"  # keys in an exported config.json
@@ -123,15 +123,10 @@ class LanguageCollator(QwenCollator):
         assert isinstance(sample, (ProgressSample, ProgressSampleRefs))  # by check_type
         (trajectory,) = sample.trajectories
         self._check_task(trajectory.task)
-        try:
-            return self.prompts(video_of(trajectory, sample.frame_steps), trajectory.task)
-        except ValueError as error:  # the frames are too small or too narrow
-            if isinstance(error, InvalidSampleError):
-                raise
-            raise InvalidSampleError.at("frames", *str(error).split(", got ")) from error
+        return self.prompts(video_of(trajectory, sample.frame_steps), trajectory.task)
 
     def prompts(self, video: VlmVideo, task: str) -> list[VlmRow]:
-        """Return the conversations about a video. Raises ValueError for frames that cannot be resized."""
+        """Return the conversations about a video. Raises InvalidSampleError for frames that cannot be resized."""
         raise NotImplementedError
 
     def row(

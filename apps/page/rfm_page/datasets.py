@@ -16,7 +16,8 @@ import av
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.frames import VideoError, video_stream
+from rfm_client import InvalidSampleError
+from rfm_client.frames import video_stream
 from rfm_client.options import ConfigError
 from rfm_labels.datasets import (
     INFO_FILE,
@@ -48,11 +49,10 @@ class ShownLeRobot(ShownDataset):
         try:
             import pyarrow  # noqa: F401
         except ImportError:
-            expected = "expected pyarrow, which reads datasets, got none: pip install ./client ./apps/labels"
-            raise ConfigError("dataset", expected) from None
+            remedy = "pip install ./client ./apps/labels"
+            raise ConfigError.at("dataset", "pyarrow, which reads datasets", "none", remedy) from None
         if not (Path(folder) / INFO_FILE).is_file():
-            expected = f"expected the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file, got {folder}"
-            raise ConfigError("dataset", expected)
+            raise ConfigError.at("dataset", f"the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file", folder)
         root = Path(folder).resolve()
         try:
             half_s = 0.5 / Info.read(root).fps  # a player shows the nearest frame, too
@@ -60,7 +60,7 @@ class ShownLeRobot(ShownDataset):
             shown.check()
             return shown
         except DatasetError as error:
-            raise ConfigError("dataset", str(error)) from None
+            raise ConfigError(str(error), "dataset") from None
 
     def check(self) -> None:
         """Raise DatasetError for a link out of the folder."""
@@ -105,8 +105,8 @@ def _cut(span: Span, take: Callable[[int], object]) -> bytes:
                     packet.dts -= zero
                     packet.stream = written
                     copy.mux(packet)
-    except VideoError as error:
-        raise span.error(error.expected, error.got) from error
+    except InvalidSampleError as error:
+        raise DatasetError.like(error, where=f"{span.where}: {span.file}") from error
     except (av.FFmpegError, OSError) as error:
         raise span.error("a video of the episode", error.strerror or str(error)) from error
     return clip.getvalue()

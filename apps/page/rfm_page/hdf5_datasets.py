@@ -47,7 +47,7 @@ class ShownHdf5(ShownDataset):
             shown.check()
             return shown
         except (DatasetError, ImportError) as error:
-            raise ConfigError("dataset", str(error)) from None
+            raise ConfigError(str(error), "dataset") from None
 
     def check(self) -> None:
         """Raise DatasetError for data in other files, in the dataset or its labels."""

@@ -49,6 +49,6 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         from rfm_page.datasets import ShownLeRobot
         from rfm_page.hdf5_datasets import ShownHdf5
     except ModuleNotFoundError as error:
-        told = f"expected the package {error.name}, which reads it, got none: pip install ./apps/labels"
-        raise ConfigError("dataset", told) from None
+        expected = f"the package {error.name}, which reads it"
+        raise ConfigError.at("dataset", expected, "none", "pip install ./apps/labels") from None
     return [ShownHdf5.open(path) if is_hdf5(Path(path)) else ShownLeRobot.open(path) for path in config.dataset]

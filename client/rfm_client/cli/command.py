@@ -18,6 +18,7 @@ from typer.core import TyperCommand
 from typer.models import OptionInfo
 
 from rfm_client.contract import errors
+from rfm_client.contract.errors import LocatedError
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of, settings_of
 
 STANDARD_OUTPUT = "-"
@@ -132,7 +133,7 @@ class OptionsOf:
             try:
                 value = each.parse(value) if each.parse else value
             except ValueError as error:
-                raise typer.BadParameter(str(error), param_hint=f"'{self.option(each)}'") from None
+                raise _usage_error(error, self.option(each)) from None
             given[each.name] = tuple(value) if isinstance(value, list) else value
         return given
 
@@ -255,7 +256,7 @@ def usage_errors(option: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from error
+        raise _usage_error(error, option) from error
 
 
 def missing_package(error: ImportError) -> str:
@@ -265,14 +266,22 @@ def missing_package(error: ImportError) -> str:
     return f'{error}: pip install "./client[cli]"'
 
 
+def _usage_error(error: ValueError, option: str) -> typer.BadParameter:
+    return typer.BadParameter(
+        error.problem if isinstance(error, LocatedError) else str(error), param_hint=f"'{option}'"
+    )
+
+
 def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:
     """Wrong usage of the options whose settings the error names; the error itself for other settings."""
-    keys = error.key.split(", ")
+    options: dict[str, str] = {}
     for mark in marks:
-        options = {each.name: mark.option(each) for each in mark.chosen}
-        if options.keys() >= set(keys):
-            return typer.BadParameter(error.expected, param_hint=f"'{', '.join(options[key] for key in keys)}'")
-    return error
+        options = {each.name: mark.option(each) for each in mark.chosen} | options
+    if error.where not in options or (error.other and error.other not in options):
+        return error
+    if error.other:
+        return typer.BadParameter(str(error.named(options.__getitem__)))
+    return _usage_error(error, options[error.where])
 
 
 def _mark(hint: Any) -> OptionsOf | None:

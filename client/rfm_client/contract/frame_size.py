@@ -7,6 +7,8 @@ import re
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, cast
 
+from rfm_client.contract.errors import InvalidValueError
+
 Rule: TypeAlias = Literal["shortest", "longest", "exact"]
 
 _FORMS = "'shortest PX', 'longest PX' or 'exact HEIGHTxWIDTH'"
@@ -31,7 +33,7 @@ class FrameSize:
         """Parse ``shortest 256``, ``longest 512`` or ``exact 224x320``, as ``str`` writes them. Raises ValueError."""
         match = _TEXT.fullmatch(text)
         if match is None:
-            raise ValueError(f"frame_size: expected {_FORMS}, got {text!r}")
+            raise InvalidValueError.at("frame_size", _FORMS, repr(text))
         rule, *edges = (part for part in match.groups() if part)
         return cls(cast(Rule, rule), tuple(map(int, edges)))
 

@@ -7,6 +7,8 @@ import errno
 import os
 import socket
 
+from rfm_client.contract.errors import InvalidValueError
+
 
 def in_url(host: str) -> str:
     """Return the host as a URL writes it: IPv6 in brackets."""
@@ -29,4 +31,4 @@ def check_free(host: str, port: int, where: str, *, port_option: str, host_optio
         is_of_port = number in (errno.EADDRINUSE, errno.EACCES)
         remedy = f"{port_option} names another port" if is_of_port else f"{host_option} names another address"
         expected = f"a free port of this machine at {in_url(host)}:{port}"
-        raise ValueError(f"{where}: expected {expected}, got: {reason}; {remedy}") from None
+        raise InvalidValueError.at(where, expected, reason, remedy) from None

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
 
+from rfm_client.contract.errors import InvalidValueError
+
 Texts: TypeAlias = tuple[str, ...]
 
 _PLAIN: dict[Any, tuple[type, ...]] = {Path: (str,), float: (int, float), Texts: (list,)}  # else the type itself
@@ -19,17 +21,38 @@ _UNBOUNDED = 2**31 - 1  # a bound that only the number's type sets
 _NAMES: dict[Any, str] = {types.NoneType: "null", Path: "str", Texts: "list of str"}
 
 
-class ConfigError(ValueError):
-    """A setting with an invalid value.
+class ConfigError(InvalidValueError):
+    """An invalid setting, or two settings that do not fit together.
 
-    key: name of the setting, or several names with commas between
-    expected: ``expected X, got Y``
+    where: name of the setting
+    other: name of the second setting; empty: none
     """
 
-    def __init__(self, key: str, expected: str) -> None:
-        super().__init__(f"{key}: {expected}")
-        self.key = key
-        self.expected = expected
+    other = ""
+
+    @classmethod
+    def needs(cls, name: str, other: str) -> ConfigError:
+        """Return the error of a setting that needs another."""
+        return cls.like(cls("needs", name), other=other)
+
+    @classmethod
+    def conflict(cls, name: str, other: str) -> ConfigError:
+        """Return the error of two settings that exclude each other."""
+        return cls.like(cls("conflicts with", name), other=other)
+
+    @classmethod
+    def require_both(cls, settings: object, name: str, other: str) -> None:
+        """Raise the error of two settings of which only one is given."""
+        given = [each for each in (name, other) if getattr(settings, each) is not None]
+        if len(given) == 1:
+            raise cls.needs(given[0], other if given[0] == name else name)
+
+    def named(self, name_of: Callable[[str], str]) -> ConfigError:
+        """Return the error under the names that the settings have elsewhere."""
+        return self.like(self, where=name_of(self.where), other=name_of(self.other) if self.other else "")
+
+    def __str__(self) -> str:
+        return f"{self.where} {self.problem} {self.other}" if self.other else super().__str__()
 
 
 @dataclass(frozen=True)
@@ -68,20 +91,20 @@ class Setting:
         for kind in self._kinds:
             if _spells(value, kind):
                 return None if value is None else kind(value)
-        raise ConfigError(self.name, f"expected {self._expected}, got {value!r:.200}")
+        raise ConfigError.at(self.name, self._expected, f"{value!r:.200}")
 
     def check(self, value: Any) -> None:
         """Raise ConfigError for a value out of bounds or not among the choices."""
         if value is None:
             return
         if self._choices and value not in self._choices:
-            raise ConfigError(self.name, f"expected {self._expected}, got {value!r:.200}")
+            raise ConfigError.at(self.name, self._expected, f"{value!r:.200}")
         if self.least is not None and not _is_number(value):
-            raise ConfigError(self.name, f"expected a finite number, got {value!r:.200}")
+            raise ConfigError.at(self.name, "a finite number", f"{value!r:.200}")
         if self.least is not None and value < self.least:
-            raise ConfigError(self.name, f"expected at least {self.least}, got {value}")
+            raise ConfigError.at(self.name, f"at least {self.least}", value)
         if self.most is not None and value > self.most:
-            raise ConfigError(self.name, f"expected at most {self.most}, got {value}")
+            raise ConfigError.at(self.name, f"at most {self.most}", value)
 
     @property
     def placeholder(self) -> str | None:

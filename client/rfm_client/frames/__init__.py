@@ -19,7 +19,7 @@ from rfm_client.frames.orientation import (
     PerCamera,
     Value,
 )
-from rfm_client.frames.pictures import PictureError, decoded_picture, exif_turn, opened_picture, pillow, upright_picture
+from rfm_client.frames.pictures import decoded_picture, exif_turn, opened_picture, pillow, upright_picture
 from rfm_client.frames.resize import as_jpeg, load_pillow, resize_frames
 from rfm_client.frames.sampling import RULES, Rule, Sampling, of_prefixes, prefix_samples, trained_rule
 from rfm_client.frames.video import frame_times_s, read_video
@@ -28,7 +28,6 @@ from rfm_client.frames.video_decoding import (
     UNDAMAGED,
     Packets,
     Upright,
-    VideoError,
     decoder,
     import_av,
     judged,
@@ -56,12 +55,10 @@ __all__ = [
     "Orientation",
     "Packets",
     "PerCamera",
-    "PictureError",
     "Rule",
     "Sampling",
     "Upright",
     "Value",
-    "VideoError",
     "as_jpeg",
     "cached_snapshot",
     "check_local_video",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeAlias, Ty
 
 import numpy as np
 
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.samples import UInt8Array
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
 def check_value(name: str, values: tuple[str, ...], value: object) -> None:
     """Raise ValueError unless the value is one of the option's values."""
     if value not in values:
-        raise ValueError(f"{name}: expected one of {', '.join(values)}, got {value!r}")
+        raise InvalidValueError.at(name, f"one of {', '.join(values)}", repr(value))
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ class PerCamera(Generic[Value]):
         for text in texts:
             camera, is_named, value = text.rpartition("=")
             if (camera in cameras) if is_named else default is not None:
-                raise ValueError(f"{cls.NAME}: expected each camera once, got {text!r} again")
+                raise InvalidValueError.at(cls.NAME, "each camera once", f"{text!r} again")
             if is_named:
                 cameras[camera] = value
             else:

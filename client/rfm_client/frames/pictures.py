@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
 
 _UPRIGHT = {  # Pillow's name by EXIF orientation
@@ -32,15 +33,6 @@ _BROKEN = (OSError, SyntaxError, ValueError)  # Pillow's errors for broken pixel
 _DEEP = ";16"  # Pillow's mark of 16 bits a channel, which it cuts to 8
 
 
-class PictureError(Exception):
-    """A file that is not one readable picture. ``expected`` and ``got`` are the parts of a message."""
-
-    def __init__(self, expected: str, got: object) -> None:
-        super().__init__(expected, got)
-        self.expected = expected
-        self.got = got
-
-
 def pillow() -> str:
     """Return Pillow's name and version. Raises ImportError with the extra to install."""
     try:
@@ -51,29 +43,32 @@ def pillow() -> str:
 
 
 def opened_picture(picture: bytes | Path) -> Any:
-    """Open a picture of 8-bit colours, or its file, and read only its header. Raises PictureError."""
+    """Open a picture of 8-bit colours, or its file, and read only its header. Raises InvalidSampleError."""
     pillow()
     from PIL import Image
 
     try:
         opened = Image.open(picture if isinstance(picture, Path) else io.BytesIO(picture))
     except (*_BROKEN, Image.DecompressionBombError) as error:
-        raise PictureError("an image", error) from error
+        raise InvalidSampleError.at("picture", "an image", error) from error
     is_deep = _DEEP in str(opened.tile)
     if is_deep or opened.mode not in _COLOURS:
         opened.close()
         expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
-        raise PictureError(expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
+        raise InvalidSampleError.at("picture", expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
     return opened
 
 
 def decoded_picture(picture: Any) -> UInt8Array:
-    """Return the pixels of an opened picture, uint8 [H, W, 3], upright by EXIF, and close it. Raises PictureError."""
+    """Return the pixels of an opened picture, uint8 [H, W, 3], upright by EXIF, and close it.
+
+    Raises InvalidSampleError.
+    """
     with picture:
         try:
             return np.asarray(upright_picture(picture).convert("RGB"))
         except _BROKEN as error:
-            raise PictureError("an image", error) from error
+            raise InvalidSampleError.at("picture", "an image", error) from error
 
 
 def upright_picture(picture: Any) -> Any:

@@ -165,7 +165,8 @@ class SampleScorer:
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
             error.request_id = request_id
-            if marks and wire.UNCLEAR in str(error):  # the server has an older export now
+            is_unclear = isinstance(error, InvalidSampleError) and error.where == wire.UNCLEAR
+            if marks and is_unclear:  # the server has an older export now
                 self._infos.pop(model, None)
                 return await self._request(model, samples, call, asks_marks=False)
             if len(samples) == 1:

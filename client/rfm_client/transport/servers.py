@@ -27,13 +27,13 @@ from rfm_client.contract.errors import (
     ClientClosedError,
     DeadlineExceededError,
     InferenceFailedError,
+    InvalidValueError,
     ModelNotFoundError,
     ProcessEndedError,
     RewardError,
     ServerUnavailableError,
 )
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.triton import LATE
 from rfm_client.contract.wire import Tensors
 from rfm_client.transport.calls import Answer, Transport, TritonTransport
 from rfm_client.transport.deadline import Deadline
@@ -116,7 +116,7 @@ class Servers:
 
     def __init__(self, transports: Sequence[Transport], *, retry: bool) -> None:
         if not transports:
-            raise ValueError("url: expected at least one, got none")
+            raise InvalidValueError.at("url", "at least one", "none")
         self._servers = [KnownServer(transport) for transport in transports]
         self._retry = retry
         self._is_closed = False
@@ -237,8 +237,7 @@ class Servers:
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
                     raise failed from failed.__cause__  # the reason for most of the lost time
-                where = error.message.rpartition(f": {LATE}")[0] or server.transport.url
-                raise deadline.exceeded(where) from error
+                raise deadline.exceeded(error.server or server.transport.url) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
                 if not self._retry:

@@ -16,7 +16,7 @@ from typing import Any
 
 from rfm_client import UInt8Array
 from rfm_client.frames import Corrections, decoder, pillow
-from rfm_client.options import checked_positive, first_names
+from rfm_client.options import InvalidValueError, checked_positive, first_names
 from rfm_labels.datasets import lerobot_v21, lerobot_v30
 from rfm_labels.datasets.faults import listed
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
@@ -58,8 +58,8 @@ class LeRobotDataset(Dataset):
     ) -> None:
         try:
             self._tolerance_s = checked_positive("tolerance_s", tolerance_s)
-        except ValueError as error:
-            raise DatasetError(str(error)) from None
+        except InvalidValueError as error:
+            raise DatasetError.like(error) from None
         self.root = root
         self.source = source or root.resolve().name
         self.revision = revision

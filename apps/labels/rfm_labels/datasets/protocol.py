@@ -18,7 +18,7 @@ import numpy as np
 
 from rfm_client import RewardError, Trajectory, UInt8Array
 from rfm_client.frames import Correction, Corrections, Orientation, PerCamera, Value
-from rfm_client.options import is_blank
+from rfm_client.options import InvalidValueError, is_blank
 from rfm_client.options import require as require_that
 from rfm_labels.datasets.camera_names import word_of_no_colours
 from rfm_labels.datasets.faults import fault_lines
@@ -30,13 +30,8 @@ SeveralTasks: TypeAlias = Literal["each", "first"]
 _CAMERA_PREFIX = "observation.images."
 
 
-class DatasetError(RewardError, ValueError):
-    """A contradictory or unreadable dataset, reported as ``where: expected X, got Y``."""
-
-    @classmethod
-    def at(cls, where: object, expected: str, got: object) -> DatasetError:
-        """Return the error at a file, or at a place in it."""
-        return cls(f"{where}: expected {expected}, got {got}")
+class DatasetError(RewardError, InvalidValueError):
+    """A contradictory or unreadable dataset. where: a file, or a place in it"""
 
 
 class MissingTaskError(DatasetError):

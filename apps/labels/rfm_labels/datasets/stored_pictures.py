@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rfm_client import UInt8Array
-from rfm_client.frames import PictureError, exif_turn, opened_picture
+from rfm_client import InvalidSampleError, UInt8Array
 from rfm_client.frames import decoded_picture as pixels_of
+from rfm_client.frames import exif_turn, opened_picture
 from rfm_labels.datasets.protocol import DatasetError
 
 
@@ -35,5 +35,5 @@ def turn_mark(picture: bytes | Path) -> str:
 def _errors_at(where: str) -> Iterator[None]:
     try:
         yield
-    except PictureError as error:
-        raise DatasetError.at(where, error.expected, error.got) from error
+    except InvalidSampleError as error:
+        raise DatasetError.like(error, where=where) from error

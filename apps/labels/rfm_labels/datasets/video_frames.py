@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client import UInt8Array
+from rfm_client import InvalidSampleError, UInt8Array
 from rfm_client.frames import (
     DAMAGED,
     UNDAMAGED,
     Packets,
     Upright,
-    VideoError,
     import_av,
     judged,
     read_packets,
@@ -90,8 +89,8 @@ def video_packets(file: Path, container: str | None = None) -> Packets:
     try:
         with file.open("rb") as opened:
             packets = read_packets(opened, container)
-    except VideoError as error:
-        raise DatasetError.at(file, error.expected, error.got) from error
+    except InvalidSampleError as error:
+        raise DatasetError.like(error, where=str(file)) from error
     except FileNotFoundError as error:
         raise DatasetError.at(file, "a video file", "none") from error
     except (av.FFmpegError, OSError) as error:
@@ -110,8 +109,8 @@ def decode(span: Span) -> Iterator[UInt8Array]:
                     raise DatasetError.at(f"{span.where}: {span.file}: frame {num_given}", UNDAMAGED, DAMAGED)
                 yield upright(frame)
                 num_given += 1
-    except VideoError as error:
-        raise span.error(error.expected, error.got) from error
+    except InvalidSampleError as error:
+        raise DatasetError.like(error, where=f"{span.where}: {span.file}") from error
     except (av.FFmpegError, OSError) as error:
         raise span.error(f"frame {num_given} to be decoded", error.strerror or str(error)) from error
 
