@@ -164,7 +164,7 @@ class ServeConfig(Settings):
         object.__setattr__(self, "host", _address(self.host))
         ConfigError.require_both(self, "grpc_certificate", "grpc_key")
         if self.grpc_client_ca is not None and self.grpc_certificate is None:
-            raise ConfigError.needs("grpc_client_ca", "grpc_certificate")
+            raise ConfigError.of_two("grpc_client_ca", "needs", "grpc_certificate")
 
     @property
     def is_loopback(self) -> bool:

@@ -41,14 +41,14 @@ class AdministeredServer(Settings):
 
     @contextmanager
     def connected(self, context: typer.Context, files: Given) -> Iterator[RepositoryApi]:
-        """Yield the server's repository API. Raises AdminKeyError, RepositoryApiError.
+        """Yield the server's repository API. Raises InvalidValueError, RepositoryApiError.
 
         files: given after the subcommand; they win over those before it
         """
         before: CredentialFiles = context.obj
         credentials = replace(before, **files).read()
         if credentials.uses_tls and not self.url.startswith(SECURE):
-            raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {self.url}")
+            raise RepositoryApiError.at("url", f"{SECURE}host:port with certificates", self.url)
         options = credentials.grpc_options(self.url.partition(":")[0])
         with RepositoryApi(self.url, take_key(self.admin_key_file, os.environ), options) as api:
             yield api

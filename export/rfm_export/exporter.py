@@ -149,22 +149,18 @@ def _check_gpus(num_gpus: int | None) -> None:
     """Raise ExportError for more GPUs than this machine has: Triton would refuse to load the models."""
     there = torch.cuda.device_count()
     if num_gpus is not None and num_gpus > there:
-        raise ExportError(
-            f"num_gpus: expected at most {there}, got {num_gpus}; --other-machine exports for a machine with more, "
-            "--num-gpus 0 for the CPU"
-        )
+        remedy = "--other-machine exports for a machine with more, --num-gpus 0 for the CPU"
+        raise ExportError.at("num_gpus", f"at most {there}", num_gpus, remedy)
 
 
 def _check_graphs(settings: ExportConfig, description: Description) -> None:
     """Raise ExportError if CUDA graphs are on but nothing would use them."""
     if settings.cuda_graphs and not description.uses_graphs:
         expected = "an RFM, Robometer or RoboReward checkpoint (its expected score) on a Qwen backbone"
-        raise ExportError(f"cuda_graphs: expected {expected}, got another; leave out --cuda-graphs")
+        raise ExportError.at("cuda_graphs", expected, "another", "leave out --cuda-graphs")
     if settings.cuda_graphs and not _num_gpus(settings):
-        raise ExportError(
-            "cuda_graphs: expected an export for GPUs, got one for the CPU; leave out --cuda-graphs, or name "
-            "--num-gpus with --other-machine"
-        )
+        remedy = "leave out --cuda-graphs, or name --num-gpus with --other-machine"
+        raise ExportError.at("cuda_graphs", "an export for GPUs", "one for the CPU", remedy)
 
 
 @contextmanager
@@ -174,7 +170,7 @@ def _needing_disk(repository: Path) -> Iterator[None]:
         yield
     except (OSError, SafetensorError) as error:  # safetensors reports a full disk as SafetensorError
         kept = "the versions that are served stay as they are; make room there, or name another --repository"
-        raise ExportError(f"{repository}: expected room for the exported files, got: {error}; {kept}") from error
+        raise ExportError.at(repository, "room for the exported files", error, kept) from error
 
 
 def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, staged: Path) -> None:
@@ -245,7 +241,7 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     config = _read_config(repository, scorer)
     versions = config.version_policy.specific.versions
     if not versions:
-        raise ExportError(f"{repository / scorer}: expected a configuration that names its versions, got none")
+        raise ExportError.at(repository / scorer, "a configuration that names its versions", "none")
     number = max(versions)
     folder = repository / scorer / str(number) / CHECKPOINT_FOLDER
     family = families.choose(folder, config.parameters[FAMILY_PARAMETER].string_value or None)
@@ -284,7 +280,7 @@ def _read_config(repository: Path, name: str) -> Any:
     try:
         return read_config(repository, name)
     except (OSError, ParseError) as error:
-        raise ExportError(f"{repository / name}: expected an exported model, got {error}") from error
+        raise ExportError.at(repository / name, "an exported model", error) from error
 
 
 def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], settings: ExportConfig) -> None:
@@ -296,11 +292,10 @@ def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], setti
     names = {model.name for model in models}
     for name in (settings.name, encoder_name(settings.name), frames_name(settings.name)):
         if name not in names and (repository / name).exists():
-            raise ExportError(
-                f"{repository / name}: expected a checkpoint that this model can serve too, got one that it cannot; "
-                "choose another --repository or --name, or, of a ReWiND checkpoint, name its encoders "
-                "(--image-encoder, --text-encoder)"
-            )
+            encoders = "of a ReWiND checkpoint, name its encoders (--image-encoder, --text-encoder)"
+            remedy = f"choose another --repository or --name, or, {encoders}"
+            expected = "a checkpoint that this model can serve too"
+            raise ExportError.at(repository / name, expected, "one that it cannot", remedy)
     for model in models:
         if not (repository / model.name).exists():
             continue
@@ -312,7 +307,9 @@ def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], setti
         outputs = [tensor for tensor in model.config.output if tensor.name not in given]
         for kind, before, after in (("input", asked, inputs), ("output", there.output, outputs)):
             if list(before) != list(after):
-                raise ExportError(
-                    f"{repository / model.name}: expected a checkpoint with the same {kind}s as its other versions, "
-                    "got one with different shapes; choose another --name or --repository"
+                raise ExportError.at(
+                    repository / model.name,
+                    f"a checkpoint with the same {kind}s as its other versions",
+                    "one with different shapes",
+                    "choose another --name or --repository",
                 )

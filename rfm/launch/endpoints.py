@@ -129,11 +129,11 @@ def check_version(host: str, version: str, *, accepted: bool) -> None:
     if is_safe or accepted or is_loopback(host):
         return
     floor = ".".join(map(str, SECURITY_FLOOR))
-    raise ServerStartError(
-        f"host: expected a loopback address for Triton {version or 'of no version'}, which has known remote "
-        f"vulnerabilities (Triton {floor}, in NVIDIA's container 26.07, has not), got {host}; "
-        "--accept-known-vulnerabilities serves there all the same"
+    expected = (
+        f"a loopback address for Triton {version or 'of no version'}, which has known remote vulnerabilities (Triton "
+        f"{floor}, in NVIDIA's container 26.07, has not)"
     )
+    raise ServerStartError.at("host", expected, host, "--accept-known-vulnerabilities serves there all the same")
 
 
 def free_ports(count: int) -> list[int]:

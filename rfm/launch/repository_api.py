@@ -77,8 +77,8 @@ class RepositoryApi:
         except InvalidValueError as error:
             raise RepositoryApiError.like(error) from None
         if scheme not in ("grpc", "grpcs"):
-            raise RepositoryApiError(
-                f"url: expected grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port, got {url}"
+            raise RepositoryApiError.at(
+                "url", "grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port", url
             )
         self._url = url
         self._headers = grpc_metadata(admin_key)
@@ -112,7 +112,7 @@ class RepositoryApi:
             if all(entry.version in kept for entry in going):
                 return
             time.sleep(POLL_S)
-        raise RepositoryApiError(f"{model}: expected its old versions to finish within {FINISH_S:g} s, got no end")
+        raise RepositoryApiError.at(model, f"its old versions to finish within {FINISH_S:g} s", "no end")
 
     def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
         """Return the outputs of a version for a probe, whose request id distinguishes it from callers' requests."""
@@ -137,8 +137,8 @@ class RepositoryApi:
             message = one_line(error.message() or "no reason given")
             if triton.RESTRICTED in message:
                 got = "another" if self._headers else "none"
-                raise RepositoryApiError(
-                    f"admin key: expected that of the server at {self._url} (--admin-key-file or {VARIABLE}), got {got}"
+                raise RepositoryApiError.at(
+                    "admin key", f"that of the server at {self._url} (--admin-key-file or {VARIABLE})", got
                 ) from None
             is_server_s = str(error.status()) in _OF_SERVER
             raise RepositoryApiError(f"{self._url}: {message}" if is_server_s else message) from error

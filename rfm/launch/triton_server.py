@@ -155,7 +155,7 @@ class TritonServer:
                 self.stop()
                 self._start_ready(served)
         except OSError as error:
-            raise ServerStartError(f"{error.filename}: expected to be readable, got: {error.strerror}") from error
+            raise ServerStartError.at(error.filename, "to be readable", error.strerror) from error
 
     def stop(self) -> None:
         """End the server gracefully, by force after KILL_AFTER_S."""
@@ -188,8 +188,8 @@ class TritonServer:
         if not there:
             raise ServerStartError(no_models(self.repository))
         if len(str(self.repository).split()) > 1:  # Triton's Python backend passes the path to a shell unquoted
-            where = "repository: expected a path without spaces, such as a link (ln -s)"
-            raise ServerStartError(f"{where}, got {self.repository}")
+            expected = "a path without spaces, such as a link (ln -s)"
+            raise ServerStartError.at("repository", expected, self.repository)
         as_in_file = there
         if served is not None:
             as_in_file = [name for name in served if _names_the_same_versions(self.repository, name, served[name])]
@@ -229,7 +229,7 @@ class TritonServer:
         except OSError as error:
             self._claim.release()
             self._claim = None
-            raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
+            raise ServerStartError.at("tritonserver", f"a program at {program}", error.strerror) from error
         if self._signal is not None:
             self._group.process.send_signal(self._signal)
 

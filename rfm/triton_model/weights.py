@@ -23,8 +23,8 @@ def check_digest(version: Path, expected: str) -> None:
     if is_there(kept):
         expected = _digest_in(kept)
     if expected and (got := weights_digest([version])) != expected:
-        raise CheckpointError(
-            f"{version}: expected the weights that were exported ({expected}), got others ({got}); export them again"
+        raise CheckpointError.at(
+            version, f"the weights that were exported ({expected})", f"others ({got})", "export them again"
         )
 
 
@@ -33,5 +33,5 @@ def _digest_in(file: Path) -> str:
     try:
         config = text_format.Parse(file.read_text(), pb.ModelConfig())
     except (OSError, ValueError, text_format.ParseError) as error:
-        raise CheckpointError(f"{file}: expected a configuration of the export, got {error}") from error
+        raise CheckpointError.at(file, "a configuration of the export", error) from error
     return str(config.parameters[DIGEST_PARAMETER].string_value)

@@ -211,7 +211,7 @@ class VlmCheckpoint:
         if self.config.family == SMOL and is_at_least(5):  # transformers 5 computes other image features
             expected = "transformers < 5 for a SmolVLM checkpoint, whose scores would differ"
             version = importlib.metadata.version("transformers")
-            raise CheckpointError(f"transformers: expected {expected}, got {version}")
+            raise CheckpointError.at("transformers", expected, version)
         network = self._network(wanted)
         fit(network, self.weights, self.factors)
         # Parameters only: rotary frequencies stay float32, as upstream.
@@ -332,9 +332,9 @@ def _config(
 ) -> VlmConfig:
     family = str(backbone["model_type"])
     if "progress_head.4.weight" not in weights:
-        raise CheckpointError(f"{folder}: expected reward heads, got no progress_head.4.weight")
+        raise CheckpointError.at(folder, "reward heads", "no progress_head.4.weight")
     if "frame_pool_attn.weight" not in weights:
-        raise CheckpointError(f"{folder}: expected frame_pool_attn.weight, got none: {OF_AN_OLD_RUN}")
+        raise CheckpointError.at(folder, "frame_pool_attn.weight", f"none: {OF_AN_OLD_RUN}")
     network = run.network()
     config = VlmConfig(
         backbone=backbone,
@@ -348,7 +348,7 @@ def _config(
     )
     if (family == SMOL or config.per_frame_progress_token) and not config.multi_image:
         why = "SmolVLM" if family == SMOL else "per-frame progress tokens"
-        raise CheckpointError(f"{run.file}: use_multi_image with {why}: expected true, got false")
+        raise CheckpointError.at(f"{run.file}: use_multi_image with {why}", "true", "false")
     return config
 
 
@@ -378,4 +378,4 @@ def _check_layers(config: Any) -> None:
     for name in _LAYER_COUNTS if isinstance(config, dict) else ():
         count = config.get(name)
         if isinstance(count, (int, float)) and count > MAX_LAYERS:
-            raise CheckpointError(f"{NETWORK_CONFIG}: {name}: expected at most {MAX_LAYERS}, got {shown(count)}")
+            raise CheckpointError.at(f"{NETWORK_CONFIG}: {name}", f"at most {MAX_LAYERS}", shown(count))

@@ -111,7 +111,7 @@ class LanguageCollator(QwenCollator):
         """Raise CheckpointError unless a prompt has its video once."""
         num_videos = self.example().count(VIDEO)
         if num_videos != 1:
-            raise CheckpointError(f"chat template: expected one video in a prompt, got {num_videos}")
+            raise CheckpointError.at("chat template", "one video in a prompt", num_videos)
 
     def example(self) -> str:
         """Return the prompt of an example task, with VIDEO in the place of the video."""
@@ -208,7 +208,7 @@ class LanguageCheckpoint:
         num_rows = self.config.backbone["text_config"]["vocab_size"]
         if len(tokenizer) > num_rows:
             expected = f"a tokenizer of at most {num_rows} tokens, as the embedding"
-            raise CheckpointError(f"base model {self.processor}: expected {expected}, got {len(tokenizer)}")
+            raise CheckpointError.at(f"base model {self.processor}", expected, len(tokenizer))
         check_tokens(self.config, tokenizer, self.processor)
         where = f"base model {self.processor}: preprocessing of videos"
         normalisation = normalisation_of(preprocessor, SIZED_BY_PROCESSOR, where)

@@ -67,19 +67,20 @@ class RunConfig:
         """
         file = find_run_config(folder)
         if file is None:
-            raise CheckpointError(
-                f"{folder}: expected {RUN_CONFIG} of the training run there, in the folder above, or on main of its "
-                "Hub repository, got none: weights do not tell how the model was shown frames; "
+            raise CheckpointError.at(
+                folder,
+                f"{RUN_CONFIG} of the training run there, in the folder above, or on main of its Hub repository",
+                "none: weights do not tell how the model was shown frames",
                 f"copy the run's {RUN_CONFIG} into the folder; with an ordinary vision-language model, say --as which "
-                "reward model it is asked"
+                "reward model it is asked",
             )
         content = read_run_config(file)
         sections = {name: content.get(name) or {} for name in _SECTIONS}
         for name, section in sections.items():
             if not isinstance(section, dict):
-                raise CheckpointError(f"{file}: {name}: expected a mapping, got {shown(section)}")
+                raise CheckpointError.at(f"{file}: {name}", "a mapping", shown(section))
         if not sections["model"]:
-            raise CheckpointError(f"{file}: model: expected the settings of the training run, got none")
+            raise CheckpointError.at(f"{file}: model", "the settings of the training run", "none")
         return cls(file, file_name(file, folder), sections)
 
     def check_model_type(self) -> None:
@@ -91,12 +92,12 @@ class RunConfig:
                 "in different ways, and upstream's successor dropped the type"
             )
         if model_type != HEADS:
-            raise CheckpointError(f"{self.file}: model.model_type: expected {HEADS}, got {shown(model_type)}{why}")
+            raise CheckpointError.at(f"{self.file}: model.model_type", HEADS, f"{shown(model_type)}{why}")
         for section in ("model", "data"):
             for key in _DROPPED:
                 if self.get(f"{section}.{key}", False):
                     expected = "false (upstream dropped this way to prompt a model)"
-                    raise CheckpointError(f"{self.file}: {section}.{key}: expected {expected}, got true")
+                    raise CheckpointError.at(f"{self.file}: {section}.{key}", expected, "true")
 
     def network(self) -> dict[str, Any]:
         """Return the fields of VlmConfig about the network and its prompts, except the frame size.
@@ -106,7 +107,7 @@ class RunConfig:
         temperature = self.get("model.frame_pooling_attn_temperature", 1.0)
         if not 0 < temperature < math.inf:
             where = f"{self.file}: {self.shown('model.frame_pooling_attn_temperature')}"
-            raise CheckpointError(f"{where}: expected a number above 0, got {shown(temperature)}")
+            raise CheckpointError.at(where, "a number above 0", shown(temperature))
         return {
             "dtype": self._one_of("model.torch_dtype", "bfloat16", DTYPES),
             "multi_image": self._of_either("multi_image"),
@@ -132,7 +133,7 @@ class RunConfig:
         keys = ("resized_height", "resized_width")
         for key in keys:
             if key not in self.sections["data"]:  # upstream's default changed from 224 to null
-                raise CheckpointError(f"{self.file}: data.{key}: expected a number or null, got no such key")
+                raise CheckpointError.at(f"{self.file}: data.{key}", "a number or null", "no such key")
         height, width = (frame_count(self.sections["data"].get(key), f"{self.file}: data.{key}") for key in keys)
         return None if height is None or width is None else (height, width)
 
@@ -166,15 +167,13 @@ class RunConfig:
         if type(value) is int and type(default) is float:
             value = float(value)
         if type(value) is not type(default):
-            raise CheckpointError(
-                f"{self.file}: {self.shown(place)}: expected {type(default).__name__}, got {shown(value)}"
-            )
+            raise CheckpointError.at(f"{self.file}: {self.shown(place)}", f"{type(default).__name__}", shown(value))
         return value
 
     def _one_of(self, place: str, default: str, known: tuple[str, ...]) -> str:
         value = self.get(place, default).removeprefix("torch.")
         if value not in known:
-            raise CheckpointError(f"{self.file}: {self.shown(place)}: expected one of {known}, got {shown(value)}")
+            raise CheckpointError.at(f"{self.file}: {self.shown(place)}", f"one of {known}", shown(value))
         return value
 
     def _of_either(self, setting: str) -> bool:
@@ -184,7 +183,7 @@ class RunConfig:
         if len(set(values.values())) > 1:
             got = " and ".join(f"{place} {str(value).lower()}" for place, value in values.items())
             mend = "set both to how the run showed frames"
-            raise CheckpointError(f"{self.file}: expected {' and '.join(places)} to agree, got {got}; {mend}")
+            raise CheckpointError.at(self.file, f"{' and '.join(places)} to agree", got, mend)
         return any(values.values())
 
 

@@ -34,6 +34,6 @@ def page_of(config: Any) -> Page | None:
     """
     found = list(entry_points(group="rfm_gateway.page")) if config.viewer else []
     if config.viewer and config.dataset and not found:
-        raise ConfigError.at("dataset", "the package rfm-page, which shows it", "none", INSTALL)
+        raise ConfigError.at("dataset", "the package rfm-page, which shows it", f"none: {INSTALL}")
     page: Page | None = found[0].load() if found else None
     return page

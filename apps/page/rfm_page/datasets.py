@@ -49,8 +49,8 @@ class ShownLeRobot(ShownDataset):
         try:
             import pyarrow  # noqa: F401
         except ImportError:
-            remedy = "pip install ./client ./apps/labels"
-            raise ConfigError.at("dataset", "pyarrow, which reads datasets", "none", remedy) from None
+            got = "none: pip install ./client ./apps/labels"
+            raise ConfigError.at("dataset", "pyarrow, which reads datasets", got) from None
         if not (Path(folder) / INFO_FILE).is_file():
             raise ConfigError.at("dataset", f"the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file", folder)
         root = Path(folder).resolve()

@@ -50,5 +50,5 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         from rfm_page.hdf5_datasets import ShownHdf5
     except ModuleNotFoundError as error:
         expected = f"the package {error.name}, which reads it"
-        raise ConfigError.at("dataset", expected, "none", "pip install ./apps/labels") from None
+        raise ConfigError.at("dataset", expected, "none: pip install ./apps/labels") from None
     return [ShownHdf5.open(path) if is_hdf5(Path(path)) else ShownLeRobot.open(path) for path in config.dataset]

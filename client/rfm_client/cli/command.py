@@ -274,14 +274,11 @@ def _usage_error(error: ValueError, option: str) -> typer.BadParameter:
 
 def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:
     """Wrong usage of the options whose settings the error names; the error itself for other settings."""
-    options: dict[str, str] = {}
-    for mark in marks:
-        options = {each.name: mark.option(each) for each in mark.chosen} | options
-    if error.where not in options or (error.other and error.other not in options):
+    options = {each.name: mark.option(each) for mark in marks for each in mark.chosen}
+    if not {error.where, error.other or error.where} <= options.keys():
         return error
-    if error.other:
-        return typer.BadParameter(str(error.named(options.__getitem__)))
-    return _usage_error(error, options[error.where])
+    named = error.named(options.__getitem__)
+    return typer.BadParameter(str(named)) if error.other else _usage_error(named, named.where)
 
 
 def _mark(hint: Any) -> OptionsOf | None:

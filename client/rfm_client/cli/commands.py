@@ -93,7 +93,7 @@ def score(
     """Score each frame of one or more videos: progress and success. A failed video does not stop the others."""
     output.begin(videos)
     if prefix.sampling is not None and video.max_frames is not None:
-        raise ConfigError.conflict("sampling", "max_frames")
+        raise ConfigError.of_two("sampling", "conflicts with", "max_frames")
     rows = StreamedTable(scoring.COLUMNS, videos)
     arrays = output.array_files(scoring.unique_stems(videos))
 

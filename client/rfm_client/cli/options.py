@@ -177,10 +177,10 @@ class PrefixOptions(Settings):
             raise ConfigError.at("frame_steps", f"0 or at least {MIN_FRAME_STEPS}", self.frame_steps)
         if self.sampling is None:
             if self.frames is not None:
-                raise ConfigError.needs("frames", "sampling")
+                raise ConfigError.of_two("frames", "needs", "sampling")
             return
         if self.frame_steps:
-            raise ConfigError.conflict("sampling", "frame_steps")
+            raise ConfigError.of_two("sampling", "conflicts with", "frame_steps")
         try:
             Sampling.of(self.sampling, self.frames, trained_frames=1)
         except InvalidValueError as error:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidValueError
 
 Texts: TypeAlias = tuple[str, ...]
@@ -31,21 +32,16 @@ class ConfigError(InvalidValueError):
     other = ""
 
     @classmethod
-    def needs(cls, name: str, other: str) -> ConfigError:
-        """Return the error of a setting that needs another."""
-        return cls.like(cls("needs", name), other=other)
-
-    @classmethod
-    def conflict(cls, name: str, other: str) -> ConfigError:
-        """Return the error of two settings that exclude each other."""
-        return cls.like(cls("conflicts with", name), other=other)
+    def of_two(cls, name: str, relation: str, other: str) -> ConfigError:
+        """Return the error of two settings: ``name needs other``, for example."""
+        return cls.like(cls(relation, name), other=other)
 
     @classmethod
     def require_both(cls, settings: object, name: str, other: str) -> None:
-        """Raise the error of two settings of which only one is given."""
-        given = [each for each in (name, other) if getattr(settings, each) is not None]
-        if len(given) == 1:
-            raise cls.needs(given[0], other if given[0] == name else name)
+        """Raise the error of a pair of settings of which only one is given."""
+        for given, missing in ((name, other), (other, name)):
+            if getattr(settings, given) is not None and getattr(settings, missing) is None:
+                raise cls.of_two(given, "needs", missing)
 
     def named(self, name_of: Callable[[str], str]) -> ConfigError:
         """Return the error under the names that the settings have elsewhere."""
@@ -97,14 +93,11 @@ class Setting:
         """Raise ConfigError for a value out of bounds or not among the choices."""
         if value is None:
             return
-        if self._choices and value not in self._choices:
-            raise ConfigError.at(self.name, self._expected, f"{value!r:.200}")
-        if self.least is not None and not _is_number(value):
-            raise ConfigError.at(self.name, "a finite number", f"{value!r:.200}")
-        if self.least is not None and value < self.least:
-            raise ConfigError.at(self.name, f"at least {self.least}", value)
-        if self.most is not None and value > self.most:
-            raise ConfigError.at(self.name, f"at most {self.most}", value)
+        got = f"{value!r:.200}"
+        require(self.name, not self._choices or value in self._choices, self._expected, got, ConfigError)
+        require(self.name, self.least is None or _is_number(value), "a finite number", got, ConfigError)
+        require(self.name, self.least is None or value >= self.least, f"at least {self.least}", value, ConfigError)
+        require(self.name, self.most is None or value <= self.most, f"at most {self.most}", value, ConfigError)
 
     @property
     def placeholder(self) -> str | None:

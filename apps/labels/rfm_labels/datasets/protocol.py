@@ -10,7 +10,7 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
@@ -53,9 +53,7 @@ class FaultsError(DatasetError):
         return cls("\n".join(fault_lines(messages, numbers, len(without_task))))
 
 
-def require(where: object, condition: bool, expected: str, got: object) -> None:
-    """Raise DatasetError unless the condition holds."""
-    require_that(where, condition, expected, got, DatasetError)
+require = partial(require_that, error=DatasetError)
 
 
 @dataclass(frozen=True)
