@@ -21,6 +21,7 @@ from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import Installation, ServerStartError, find_installation
 from rfm.launch.triton_options import MAX_HTTP_BYTES, size_limits
 from rfm.launch.triton_server import TritonServer
+from rfm_client.contract.errors import InvalidValueError
 from rfm_commands.cli import app
 from rfm_serve import KEY
 

@@ -109,7 +109,7 @@ def test_files_of_tls_are_read_before_anything_starts(papers: Papers) -> None:
     ):
         with pytest.raises(ServerStartError, match=f"^{told}"):
             replace(Endpoints.free(), grpc_tls=tls).check()
-    with pytest.raises(ConfigError, match="^grpc_client_ca needs grpc_certificate$"):
+    with pytest.raises(ConfigError, match=r"^grpc_client_ca needs grpc_certificate$"):
         ServeConfig(grpc_client_ca=papers.ca)
 
 
