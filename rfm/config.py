@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
 
 from rfm.parameters import DEFAULT_HANG_S
 from rfm_client.contract.addresses import MAX_PORT, is_loopback
+from rfm_client.contract.checks import require
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.settings import ConfigError, Settings, setting
 
@@ -116,8 +117,7 @@ class ExportConfig(Settings):
         super().__post_init__()
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", self.name):
             raise ConfigError.at("name", "letters, digits, _ and -", f"{self.name!r:.200}")
-        if len(self.name) > MAX_NAME:
-            raise ConfigError.at("name", f"at most {MAX_NAME} characters", len(self.name))
+        require("name", len(self.name) <= MAX_NAME, f"at most {MAX_NAME} characters", len(self.name), ConfigError)
 
     @property
     def torch_dtype(self) -> torch.dtype | None:

@@ -307,9 +307,6 @@ def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], setti
         outputs = [tensor for tensor in model.config.output if tensor.name not in given]
         for kind, before, after in (("input", asked, inputs), ("output", there.output, outputs)):
             if list(before) != list(after):
-                raise ExportError.at(
-                    repository / model.name,
-                    f"a checkpoint with the same {kind}s as its other versions",
-                    "one with different shapes",
-                    "choose another --name or --repository",
-                )
+                expected = f"a checkpoint with the same {kind}s as its other versions"
+                remedy = "choose another --name or --repository"
+                raise ExportError.at(repository / model.name, expected, "one with different shapes", remedy)

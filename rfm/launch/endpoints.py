@@ -35,13 +35,10 @@ class GrpcTls:
     client_ca: Path | None = None
 
     def check(self) -> None:
-        """Check the files. Raises ServerStartError."""
-        try:
-            check_certificate(self.certificate, self.key, "grpc_certificate")
-            if self.client_ca is not None:
-                check_authorities(self.client_ca, "grpc_client_ca")
-        except InvalidValueError as error:
-            raise ServerStartError.like(error) from None
+        """Check the files. Raises ConfigError."""
+        check_certificate(self.certificate, self.key, "grpc_certificate")
+        if self.client_ca is not None:
+            check_authorities(self.client_ca, "grpc_client_ca")
 
     def arguments(self) -> list[str]:
         """Return arguments of tritonserver for gRPC with TLS."""
@@ -108,18 +105,18 @@ class Endpoints:
 
     def check(self) -> None:
         """Check ports, addresses and certificates. Raises ServerStartError."""
-        if self.grpc_tls is not None:
-            self.grpc_tls.check()
         listening = (
             ("HTTP", self.http_host, self.http_port),
             ("gRPC", self.host, self.grpc_port),
             ("metrics", self.host, self.metrics_port),
         )
-        for name, host, port in listening:
-            try:
+        try:
+            if self.grpc_tls is not None:
+                self.grpc_tls.check()
+            for name, host, port in listening:
                 check_free(host, port, name, port_option=f"--{name.lower()}-port")
-            except InvalidValueError as error:
-                raise ServerStartError.like(error) from None
+        except InvalidValueError as error:
+            raise ServerStartError.like(error) from None
 
 
 def check_version(host: str, version: str, *, accepted: bool) -> None:

@@ -19,7 +19,8 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 from rfm.launch.admin_key import VARIABLE, grpc_metadata
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
-from rfm_client.contract.errors import InvalidValueError, LocatedError
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import LocatedError
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.wire import Tensors
 
@@ -68,18 +69,13 @@ class RepositoryApi:
 
     options: for tritonclient's gRPC client, such as the options of Credentials
 
-    The constructor and the methods raise RepositoryApiError.
+    The constructor raises InvalidValueError for an unusable URL, the methods raise RepositoryApiError.
     """
 
     def __init__(self, url: str, admin_key: str | None, options: Mapping[str, Any] | None = None) -> None:
-        try:
-            scheme, address = split_url(url)
-        except InvalidValueError as error:
-            raise RepositoryApiError.like(error) from None
-        if scheme not in ("grpc", "grpcs"):
-            raise RepositoryApiError.at(
-                "url", "grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port", url
-            )
+        scheme, address = split_url(url)
+        expected = "grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port"
+        require("url", scheme in ("grpc", "grpcs"), expected, url)
         self._url = url
         self._headers = grpc_metadata(admin_key)
         given = dict(options or {})
@@ -137,9 +133,8 @@ class RepositoryApi:
             message = one_line(error.message() or "no reason given")
             if triton.RESTRICTED in message:
                 got = "another" if self._headers else "none"
-                raise RepositoryApiError.at(
-                    "admin key", f"that of the server at {self._url} (--admin-key-file or {VARIABLE})", got
-                ) from None
+                expected = f"that of the server at {self._url} (--admin-key-file or {VARIABLE})"
+                raise RepositoryApiError.at("admin key", expected, got) from None
             is_server_s = str(error.status()) in _OF_SERVER
             raise RepositoryApiError(f"{self._url}: {message}" if is_server_s else message) from error
 

@@ -46,6 +46,7 @@ from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
 from rfm.rewind.pretrained import IMAGE_ENCODER, TEXT_ENCODER, differences, image_facts, text_facts
 from rfm_client.contract import Sample
+from rfm_client.contract.checks import require
 
 MODEL_TYPE = "rewind_transformer"
 IMAGE_ENCODER_PREFIX = "image_encoder."
@@ -246,8 +247,7 @@ def load(folder: Path, options: Options) -> RewindCheckpoint:
 def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -> RewindCheckpoint:
     """Return the checkpoint, with its weights renamed to upstream's names."""
     first = weights.pop(_FIRST_CODES_FRAME)
-    if first.dim() != 2:
-        raise CheckpointError.at(_FIRST_CODES_FRAME, "2 axes", list(first.shape))
+    require(_FIRST_CODES_FRAME, first.dim() == 2, "2 axes", list(first.shape), CheckpointError)
     weights.pop(_FIRST_CODES_UNREAD, None)
     weights["first_embedding_A"] = first[None]
     if options.image_encoder or options.text_encoder:
@@ -315,8 +315,7 @@ def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, De
 def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
     """Return a weight's shape. Raises KeyError if it is missing, CheckpointError if it has not ``rank`` axes."""
     shape = weights[name].shape
-    if len(shape) != rank:
-        raise CheckpointError.at(name, f"{rank} axes", list(shape))
+    require(name, len(shape) == rank, f"{rank} axes", list(shape), CheckpointError)
     return shape
 
 

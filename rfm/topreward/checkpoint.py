@@ -27,6 +27,7 @@ from rfm.vlm.preprocessor import (
     check_settings,
     read_preprocessor,
 )
+from rfm_client.contract.checks import require
 
 LEROBOT, ROBOMETER = "topreward", "topreward-robometer"  # of ``--as``
 REWARD_MODELS = (LEROBOT, ROBOMETER)
@@ -187,13 +188,10 @@ def _check(settings: Mapping[str, Any]) -> None:
     prefixes, fps, suffix = settings["num_prefixes"], settings["fps"], settings["prompt_suffix"]
     if prefixes is not None and prefixes < 2:
         raise CheckpointError.at("num_prefixes", "at least 2, the first and the last", prefixes)
-    if settings["max_frames"] < 1:
-        raise CheckpointError.at("max_frames", "at least 1", settings["max_frames"])
-    if not 0 < float(fps) < float("inf"):
-        raise CheckpointError.at("fps", "a finite number above 0", shown(fps))
+    require("max_frames", settings["max_frames"] >= 1, "at least 1", settings["max_frames"], CheckpointError)
+    require("fps", 0 < float(fps) < float("inf"), "a finite number above 0", shown(fps), CheckpointError)
     try:
         is_good = suffix.format(instruction="TASK") != suffix.format(instruction="")
     except (AttributeError, IndexError, LookupError, ValueError):
         is_good = False
-    if not is_good:
-        raise CheckpointError.at("prompt_suffix", "text with {instruction}", shown(suffix))
+    require("prompt_suffix", is_good, "text with {instruction}", shown(suffix), CheckpointError)

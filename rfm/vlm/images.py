@@ -32,6 +32,7 @@ IMAGE_TOKENS = (4, 16_384)  # merged tokens of an image: least, most
 VIDEO_TOKENS = (128.0, 768.0)  # of a frame of a video
 VIDEO_TOTAL_TOKENS = 128_000 * 0.9  # of a whole video
 MAX_QWEN_ASPECT_RATIO = 200
+_NOT_LONG = f"an image at most {MAX_QWEN_ASPECT_RATIO} times as long as wide"
 MAX_VIDEO_SIDE_PX = 480  # larger frames of videos are scaled down first
 
 
@@ -51,9 +52,8 @@ class Grid:
 
 def check_aspect(height: int, width: int) -> None:
     """Raise InvalidSampleError for an image over 200 times as long as wide."""
-    expected = f"an image at most {MAX_QWEN_ASPECT_RATIO} times as long as wide"
     is_fit = max(height, width) / min(height, width) <= MAX_QWEN_ASPECT_RATIO
-    require("frames", is_fit, expected, f"{height} x {width}", InvalidSampleError)
+    require("frames", is_fit, _NOT_LONG, f"{height} x {width}", InvalidSampleError)
 
 
 def fitted_size(height: int, width: int, factor: int, tokens: tuple[float, float] = IMAGE_TOKENS) -> tuple[int, int]:

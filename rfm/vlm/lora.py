@@ -226,24 +226,18 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
     if not base:
         raise CheckpointError.at(run.file, "model.base_model_id (or --base-model)", "none")
     named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
+    where = f"{folder / ADAPTER_CONFIG}: base_model_name_or_path"
     if isinstance(named, str) and _FEW_BITS.search(named):
-        where, remedy = f"{folder / ADAPTER_CONFIG}: base_model_name_or_path", DEQUANTIZED.format(base=named)
+        remedy = DEQUANTIZED.format(base=named)
         raise CheckpointError.at(where, "weights in full precision", shown(named), remedy)
     if named and model_name(str(named)) != model_name(base):
-        raise CheckpointError.at(
-            f"{folder / ADAPTER_CONFIG}: base_model_name_or_path",
-            f"{cut(base)}, the model.base_model_id of {run.file}",
-            shown(named),
-            "name the one that the adapter was trained on with --base-model",
-        )
+        remedy = "name the one that the adapter was trained on with --base-model"
+        raise CheckpointError.at(where, f"{cut(base)}, the model.base_model_id of {run.file}", shown(named), remedy)
     began_with = run.get("training.load_from_checkpoint", "")
     if began_with:
-        raise CheckpointError.at(
-            f"{run.file}: training.load_from_checkpoint",
-            "none beside an adapter",
-            f"{shown(began_with)}: the adapter may change its weights in place of those of {cut(base)}",
-            f"{MERGE}; if it does change those of {cut(base)}, name them with --base-model",
-        )
+        got = f"{shown(began_with)}: the adapter may change its weights in place of those of {cut(base)}"
+        remedy = f"{MERGE}; if it does change those of {cut(base)}, name them with --base-model"
+        raise CheckpointError.at(f"{run.file}: training.load_from_checkpoint", "none beside an adapter", got, remedy)
     return base
 
 

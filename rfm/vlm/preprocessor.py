@@ -97,12 +97,12 @@ def check_settings(settings: Settings, neutral: Settings, where: object) -> None
         if name not in neutral and value in (False, {}, []):
             continue
         usual = "1/255" if name == "rescale_factor" else json.dumps(neutral.get(name))
-        raise CheckpointError.at(
-            f"{where}: {name}",
-            usual if name in neutral else "a known setting",
-            f"{_text(value)}, which is not applied here and may change pixels",
-            "if the model was trained without it, remove it from a copy of the folder and name that with --base-model",
+        expected = usual if name in neutral else "a known setting"
+        got = f"{_text(value)}, which is not applied here and may change pixels"
+        remedy = (
+            "if the model was trained without it, remove it from a copy of the folder and name that with --base-model"
         )
+        raise CheckpointError.at(f"{where}: {name}", expected, got, remedy)
 
 
 def _text(value: Any) -> str:

@@ -17,6 +17,7 @@ from rfm.checkpoint.provenance import OF_UPSTREAM, OF_WEIGHTS, TRAINED_WITH_PADD
 from rfm.checkpoint.run_config import find_run_config, frame_count
 from rfm.vlm.backbone import QWEN_2_5, SMOL
 from rfm.vlm.network import VlmConfig
+from rfm_client.contract.checks import require
 
 if TYPE_CHECKING:
     from rfm.vlm.lora import Scaling
@@ -79,8 +80,7 @@ class RunConfig:
         for name, section in sections.items():
             if not isinstance(section, dict):
                 raise CheckpointError.at(f"{file}: {name}", "a mapping", shown(section))
-        if not sections["model"]:
-            raise CheckpointError.at(f"{file}: model", "the settings of the training run", "none")
+        require(f"{file}: model", bool(sections["model"]), "the settings of the training run", "none", CheckpointError)
         return cls(file, file_name(file, folder), sections)
 
     def check_model_type(self) -> None:
@@ -172,8 +172,7 @@ class RunConfig:
 
     def _one_of(self, place: str, default: str, known: tuple[str, ...]) -> str:
         value = self.get(place, default).removeprefix("torch.")
-        if value not in known:
-            raise CheckpointError.at(f"{self.file}: {self.shown(place)}", f"one of {known}", shown(value))
+        require(f"{self.file}: {self.shown(place)}", value in known, f"one of {known}", shown(value), CheckpointError)
         return value
 
     def _of_either(self, setting: str) -> bool:

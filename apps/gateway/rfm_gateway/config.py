@@ -80,7 +80,10 @@ class GatewayConfig(Settings):
     @property
     def credentials(self) -> Credentials:
         """Credentials for Triton. Raises ConfigError for unusable files."""
-        return Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key)
+        try:
+            return Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key)
+        except ConfigError as error:
+            raise error.named(lambda name: f"triton_{name.removeprefix('client_')}") from None
 
     @property
     def tls(self) -> dict[str, Any]:

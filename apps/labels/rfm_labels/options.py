@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias, get_args
 
 from rfm_client.frames import Fuse, Rule
-from rfm_client.options import ConfigError, InvalidValueError, Settings, checked_count, checked_finite, setting
+from rfm_client.options import ConfigError, InvalidValueError, Settings, checked_count, checked_finite, require, setting
 
 Mode: TypeAlias = Literal["prefix", "whole"]
 Format: TypeAlias = Literal["progress", "signals", "hdf5"]
@@ -114,8 +114,7 @@ class LabelOptions(Settings):
             if value is not None and not _NAME.fullmatch(value):
                 raise ConfigError.at(name, "1 to 64 letters, digits, _ or -", repr(value))
         for each in self.formats:
-            if each not in FORMATS:
-                raise ConfigError.at("formats", f"one of {', '.join(FORMATS)}", repr(each))
+            require("formats", each in FORMATS, f"one of {', '.join(FORMATS)}", repr(each), ConfigError)
         if len(set(self.cameras)) != len(self.cameras):
             raise ConfigError.at("cameras", "each once", ", ".join(self.cameras))
         if self.mode == "whole" and self.sampling not in (None, "all"):

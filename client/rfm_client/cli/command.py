@@ -18,7 +18,6 @@ from typer.core import TyperCommand
 from typer.models import OptionInfo
 
 from rfm_client.contract import errors
-from rfm_client.contract.errors import LocatedError
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of, settings_of
 
 STANDARD_OUTPUT = "-"
@@ -130,10 +129,8 @@ class OptionsOf:
             value = values.pop(self.name(each))
             if value in (None, []):
                 continue
-            try:
+            with usage_errors(self.option(each)):
                 value = each.parse(value) if each.parse else value
-            except ValueError as error:
-                raise _usage_error(error, self.option(each)) from None
             given[each.name] = tuple(value) if isinstance(value, list) else value
         return given
 
@@ -256,7 +253,7 @@ def usage_errors(option: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise _usage_error(error, option) from error
+        raise typer.BadParameter(str(getattr(error, "problem", error)), param_hint=f"'{option}'") from error
 
 
 def missing_package(error: ImportError) -> str:
@@ -266,19 +263,15 @@ def missing_package(error: ImportError) -> str:
     return f'{error}: pip install "./client[cli]"'
 
 
-def _usage_error(error: ValueError, option: str) -> typer.BadParameter:
-    return typer.BadParameter(
-        error.problem if isinstance(error, LocatedError) else str(error), param_hint=f"'{option}'"
-    )
-
-
 def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:
     """Wrong usage of the options whose settings the error names; the error itself for other settings."""
     options = {each.name: mark.option(each) for mark in marks for each in mark.chosen}
     if not {error.where, error.other or error.where} <= options.keys():
         return error
     named = error.named(options.__getitem__)
-    return typer.BadParameter(str(named)) if error.other else _usage_error(named, named.where)
+    if error.other:
+        return typer.BadParameter(str(named))
+    return typer.BadParameter(named.problem, param_hint=f"'{named.where}'")
 
 
 def _mark(hint: Any) -> OptionsOf | None:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeAlias, Ty
 
 import numpy as np
 
-from rfm_client.contract.errors import InvalidValueError
+from rfm_client.contract.checks import require
 from rfm_client.contract.samples import UInt8Array
+from rfm_client.contract.settings import ConfigError
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -45,8 +46,7 @@ def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
 
 def check_value(name: str, values: tuple[str, ...], value: object) -> None:
     """Raise ValueError unless the value is one of the option's values."""
-    if value not in values:
-        raise InvalidValueError.at(name, f"one of {', '.join(values)}", repr(value))
+    require(name, value in values, f"one of {', '.join(values)}", repr(value), ConfigError)
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,8 @@ class PerCamera(Generic[Value]):
         cameras: dict[str, Any] = {}
         for text in texts:
             camera, is_named, value = text.rpartition("=")
-            if (camera in cameras) if is_named else default is not None:
-                raise InvalidValueError.at(cls.NAME, "each camera once", f"{text!r} again")
+            is_first = camera not in cameras if is_named else default is None
+            require(cls.NAME, is_first, "each camera once", f"{text!r} again", ConfigError)
             if is_named:
                 cameras[camera] = value
             else:

@@ -22,12 +22,12 @@ import time
 from collections.abc import Awaitable, Callable, Collection, Sequence
 from typing import TypeVar
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import (
     AccessDeniedError,
     ClientClosedError,
     DeadlineExceededError,
     InferenceFailedError,
-    InvalidValueError,
     ModelNotFoundError,
     ProcessEndedError,
     RewardError,
@@ -115,8 +115,7 @@ class Servers:
     """Several servers that share the requests, for one event loop. retry: True: send failed requests again"""
 
     def __init__(self, transports: Sequence[Transport], *, retry: bool) -> None:
-        if not transports:
-            raise InvalidValueError.at("url", "at least one", "none")
+        require("url", len(transports) > 0, "at least one", "none")
         self._servers = [KnownServer(transport) for transport in transports]
         self._retry = retry
         self._is_closed = False

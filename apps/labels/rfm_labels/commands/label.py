@@ -26,7 +26,7 @@ from rfm_client.command_line import (
     with_options,
 )
 from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, Channels, Orient
-from rfm_client.options import ConfigError, InvalidValueError, Settings, Texts, setting
+from rfm_client.options import Settings, Texts, setting
 from rfm_labels import blank_cameras
 from rfm_labels.commands.progress_bar import ProgressBar, Say
 from rfm_labels.datasets.faults import listed
@@ -107,10 +107,7 @@ class EpisodeTexts(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         for option in _OF_CAMERAS:
-            try:
-                option.parse(getattr(self, option.NAME))
-            except InvalidValueError as error:
-                raise ConfigError.like(error) from None
+            option.parse(getattr(self, option.NAME))
 
     @property
     def opening(self) -> dict[str, Any]:
