@@ -8,9 +8,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from rfm_client import RewardError
 from rfm_client.cli import command
-from rfm_client.contract.errors import LocatedError
 
 OF_A_CHECKPOINT = ("checkpoint", "image_encoder", "text_encoder", "base_model", "reward_model")  # settings that name it
 ASKED_BY = ("video_prompt", "strict_answers", "weights")  # settings that change how it is asked, or its weights
@@ -29,7 +27,6 @@ class RfmCommand(command.Command):
 
     program = "rfm"
     has_codes = False
-    expected = (LocatedError, RewardError, OSError)
 
 
 def say(line: str) -> None:

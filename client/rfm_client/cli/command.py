@@ -171,7 +171,6 @@ class Command(TyperCommand):
     """
 
     program = "rfm-client"
-    expected: tuple[type[Exception], ...] = (errors.RewardError, OSError)
     has_codes = True  # False: every error ends the command with 1
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -215,7 +214,7 @@ class Command(TyperCommand):
             raise
         except ImportError as error:
             code, lines = ExitCode.FAILED, [missing_package(error)]
-        except self.expected as error:
+        except (errors.LocatedError, errors.RewardError, OSError) as error:
             code = exit_code(error) if self.has_codes else ExitCode.FAILED
             lines = str(error).split("\n")
         for line in lines:

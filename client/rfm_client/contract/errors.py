@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Errors of invalid values, which carry fields, and errors of a call to the server.
 
-    LocatedError                  ``where: expected X, got Y; remedy``
-    +-- InvalidValueError         an argument or setting
-
     RewardError
     +-- InvalidSampleError        the sample is at fault; a retry gives the same answer
     +-- ClientClosedError         the client was closed before or during the call

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from rfm_client.options import InvalidValueError, checked_count
+from rfm_client.options import checked_count
 from rfm_labels.datasets.lerobot_rows import Entry, Info
 from rfm_labels.datasets.lerobot_tasks import by_number
 from rfm_labels.datasets.protocol import DatasetError, require
@@ -70,7 +70,4 @@ def _entry(info: Info, where: str, index: int, line: Mapping[str, Any]) -> Entry
 
 
 def _number(where: str, line: Mapping[str, Any], name: str) -> int:
-    try:
-        return checked_count(f"{where}: {name}", line.get(name), least=0)
-    except InvalidValueError as error:
-        raise DatasetError.like(error) from error
+    return checked_count(f"{where}: {name}", line.get(name), least=0, error=DatasetError)
