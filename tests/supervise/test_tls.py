@@ -358,6 +358,15 @@ def test_half_a_certificate_of_the_gateway_is_refused(papers: Papers) -> None:
     assert "Invalid value: --certificate needs --key" in done.stderr
 
 
+def test_a_file_for_triton_that_is_not_there_is_refused_with_the_gateway_s_option() -> None:
+    done = CliRunner().invoke(app, ["gateway", "--triton", "grpcs://127.0.0.1:1", "--triton-ca-file", "/nowhere"])
+    assert done.exit_code == 2
+    told = (
+        "Invalid value for '--triton-ca-file': expected certificates (PEM) at /nowhere, got No such file or directory"
+    )
+    assert told in done.stderr
+
+
 def test_rfm_serve_heals_with_tls(mutual: Endpoints, papers: Papers, running: Serving, repository: Path) -> None:
     """It is told of no certificate for itself."""
     kill_model(repository)
