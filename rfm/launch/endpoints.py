@@ -15,7 +15,7 @@ from rfm.config import DEFAULT_HOST, ServeConfig
 from rfm.launch.installation import ServerStartError
 from rfm_client.contract.addresses import check_authorities, check_certificate, is_loopback
 from rfm_client.contract.errors import InvalidValueError
-from rfm_client.contract.listening import check_free, in_url
+from rfm_client.contract.listening import ListenAddress, in_url
 
 PORTS = range(20_000, 32_000)  # below the ports that Linux gives to outgoing connections
 SECURITY_FLOOR = (
@@ -114,7 +114,7 @@ class Endpoints:
             if self.grpc_tls is not None:
                 self.grpc_tls.check()
             for name, host, port in listening:
-                check_free(host, port, name, port_option=f"--{name.lower()}-port")
+                ListenAddress(host, port).check_free(name, port_option=f"--{name.lower()}-port")
         except InvalidValueError as error:
             raise ServerStartError.like(error) from None
 

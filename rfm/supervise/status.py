@@ -15,7 +15,7 @@ from typing import Any
 
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
-from rfm_client.contract.listening import check_free
+from rfm_client.contract.listening import ListenAddress
 
 NO_REASON = ""  # of a ready model
 REQUEST_S = 5.0  # longest silence of a connection
@@ -85,7 +85,7 @@ class StatusServer(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, host: str, port: int, status: Status) -> None:
-        check_free(host, port, "status", port_option="--status-port")
+        ListenAddress(host, port).check_free("status", port_option="--status-port")
         self.status = status
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         super().__init__((host, port), _Handler)

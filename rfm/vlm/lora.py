@@ -44,7 +44,6 @@ from rfm.vlm.backbone import (
 )
 from rfm.vlm.lora_targets import TEXT, WHOLE, check_factors, check_none_lost, check_replaced
 from rfm.vlm.rounded import is_rounded, shape_of
-from rfm.vlm.run_config import RunConfig, model_name
 
 LORA_NAME = re.compile(r"(?P<module>.+)\.lora_(?P<side>[AB])(\.default)?\.weight")
 _BASE_LAYER = ".base_layer."
@@ -195,10 +194,9 @@ _NO_EMBEDDING = (
     "lost with the run; save the whole model where it was trained (save_model() of the trainer), or the adapter with "
     "save_pretrained(..., save_embedding_layers=True)"
 )
-# In names of SmolVLM's weights, of LoRA factors of embeddings, and of an embedding that PEFT saves in two ways at once.
-_OTHER = re.compile(r"\.(text_model|lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
+# In names of LoRA factors of embeddings, and of an embedding that PEFT saves in two ways at once.
+_OTHER = re.compile(r"\.(lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
 _PARTS = ("model.language_model.", "model.visual.")  # in names of an adapter around all of them
-_FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # Unsloth's names of base models rounded to fewer bits, for training
 
 
 def has_adapter(folder: Path) -> bool:
@@ -214,31 +212,6 @@ def has_adapter(folder: Path) -> bool:
         remedy = "move away the one that is not meant"
         raise CheckpointError.at(folder, f"an adapter ({adapter[0]}) or whole weights ({whole[0]})", "both", remedy)
     return bool(adapter)
-
-
-def base_of_adapter(folder: Path, run: RunConfig) -> str:
-    """Return the base model that the run names.
-
-    Raises CheckpointError if the adapter names another, or if the run began with a checkpoint, whose weights the
-    adapter may change.
-    """
-    base = run.get("model.base_model_id", "")
-    if not base:
-        raise CheckpointError.at(run.file, "model.base_model_id (or --base-model)", "none")
-    named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
-    where = f"{folder / ADAPTER_CONFIG}: base_model_name_or_path"
-    if isinstance(named, str) and _FEW_BITS.search(named):
-        remedy = DEQUANTIZED.format(base=named)
-        raise CheckpointError.at(where, "weights in full precision", shown(named), remedy)
-    if named and model_name(str(named)) != model_name(base):
-        remedy = "name the one that the adapter was trained on with --base-model"
-        raise CheckpointError.at(where, f"{cut(base)}, the model.base_model_id of {run.file}", shown(named), remedy)
-    began_with = run.get("training.load_from_checkpoint", "")
-    if began_with:
-        got = f"{shown(began_with)}: the adapter may change its weights in place of those of {cut(base)}"
-        remedy = f"{MERGE}; if it does change those of {cut(base)}, name them with --base-model"
-        raise CheckpointError.at(f"{run.file}: training.load_from_checkpoint", "none beside an adapter", got, remedy)
-    return base
 
 
 def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor], Scaling]:

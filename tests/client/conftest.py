@@ -4,16 +4,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import clip
-from environments import MODEL, LateClient
 from paths import ROOT
-from reference_server import Served
-from rfm_client import RewardClient
 
 
 @pytest.fixture(scope="session")
@@ -28,18 +24,6 @@ def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("TERMINAL_WIDTH", "200")
     monkeypatch.delenv("RFM_URL", raising=False)
-
-
-@pytest.fixture
-def client(served: Served) -> Iterator[RewardClient]:
-    with served.client("grpc", MODEL) as client:
-        yield client
-
-
-@pytest.fixture
-def late(served: Served) -> Iterator[LateClient]:
-    with LateClient(served.url("grpc")) as client:
-        yield client
 
 
 @pytest.fixture

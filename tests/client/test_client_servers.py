@@ -69,7 +69,7 @@ class Stand:
         self.asked["model_info"] += 1
         if self.error is not None:
             raise self.error
-        return ModelInfo(model, (str(self.version),), 64, None, None, None, None, None)
+        return ModelInfo(name=model, versions=(str(self.version),), max_batch_size=64)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         return self.error is None and not self.is_down

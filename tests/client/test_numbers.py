@@ -13,7 +13,7 @@ import pytest
 
 from rfm_client import RewardClient
 from rfm_client.contract.results import FrameScores
-from rfm_client.episodes.steps import EpisodeOptions, SuccessRule
+from rfm_client.episodes import EpisodeOptions, SuccessRule
 from rfm_client.frames.inputs import load_trajectory
 from rfm_client.frames.sampling import Sampling
 from rfm_client.frames.video import read_video

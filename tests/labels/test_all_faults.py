@@ -20,16 +20,8 @@ from labelling import FEW, LEROBOT, WRIST, BrightnessScorer, Notes
 from pictures import numbered, write_video
 from rfm_client import RewardError
 from rfm_client.cli.command import ExitCode
-from rfm_labels import (
-    DatasetError,
-    LabelOptions,
-    RayOptions,
-    Scorer,
-    label,
-    open_dataset,
-    parse_episodes,
-)
-from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
+from rfm_labels import DatasetError, LabelOptions, RayOptions, Scorer, label, open_dataset, parse_episodes
+from rfm_labels.commands import EpisodeTexts, LabelCommand, RunOptions
 
 TASK = "stack the cups"
 

@@ -20,9 +20,8 @@ from pyarrow import parquet
 from labelling import BrightnessScorer, brightness
 from pictures import numbered, numbers
 from rfm_client.cli.command import ExitCode
-from rfm_client.frames.orientation import Orient
 from rfm_labels import DatasetError, LabelOptions, RayOptions, Scorer, label, open_dataset
-from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
+from rfm_labels.commands import EpisodeTexts, LabelCommand, RunOptions
 
 TASK = "stack the cups"
 COUNT = 12  # frames of an episode, so that 10.png is there
@@ -134,7 +133,7 @@ def test_arrays_are_episodes_with_their_own_tasks_or_the_callers(tmp_path: Path)
     frames = numbered(COUNT)
     np.save(tmp_path / "10.npy", frames[:4])
     np.savez(tmp_path / "9.npz", frames=frames.astype(np.float32) / 255, task="open the box")
-    dataset = open_dataset(tmp_path, task=TASK, orient=Orient.parse(["flip-vertical"]))
+    dataset = open_dataset(tmp_path, task=TASK, orient="flip-vertical")
     assert (dataset.kind, dataset.decoder("frames")) == ("arrays", None)
     told = [(e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
     assert told == [("9.npz", "open the box", COUNT, 0), ("10.npy", TASK, 4, COUNT)]

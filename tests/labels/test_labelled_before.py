@@ -19,7 +19,7 @@ from pyarrow import parquet
 
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, without_cost
 from rfm_labels import DatasetError, LabelOptions, RayOptions, Scorer, label, open_dataset
-from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
+from rfm_labels.commands import EpisodeTexts, LabelCommand, RunOptions
 
 TOY = LEROBOT / "toy_v30_many"
 CAMERAS = (WRIST, FRONT)  # not in the order of their names

@@ -29,10 +29,11 @@ import local_hub
 from encoding import encode, encode_here
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer
 from pictures import write_video
+from rfm_client.frames import video_file
+from rfm_client.frames.video_decoding import read_packets
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 from rfm_labels.datasets import lerobot
-from rfm_labels.datasets.protocol import chosen_cameras, digest_of
-from rfm_labels.datasets.video_frames import video_packets
+from rfm_labels.datasets.stored_files import digest_of
 
 HUB_ID = "org/name"
 ELSEWHERE = goldens.ROOT.parent / "lerobot"  # beside the further reference cases, where there are some
@@ -123,14 +124,14 @@ def test_a_depth_camera_counts_only_where_it_is_named(tmp_path: Path, mark: dict
     root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "toy")
     change_info(root, lambda info: info["features"][WRIST].update(mark))
     dataset = open_dataset(root)
-    assert chosen_cameras(dataset, ()) == (FRONT,)
+    assert dataset.chosen_cameras() == (FRONT,)
     assert (list(dataset.cameras), list(dataset.depth_cameras)) == ([FRONT, WRIST], [WRIST])
-    assert chosen_cameras(dataset, ["front", "wrist"]) == (FRONT, WRIST)
+    assert dataset.chosen_cameras(["front", "wrist"]) == (FRONT, WRIST)
     report = label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path, limit=1, frames=2, formats=("progress",)))
     assert "progress.wrist" not in parquet.read_schema(report.files[0]).names
     change_info(root, lambda info: info["features"][FRONT].update(mark))
     with pytest.raises(DatasetError, match=r"^cameras: expected .* named: all are depth cameras, got none$"):
-        chosen_cameras(open_dataset(root), ())
+        open_dataset(root).chosen_cameras()
 
 
 def saved(convert: Callable[[Any], Any] = lambda image: image, form: str = "PNG") -> Callable[[Any], bytes]:
@@ -480,11 +481,11 @@ def test_a_check_reads_the_packets_of_each_video_once(monkeypatch: pytest.Monkey
     """Also with more cameras than videos that otherwise stay in memory."""
     read: list[Path] = []
 
-    def counted(file: Path, container: str | None = None) -> Any:
-        read.append(file)
-        return video_packets(file, container)
+    def counted(file: Any, container: str | None = None) -> Any:
+        read.append(Path(file.name))
+        return read_packets(file, container)
 
-    monkeypatch.setattr(lerobot, "video_packets", counted)
+    monkeypatch.setattr(video_file, "read_packets", counted)
     monkeypatch.setattr(lerobot, "_VIDEOS_AT_A_TIME", 1)
     dataset = open_dataset(LEROBOT / "toy_v30_many")
     for episode in dataset.episodes:

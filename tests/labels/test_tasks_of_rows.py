@@ -16,7 +16,7 @@ from pyarrow import parquet
 
 from labelling import FEW, FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
-from rfm_labels.datasets.lerobot_v30 import read_tasks
+from rfm_labels.datasets.lerobot_rows import read_sentences
 
 V21, V30 = LEROBOT / "toy_v21", LEROBOT / "toy_v30_many"
 LENGTH = 58  # of episode 0 of V30
@@ -56,7 +56,7 @@ def write_subtasks(root: Path, table: pa.Table) -> None:
 
 
 def sentences() -> dict[int, str | None]:
-    return read_tasks(V30)
+    return read_sentences(V30 / "meta" / "tasks.parquet")
 
 
 ANNOTATION = "annotation.human.action.task_description"
@@ -288,7 +288,7 @@ def test_a_table_of_tasks_is_read_as_its_writers_name_its_columns(
 ) -> None:
     (tmp_path / "meta").mkdir()
     parquet.write_table(pa.table(columns), tmp_path / "meta" / "tasks.parquet")
-    assert list(read_tasks(tmp_path).values()) == expected
+    assert list(read_sentences(tmp_path / "meta" / "tasks.parquet").values()) == expected
 
 
 def test_a_table_of_tasks_out_of_order_is_told_since_lerobot_counts_its_rows(tmp_path: Path, output: Path) -> None:

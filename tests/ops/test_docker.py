@@ -33,7 +33,7 @@ from paths import ROOT
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import Endpoints
 from rfm_commands.config import Config
-from rfm_export.batches import MOST_SAMPLES
+from rfm_export.source import MOST_SAMPLES
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 

@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ from gateway_requests import TOLERANCE
 from gateways import Gateway, poll, running
 from paths import VIDEOS
 from rfm.launch.triton_server import Endpoints
-from rfm_client.frames.orientation import CHANNEL_ORDERS, ORIENTATIONS, ChannelOrder, Correction, Orientation
+from rfm_client.frames import ChannelOrder, Correction, Orientation
 from toy_world import Task, make_clip
 from viewer_requests import by_command_line
 
@@ -142,7 +142,7 @@ def picture(page: Page) -> Image.Image:
 
 @pytest.mark.parametrize(
     ("orientation", "channels"),
-    [*((orientation, "rgb") for orientation in ORIENTATIONS), ("none", "bgr"), ("rotate90", "bgr")],
+    [*((orientation, "rgb") for orientation in get_args(Orientation)), ("none", "bgr"), ("rotate90", "bgr")],
 )
 def test_a_person_sees_what_the_model_sees(page: Page, orientation: Orientation, channels: ChannelOrder) -> None:
     frames = make_clip("success", Task("red", "bowl"), 2_000_000).frames[:, :40]
@@ -163,7 +163,7 @@ def test_a_person_sees_what_the_model_sees(page: Page, orientation: Orientation,
         expected = Image.fromarray(correction.applied(frames[0]))
         return float(np.abs(np.float32(seen.resize(expected.size)) - np.float32(expected)).mean())
 
-    corrections = [Correction(*both) for both in itertools.product(ORIENTATIONS, CHANNEL_ORDERS)]
+    corrections = [Correction(*both) for both in itertools.product(get_args(Orientation), get_args(ChannelOrder))]
     assert min(corrections, key=distance) == Correction(orientation, channels)
 
 

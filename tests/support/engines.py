@@ -6,8 +6,6 @@ from __future__ import annotations
 import functools
 import importlib.metadata
 
-import pytest
-
 import goldens
 from rfm import families
 from rfm.config import ExportConfig
@@ -24,8 +22,6 @@ def serve_config(config: goldens.Config, name: str = "rfm") -> ExportConfig:
 @functools.cache
 def load_engine(name: str) -> Engine:
     """The engine of a reference checkpoint, with its encoders if it has some."""
-    if name.startswith("smol") and TRANSFORMERS >= 5:
-        pytest.skip("SmolVLM is refused with transformers 5")
     config = goldens.config(name)
     checkpoint = families.load(config.checkpoint, **config.sources)
     return Engine.of(checkpoint, encoders=checkpoint.encoders())

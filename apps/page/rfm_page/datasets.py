@@ -9,30 +9,17 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client import InvalidSampleError
-from rfm_client.frames import video_stream
-from rfm_client.options import ConfigError
-from rfm_labels.datasets import (
-    INFO_FILE,
-    TASK_COLUMN,
-    DatasetEpisode,
-    DatasetError,
-    Info,
-    LeRobotDataset,
-    Span,
-    TaskOverride,
-)
+from rfm_client.frames import FrameFileError, Video
+from rfm_labels import DatasetEpisode
+from rfm_labels.datasets import LeRobotDataset, Span
 from rfm_page.links import check_links, links_in
 from rfm_page.shown import ShownDataset
-
-_AS_STORED = TaskOverride(column=TASK_COLUMN, is_needed=False)  # blank and outdated tasks are shown, too
 
 
 @dataclass(frozen=True)
@@ -42,25 +29,6 @@ class ShownLeRobot(ShownDataset):
     has_stored_pixels = True
 
     dataset: LeRobotDataset
-
-    @classmethod
-    def open(cls, folder: str) -> ShownLeRobot:
-        """Open the dataset in a folder. Raises ConfigError for any other folder, or links out of it."""
-        try:
-            import pyarrow  # noqa: F401
-        except ImportError:
-            got = "none: pip install ./client ./apps/labels"
-            raise ConfigError.at("dataset", "pyarrow, which reads datasets", got) from None
-        if not (Path(folder) / INFO_FILE).is_file():
-            raise ConfigError.at("dataset", f"the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file", folder)
-        root = Path(folder).resolve()
-        try:
-            half_s = 0.5 / Info.read(root).fps  # a player shows the nearest frame, too
-            shown = cls(root, root, LeRobotDataset(root, task=_AS_STORED, tolerance_s=half_s))
-            shown.check()
-            return shown
-        except DatasetError as error:
-            raise ConfigError(str(error), "dataset") from None
 
     def check(self) -> None:
         """Raise DatasetError for a link out of the folder."""
@@ -92,10 +60,7 @@ def _cut(span: Span, take: Callable[[int], object]) -> bytes:
     """
     clip = io.BytesIO()
     try:
-        with av.open(
-            str(span.file), format="mov"
-        ) as video:  # without format=, FFmpeg would open the files in a play list
-            stream = video_stream(video)
+        with Video(span.video.file, "mov").opened() as (video, stream):  # another format may name other files
             packets = _packets(video, stream, span, take)
             zero = min(packet.pts for packet in packets if packet.pts * stream.time_base > _begin_s(span))
             with av.open(clip, "w", format="mp4") as copy:
@@ -105,8 +70,8 @@ def _cut(span: Span, take: Callable[[int], object]) -> bytes:
                     packet.dts -= zero
                     packet.stream = written
                     copy.mux(packet)
-    except InvalidSampleError as error:
-        raise DatasetError.like(error, where=f"{span.where}: {span.file}") from error
+    except FrameFileError as error:
+        raise span.error(error.expected, error.got) from error
     except (av.FFmpegError, OSError) as error:
         raise span.error("a video of the episode", error.strerror or str(error)) from error
     return clip.getvalue()

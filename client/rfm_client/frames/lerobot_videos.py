@@ -15,6 +15,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.frames.pictures import FrameFileError
 from rfm_client.frames.video_decoding import import_av, read_packets
 
 _INSTEAD = (
@@ -95,7 +96,7 @@ def _num_frames(video: Path) -> int | None:
     try:
         with video.open("rb") as file:
             return read_packets(file).count
-    except (InvalidSampleError, import_av().FFmpegError, OSError):
+    except (FrameFileError, import_av().FFmpegError, OSError):
         return None
 
 

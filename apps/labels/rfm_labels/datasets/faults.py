@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""List the faults of all episodes, and the options that help."""
+"""Errors of a dataset, and the lines that tell the faults of many episodes with the options that help."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+
+from rfm_client import RewardError
+from rfm_client.options import InvalidValueError
+from rfm_client.options import require as require_that
 
 _MOST_SHOWN = 20
 
@@ -44,3 +49,29 @@ def fault_lines(faults: Mapping[int, str], numbers: Sequence[int], num_without_t
     if others:
         lines.append(f"to continue without the faulty episodes: --episodes {listed(others)}")
     return lines
+
+
+class DatasetError(RewardError, InvalidValueError):
+    """A contradictory or unreadable dataset. where: a file, or a place in it"""
+
+
+class MissingTaskError(DatasetError):
+    """An episode without a task."""
+
+
+class UnusedTaskError(DatasetError):
+    """A task of the caller that no episode needs."""
+
+
+class FaultsError(DatasetError):
+    """Several faults, one per line, then the options that help."""
+
+    @classmethod
+    def of(cls, faults: Mapping[int, RewardError], numbers: Sequence[int]) -> FaultsError:
+        """Return the error of these episodes. numbers: of all chosen episodes"""
+        without_task = [fault for fault in faults.values() if isinstance(fault, MissingTaskError)]
+        messages = {number: str(fault) for number, fault in faults.items()}
+        return cls("\n".join(fault_lines(messages, numbers, len(without_task))))
+
+
+require = partial(require_that, error=DatasetError)
