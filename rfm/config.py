@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
 
 from rfm.parameters import DEFAULT_HANG_S
 from rfm_client.contract.addresses import MAX_PORT, is_loopback
+from rfm_client.contract.checks import require
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.settings import ConfigError, Settings, setting
 
@@ -115,9 +116,8 @@ class ExportConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", self.name):
-            raise ConfigError("name", f"expected letters, digits, _ and -, got {self.name!r:.200}")
-        if len(self.name) > MAX_NAME:
-            raise ConfigError("name", f"expected at most {MAX_NAME} characters, got {len(self.name)}")
+            raise ConfigError.at("name", "letters, digits, _ and -", f"{self.name!r:.200}")
+        require("name", len(self.name) <= MAX_NAME, f"at most {MAX_NAME} characters", len(self.name), ConfigError)
 
     @property
     def torch_dtype(self) -> torch.dtype | None:
@@ -162,10 +162,9 @@ class ServeConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "host", _address(self.host))
-        if (self.grpc_certificate is None) != (self.grpc_key is None):
-            raise ConfigError("grpc_certificate, grpc_key", "expected both or none, got one")
+        ConfigError.require_both(self, "grpc_certificate", "grpc_key")
         if self.grpc_client_ca is not None and self.grpc_certificate is None:
-            raise ConfigError("grpc_client_ca", "expected with grpc_certificate and grpc_key, got it alone")
+            raise ConfigError.of_two("grpc_client_ca", "needs", "grpc_certificate")
 
     @property
     def is_loopback(self) -> bool:
@@ -185,4 +184,4 @@ def _address(host: str) -> str:
         return str(ipaddress.ip_address(address))
     except ValueError:  # Triton would take a name as 255.255.255.255
         expected = "an IP address without port (http_port), such as 127.0.0.1, ::1, 0.0.0.0 or ::"
-        raise ConfigError("host", f"expected {expected}, got {address!r:.200}") from None
+        raise ConfigError.at("host", expected, f"{address!r:.200}") from None

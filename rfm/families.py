@@ -23,11 +23,11 @@ def named(package: str) -> Family:
     try:
         family = getattr(import_module(package), "FAMILY", None)
     except ImportError as error:
-        raise CheckpointError(f"family: expected a package that can be imported, got {package}: {error}") from error
+        raise CheckpointError.at("family", "a package that can be imported", f"{package}: {error}") from error
     if not isinstance(family, Family):
-        raise CheckpointError(f"family: expected a package with a FAMILY, got {package}")
+        raise CheckpointError.at("family", "a package with a FAMILY", package)
     if family.name != package:
-        raise CheckpointError(f"family: expected the name of its package, {package}, got {family.name}")
+        raise CheckpointError.at("family", f"the name of its package, {package}", family.name)
     return family
 
 
@@ -35,7 +35,7 @@ def encoders_of(package: str) -> type[FrameEncoders]:
     """Return the class of a family's encoders. Raises CheckpointError if the family has none."""
     encoders = named(package).encoders
     if encoders is None:
-        raise CheckpointError(f"family: expected one with encoders, got {package}, whose checkpoints score raw frames")
+        raise CheckpointError.at("family", "one with encoders", f"{package}, whose checkpoints score raw frames")
     return encoders
 
 
@@ -52,7 +52,7 @@ def choose(folder: Path, package: str | None = None, options: Options | None = N
         if (found := next((family for family in known if wanted in family.reward_models), None)) is not None:
             return found
         names = [name for family in known for name in family.reward_models]
-        raise CheckpointError(f"--as: expected one of {', '.join(names)}, got {wanted!r}")
+        raise CheckpointError.at("--as", f"one of {', '.join(names)}", repr(wanted))
     return next((family for family in known if family.reads(folder)), known[-1])  # its load explains the fault
 
 

@@ -69,7 +69,7 @@ class Options:
             wanted = getattr(self, name)
             if wanted and getattr(config, name, None) != wanted:
                 flag, mend = f"--{name.replace('_', '-')}", "leave it out, or export the checkpoint again"
-                raise CheckpointError(f"{flag}: expected {expected}, got another checkpoint; {mend}")
+                raise CheckpointError.at(flag, expected, "another checkpoint", mend)
 
     def named(self) -> tuple[str | None, dict[str, str]]:
         """Return the reward model's name and the user's settings of it, from ``name,setting=value,...``.
@@ -80,7 +80,7 @@ class Options:
             return None, {}
         name, *settings = self.reward_model.split(",")
         if wrong := [setting for setting in settings if setting.count("=") != 1]:
-            raise CheckpointError(f"--as: expected setting=value, got {wrong[0]!r}")
+            raise CheckpointError.at("--as", "setting=value", repr(wrong[0]))
         return name, dict(setting.split("=") for setting in settings)
 
     def settings(self, known: Mapping[str, type]) -> dict[str, Any]:
@@ -94,11 +94,11 @@ class Options:
 def _value(name: str, text: str, known: Mapping[str, type]) -> Any:
     if name not in known:
         expected = f"settings among {', '.join(known)}" if known else "no settings of this reward model"
-        raise CheckpointError(f"--as: expected {expected}, got {name!r}")
+        raise CheckpointError.at("--as", expected, repr(name))
     try:
         return {"true": True, "false": False}[text] if known[name] is bool else known[name](text)
     except (KeyError, ValueError):
-        raise CheckpointError(f"--as: {name}: expected a value of type {known[name].__name__}, got {text!r}") from None
+        raise CheckpointError.at(f"--as: {name}", f"a value of type {known[name].__name__}", repr(text)) from None
 
 
 def config_fields(config: Any) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from rfm_client.contract.errors import (
     DeadlineExceededError,
     InferenceFailedError,
     InvalidSampleError,
+    InvalidValueError,
     ModelNotFoundError,
     RewardError,
 )
@@ -143,7 +144,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         """
         tasks = [task] * num if isinstance(task, str) else list(task)
         if len(tasks) != num:
-            raise ValueError(f"task: expected one for each of {num} episodes, got {len(tasks)}")
+            raise InvalidValueError.at("task", f"one for each of {num} episodes", len(tasks))
         each, where = EpisodeOptions(**options), "episodes[{}]" if num > 1 else ""
         steps = [Steps(sentence, each, env, where.format(env)) for env, sentence in enumerate(tasks)]
         return AsyncEpisodes(self._steps, self._call, steps)

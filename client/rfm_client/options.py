@@ -2,12 +2,14 @@
 """Declare settings of a command or a configuration file, and check values. Applications build on it."""
 
 from rfm_client.contract.checks import first_names, require
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.numbers import checked_count, checked_finite
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting, settings_of
 from rfm_client.contract.tasks import is_blank
 
 __all__ = [
     "ConfigError",
+    "InvalidValueError",
     "Settings",
     "Texts",
     "checked_count",

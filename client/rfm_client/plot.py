@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.results import FrameScores
 
 if TYPE_CHECKING:
@@ -48,12 +49,10 @@ def plot_scores(
     Raises ValueError for no result, for more than 40, and for another number of names or times; ImportError without
     matplotlib.
     """
-    if not 0 < len(results) <= MAX_CURVES:
-        raise ValueError(f"results: expected 1 to {MAX_CURVES}, got {len(results)}")
+    require("results", 0 < len(results) <= MAX_CURVES, f"1 to {MAX_CURVES}", len(results))
     times_s = [None] * len(results) if times_s is None else times_s
     for name, values in (("names", names), ("times_s", times_s)):
-        if len(values) != len(results):
-            raise ValueError(f"{name}: expected {len(results)}, as many as results, got {len(values)}")
+        require(name, len(values) == len(results), f"{len(results)}, as many as results", len(values))
     try:
         import matplotlib.style
         from matplotlib.figure import Figure

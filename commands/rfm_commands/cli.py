@@ -106,7 +106,7 @@ def export(
 
     if source is not None:
         if "checkpoint" in given:
-            raise typer.BadParameter("expected CHECKPOINT or --checkpoint, got both", param_hint="CHECKPOINT")
+            raise typer.BadParameter("give CHECKPOINT or --checkpoint, not both")
         given["checkpoint"] = source
     settings = _config(config_file, export=given).export
     if check:
@@ -205,8 +205,7 @@ def _folder_and_arguments(words: Sequence[str], repository: Path | None) -> tupl
     """The repository, and the arguments of tritonserver: typer passes words after ``--`` as words, too."""
     folder = words[0] if words and not words[0].startswith("-") else None
     if (folder is None) == (repository is None):
-        got = "none" if folder is None else "both"
-        raise typer.BadParameter(f"expected it, or --repository, got {got}", param_hint="FOLDER")
+        raise typer.BadParameter(f"give FOLDER or --repository{', not both' * (folder is not None)}")
     return (repository, words) if repository is not None else (Path(str(folder)), words[1:])
 
 

@@ -8,14 +8,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from rfm.checkpoint.content import CheckpointError
-from rfm.launch.admin_key import AdminKeyError
-from rfm.launch.installation import ServerStartError
-from rfm.launch.repository_api import RepositoryApiError
-from rfm_client import RewardError
 from rfm_client.cli import command
-from rfm_client.contract.settings import ConfigError
-from rfm_export.errors import ExportError
 
 OF_A_CHECKPOINT = ("checkpoint", "image_encoder", "text_encoder", "base_model", "reward_model")  # settings that name it
 ASKED_BY = ("video_prompt", "strict_answers", "weights")  # settings that change how it is asked, or its weights
@@ -34,10 +27,6 @@ class RfmCommand(command.Command):
 
     program = "rfm"
     has_codes = False
-    expected = (
-        *(AdminKeyError, CheckpointError, ConfigError, ExportError, RepositoryApiError, RewardError),
-        *(ServerStartError, OSError),
-    )
 
 
 def say(line: str) -> None:

@@ -43,7 +43,7 @@ class Config:
         ports["gateway.port"] = self.gateway.port
         taken = {name: port for name, port in ports.items() if port is not None}
         if len(set(taken.values())) < len(taken):
-            raise ConfigError("ports", f"expected different ones, got {taken}")
+            raise ConfigError.at("ports", "different ones", taken)
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Config:
@@ -51,19 +51,19 @@ class Config:
         try:
             content = read_yaml(Path(path))
         except (OSError, ValueError) as error:
-            raise ConfigError(str(path), f"expected a YAML file, got {error}") from error
+            raise ConfigError.at(str(path), "a YAML file", error) from error
         values: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
         written: dict[str, str] = {}  # a setting's key in the file, for messages
         try:
             for name, setting, value in _entries(content):
                 section, _, key = setting.partition(".")
                 if key in values[section]:
-                    raise ConfigError(name, f"expected once, got {setting} twice")
+                    raise ConfigError.at(name, "once", f"{setting} twice")
                 values[section][key] = value
                 written[setting] = name
             return cls(**{section: _made(section, values[section], written) for section in SECTIONS})
         except ConfigError as error:
-            raise ConfigError(f"{path}: {error.key}" if error.key else str(path), error.expected) from None
+            raise error.like(error, where=f"{path}: {error.where}" if error.where else str(path)) from None
 
     def with_options(self, **sections: Mapping[str, Any]) -> Config:
         """Return a copy with these values, by section and key. Raises ConfigError."""
@@ -72,7 +72,7 @@ class Config:
             try:
                 changed[section] = replace(getattr(self, section), **values)
             except ConfigError as error:
-                raise ConfigError(f"{section}.{error.key}", error.expected) from None
+                raise error.named(f"{section}.{{}}".format) from None
         return replace(self, **changed)
 
 
@@ -97,8 +97,7 @@ def _made(section: str, values: Mapping[str, Any], written: Mapping[str, str]) -
     try:
         return kind(**{key: known[key].from_plain(value) for key, value in values.items()})
     except ConfigError as error:
-        name = f"{section}.{error.key}"
-        raise ConfigError(written.get(name, name), error.expected) from None
+        raise error.named(lambda key: written.get(f"{section}.{key}", f"{section}.{key}")) from None
 
 
 def _items(content: Any, where: str) -> Iterable[tuple[Any, Any]]:
@@ -106,7 +105,7 @@ def _items(content: Any, where: str) -> Iterable[tuple[Any, Any]]:
     if content is None:
         return ()
     if not isinstance(content, dict):
-        raise ConfigError(where, f"expected keys and values, got {type(content).__name__}")
+        raise ConfigError.at(where, "keys and values", type(content).__name__)
     return content.items()
 
 
@@ -117,4 +116,4 @@ def _unknown(name: str, known: Iterable[str]) -> ConfigError:
     close = get_close_matches(name.rpartition(".")[2], keys, 1, cutoff=0.75)
     near = [each for each, key in zip(names, keys, strict=True) if [key] == close]
     meant = f"; perhaps {' or '.join(near)}" if near else ""
-    return ConfigError(name, f"expected one of {', '.join(known)}, got an unknown key{meant}")
+    return ConfigError.at(name, f"one of {', '.join(known)}", f"an unknown key{meant}")

@@ -119,7 +119,7 @@ def _settings_digest(
             return settings_digest([*folders, Path(written)], told)
     except (OSError, SafetensorError) as error:  # safetensors reports a full disk as SafetensorError
         expected = "a folder of temporary files with room for a copy of the encoders"
-        raise CheckpointError(f"TMPDIR: expected {expected}, got: {error}; name another one with it") from error
+        raise CheckpointError.at("TMPDIR", expected, error, "name another one with it") from error
 
 
 def _named(value: Any) -> Any:

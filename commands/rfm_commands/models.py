@@ -21,7 +21,7 @@ from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApi
 from rfm_client.cli.command import Given, OptionsOf, with_options
 from rfm_client.cli.options import CredentialFiles
 from rfm_client.contract.settings import Settings, setting
-from rfm_commands.command import RfmCommand, fail
+from rfm_commands.command import RfmCommand
 from rfm_commands.rollout import Rollout, check_files, models_of, previous_version
 
 SECURE = "grpcs://"
@@ -41,17 +41,14 @@ class AdministeredServer(Settings):
 
     @contextmanager
     def connected(self, context: typer.Context, files: Given) -> Iterator[RepositoryApi]:
-        """Yield the server's repository API. Raises AdminKeyError, RepositoryApiError.
+        """Yield the server's repository API. Raises InvalidValueError, RepositoryApiError.
 
         files: given after the subcommand; they win over those before it
         """
         before: CredentialFiles = context.obj
-        try:
-            credentials = replace(before, **files).read()
-        except ValueError as error:
-            fail(str(error))
+        credentials = replace(before, **files).read()
         if credentials.uses_tls and not self.url.startswith(SECURE):
-            raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {self.url}")
+            raise RepositoryApiError.at("url", f"{SECURE}host:port with certificates", self.url)
         options = credentials.grpc_options(self.url.partition(":")[0])
         with RepositoryApi(self.url, take_key(self.admin_key_file, os.environ), options) as api:
             yield api

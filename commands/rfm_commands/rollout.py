@@ -78,11 +78,11 @@ def previous_version(repository: Path, name: str, server: RepositoryApi) -> int:
     models = models_of(repository, name)
     served = [version for model in models for version in server.ready_versions(model)]
     if not served:
-        raise RolloutError(f"{name}: expected to be served, got no version that is")
+        raise RolloutError.at(name, "to be served", "no version that is")
     each = [{int(path.name) for path in (repository / model).glob("*") if path.name.isdecimal()} for model in models]
     older = [version for version in set.intersection(*each) if version < max(served)]
     if not older:
-        raise RolloutError(f"{repository / models[0]}: expected a version before {max(served)}, got none")
+        raise RolloutError.at(repository / models[0], f"a version before {max(served)}", "none")
     return max(older)
 
 
@@ -109,7 +109,7 @@ class Rollout:
             old = {model: read_config(self.repository, model) for model in models if not served[model]}
             old |= self._configs(models, {model: max(served[model]) for model in models if served[model]})
         except (OSError, ParseError) as error:
-            raise RolloutError(f"{self.name} version {version}: expected an exported version, got {error}") from error
+            raise RolloutError.at(f"{self.name} version {version}", "an exported version", error) from error
         check_files(self.repository, new)
         try:
             self._switch(new, served, version)

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Errors that stop an export."""
 
+from rfm_client.contract.errors import LocatedError
 
-class ExportError(Exception):
+
+class ExportError(LocatedError):
     """An export that cannot be made, and the reason."""
 
 

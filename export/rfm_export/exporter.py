@@ -100,7 +100,7 @@ def _needing_disk(repository: Path) -> Iterator[None]:
         yield
     except (OSError, SafetensorError) as error:  # safetensors reports a full disk as SafetensorError
         kept = "the versions that are served stay as they are; make room there, or name another --repository"
-        raise ExportError(f"{repository}: expected room for the exported files, got: {error}; {kept}") from error
+        raise ExportError.at(repository, "room for the exported files", error, kept) from error
 
 
 def _save(source: Source, version: Version, staged: Path) -> None:
@@ -118,10 +118,10 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     try:
         origin = origin_in(description_in(config))
     except ValueError as error:
-        raise ExportError(f"{repository / scorer / CONFIG_FILE}: {error}; export again") from error
+        raise ExportError(f"{error}; export again", repository / scorer / CONFIG_FILE) from error
     versions = config.version_policy.specific.versions
     if not versions:
-        raise ExportError(f"{repository / scorer}: expected a configuration that names its versions, got none")
+        raise ExportError.at(repository / scorer, "a configuration that names its versions", "none")
     number = max(versions)
     folder = repository / scorer / str(number) / CHECKPOINT_FOLDER
     family = families.choose(folder, config.parameters[FAMILY_PARAMETER].string_value or None)
@@ -145,7 +145,7 @@ def _read_config(repository: Path, name: str) -> Any:
     try:
         return read_config(repository, name)
     except (OSError, ParseError) as error:
-        raise ExportError(f"{repository / name}: expected an exported model, got {error}") from error
+        raise ExportError.at(repository / name, "an exported model", error) from error
 
 
 def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], settings: ExportConfig) -> None:
@@ -157,11 +157,10 @@ def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], setti
     names = {model.name for model in models}
     for name in (settings.name, encoder_name(settings.name), frames_name(settings.name)):
         if name not in names and (repository / name).exists():
-            raise ExportError(
-                f"{repository / name}: expected a checkpoint that this model can serve too, got one that it cannot; "
-                "choose another --repository or --name, or, of a ReWiND checkpoint, name its encoders "
-                "(--image-encoder, --text-encoder)"
-            )
+            encoders = "of a ReWiND checkpoint, name its encoders (--image-encoder, --text-encoder)"
+            remedy = f"choose another --repository or --name, or, {encoders}"
+            expected = "a checkpoint that this model can serve too"
+            raise ExportError.at(repository / name, expected, "one that it cannot", remedy)
     for model in models:
         if not (repository / model.name).exists():
             continue
@@ -174,7 +173,6 @@ def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], setti
         outputs = [tensor for tensor in model.config.output if tensor.name not in given]
         for kind, before, after in (("input", asked, inputs), ("output", there.output, outputs)):
             if list(before) != list(after):
-                raise ExportError(
-                    f"{repository / model.name}: expected a checkpoint with the same {kind}s as its other versions, "
-                    "got one with different shapes; choose another --name or --repository"
-                )
+                expected = f"a checkpoint with the same {kind}s as its other versions"
+                remedy = "choose another --name or --repository"
+                raise ExportError.at(repository / model.name, expected, "one with different shapes", remedy)

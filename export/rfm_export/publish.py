@@ -49,7 +49,7 @@ def alone(repository: Path) -> Iterator[None]:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released when the process ends, even if killed
     except BlockingIOError:
         os.close(descriptor)
-        raise ExportError(f"{repository}: expected no other export or rollout at work, got one") from None
+        raise ExportError.at(repository, "no other export or rollout at work", "one") from None
     except OSError as error:
         if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL):
             os.close(descriptor)
@@ -69,18 +69,14 @@ def _make_writable(repository: Path) -> None:
     """Make the folder, if need be. Raises ExportError for a folder that an export or rollout cannot change."""
     try:
         if (repository / CONFIG_FILE).exists():
-            raise ExportError(
-                f"{repository}: expected a repository, got a model of one: --repository {repository.parent}"
-            )
+            raise ExportError.at(repository, "a repository", f"a model of one: --repository {repository.parent}")
         repository.mkdir(parents=True, exist_ok=True)
         if not os.access(repository, os.W_OK | os.X_OK, effective_ids=True):
             reason = errno.EROFS if os.statvfs(repository).f_flag & os.ST_RDONLY else errno.EACCES
             raise OSError(reason, os.strerror(reason))
     except OSError as error:
         expected = "a folder that this user may change"
-        raise ExportError(
-            f"{repository}: expected {expected}, got: {error.strerror}; --repository names another one"
-        ) from error
+        raise ExportError.at(repository, expected, error.strerror, "--repository names another one") from error
 
 
 @contextmanager
@@ -168,7 +164,7 @@ def _settle(staged: Path) -> None:
     """Flush all files to the disk, so that a power cut leaves no partial file. Raises ExportError for a link."""
     for path in (staged, *staged.rglob("*")):
         if path.is_symlink():
-            raise ExportError(f"{path}: expected a file or folder, got a link")
+            raise ExportError.at(path, "a file or folder", "a link")
         descriptor = os.open(path, os.O_RDONLY)
         try:
             os.fsync(descriptor)

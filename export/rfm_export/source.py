@@ -114,7 +114,7 @@ def device_named(name: str) -> torch.device:
     if torch.cuda.is_available():
         there, why = ["cpu", "cuda", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))], ""
     if name not in there:
-        raise ExportError(f"device: expected one of {', '.join(there)}, got {name}{why}")
+        raise ExportError.at("device", f"one of {', '.join(there)}", f"{name}{why}")
     return torch.device(name)
 
 
@@ -122,22 +122,18 @@ def _check_gpus(num_gpus: int | None) -> None:
     """Raise ExportError for more GPUs than this machine has: Triton would refuse to load the models."""
     there = torch.cuda.device_count()
     if num_gpus is not None and num_gpus > there:
-        raise ExportError(
-            f"num_gpus: expected at most {there}, got {num_gpus}; --other-machine exports for a machine with more, "
-            "--num-gpus 0 for the CPU"
-        )
+        remedy = "--other-machine exports for a machine with more, --num-gpus 0 for the CPU"
+        raise ExportError.at("num_gpus", f"at most {there}", num_gpus, remedy)
 
 
 def _check_graphs(settings: ExportConfig, description: Description) -> None:
     """Raise ExportError if CUDA graphs are on but nothing would use them."""
     if settings.cuda_graphs and not description.uses_graphs:
         expected = "an RFM, Robometer or RoboReward checkpoint (its expected score) on a Qwen backbone"
-        raise ExportError(f"cuda_graphs: expected {expected}, got another; leave out --cuda-graphs")
+        raise ExportError.at("cuda_graphs", expected, "another", "leave out --cuda-graphs")
     if settings.cuda_graphs and not num_gpus(settings):
-        raise ExportError(
-            "cuda_graphs: expected an export for GPUs, got one for the CPU; leave out --cuda-graphs, or name "
-            "--num-gpus with --other-machine"
-        )
+        remedy = "leave out --cuda-graphs, or name --num-gpus with --other-machine"
+        raise ExportError.at("cuda_graphs", "an export for GPUs", "one for the CPU", remedy)
 
 
 def num_gpus(settings: ExportConfig) -> int:

@@ -123,7 +123,7 @@ def needing_room(device: torch.device) -> Iterator[None]:
     except torch.OutOfMemoryError as error:
         reason = str(error).partition("\n")[0].partition(". ")[0]
         expected = f"room on {device} to compare the export with the checkpoint"
-        raise ExportError(f"device: expected {expected}, got: {reason}; --device names another one") from error
+        raise ExportError.at("device", expected, reason, "--device names another one") from error
 
 
 def probes(description: Description, *, with_encoders: bool, seed: int = 0) -> list[Sample]:
@@ -169,9 +169,7 @@ def verify(
         expected, got = _numbers(index, "the checkpoint", before), _numbers(index, "the export", after)
         if not np.allclose(got, expected, rtol=0, atol=TOLERANCE, equal_nan=True):
             largest = np.nanmax(np.abs(got - expected))  # NaN: success is not predicted
-            raise ExportDiffersError(
-                f"probe {index}: expected the checkpoint's scores, got a difference of {largest:g}"
-            )
+            raise ExportDiffersError.at(f"probe {index}", "the checkpoint's scores", f"a difference of {largest:g}")
 
 
 def largest_difference(full: Callable[[], Engine], rounded: Callable[[], Engine], samples: Sequence[Sample]) -> float:
@@ -206,10 +204,8 @@ def verify_graphs(make: Callable[[], Engine], description: Description, say: Say
         )
         if not np.allclose(graphed, plain, rtol=0, atol=GRAPHS_TOLERANCE, equal_nan=True):
             difference = np.nanmax(np.abs(graphed - plain))
-            raise ExportDiffersError(
-                f"probe {index}: cuda_graphs: expected the scores of a plain pass, got a difference of "
-                f"{difference:g}; leave out --cuda-graphs"
-            )
+            where, remedy = f"probe {index}: cuda_graphs", "leave out --cuda-graphs"
+            raise ExportDiffersError.at(where, "the scores of a plain pass", f"a difference of {difference:g}", remedy)
     if engine.graphs.has_failed:
         say("cuda_graphs: this device cannot capture the network's passes, so the setting gains nothing here")
 
@@ -217,6 +213,6 @@ def verify_graphs(make: Callable[[], Engine], description: Description, say: Say
 def _numbers(index: int, whose: str, outcome: Outcome) -> npt.NDArray[np.float64]:
     """All scores of a probe, concatenated."""
     if isinstance(outcome, RewardError):
-        raise ExportDiffersError(f"probe {index}: expected scores of {whose}, got: {outcome}") from outcome
+        raise ExportDiffersError.at(f"probe {index}", f"scores of {whose}", outcome) from outcome
     arrays = [array.ravel() for scores in trajectory_scores(outcome).values() for array in scores.arrays.values()]
     return np.concatenate([[*answer(outcome).values()], *arrays], dtype=np.float64)

@@ -16,6 +16,7 @@ import yaml
 from safetensors import SafetensorError, safe_open
 
 from rfm.plain_yaml import read_yaml
+from rfm_client.contract.errors import LocatedError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -61,7 +62,7 @@ _short.maxstring = _short.maxother = 100
 _MAX_LISTED = 20
 
 
-class CheckpointError(Exception):
+class CheckpointError(LocatedError):
     """A checkpoint that cannot be loaded: the file, its fault and the remedy."""
 
 
@@ -78,7 +79,7 @@ def expecting(what: str, where: object) -> Iterator[None]:
     try:
         yield
     except misfits() as error:
-        raise CheckpointError(f"{where}: expected {what}, got {type(error).__name__}: {cut(str(error))}") from error
+        raise CheckpointError.at(where, what, f"{type(error).__name__}: {cut(str(error))}") from error
 
 
 def shown(value: object) -> str:
@@ -107,12 +108,12 @@ def is_there(file: Path) -> bool:
         kind = stat.S_IFMT(file.stat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
         if file.is_symlink():
-            raise CheckpointError(f"{file}: expected a file, got a link that leads nowhere") from None
+            raise CheckpointError.at(file, "a file", "a link that leads nowhere") from None
         return False
     except (OSError, ValueError) as error:
-        raise CheckpointError(f"{file}: expected a file, got: {error}") from error
+        raise CheckpointError.at(file, "a file", error) from error
     if kind != stat.S_IFREG:  # opening a pipe would wait for its writer
-        raise CheckpointError(f"{file}: expected a file, got {_KINDS.get(kind, 'something else')}")
+        raise CheckpointError.at(file, "a file", _KINDS.get(kind, "something else"))
     return True
 
 
@@ -123,12 +124,12 @@ def read_json(file: Path) -> dict[str, Any]:
         with file.open("rb") as stream:
             text = stream.read(MAX_JSON_BYTES + 1)
         if len(text) > MAX_JSON_BYTES:
-            raise CheckpointError(f"{file}: expected at most {MAX_JSON_BYTES} bytes of JSON, got more")
+            raise CheckpointError.at(file, f"at most {MAX_JSON_BYTES} bytes of JSON", "more")
         content = json.loads(text, object_pairs_hook=_once)
     except (OSError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{file}: expected JSON, got {cut(str(error))}") from error
+        raise CheckpointError.at(file, "JSON", cut(str(error))) from error
     if not isinstance(content, dict):
-        raise CheckpointError(f"{file}: expected a JSON object, got {type(content).__name__}")
+        raise CheckpointError.at(file, "a JSON object", type(content).__name__)
     return content
 
 
@@ -141,9 +142,9 @@ def read_run_config(file: Path) -> dict[str, Any]:
     try:
         config = read_yaml(file, _PlainLoader)
     except (OSError, ValueError) as error:
-        raise CheckpointError(f"{file}: expected YAML, got {cut(str(error))}") from error
+        raise CheckpointError.at(file, "YAML", cut(str(error))) from error
     if not isinstance(config, dict):
-        raise CheckpointError(f"{file}: expected a mapping, got {type(config).__name__}")
+        raise CheckpointError.at(file, "a mapping", type(config).__name__)
     return config
 
 
@@ -156,7 +157,7 @@ def read_tensors(file: Path) -> dict[str, Tensor]:
         _check_header(file)
         return load_file(file)
     except (OSError, SafetensorError, *_MISFITS) as error:
-        raise CheckpointError(f"{file}: expected a safetensors file, got {cut(str(error))}") from error
+        raise CheckpointError.at(file, "a safetensors file", cut(str(error))) from error
 
 
 def tensor_names(file: Path) -> list[str]:
@@ -167,12 +168,12 @@ def tensor_names(file: Path) -> list[str]:
         with safe_open(file, "np") as content:
             return list(content.keys())
     except (OSError, SafetensorError, *_MISFITS) as error:
-        raise CheckpointError(f"{file}: expected a safetensors file, got {cut(str(error))}") from error
+        raise CheckpointError.at(file, "a safetensors file", cut(str(error))) from error
 
 
 def _require(file: Path) -> None:
     if not is_there(file):
-        raise CheckpointError(f"{file}: expected a file, got none")
+        raise CheckpointError.at(file, "a file", "none")
 
 
 def _check_header(file: Path) -> None:

@@ -37,13 +37,13 @@ def find(source: str | Path, say: Callable[[str], object] = _log.warning) -> Pat
         if str(source) and path.is_dir():
             return path
         if path.is_file():
-            raise CheckpointError(f"checkpoint: expected {_SOURCE}, got the file {path}: name {path.parent}")
+            raise CheckpointError.at("checkpoint", _SOURCE, f"the file {path}: name {path.parent}")
     except (OSError, RuntimeError) as error:
         got = f"{shown(str(source))}: {type(error).__name__}"
-        raise CheckpointError(f"checkpoint: expected {_SOURCE}, got {got}") from error
+        raise CheckpointError.at("checkpoint", _SOURCE, got) from error
     match = _ID.fullmatch(str(source))
     if match is None or ".." in Path(source).parts:
-        raise CheckpointError(f"checkpoint: expected {_SOURCE}, got {shown(str(source))}{_near(path)}")
+        raise CheckpointError.at("checkpoint", _SOURCE, f"{shown(str(source))}{_near(path)}")
     return _fetch(match["repo"], match["subfolder"] or "", match["tag"], path, say)
 
 
@@ -57,7 +57,7 @@ def check_links(folder: Path) -> None:
     allowed = home if snapshot is None or not (snapshot.parent.parent / "blobs").is_dir() else snapshot.parent.parent
     for file in (*folder.glob("*"), *folder.glob("*/*")):
         if file.is_symlink() and not file.resolve().is_relative_to(allowed):
-            raise CheckpointError(f"{file}: expected a file of the checkpoint, got a link to {file.resolve()}")
+            raise CheckpointError.at(file, "a file of the checkpoint", f"a link to {file.resolve()}")
 
 
 def commit_of(folder: Path) -> str:
@@ -137,8 +137,8 @@ def _snapshot(repo_id: str, subfolder: str, tag: str | None, path: Path, *, is_d
     if not any(is_there(snapshot / name) for name in run_configs):  # upstream tags the commit before its upload
         _fetch_run_config_of_main(repo_id, run_configs, is_down=is_down)
     if not folder.is_dir():
-        raise CheckpointError(
-            f"{repo_id}@{tag or 'main'}: expected the folder {subfolder}, got none of this name{_near(path)}"
+        raise CheckpointError.at(
+            f"{repo_id}@{tag or 'main'}", f"the folder {subfolder}", f"none of this name{_near(path)}"
         )
     return folder
 
@@ -151,11 +151,12 @@ def _refuse_pickles(repo_id: str, subfolder: str, tag: str | None) -> None:
     if names:
         revision = "" if tag is None else f" --revision {shlex.quote(tag)}"
         fetch = f"hf download {repo_id}{revision} --local-dir FOLDER"
-        raise CheckpointError(
-            f"{repo_id}@{tag or 'main'}: expected {WEIGHTS}, got {cut(', '.join(names))}: pickles may run code when "
-            f"they are loaded, so none is fetched. If you trust who made it: {fetch}, then name "
-            f"{Path('FOLDER', subfolder)} as the checkpoint, and you are told how to convert it"
+        got = (
+            f"{cut(', '.join(names))}: pickles may run code when they are loaded, so none is fetched. If you trust who "
+            f"made it: {fetch}, then name {Path('FOLDER', subfolder)} as the checkpoint, and you are told how to "
+            "convert it"
         )
+        raise CheckpointError.at(f"{repo_id}@{tag or 'main'}", WEIGHTS, got)
 
 
 def _near(path: Path) -> str:

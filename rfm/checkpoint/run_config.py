@@ -55,10 +55,9 @@ def _check_base(file: Path, folder: Path) -> None:
     else:  # an adapter names its base model; the first ReWiND checkpoints have no config.json
         kind = None if is_there(folder / ADAPTER_CONFIG) else "rewind_transformer"
     if isinstance(kind, str) and isinstance(base, str) and base and plain(kind) not in plain(base):
-        raise CheckpointError(
-            f"{file}: expected the run of {folder}, whose network is {shown(kind)}, got model.base_model_id "
-            f"{shown(base)}; copy the run's {RUN_CONFIG} into {folder}, also if it is this one"
-        )
+        expected = f"the run of {folder}, whose network is {shown(kind)}"
+        remedy = f"copy the run's {RUN_CONFIG} into {folder}, also if it is this one"
+        raise CheckpointError.at(file, expected, f"model.base_model_id {shown(base)}", remedy)
 
 
 def _places_on_main(home: Path) -> list[Path]:
@@ -88,16 +87,16 @@ def trained_frames(run: Mapping[str, Any], file: Path) -> int | None:
     """
     data = run.get("data") or {}
     if not isinstance(data, dict):
-        raise CheckpointError(f"{file}: data: expected a mapping, got {shown(data)}")
+        raise CheckpointError.at(f"{file}: data", "a mapping", shown(data))
     return frame_count(data.get("max_frames"), f"{file}: data.max_frames")
 
 
 def frame_count(frames: Any, where: str) -> int | None:
     """Return ``frames`` if it is None or a valid number of frames. Raises CheckpointError otherwise."""
     if frames is not None and (type(frames) is not int or frames < 1):
-        raise CheckpointError(f"{where}: expected a whole number of at least 1, got {shown(frames)}")
+        raise CheckpointError.at(where, "a whole number of at least 1", shown(frames))
     if frames is not None and frames > MAX_COUNT:
-        raise CheckpointError(f"{where}: expected at most {MAX_COUNT}, got {shown(frames)}")
+        raise CheckpointError.at(where, f"at most {MAX_COUNT}", shown(frames))
     return frames
 
 
@@ -108,10 +107,11 @@ def check_progress(run: Mapping[str, Any], file: Path) -> None:
     """
     kind = section_of(run, "data").get("progress_pred_type")
     if isinstance(kind, str) and kind.startswith("relative"):  # upstream's names for increments
-        raise CheckpointError(
-            f"{file}: data.progress_pred_type: expected absolute progress, got {shown(kind)}: such a head predicts how "
-            "far the task has come since the frame before, which would be served as how far it has come"
+        got = (
+            f"{shown(kind)}: such a head predicts how far the task has come since the frame before, which would be "
+            "served as how far it has come"
         )
+        raise CheckpointError.at(f"{file}: data.progress_pred_type", "absolute progress", got)
 
 
 def training_notes(folder: Path, answered: Collection[str]) -> list[str]:

@@ -82,7 +82,7 @@ def read_weights(folder: Path) -> dict[str, Tensor]:
     else:
         refuse_pickles(folder, WEIGHTS, PICKLE_STEM)
         got = cut(", ".join(sorted(path.name for path in folder.iterdir()))) or "nothing"
-        raise CheckpointError(f"{folder}: expected {WEIGHTS} or {WEIGHTS_INDEX}, got {got}: {_below(folder)}")
+        raise CheckpointError.at(folder, f"{WEIGHTS} or {WEIGHTS_INDEX}", f"{got}: {_below(folder)}")
     _check_network(folder, weights)
     return _unwrapped(weights, files, folder / WEIGHTS)
 
@@ -97,44 +97,42 @@ def _check_network(folder: Path, names: Iterable[str]) -> None:
     if found is None or "type" in content or is_first or stated == found:  # ``type``: of LeRobot
         return
     got = "none" if stated is None else shown(stated)
-    raise CheckpointError(
-        f"{file}: model_type: expected {found}, by the names of the weights, got {got}: the file describes another "
-        f"network; copy {NETWORK_CONFIG} of the model that the run started from"
-    )
+    expected = f"{found}, by the names of the weights"
+    remedy = f"copy {NETWORK_CONFIG} of the model that the run started from"
+    raise CheckpointError.at(f"{file}: model_type", expected, f"{got}: the file describes another network", remedy)
 
 
 def check_one_form(folder: Path) -> None:
     """Raise CheckpointError for weights both in one file and in shards, since no file tells which are newer."""
     shards = [path.name for path in (folder / WEIGHTS_INDEX, *sorted(folder.glob(_SHARDS))) if is_there(path)]
     if shards and is_there(folder / WEIGHTS):
-        raise CheckpointError(
-            f"{folder}: expected {WEIGHTS} or shards, got {WEIGHTS} and {listed(shards)}, of which one is older; "
-            "move away what is not meant: transformers, which reads the former, leaves it when it writes shards"
-        )
+        expected = f"{WEIGHTS} or shards"
+        remedy = "move away what is not meant: transformers, which reads the former, leaves it when it writes shards"
+        raise CheckpointError.at(folder, expected, f"{WEIGHTS} and {listed(shards)}, of which one is older", remedy)
 
 
 def _read_shards(index: Path) -> tuple[list[Path], dict[str, Tensor]]:
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict):
-        raise CheckpointError(f"{index}: expected a weight_map, got none")
+        raise CheckpointError.at(index, "a weight_map", "none")
     weights: dict[str, Tensor] = {}
     shard_of: dict[str, str] = {}
     for shard in dict.fromkeys(map(str, weight_map.values())):
         if Path(shard).name != shard or not shard.endswith(".safetensors"):
-            raise CheckpointError(f"{index}: expected names of files beside it, got {shown(shard)}")
+            raise CheckpointError.at(index, "names of files beside it", shown(shard))
         if not is_there(index.parent / shard):
             raise CheckpointError(f"{index}: names the shard {shard}, which is not there")
         for name, tensor in read_tensors(index.parent / shard).items():
             if name in shard_of:
                 got = f"{shown(name)} in {shard_of[name]} and in {shard}"
-                raise CheckpointError(f"{index}: expected each tensor in one shard, got {got}; save the weights again")
+                raise CheckpointError.at(index, "each tensor in one shard", got, "save the weights again")
             weights[name], shard_of[name] = tensor, shard
     _check_names(weight_map.keys(), weights.keys())
     for file in sorted(index.parent.glob(_SHARDS)):
         unknown = set(tensor_names(file)) - shard_of.keys()
         if unknown:
             got = f"{file.name}, which it does not name, with {listed(sorted(unknown))}"
-            raise CheckpointError(f"{index}: expected the names of all shards, got {got}; move that file away")
+            raise CheckpointError.at(index, "the names of all shards", got, "move that file away")
     return [index.parent / shard for shard in dict.fromkeys(shard_of.values())], weights
 
 
@@ -148,7 +146,7 @@ def _unwrapped(weights: Mapping[str, Tensor], files: Sequence[Path], target: Pat
     bare: dict[str, Tensor] = {}
     for name, tensor in weights.items():
         if (short := _WRAPPERS.sub("", name)) in bare:
-            raise CheckpointError(f"{target.parent}: expected each weight once, got {shown(short)} and {shown(name)}")
+            raise CheckpointError.at(target.parent, "each weight once", f"{shown(short)} and {shown(name)}")
         bare[short] = tensor
     head = next((name for name in bare if name == _HEAD or name.endswith(f".{_HEAD}")), _HEAD)
     prefix = head.removesuffix(_HEAD)
@@ -157,10 +155,8 @@ def _unwrapped(weights: Mapping[str, Tensor], files: Sequence[Path], target: Pat
         stripped = target.parent / "stripped.safetensors"
         line = f"{_command(_STRIP, [prefix, stripped, *files])} && mv {shlex.join([str(stripped), str(target)])}"
         then = "" if list(files) == [target] else ", then move the shards and their index away"
-        raise CheckpointError(
-            f"{target.parent}: expected {_HEAD}, got {shown(head)}, with the prefix {prefix} that {shown(other)} lacks"
-            f"; strip it with: {line}{then}"
-        )
+        got = f"{shown(head)}, with the prefix {prefix} that {shown(other)} lacks"
+        raise CheckpointError.at(target.parent, _HEAD, got, f"strip it with: {line}{then}")
     return {name.removeprefix(prefix): tensor for name, tensor in bare.items()}
 
 
@@ -198,9 +194,9 @@ def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> N
     _check_names(expected.keys(), got.keys())
     for name, tensor in got.items():
         if tensor.shape != expected[name].shape:
-            raise CheckpointError(f"{name}: expected {list(expected[name].shape)}, got {list(tensor.shape)}")
+            raise CheckpointError.at(name, f"{list(expected[name].shape)}", list(tensor.shape))
         if tensor.is_floating_point() != expected[name].is_floating_point():
-            raise CheckpointError(f"{name}: expected numbers like {expected[name].dtype}, got {tensor.dtype}")
+            raise CheckpointError.at(name, f"numbers like {expected[name].dtype}", tensor.dtype)
 
 
 def check_values(weights: Mapping[str, Tensor]) -> None:
@@ -214,12 +210,10 @@ def check_values(weights: Mapping[str, Tensor]) -> None:
         extremes = tensor.aminmax()  # 50 times as fast as isfinite of each value
         if not all(extreme.isfinite() for extreme in extremes):
             at = (~tensor.isfinite()).nonzero()[0].tolist()
-            raise CheckpointError(f"{name}: expected finite weights, got {tensor[tuple(at)].item()} at {at}")
+            raise CheckpointError.at(name, "finite weights", f"{tensor[tuple(at)].item()} at {at}")
         is_matrix = tensor.dim() > 1 and min(tensor.shape) > 1
         if is_matrix and not any(extremes) and not _MAY_BE_ZERO.match(name):
-            raise CheckpointError(
-                f"{name}: expected weights, got 0 throughout: the file is incomplete; fetch or copy it again"
-            )
+            raise CheckpointError.at(name, "weights", "0 throughout: the file is incomplete", "fetch or copy it again")
 
 
 def _check_names(expected: Iterable[str], got: Iterable[str]) -> None:
@@ -253,14 +247,15 @@ def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
         return
     if len(names) > 1 and f"{stem}.bin" in names:
         both = f"{stem}.bin and {names[0]}"
-        raise CheckpointError(f"{folder}: expected one form of the weights, got {both}; move away what is not meant")
+        raise CheckpointError.at(folder, "one form of the weights", both, "move away what is not meant")
     files = names if names[0].endswith(".bin") and "-of-" in names[0] else names[:1]  # all shards, or the first other
-    raise CheckpointError(
-        f"{folder}: expected {wanted}, got {cut(', '.join(names))}: pickles may run code when they are loaded, so they "
-        "are refused. If you trust who made it, convert it. weights_only=True lets PyTorch make tensors and little "
-        "else; do not convert a file that needs more: "
-        + _command(_CONVERT, [folder / wanted, *(folder / name for name in files)])
+    command = _command(_CONVERT, [folder / wanted, *(folder / name for name in files)])
+    got = (
+        f"{cut(', '.join(names))}: pickles may run code when they are loaded, so they are refused. If you trust who "
+        "made it, convert it. weights_only=True lets PyTorch make tensors and little else; do not convert a file that "
+        f"needs more: {command}"
     )
+    raise CheckpointError.at(folder, wanted, got)
 
 
 def _command(code: str, arguments: Iterable[str | Path]) -> str:

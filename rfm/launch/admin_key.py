@@ -14,6 +14,8 @@ import stat
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.names import ADMIN_KEY_VARIABLE
 
 VARIABLE = ADMIN_KEY_VARIABLE
@@ -26,17 +28,13 @@ _RANDOM_BYTES = 32
 _VISIBLE = re.compile("[!-~]*")  # characters that a header can carry unchanged
 
 
-class AdminKeyError(Exception):
-    """An unusable key. The message names its source and the expected form, never the key."""
-
-
 def new_key() -> str:
     """Return a new random key, as URL-safe text."""
     return secrets.token_urlsafe(_RANDOM_BYTES)
 
 
 def take_key(file: Path | None, environment: MutableMapping[str, str]) -> str | None:
-    """Return the key in ``file``, else the key in ``environment``, else None. Raises AdminKeyError.
+    """Return the key in ``file``, else the key in ``environment``, else None. Raises InvalidValueError.
 
     Removes the key from ``environment``, so that no child process gets it.
     """
@@ -70,25 +68,22 @@ def _read(file: Path) -> str:
     """
     try:
         status = file.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise AdminKeyError(f"--admin-key-file: expected a file, got {file}, which is none")
+        require("--admin-key-file", stat.S_ISREG(status.st_mode), "a file", f"{file}, which is none")
         expected = 0o640 if status.st_uid == 0 else 0o600
         mode = stat.S_IMODE(status.st_mode)
         if mode & ~expected:
             owner = "root's file" if status.st_uid == 0 else "file"
-            raise AdminKeyError(
-                f"--admin-key-file: {file}: expected mode {expected:o} or less of a {owner}, got {mode:o}"
+            raise InvalidValueError.at(
+                f"--admin-key-file: {file}", f"mode {expected:o} or less of a {owner}", f"{mode:o}"
             )
         return file.read_text()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "no text"
-        raise AdminKeyError(f"--admin-key-file: expected a text file at {file}, got: {reason}") from None
+        raise InvalidValueError.at("--admin-key-file", f"a text file at {file}", reason) from None
 
 
 def _checked(text: str, where: str) -> str:
     key = text.strip()
-    if len(key) < MIN_CHARACTERS:
-        raise AdminKeyError(f"{where}: expected at least {MIN_CHARACTERS} characters, got {len(key)}")
-    if not _VISIBLE.fullmatch(key):
-        raise AdminKeyError(f"{where}: expected visible ASCII characters without spaces, got others")
+    require(where, len(key) >= MIN_CHARACTERS, f"at least {MIN_CHARACTERS} characters", len(key))
+    require(where, bool(_VISIBLE.fullmatch(key)), "visible ASCII characters without spaces", "others")  # shows no key
     return key

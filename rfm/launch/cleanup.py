@@ -42,8 +42,8 @@ class Claim:
             new_lock.rename(self._lock)  # renamed once locked, so that ``clear`` never finds it unlocked
             self.backends.mkdir(0o700)
         except OSError as error:
-            raise ServerStartError(
-                f"{error.filename}: expected room for a server's files, got: {error.strerror}; {NEEDS_ROOM}"
+            raise ServerStartError.at(
+                error.filename, "room for a server's files", error.strerror, NEEDS_ROOM
             ) from error
 
     def requests_inside(self) -> list[str]:

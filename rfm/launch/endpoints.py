@@ -14,6 +14,7 @@ from pathlib import Path
 from rfm.config import DEFAULT_HOST, ServeConfig
 from rfm.launch.installation import ServerStartError
 from rfm_client.contract.addresses import check_authorities, check_certificate, is_loopback
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.listening import ListenAddress, in_url
 
 PORTS = range(20_000, 32_000)  # below the ports that Linux gives to outgoing connections
@@ -34,13 +35,10 @@ class GrpcTls:
     client_ca: Path | None = None
 
     def check(self) -> None:
-        """Check the files. Raises ServerStartError."""
-        try:
-            check_certificate(self.certificate, self.key, "grpc_certificate, grpc_key")
-            if self.client_ca is not None:
-                check_authorities(self.client_ca, "grpc_client_ca")
-        except ValueError as error:
-            raise ServerStartError(str(error)) from None
+        """Check the files. Raises ConfigError."""
+        check_certificate(self.certificate, self.key, "grpc_certificate")
+        if self.client_ca is not None:
+            check_authorities(self.client_ca, "grpc_client_ca")
 
     def arguments(self) -> list[str]:
         """Return arguments of tritonserver for gRPC with TLS."""
@@ -107,18 +105,18 @@ class Endpoints:
 
     def check(self) -> None:
         """Check ports, addresses and certificates. Raises ServerStartError."""
-        if self.grpc_tls is not None:
-            self.grpc_tls.check()
         listening = (
             ("HTTP", self.http_host, self.http_port),
             ("gRPC", self.host, self.grpc_port),
             ("metrics", self.host, self.metrics_port),
         )
-        for name, host, port in listening:
-            try:
+        try:
+            if self.grpc_tls is not None:
+                self.grpc_tls.check()
+            for name, host, port in listening:
                 ListenAddress(host, port).check_free(name, port_option=f"--{name.lower()}-port")
-            except ValueError as error:
-                raise ServerStartError(str(error)) from None
+        except InvalidValueError as error:
+            raise ServerStartError.like(error) from None
 
 
 def check_version(host: str, version: str, *, accepted: bool) -> None:
@@ -128,11 +126,11 @@ def check_version(host: str, version: str, *, accepted: bool) -> None:
     if is_safe or accepted or is_loopback(host):
         return
     floor = ".".join(map(str, SECURITY_FLOOR))
-    raise ServerStartError(
-        f"host: expected a loopback address for Triton {version or 'of no version'}, which has known remote "
-        f"vulnerabilities (Triton {floor}, in NVIDIA's container 26.07, has not), got {host}; "
-        "--accept-known-vulnerabilities serves there all the same"
+    expected = (
+        f"a loopback address for Triton {version or 'of no version'}, which has known remote vulnerabilities (Triton "
+        f"{floor}, in NVIDIA's container 26.07, has not)"
     )
+    raise ServerStartError.at("host", expected, host, "--accept-known-vulnerabilities serves there all the same")
 
 
 def free_ports(count: int) -> list[int]:

@@ -16,6 +16,8 @@ import sysconfig
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rfm_client.contract.errors import LocatedError
+
 EXECUTABLE = "tritonserver"
 WHEEL = "nvidia-pytriton"
 WHEEL_VERSION = "2.51.0"  # Triton's version in it
@@ -23,11 +25,11 @@ _BACKEND_FILES = ("libtriton_python.so", "triton_python_backend_utils.py")
 _STUB = "triton_python_backend_stub"
 
 
-class ServerStartError(Exception):
+class ServerStartError(LocatedError):
     """tritonserver cannot start. Its message is one line. model: the model at fault; None: no model"""
 
-    def __init__(self, reason: str, model: str | None = None) -> None:
-        super().__init__(reason)
+    def __init__(self, problem: str, where: object = "", model: str | None = None) -> None:
+        super().__init__(problem, where)
         self.model = model
 
 
@@ -59,7 +61,7 @@ def find_installation(executable: Path | None = None) -> Installation:
     """Return the installation of ``executable``, else of PATH, else of the wheel. Raises ServerStartError."""
     if executable is not None:
         if not (executable.is_file() and os.access(executable, os.X_OK)):
-            raise ServerStartError(f"tritonserver: expected a program at {executable}, got none")
+            raise ServerStartError.at("tritonserver", f"a program at {executable}", "none")
         return Installation(executable)
     in_path = shutil.which(EXECUTABLE)
     return Installation(Path(in_path)) if in_path else _wheel_installation()
@@ -69,14 +71,12 @@ def _wheel_installation() -> Installation:
     package = importlib.util.find_spec("pytriton")
     if package is None or not package.submodule_search_locations:
         where = f'an explicit path, {EXECUTABLE} in PATH or the wheel (pip install ".[triton]")'
-        raise ServerStartError(f"tritonserver: expected {where}, got none of them")
+        raise ServerStartError.at("tritonserver", where, "none of them")
     wheel = Path(package.submodule_search_locations[0]) / EXECUTABLE
     numpy_version = importlib.metadata.version("numpy")
     if int(numpy_version.partition(".")[0]) >= 2:
         # With numpy 2, this release's stub returns empty outputs without an error.
-        raise ServerStartError(
-            f"numpy: expected < 2 with the Triton of {WHEEL}, got {numpy_version}: pip install 'numpy<2'"
-        )
+        raise ServerStartError.at("numpy", f"< 2 with the Triton of {WHEEL}", f"{numpy_version}: pip install 'numpy<2'")
     _stub(wheel)
     library_folders = (wheel.parent.parent / "nvidia_pytriton.libs", _libpython().parent)
     # The stub takes its Python environment from the first python3 in PATH.
@@ -92,7 +92,7 @@ def _stub(wheel: Path) -> Path:
     stub = wheel / "python_backend_stubs" / version / _STUB
     if not stub.is_file():
         there = ", ".join(sorted(path.name for path in stub.parent.parent.glob("*")))
-        raise ServerStartError(f"Python: expected one of {there} for the Triton of {WHEEL}, got {version}")
+        raise ServerStartError.at("Python", f"one of {there} for the Triton of {WHEEL}", version)
     return stub
 
 
@@ -105,7 +105,7 @@ def _libpython() -> Path:
             return Path(folder) / name
     package = name.partition(".so")[0]
     hint = f"apt-get install {package}, or a Python built with --enable-shared"
-    raise ServerStartError(f"{name}: expected in {folders[0]}, got nothing there ({hint})")
+    raise ServerStartError.at(name, f"in {folders[0]}", f"nothing there ({hint})")
 
 
 def _prepended(variable: str, *folders: Path) -> str:

@@ -19,6 +19,8 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 from rfm.launch.admin_key import VARIABLE, grpc_metadata
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import LocatedError
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.wire import Tensors
 
@@ -38,7 +40,7 @@ _NOT_LOADED = "not loaded"  # this project's name for a missing state
 _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
 
 
-class RepositoryApiError(Exception):
+class RepositoryApiError(LocatedError):
     """A failed request of the repository API, with the reason."""
 
 
@@ -67,18 +69,13 @@ class RepositoryApi:
 
     options: for tritonclient's gRPC client, such as the options of Credentials
 
-    The constructor and the methods raise RepositoryApiError.
+    The constructor raises InvalidValueError for an unusable URL, the methods raise RepositoryApiError.
     """
 
     def __init__(self, url: str, admin_key: str | None, options: Mapping[str, Any] | None = None) -> None:
-        try:
-            scheme, address = split_url(url)
-        except ValueError as error:
-            raise RepositoryApiError(str(error)) from None
-        if scheme not in ("grpc", "grpcs"):
-            raise RepositoryApiError(
-                f"url: expected grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port, got {url}"
-            )
+        scheme, address = split_url(url)
+        expected = "grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port"
+        require("url", scheme in ("grpc", "grpcs"), expected, url)
         self._url = url
         self._headers = grpc_metadata(admin_key)
         given = dict(options or {})
@@ -111,7 +108,7 @@ class RepositoryApi:
             if all(entry.version in kept for entry in going):
                 return
             time.sleep(POLL_S)
-        raise RepositoryApiError(f"{model}: expected its old versions to finish within {FINISH_S:g} s, got no end")
+        raise RepositoryApiError.at(model, f"its old versions to finish within {FINISH_S:g} s", "no end")
 
     def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
         """Return the outputs of a version for a probe, whose request id distinguishes it from callers' requests."""
@@ -136,9 +133,8 @@ class RepositoryApi:
             message = one_line(error.message() or "no reason given")
             if triton.RESTRICTED in message:
                 got = "another" if self._headers else "none"
-                raise RepositoryApiError(
-                    f"admin key: expected that of the server at {self._url} (--admin-key-file or {VARIABLE}), got {got}"
-                ) from None
+                expected = f"that of the server at {self._url} (--admin-key-file or {VARIABLE})"
+                raise RepositoryApiError.at("admin key", expected, got) from None
             is_server_s = str(error.status()) in _OF_SERVER
             raise RepositoryApiError(f"{self._url}: {message}" if is_server_s else message) from error
 

@@ -19,7 +19,7 @@ def check_models(repository: Path, models: Collection[str]) -> None:
     """Check the files of models. Raises ServerStartError with the fault of each model."""
     faults = {model: fault for model in models if (fault := fault_in(repository, model)) is not None}
     if faults:
-        raise ServerStartError("; ".join(faults.values()), next(iter(faults)))
+        raise ServerStartError("; ".join(faults.values()), model=next(iter(faults)))
 
 
 def fault_in(repository: Path, model: str, config: ModelConfig | None = None) -> str | None:

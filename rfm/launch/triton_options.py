@@ -40,9 +40,9 @@ def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
     for argument in more:
         match = _ARGUMENT.fullmatch(argument)
         if match is None:
-            raise ServerStartError(f"tritonserver: expected --option=value, got {argument.partition('=')[0]}")
+            raise ServerStartError.at("tritonserver", "--option=value", argument.partition("=")[0])
         if match[1] not in _REPEATED and any(option.startswith(match[1]) for option in kept):
-            raise ServerStartError(f"tritonserver: expected an option that rfm serve leaves open, got {match[1]}")
+            raise ServerStartError.at("tritonserver", "an option that rfm serve leaves open", match[1])
 
 
 def size_limits(installation: Installation, given: Sequence[str]) -> list[str]:

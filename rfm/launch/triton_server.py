@@ -154,7 +154,7 @@ class TritonServer:
                 self.stop()
                 self._start_ready(served)
         except OSError as error:
-            raise ServerStartError(f"{error.filename}: expected to be readable, got: {error.strerror}") from error
+            raise ServerStartError.at(error.filename, "to be readable", error.strerror) from error
 
     def stop(self) -> None:
         """End the server gracefully, by force after KILL_AFTER_S."""
@@ -187,8 +187,8 @@ class TritonServer:
         if not there:
             raise ServerStartError(no_models(self.repository))
         if len(str(self.repository).split()) > 1:  # Triton's Python backend passes the path to a shell unquoted
-            where = "repository: expected a path without spaces, such as a link (ln -s)"
-            raise ServerStartError(f"{where}, got {self.repository}")
+            expected = "a path without spaces, such as a link (ln -s)"
+            raise ServerStartError.at("repository", expected, self.repository)
         as_in_file = there
         if served is not None:
             as_in_file = [name for name in served if _names_the_same_versions(self.repository, name, served[name])]
@@ -228,7 +228,7 @@ class TritonServer:
         except OSError as error:
             self._claim.release()
             self._claim = None
-            raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
+            raise ServerStartError.at("tritonserver", f"a program at {program}", error.strerror) from error
         if self._signal is not None:
             self._group.process.send_signal(self._signal)
 
@@ -245,7 +245,7 @@ class TritonServer:
             failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in models]
             if failed:
                 reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
-                raise _failed(f"models: expected all to be ready, got {reasons}{_remedy(reasons)}", failed[0].name)
+                raise _failed(f"expected all to be ready, got {reasons}{_remedy(reasons)}", failed[0].name)
             check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
             return
         kind = SpoiltStartError if status == -signal.SIGABRT else ServerStartError
@@ -264,9 +264,9 @@ class TritonServer:
             status, text = answer.result()
         except NO_ANSWER as error:
             model = name if self.exit_status is None else None  # else Triton itself has ended
-            raise ServerStartError(f"models: expected {name} to load, got: {error}", model) from error
+            raise ServerStartError(f"expected {name} to load, got: {error}", "models", model) from error
         if status != HTTPStatus.OK:
-            raise _failed(f"models: expected {name} to load, got: {text}", name)
+            raise _failed(f"expected {name} to load, got: {text}", name)
 
     def _pause(self, processes: ModelProcesses, ends_s: float) -> None:
         """Wait for POLL_S. Kill Triton and raise SpoiltStartError if a model process is dead, or after ``ends_s``."""
@@ -276,7 +276,7 @@ class TritonServer:
             return
         self.kill()
         model, why = found or (UNKNOWN, f"no answer in {LOAD_S:g} s")
-        raise SpoiltStartError(f"models: expected {model or 'each'} to load, got: {why}", model or None)
+        raise SpoiltStartError(f"expected {model or 'each'} to load, got: {why}", "models", model or None)
 
     def _arguments(self, models: Sequence[str]) -> list[str]:
         return [
@@ -298,8 +298,8 @@ class TritonServer:
         return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE, **of_models}
 
 
-def _failed(reason: str, model: str) -> ServerStartError:
-    return (SpoiltStartError if re.search(_DIED, reason) else ServerStartError)(reason, model)
+def _failed(problem: str, model: str) -> ServerStartError:
+    return (SpoiltStartError if re.search(_DIED, problem) else ServerStartError)(problem, "models", model)
 
 
 def _remedy(reasons: str) -> str:

@@ -46,6 +46,7 @@ from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
 from rfm.rewind.pretrained import IMAGE_ENCODER, TEXT_ENCODER, differences, image_facts, text_facts
 from rfm_client.contract import Sample
+from rfm_client.contract.checks import require
 from rfm_client.contract.description import Description
 
 MODEL_TYPE = "rewind_transformer"
@@ -177,7 +178,7 @@ class RewindCheckpoint:
             )
         widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), self.description.widths
         if widths != expected:
-            raise CheckpointError(f"encoders {' and '.join(self._sources)}: expected widths {expected}, got {widths}")
+            raise CheckpointError.at(f"encoders {' and '.join(self._sources)}", f"widths {expected}", widths)
         return encoders
 
     @contextmanager
@@ -248,8 +249,7 @@ def load(folder: Path, options: Options) -> RewindCheckpoint:
 def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -> RewindCheckpoint:
     """Return the checkpoint, with its weights renamed to upstream's names."""
     first = weights.pop(_FIRST_CODES_FRAME)
-    if first.dim() != 2:
-        raise CheckpointError(f"{_FIRST_CODES_FRAME}: expected 2 axes, got {list(first.shape)}")
+    require(_FIRST_CODES_FRAME, first.dim() == 2, "2 axes", list(first.shape), CheckpointError)
     weights.pop(_FIRST_CODES_UNREAD, None)
     weights["first_embedding_A"] = first[None]
     if options.image_encoder or options.text_encoder:
@@ -307,18 +307,17 @@ def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, De
         raise CheckpointError(f"{folder}: expected a ReWiND checkpoint, which has {error}") from error
     for name, most in _LIMITS.items():
         if not 1 <= getattr(config, name) <= most:
-            raise CheckpointError(f"{folder}: {name}: expected 1 to {most}, got {shown(getattr(config, name))}")
+            raise CheckpointError.at(f"{folder}: {name}", f"1 to {most}", shown(getattr(config, name)))
     if config.hidden_dim % config.num_attention_heads:
         heads = f"a divisor of the hidden width {config.hidden_dim}"
-        raise CheckpointError(f"{folder}: num_attention_heads: expected {heads}, got {config.num_attention_heads}")
+        raise CheckpointError.at(f"{folder}: num_attention_heads", heads, config.num_attention_heads)
     return config
 
 
 def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
     """Return a weight's shape. Raises KeyError if it is missing, CheckpointError if it has not ``rank`` axes."""
     shape = weights[name].shape
-    if len(shape) != rank:
-        raise CheckpointError(f"{name}: expected {rank} axes, got {list(shape)}")
+    require(name, len(shape) == rank, f"{rank} axes", list(shape), CheckpointError)
     return shape
 
 
@@ -337,20 +336,20 @@ def _stated(folder: Path) -> dict[str, Decision]:
         model = run.get("model") or {}
         network = model.get("rewind") or {} if isinstance(model, dict) else model
         if not isinstance(network, dict):
-            raise CheckpointError(f"{run_file}: model.rewind: expected a mapping, got {shown(network)}")
+            raise CheckpointError.at(f"{run_file}: model.rewind", "a mapping", shown(network))
         places[RUN_CONFIG] = f"{file_name(run_file, folder)}: model.rewind"
     if saved.get("model_type", MODEL_TYPE) != MODEL_TYPE:
         got = cut(str(saved["model_type"]))
-        raise CheckpointError(f"{folder / NETWORK_CONFIG}: model_type: expected {MODEL_TYPE}, got {got}")
+        raise CheckpointError.at(f"{folder / NETWORK_CONFIG}: model_type", MODEL_TYPE, got)
     stated: dict[str, Decision] = {}
     sources = {NETWORK_CONFIG: saved, RUN_CONFIG: network}
     for name, kind in _STATED_TYPES.items():
         values = {source: content[name] for source, content in sources.items() if content.get(name) is not None}
         for source, value in values.items():
             if type(value) is not kind:
-                raise CheckpointError(f"{folder}: {name} in {source}: expected {kind.__name__}, got {shown(value)}")
+                raise CheckpointError.at(f"{folder}: {name} in {source}", kind.__name__, shown(value))
         if name != "max_len" and len(set(values.values())) > 1:  # where max_len matters, the weights show it
-            raise CheckpointError(f"{folder}: {name}: expected {' and '.join(values)} to agree, got {values}")
+            raise CheckpointError.at(f"{folder}: {name}", f"{' and '.join(values)} to agree", values)
         if values:
             stated[name] = Decision(name, next(iter(values.values())), " and ".join(places[each] for each in values))
     if any(content.keys() >= {*_FIRST_FIELDS} for content in sources.values()):
@@ -369,7 +368,7 @@ def _stated(folder: Path) -> dict[str, Decision]:
     padding = saved.get("trained_padding")
     if padding is not None and not isinstance(padding, bool):
         where = f"{folder / NETWORK_CONFIG}: trained_padding"
-        raise CheckpointError(f"{where}: expected true or false, got {shown(padding)}")
+        raise CheckpointError.at(where, "true or false", shown(padding))
     is_said = padding is not None
     stated["trained_padding"] = (
         Decision("trained_padding", padding, NETWORK_CONFIG) if is_said else TRAINED_WITH_PADDING

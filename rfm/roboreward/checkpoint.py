@@ -60,7 +60,7 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
         collator = RoboRewardCollator(self.config, tokenizer, images)
         for score, token in zip(SCORES, collator.digits, strict=True):
             if tokenizer.decode([token]) != str(score):
-                raise CheckpointError(f"base model {self.processor}: expected a token for {score}, got none")
+                raise CheckpointError.at(f"base model {self.processor}", f"a token for {score}", "none")
         return collator
 
     def make_predictor(
@@ -91,9 +91,7 @@ def load(folder: Path, options: Options) -> RoboRewardCheckpoint:
         files = replace(files, dtype=Decision("dtype", "bfloat16", "upstream: always"))
         config = RoboRewardConfig(**files.made_of, stops=_stops(folder), is_expected=name == EXPECTED)
     elif name is not None and config.is_expected != (name == EXPECTED):
-        raise CheckpointError(
-            f"--as: expected the reward model of this export, got {name}; export the checkpoint again"
-        )
+        raise CheckpointError.at("--as", "the reward model of this export", name, "export the checkpoint again")
     if options.strict_answers and not config.is_expected:
         config = replace(config, strict_answers=True)
     named_by = "--as" if name else "the name of the folder"
@@ -116,14 +114,14 @@ def _stops(folder: Path) -> tuple[int, ...]:
     """Return the tokens that end an answer. Raises CheckpointError for settings that change the likeliest token."""
     file = folder / GENERATION_CONFIG
     if not is_there(file):
-        raise CheckpointError(f"{file}: expected the file, got none; copy it from the checkpoint as it was published")
+        raise CheckpointError.at(file, "the file", "none", "copy it from the checkpoint as it was published")
     content = read_json(file)
     for key in sorted(content.keys() - _IDLE):
         if key not in _NEUTRAL or content[key] not in (None, _NEUTRAL[key]):
             expected = f"{_NEUTRAL[key]}" if key in _NEUTRAL else "no such key"
-            raise CheckpointError(f"{file}: {key}: expected {expected}, got {shown(content[key])}; remove it")
+            raise CheckpointError.at(f"{file}: {key}", expected, shown(content[key]), "remove it")
     stops = content.get("eos_token_id")
     found = stops if isinstance(stops, list) else [stops]
     if not found or not all(type(token) is int for token in found):
-        raise CheckpointError(f"{file}: eos_token_id: expected ids of tokens, got {shown(stops)}")
+        raise CheckpointError.at(f"{file}: eos_token_id", "ids of tokens", shown(stops))
     return tuple(found)

@@ -82,7 +82,7 @@ class RoboRewardCollator(LanguageCollator):
         return self.template(PROMPT, add_generation_prompt=True) + BEFORE_ANSWER * self.config.is_expected
 
     def prompts(self, video: VlmVideo, task: str) -> list[VlmRow]:
-        """Return the conversations about a video. Raises ValueError for frames that cannot be resized."""
+        """Return the conversations about a video. Raises InvalidSampleError for frames that cannot be resized."""
         text = self.template(PROMPT.replace("{task}", task), add_generation_prompt=True)
         more = self._before_answer if self.config.is_expected else ()
         times_s = group_times(self.grid(video).groups)

@@ -15,7 +15,6 @@ from typing import Any
 
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
-from rfm.launch.installation import ServerStartError
 from rfm_client.contract.listening import ListenAddress
 
 NO_REASON = ""  # of a ready model
@@ -86,10 +85,7 @@ class StatusServer(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, host: str, port: int, status: Status) -> None:
-        try:
-            ListenAddress(host, port).check_free("status", port_option="--status-port")
-        except ValueError as error:
-            raise ServerStartError(str(error)) from None
+        ListenAddress(host, port).check_free("status", port_option="--status-port")
         self.status = status
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         super().__init__((host, port), _Handler)

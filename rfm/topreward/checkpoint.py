@@ -27,6 +27,7 @@ from rfm.vlm.preprocessor import (
     check_settings,
     read_preprocessor,
 )
+from rfm_client.contract.checks import require
 from rfm_client.contract.description import Description
 
 LEROBOT, ROBOMETER = "topreward", "topreward-robometer"  # of ``--as``
@@ -94,7 +95,7 @@ def load(folder: Path, options: Options) -> TopRewardCheckpoint:
     of_lerobot: dict[str, Any] = {}
     if content.get("type") == _TYPE:
         if name == ROBOMETER:
-            raise CheckpointError(f"--as: expected {LEROBOT} for a config.json of LeRobot, got {name}")
+            raise CheckpointError.at("--as", f"{LEROBOT} for a config.json of LeRobot", name)
         of_lerobot = _lerobot_settings(content, folder / NETWORK_CONFIG)
         files = _named_by_lerobot(content, options)
     else:
@@ -156,10 +157,10 @@ def _lerobot_settings(content: Mapping[str, Any], file: Path) -> dict[str, Any]:
     """Return the fields of TopRewardConfig in LeRobot's config.json. Raises CheckpointError for an unknown key."""
     if unknown := sorted(content.keys() - _IDLE - _DECIDING.keys()):
         remedy = "if it changes no score, remove it"
-        raise CheckpointError(f"{file}: expected the keys of LeRobot's TOPReward, got {shown(unknown[0])}; {remedy}")
+        raise CheckpointError.at(file, "the keys of LeRobot's TOPReward", shown(unknown[0]), remedy)
     for key in _DECIDING:
         if content.get(key) is None:
-            raise CheckpointError(f"{file}: {key}: expected a value, got none; save the model with LeRobot again")
+            raise CheckpointError.at(f"{file}: {key}", "a value", "none", "save the model with LeRobot again")
     return {field: content[key] for key, field in _DECIDING.items()}
 
 
@@ -173,7 +174,7 @@ def _limits(files: LanguageFolder, *, is_lerobot: bool) -> dict[str, int]:
     size = preprocessor.get("size")
     where = f"{files.processor}: {VIDEO_PREPROCESSOR_CONFIG}"
     if not isinstance(size, dict) or not all(type(size.get(edge)) is int for edge in ("shortest_edge", "longest_edge")):
-        raise CheckpointError(f"{where}: size: expected shortest_edge and longest_edge, got {shown(size)}")
+        raise CheckpointError.at(f"{where}: size", "shortest_edge and longest_edge", shown(size))
     check_settings(preprocessor, {**SIZED_BY_PROCESSOR, **sampling}, where)
     return {"least_px": size["shortest_edge"], "most_px": size["longest_edge"]}
 
@@ -182,14 +183,11 @@ def _check(settings: Mapping[str, Any]) -> None:
     """Raise CheckpointError for settings that no prompt can be made of."""
     prefixes, fps, suffix = settings["num_prefixes"], settings["fps"], settings["prompt_suffix"]
     if prefixes is not None and prefixes < 2:
-        raise CheckpointError(f"num_prefixes: expected at least 2, the first and the last, got {prefixes}")
-    if settings["max_frames"] < 1:
-        raise CheckpointError(f"max_frames: expected at least 1, got {settings['max_frames']}")
-    if not 0 < float(fps) < float("inf"):
-        raise CheckpointError(f"fps: expected a finite number above 0, got {shown(fps)}")
+        raise CheckpointError.at("num_prefixes", "at least 2, the first and the last", prefixes)
+    require("max_frames", settings["max_frames"] >= 1, "at least 1", settings["max_frames"], CheckpointError)
+    require("fps", 0 < float(fps) < float("inf"), "a finite number above 0", shown(fps), CheckpointError)
     try:
         is_good = suffix.format(instruction="TASK") != suffix.format(instruction="")
     except (AttributeError, IndexError, LookupError, ValueError):
         is_good = False
-    if not is_good:
-        raise CheckpointError(f"prompt_suffix: expected text with {{instruction}}, got {shown(suffix)}")
+    require("prompt_suffix", is_good, "text with {instruction}", shown(suffix), CheckpointError)

@@ -18,10 +18,10 @@ from torch import Tensor
 
 from rfm.vlm.images import (
     FRAMES_PER_GROUP,
-    MAX_QWEN_ASPECT_RATIO,
     MERGE,
     Grid,
     QwenImages,
+    check_aspect,
     resized,
     scaled_video,
 )
@@ -29,6 +29,7 @@ from rfm.vlm.language import LanguageCollator, LanguageConfig
 from rfm.vlm.row import VlmRow
 from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import InvalidSampleError, Sample
+from rfm_client.contract.checks import require
 
 Variant: TypeAlias = Literal["lerobot", "robometer"]
 PROMPT_PREFIX = "The above video shows a robot manipulation trajectory that completes the following task: "
@@ -95,14 +96,13 @@ class TopRewardImages(QwenImages):
     config: TopRewardConfig = field(kw_only=True)
 
     def size(self, height: int, width: int, num_frames: int) -> tuple[int, int]:
-        """Return height and width to which the frames of a prefix are resized. Raises ValueError for small frames."""
+        """Return the height and width for a prefix's frames. Raises InvalidSampleError for small frames."""
         factor = self.patch_px * MERGE
         if self.config.variant == "robometer":
             return SIDES_PX[1], SIDES_PX[1]
-        if min(height, width) < factor:
-            raise ValueError(f"frames of at least {factor} x {factor} pixels, got {height} x {width}")
-        if max(height, width) / min(height, width) > MAX_QWEN_ASPECT_RATIO:
-            raise ValueError(f"an image at most {MAX_QWEN_ASPECT_RATIO} times as long as wide, got {height} x {width}")
+        expected = f"frames of at least {factor} x {factor} pixels"
+        require("frames", min(height, width) >= factor, expected, f"{height} x {width}", InvalidSampleError)
+        check_aspect(height, width)
         fitted = [round(side / factor) * factor for side in (height, width)]
         pixels = math.ceil(num_frames / FRAMES_PER_GROUP) * FRAMES_PER_GROUP * fitted[0] * fitted[1]
         if pixels > self.config.most_px:

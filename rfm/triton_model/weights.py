@@ -23,8 +23,8 @@ def check_digest(version: Path, expected: str | None) -> None:
     if is_there(kept):
         expected = _digest_in(kept)
     if expected and (got := weights_digest([version])) != expected:
-        raise CheckpointError(
-            f"{version}: expected the weights that were exported ({expected}), got others ({got}); export them again"
+        raise CheckpointError.at(
+            version, f"the weights that were exported ({expected})", f"others ({got})", "export them again"
         )
 
 
@@ -34,4 +34,4 @@ def _digest_in(file: Path) -> str | None:
         config = text_format.Parse(file.read_text(), pb.ModelConfig())
         return Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value).weights_digest
     except (OSError, ValueError, text_format.ParseError) as error:
-        raise CheckpointError(f"{file}: expected a configuration of the export, got {error}; export again") from error
+        raise CheckpointError.at(file, "a configuration of the export", error, "export again") from error

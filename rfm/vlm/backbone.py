@@ -63,14 +63,14 @@ def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]
     """
     family = content.get("model_type")
     if family not in BACKBONES:
-        raise CheckpointError(f"{where}: model_type: expected one of {', '.join(BACKBONES)}, got {shown(family)}")
+        raise CheckpointError.at(f"{where}: model_type", f"one of {', '.join(BACKBONES)}", shown(family))
     config = _nested(content) if family == QWEN_2_5 and "text_config" not in content else {**content}
     for part, needed in zip(("text_config", "vision_config"), _NEEDED[family], strict=True):
         if not isinstance(config.get(part), dict):
-            raise CheckpointError(f"{where}: {part}: expected settings of the backbone, got {shown(config.get(part))}")
+            raise CheckpointError.at(f"{where}: {part}", "settings of the backbone", shown(config.get(part)))
         for name in needed:
             if config[part].get(name) is None:
-                raise CheckpointError(f"{where}: {part}.{name}: expected a value, got none; {_COPY}")
+                raise CheckpointError.at(f"{where}: {part}.{name}", "a value", "none", _COPY)
     config["text_config"] = _text(config["text_config"], f"{where}: text_config")
     config["vision_config"] = _vision(config["vision_config"], f"{where}: vision_config")
     return config
@@ -90,7 +90,7 @@ def check_not_quantized(config: Mapping[str, Any], where: object, remedy: str) -
     """Raise CheckpointError, with ``remedy`` at its end, if the configuration is of weights rounded to fewer bits."""
     for part in (config, config.get("text_config")):
         if (found := quantization(part)) is not None:
-            raise CheckpointError(f"{where}: quantization_config: expected none, got {shown(found)}; {remedy}")
+            raise CheckpointError.at(f"{where}: quantization_config", "none", shown(found), remedy)
 
 
 def _nested(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -104,10 +104,10 @@ def _text(config: dict[str, Any], where: str) -> dict[str, Any]:
     rope = _rope(config, where)
     theta = rope.pop("rope_theta", None)
     if type(theta) not in (int, float) or not 0 < theta < math.inf:
-        raise CheckpointError(f"{where}.rope_theta: expected a number above 0, got {shown(theta)}; {_COPY}")
+        raise CheckpointError.at(f"{where}.rope_theta", "a number above 0", shown(theta), _COPY)
     if not isinstance(rope.get("mrope_section"), list):
         got = shown(rope.get("mrope_section"))
-        raise CheckpointError(f"{where}.rope_scaling.mrope_section: expected a list of numbers, got {got}; {_COPY}")
+        raise CheckpointError.at(f"{where}.rope_scaling.mrope_section", "a list of numbers", got, _COPY)
     rest = {name: value for name, value in config.items() if name not in _ROPE}
     return rest | {"rope_theta": float(theta), "rope_scaling": None if rope == {"rope_type": "default"} else rope}
 
@@ -118,16 +118,14 @@ def _rope(config: dict[str, Any], where: str) -> dict[str, Any]:
     for part in ("rope_parameters", "rope_scaling"):
         section = config.get(part) or {}
         if not isinstance(section, dict):
-            raise CheckpointError(f"{where}.{part}: expected a mapping, got {shown(section)}")
+            raise CheckpointError.at(f"{where}.{part}", "a mapping", shown(section))
         _add(rope, section, where, part)
     _add(rope, {name: config.get(name) for name in ("rope_theta", "partial_rotary_factor")}, where, "text_config")
     if config.get("rope_interleaved"):
-        raise CheckpointError(
-            f"{where}.rope_interleaved: expected false, got {shown(config['rope_interleaved'])}; {_COPY}"
-        )
+        raise CheckpointError.at(f"{where}.rope_interleaved", "false", shown(config["rope_interleaved"]), _COPY)
     partial = rope.pop("partial_rotary_factor", 1)
     if partial != 1:
-        raise CheckpointError(f"{where}.partial_rotary_factor: expected 1, got {shown(partial)}; {_COPY}")
+        raise CheckpointError.at(f"{where}.partial_rotary_factor", "1", shown(partial), _COPY)
     return {"rope_type": "default"} | rope
 
 
@@ -137,7 +135,7 @@ def _add(rope: dict[str, Any], section: Mapping[str, Any], where: str, part: str
         value = "default" if name == "rope_type" and value == "mrope" else value  # an older value
         if value is not None and rope.setdefault(name, value) != value:
             got = f"{shown(rope[name])} and {shown(value)}"
-            raise CheckpointError(f"{where}: expected one value of {name} in {part}, got {got}; {_COPY}")
+            raise CheckpointError.at(where, f"one value of {name} in {part}", got, _COPY)
 
 
 def _vision(config: dict[str, Any], where: str) -> dict[str, Any]:
@@ -147,7 +145,7 @@ def _vision(config: dict[str, Any], where: str) -> dict[str, Any]:
     kind = rope.get("rope_type", "axial") if isinstance(rope, dict) else rope
     if theta != VISION_THETA or kind not in ("axial", "default"):
         expected = "axial with a rope_theta of 10000"
-        raise CheckpointError(f"{where}.rope_parameters: expected {expected}, got {shown(rope)}; {_COPY}")
+        raise CheckpointError.at(f"{where}.rope_parameters", expected, shown(rope), _COPY)
     for name in ("patch_size", "spatial_merge_size", "temporal_patch_size"):
         _check_count(config.get(name, 1), f"{where}.{name}")
     return {name: value for name, value in config.items() if name != "rope_parameters"}
@@ -155,7 +153,7 @@ def _vision(config: dict[str, Any], where: str) -> dict[str, Any]:
 
 def _check_count(value: object, where: str) -> None:
     if type(value) is not int or value < 1:
-        raise CheckpointError(f"{where}: expected a whole number of at least 1, got {shown(value)}; {_COPY}")
+        raise CheckpointError.at(where, "a whole number of at least 1", shown(value), _COPY)
 
 
 # Renames for a form of weights. The first pattern that matches a name is applied.
@@ -190,5 +188,5 @@ def renamed(weights: Mapping[str, Tensor], renames: Renames) -> dict[str, Tensor
     if len(names) < len(weights):
         twice = next(name for name in weights if names[rename(name)] != name)
         got = f"{shown(twice)} and {shown(names[rename(twice)])}"
-        raise CheckpointError(f"{rename(twice)}: expected one weight, got {got}; remove the one that is not meant")
+        raise CheckpointError.at(rename(twice), "one weight", got, "remove the one that is not meant")
     return {name: weights[old] for name, old in names.items()}

@@ -320,9 +320,9 @@ def _config(
     weights: Mapping[str, Tensor],
 ) -> VlmConfig:
     if "progress_head.4.weight" not in weights:
-        raise CheckpointError(f"{folder}: expected reward heads, got no progress_head.4.weight")
+        raise CheckpointError.at(folder, "reward heads", "no progress_head.4.weight")
     if "frame_pool_attn.weight" not in weights:
-        raise CheckpointError(f"{folder}: expected frame_pool_attn.weight, got none: {OF_AN_OLD_RUN}")
+        raise CheckpointError.at(folder, "frame_pool_attn.weight", f"none: {OF_AN_OLD_RUN}")
     network = run.network()
     config = VlmConfig(
         backbone=backbone,
@@ -335,7 +335,8 @@ def _config(
         **network,
     )
     if config.per_frame_progress_token and not config.multi_image:
-        raise CheckpointError(f"{run.file}: use_multi_image with per-frame progress tokens: expected true, got false")
+        where = f"{run.file}: use_multi_image with per-frame progress tokens"
+        raise CheckpointError.at(where, "true", "false")
     return config
 
 
@@ -365,4 +366,4 @@ def _check_layers(config: Any) -> None:
     for name in _LAYER_COUNTS if isinstance(config, dict) else ():
         count = config.get(name)
         if isinstance(count, (int, float)) and count > MAX_LAYERS:
-            raise CheckpointError(f"{NETWORK_CONFIG}: {name}: expected at most {MAX_LAYERS}, got {shown(count)}")
+            raise CheckpointError.at(f"{NETWORK_CONFIG}: {name}", f"at most {MAX_LAYERS}", shown(count))

@@ -116,10 +116,7 @@ class VlmCollator:
         parts: list[str | Visual] = []
         for part in question(sample, progress_in_preference=self.config.progress_in_preference):
             parts += self._frame_parts(videos[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
-        try:
-            text, pad, lengths = self._placed(self._chat.text(tuple(parts)), videos)
-        except ValueError as error:  # the frames are too narrow to be resized
-            raise InvalidSampleError.at("frames", *str(error).split(", got ")) from error
+        text, pad, lengths = self._placed(self._chat.text(tuple(parts)), videos)
         ids = expanded(self._chat.tokens(text), self.tokenizer.convert_tokens_to_ids(pad), lengths)
         is_similarity = isinstance(sample, SimilaritySample)
         query_token = SIMILARITY_TOKEN if is_similarity else PREFERENCE_TOKEN

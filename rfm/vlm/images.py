@@ -22,6 +22,8 @@ from torch import Tensor
 
 from rfm.checkpoint.content import MAX_UINT8, PIL_BICUBIC
 from rfm.engine.pixels import Normalisation
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
 
 MERGE = 2
@@ -30,6 +32,7 @@ IMAGE_TOKENS = (4, 16_384)  # merged tokens of an image: least, most
 VIDEO_TOKENS = (128.0, 768.0)  # of a frame of a video
 VIDEO_TOTAL_TOKENS = 128_000 * 0.9  # of a whole video
 MAX_QWEN_ASPECT_RATIO = 200
+_NOT_LONG = f"an image at most {MAX_QWEN_ASPECT_RATIO} times as long as wide"
 MAX_VIDEO_SIDE_PX = 480  # larger frames of videos are scaled down first
 
 
@@ -47,15 +50,20 @@ class Grid:
         return self.rows * self.columns // MERGE**2
 
 
+def check_aspect(height: int, width: int) -> None:
+    """Raise InvalidSampleError for an image over 200 times as long as wide."""
+    is_fit = max(height, width) / min(height, width) <= MAX_QWEN_ASPECT_RATIO
+    require("frames", is_fit, _NOT_LONG, f"{height} x {width}", InvalidSampleError)
+
+
 def fitted_size(height: int, width: int, factor: int, tokens: tuple[float, float] = IMAGE_TOKENS) -> tuple[int, int]:
     """Return the nearest height and width in multiples of ``factor``, of similar shape, for a Qwen backbone.
 
     factor: pixels a side of a merged token
     tokens: least and most merged tokens
-    Raises ValueError for an image over 200 times as long as wide.
+    Raises InvalidSampleError for an image over 200 times as long as wide.
     """
-    if max(height, width) / min(height, width) > MAX_QWEN_ASPECT_RATIO:
-        raise ValueError(f"an image at most {MAX_QWEN_ASPECT_RATIO} times as long as wide, got {height} x {width}")
+    check_aspect(height, width)
     least, most = (count * factor**2 for count in tokens)
     fitted = [max(factor, round(side / factor) * factor) for side in (height, width)]
     if fitted[0] * fitted[1] > most:

@@ -47,7 +47,7 @@ from rfm.vlm.rounded import fit
 from rfm.vlm.row import VlmRow
 from rfm.vlm.video import Indices, VlmVideo
 from rfm.vlm.work import flop
-from rfm_client.contract import InvalidSampleError, ProgressSample, Sample
+from rfm_client.contract import ProgressSample, Sample
 
 SETTINGS, REWARD_MODEL = "rfm", "reward_model"  # keys in an exported config.json
 VIDEO = VISION_START + VIDEO_PAD + VISION_END  # a video, or a temporal patch, in the text of a prompt
@@ -110,7 +110,7 @@ class LanguageCollator(VlmCollator):
         """Raise CheckpointError unless a prompt has its video once."""
         num_videos = self.example().count(VIDEO)
         if num_videos != 1:
-            raise CheckpointError(f"chat template: expected one video in a prompt, got {num_videos}")
+            raise CheckpointError.at("chat template", "one video in a prompt", num_videos)
 
     def example(self) -> str:
         """Return the prompt of an example task, with VIDEO in the place of the video."""
@@ -122,15 +122,10 @@ class LanguageCollator(VlmCollator):
         assert isinstance(sample, ProgressSample)  # by check_type
         (trajectory,) = sample.trajectories
         self._check_task(trajectory.task)
-        try:
-            return self.prompts(video_of(trajectory, sample.frame_steps), trajectory.task)
-        except ValueError as error:  # the frames are too small or too narrow
-            if isinstance(error, InvalidSampleError):
-                raise
-            raise InvalidSampleError.at("frames", *str(error).split(", got ")) from error
+        return self.prompts(video_of(trajectory, sample.frame_steps), trajectory.task)
 
     def prompts(self, video: VlmVideo, task: str) -> list[VlmRow]:
-        """Return the conversations about a video. Raises ValueError for frames that cannot be resized."""
+        """Return the conversations about a video. Raises InvalidSampleError for frames that cannot be resized."""
         raise NotImplementedError
 
     def row(
@@ -212,7 +207,7 @@ class LanguageCheckpoint:
         num_rows = self.config.backbone["text_config"]["vocab_size"]
         if len(tokenizer) > num_rows:
             expected = f"a tokenizer of at most {num_rows} tokens, as the embedding"
-            raise CheckpointError(f"base model {self.processor}: expected {expected}, got {len(tokenizer)}")
+            raise CheckpointError.at(f"base model {self.processor}", expected, len(tokenizer))
         check_tokens(self.config, tokenizer, self.processor)
         where = f"base model {self.processor}: preprocessing of videos"
         normalisation = normalisation_of(preprocessor, SIZED_BY_PROCESSOR, where)

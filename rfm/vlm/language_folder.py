@@ -59,14 +59,14 @@ class LanguageFolder:
         content = read_json(file)
         if content.get("model_type") != QWEN3:
             got = shown(content.get("model_type"))
-            raise CheckpointError(f"{file}: model_type: expected {QWEN3}, of an ordinary Qwen3-VL, got {got}")
+            raise CheckpointError.at(f"{file}: model_type", f"{QWEN3}, of an ordinary Qwen3-VL", got)
         settings = content.pop(SETTINGS, None)
         backbone = backbone_config(content, file)
         is_nf4 = read_unrounded_config(backbone, file)
         tensors = read_weights(folder) if settings is not None else read_published(folder, is_nf4)[0]
         weights = {name: tensor for name, tensor in renamed(tensors, _NAMES).items() if "inv_freq" not in name}
         if any(name.startswith("progress_head") for name in weights):
-            raise CheckpointError(f"{folder}: expected an ordinary Qwen3-VL, got reward heads: leave out --as")
+            raise CheckpointError.at(folder, "an ordinary Qwen3-VL", "reward heads: leave out --as")
         _tie(weights, backbone, file)
         own = folder / PROCESSOR_FOLDER
         processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
@@ -99,7 +99,7 @@ class LanguageFolder:
             return None
         if self.settings.get(REWARD_MODEL) != config.reward_model:
             got = shown(self.settings.get(REWARD_MODEL))
-            raise CheckpointError(f"{self.folder}: expected an export of {config.reward_model}, got one of {got}")
+            raise CheckpointError.at(self.folder, f"an export of {config.reward_model}", f"one of {got}")
         fields = {
             name: tuple(value) if isinstance(value, list) else value
             for name, value in self.settings.items()
@@ -135,14 +135,16 @@ def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> N
     head, embedding = weights.get(HEAD), weights.get(EMBEDDING)
     if head is None:
         if not (stated[1] if stated[0] is None else stated[0]):
-            raise CheckpointError(f"{file.parent}: expected {HEAD}, since {_TIED} is false, got none")
+            raise CheckpointError.at(file.parent, f"{HEAD}, since {_TIED} is false", "none")
     elif embedding is not None and True in stated:
         if head.shape != embedding.shape or not bool((head == embedding).all()):
-            raise CheckpointError(
-                f"{file}: {_TIED}: expected false, since {HEAD} differs from the embedding, got true; transformers 4 "
-                "scores with the embedding, transformers 5 with the head. For the head, set it to false here and in "
-                "text_config. For the embedding, load and save the model with transformers 4, which drops the head"
+            where = f"{file}: {_TIED}"
+            remedy = (
+                "transformers 4 scores with the embedding, transformers 5 with the head. For the head, set it to false "
+                "here and in text_config. For the embedding, load and save the model with transformers 4, which drops "
+                "the head"
             )
+            raise CheckpointError.at(where, f"false, since {HEAD} differs from the embedding", "true", remedy)
         del weights[HEAD]
 
 
@@ -153,7 +155,7 @@ def _dtype(config: Mapping[str, Any], file: Path) -> Decision:
         return Decision("dtype", "bfloat16", f"default, as {NETWORK_CONFIG} has no dtype", is_assumed=True)
     dtype = str(config[key]).removeprefix("torch.")
     if dtype not in DTYPES:
-        raise CheckpointError(f"{file}: {key}: expected one of {', '.join(DTYPES)}, got {shown(dtype)}")
+        raise CheckpointError.at(f"{file}: {key}", f"one of {', '.join(DTYPES)}", shown(dtype))
     return Decision("dtype", dtype, f"{NETWORK_CONFIG}: {key}")
 
 

@@ -47,10 +47,10 @@ def lerobot_run(content: Mapping[str, Any], file: Path) -> RunConfig:
     known = {LEROBOT_BACKBONE, _BINS, _LOSS, *_IDLE, *(key for keys in _DECIDING.values() for key in keys)}
     if unknown := sorted(content.keys() - known):
         remedy = "if it changes no score, remove it"
-        raise CheckpointError(f"{file}: expected the keys of LeRobot's Robometer, got {shown(unknown[0])}; {remedy}")
+        raise CheckpointError.at(file, "the keys of LeRobot's Robometer", shown(unknown[0]), remedy)
     for key in (LEROBOT_BACKBONE, *_DECIDING["model"]):
         if content.get(key) is None:
-            raise CheckpointError(f"{file}: {key}: expected a value, got none; save the model with LeRobot again")
+            raise CheckpointError.at(f"{file}: {key}", "a value", "none", "save the model with LeRobot again")
     sections = {name: {key: content.get(key) for key in keys} for name, keys in _DECIDING.items()}
     sections["data"] |= {"resized_height": None, "resized_width": None}  # LeRobot has no common size of frames
     return RunConfig(file, NETWORK_CONFIG, {"training": {}, "peft": {}, **sections}, has_sections=False)
@@ -71,9 +71,9 @@ def check_bins(content: Mapping[str, Any], weights: Mapping[str, Tensor], file: 
     """Raise CheckpointError if config.json states other progress bins than the weights have."""
     loss, bins = content.get(_LOSS), content.get(_BINS)
     if loss not in _LOSSES:
-        raise CheckpointError(f"{file}: {_LOSS}: expected one of {', '.join(_LOSSES)}, got {shown(loss)}")
+        raise CheckpointError.at(f"{file}: {_LOSS}", f"one of {', '.join(_LOSSES)}", shown(loss))
     head = weights.get("progress_head.4.weight")
     stated = bins if loss == "discrete" else 1
     if head is not None and len(head) != stated:
         got = f"{shown(bins)} with {_LOSS} {loss}; correct what the run did not have"
-        raise CheckpointError(f"{file}: {_BINS}: expected {len(head)} outputs, as progress_head has, got {got}")
+        raise CheckpointError.at(f"{file}: {_BINS}", f"{len(head)} outputs, as progress_head has", got)

@@ -73,32 +73,28 @@ class Scaling:
         """Read a LoRA configuration. Raises CheckpointError for an adapter of another kind."""
         kind = config.get("peft_type", "LORA")
         if kind != "LORA":
-            raise CheckpointError(f"{file}: peft_type: expected LORA, got {shown(kind)}; {MERGE}")
+            raise CheckpointError.at(f"{file}: peft_type", "LORA", shown(kind), MERGE)
         rank, alpha = config.get("r"), config.get("lora_alpha")
         is_number = isinstance(alpha, (int, float)) and not isinstance(alpha, bool) and math.isfinite(alpha)
         if type(rank) is not int or rank < 1 or not is_number:
             got = f"lora_alpha {shown(alpha)} and r {shown(rank)}"
-            raise CheckpointError(f"{file}: expected lora_alpha and r of the LoRA weights, got {got}")
+            raise CheckpointError.at(file, "lora_alpha and r of the LoRA weights", got)
         unsupported = sorted(name for name, value in config.items() if value and name not in _HARMLESS)
         if unsupported:
-            raise CheckpointError(f"{file}: expected plain LoRA, got {cut(', '.join(unsupported))}; {MERGE}")
+            raise CheckpointError.at(file, "plain LoRA", cut(", ".join(unsupported)), MERGE)
         return cls(file, rank, float(config["lora_alpha"]))
 
     def check_rank(self, module: str, factor: Tensor) -> None:
         """Raise CheckpointError for a factor A, [r, D], of another rank."""
         if len(factor) != self.rank:
-            raise CheckpointError(
-                f"{self.file}: r: expected {len(factor)}, the rows of {module}.lora_A, got {self.rank}; "
-                "put in r and lora_alpha of the run that trained these factors"
-            )
+            where, remedy = f"{self.file}: r", "put in r and lora_alpha of the run that trained these factors"
+            raise CheckpointError.at(where, f"{len(factor)}, the rows of {module}.lora_A", self.rank, remedy)
 
     def check_equal(self, other: Scaling) -> None:
         """Raise CheckpointError if another file has other values."""
         mine, its = (f"r {each.rank} and lora_alpha {each.alpha:g}" for each in (self, other))
         if mine != its:
-            raise CheckpointError(
-                f"{other.file}: expected {mine}, as {self.file} has it, got {its}; mend the wrong one"
-            )
+            raise CheckpointError.at(other.file, f"{mine}, as {self.file} has it", its, "mend the wrong one")
 
 
 def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
@@ -106,11 +102,9 @@ def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
     init, bias = config.get("init_lora_weights", True), config.get("bias", "none")
     if init not in _PLAIN_INITS:
         got = f"{shown(init)}, which may change the base model's weights before training"
-        raise CheckpointError(f"{file}: init_lora_weights: expected true, got {got}; {MERGE}")
+        raise CheckpointError.at(f"{file}: init_lora_weights", "true", got, MERGE)
     if bias != "none":
-        raise CheckpointError(
-            f"{file}: bias: expected none, got {shown(bias)}, which PEFT does not always save; {MERGE}"
-        )
+        raise CheckpointError.at(f"{file}: bias", "none", f"{shown(bias)}, which PEFT does not always save", MERGE)
 
 
 def split(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -182,13 +176,13 @@ def _name(module: str, side: str) -> str:
 
 def _check(module: str, weight: Tensor | None, pair: Mapping[str, Tensor]) -> None:
     if weight is None or pair.keys() != {"A", "B"}:
-        raise CheckpointError(f"{module}: expected a weight and LoRA factors A and B, got {sorted(pair)}")
+        raise CheckpointError.at(module, "a weight and LoRA factors A and B", sorted(pair))
     shapes = [list(pair[side].shape) for side in ("B", "A")]
     if [len(shape) for shape in shapes] != [2, 2] or [shapes[0][0], shapes[1][1]] != shape_of(weight):
         got = f"{shapes[0]} and {shapes[1]}"
-        raise CheckpointError(f"{module}: expected LoRA factors of {shape_of(weight)}, got {got}; {MERGE}")
+        raise CheckpointError.at(module, f"LoRA factors of {shape_of(weight)}", got, MERGE)
     if shapes[0][1] != shapes[1][0]:
-        raise CheckpointError(f"{module}: expected LoRA factors of one rank, got {shapes[0]} and {shapes[1]}")
+        raise CheckpointError.at(module, "LoRA factors of one rank", f"{shapes[0]} and {shapes[1]}")
 
 
 CUSTOM_HEADS = "custom_heads.safetensors"
@@ -215,10 +209,8 @@ def has_adapter(folder: Path) -> bool:
     if adapter and whole:
         if is_there(folder / ADAPTER_TARGET):
             return False
-        raise CheckpointError(
-            f"{folder}: expected an adapter ({adapter[0]}) or whole weights ({whole[0]}), got both; move away the one "
-            "that is not meant"
-        )
+        remedy = "move away the one that is not meant"
+        raise CheckpointError.at(folder, f"an adapter ({adapter[0]}) or whole weights ({whole[0]})", "both", remedy)
     return bool(adapter)
 
 
@@ -239,7 +231,7 @@ def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Te
     other = next((name for name in adapter if _OTHER.search(name)), None)
     if other is not None:
         expected = "LoRA factors of linear layers of a Qwen backbone"
-        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: expected {expected}, got {shown(other)}; {MERGE}")
+        raise CheckpointError.at(folder / ADAPTER_WEIGHTS, expected, shown(other), MERGE)
     if EMBEDDING not in adapter:
         raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: {_NO_EMBEDDING}")
     config, base = _read_base(base_model)
@@ -247,9 +239,7 @@ def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Te
     replaced = {name: tensor for name, tensor in adapter.items() if name not in factors}
     unknown = sorted(replaced.keys() - base.keys())
     if unknown:
-        raise CheckpointError(
-            f"{folder / ADAPTER_WEIGHTS}: expected weights of {base_model}, got also {listed(unknown)}"
-        )
+        raise CheckpointError.at(folder / ADAPTER_WEIGHTS, f"weights of {base_model}", f"also {listed(unknown)}")
     check_factors(file, adapter_config, set(map(module_of, factors)), base, root)
     check_replaced(file, adapter_config, replaced, base)
     config["text_config"]["vocab_size"] = len(replaced[EMBEDDING])

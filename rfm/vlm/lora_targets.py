@@ -37,10 +37,9 @@ def check_factors(
 def check_none_lost(file: Path, lost: set[str]) -> None:
     """Raise CheckpointError if factors are lost. file: the file that names their modules, for the message"""
     if lost:
-        raise CheckpointError(
-            f"{file}: expected LoRA factors of each module that was trained, got none for {listed(sorted(lost))}: "
-            "these modules would score as before training; copy or save the weights again where they were trained"
-        )
+        got = f"none for {listed(sorted(lost))}: these modules would score as before training"
+        remedy = "copy or save the weights again where they were trained"
+        raise CheckpointError.at(file, "LoRA factors of each module that was trained", got, remedy)
 
 
 def check_replaced(file: Path, config: Mapping[str, Any], replaced: Iterable[str], weights: Iterable[str]) -> None:
@@ -48,10 +47,8 @@ def check_replaced(file: Path, config: Mapping[str, Any], replaced: Iterable[str
     names = config.get("modules_to_save") or ()
     saved = {weight for weight in weights for name in names if f".{name}." in f".{weight}"}
     if missing := sorted(saved - set(replaced)):
-        raise CheckpointError(
-            f"{file}: modules_to_save: expected the weights of each module, got none for {listed(missing)}; "
-            "copy or save the adapter again where it was trained"
-        )
+        where, remedy = f"{file}: modules_to_save", "copy or save the adapter again where it was trained"
+        raise CheckpointError.at(where, "the weights of each module", f"none for {listed(missing)}", remedy)
 
 
 def _targeted(
@@ -93,7 +90,7 @@ def _named(file: Path, field: str, names: list[str] | str, keys: Iterable[str]) 
     try:
         return {key for key in keys if regex.fullmatch(names, key, timeout=_PATTERN_S)}
     except (TimeoutError, regex.error) as error:
-        raise CheckpointError(f"{file}: {field}: expected a pattern of names, got {shown(names)}: {error}") from error
+        raise CheckpointError.at(f"{file}: {field}", "a pattern of names", f"{shown(names)}: {error}") from error
 
 
 def _layer_of(key: str, patterns: list[str] | str | None) -> int | None:

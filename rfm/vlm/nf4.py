@@ -143,4 +143,4 @@ def _decoded(packed: Tensor, scales: Tensor, state: Mapping[str, Any]) -> Tensor
 
 def _misfit(name: str, expected: str, got: str) -> CheckpointError:
     remedy = "copy this checkpoint again, or export the full checkpoint that was rounded to NF4"
-    return CheckpointError(f"{name}: expected {expected}, got {got}; {remedy}")
+    return CheckpointError.at(name, expected, got, remedy)

@@ -63,7 +63,7 @@ def read_preprocessor(processor: str | Path, file: str, key: str) -> dict[str, A
     folder = local_copy(processor)
     nested, found = _optional(folder / PROCESSOR_CONFIG).get(key), _optional(folder / file)
     if nested is not None and not isinstance(nested, dict):
-        raise CheckpointError(f"{processor}: {PROCESSOR_CONFIG}: {key}: expected settings, got {shown(nested)}")
+        raise CheckpointError.at(f"{processor}: {PROCESSOR_CONFIG}: {key}", "settings", shown(nested))
     if nested is None and not found:
         if file == VIDEO_PREPROCESSOR_CONFIG:
             return read_preprocessor(processor, *OF_IMAGES)
@@ -73,7 +73,7 @@ def read_preprocessor(processor: str | Path, file: str, key: str) -> dict[str, A
         if name not in _IDLE and found.get(name) not in (None, value):
             both = f"{file} with {shown(found[name])} and {key} of {PROCESSOR_CONFIG} with {shown(value)}"
             remedy = "transformers 4 reads the former, transformers 5 the latter; correct the one that is older"
-            raise CheckpointError(f"{processor}: {name}: expected one value, got {both}: {remedy}")
+            raise CheckpointError.at(f"{processor}: {name}", "one value", f"{both}: {remedy}")
     return {**found, **inner}
 
 
@@ -95,11 +95,12 @@ def check_settings(settings: Settings, neutral: Settings, where: object) -> None
         if name not in neutral and value in (False, {}, []):
             continue
         usual = "1/255" if name == "rescale_factor" else json.dumps(neutral.get(name))
-        expected = f"{usual}, got {_text(value)}" if name in neutral else f"a known setting, got {_text(value)}"
-        raise CheckpointError(
-            f"{where}: {name}: expected {expected}, which is not applied here and may change pixels; if the model was "
-            "trained without it, remove it from a copy of the folder and name that with --base-model"
+        expected = usual if name in neutral else "a known setting"
+        got = f"{_text(value)}, which is not applied here and may change pixels"
+        remedy = (
+            "if the model was trained without it, remove it from a copy of the folder and name that with --base-model"
         )
+        raise CheckpointError.at(f"{where}: {name}", expected, got, remedy)
 
 
 def _text(value: Any) -> str:
@@ -117,7 +118,7 @@ def normalisation_of(settings: Settings, neutral: Settings, where: object) -> No
     check_settings(settings, neutral, where)
     mean, std = (_numbers(settings, name, where) for name in ("image_mean", "image_std"))
     if min(std) <= 0:
-        raise CheckpointError(f"{where}: image_std: expected numbers above 0, got {shown(settings['image_std'])}")
+        raise CheckpointError.at(f"{where}: image_std", "numbers above 0", shown(settings["image_std"]))
     return Normalisation(mean, std)
 
 
@@ -126,7 +127,7 @@ def patch_px(settings: Settings, vision: Settings, where: object) -> int:
     expected, stated = vision["patch_size"], settings.get("patch_size")
     if type(stated) is not int or stated != expected:
         got = "none" if stated is None else shown(stated)
-        raise CheckpointError(f"{where}: patch_size: expected {expected}, as vision_config of config.json, got {got}")
+        raise CheckpointError.at(f"{where}: patch_size", f"{expected}, as vision_config of config.json", got)
     return stated
 
 
@@ -134,5 +135,5 @@ def _numbers(settings: Settings, name: str, where: object) -> tuple[float, ...]:
     values = settings.get(name)
     each = values if isinstance(values, list) else []
     if len(each) != _CHANNELS or not all(type(value) in (int, float) and math.isfinite(value) for value in each):
-        raise CheckpointError(f"{where}: {name}: expected {_CHANNELS} numbers, got {shown(values)}")
+        raise CheckpointError.at(f"{where}: {name}", f"{_CHANNELS} numbers", shown(values))
     return tuple(map(float, each))

@@ -68,7 +68,7 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
             if is_old
             else ""
         )
-        raise CheckpointError(f"base model {processor}: expected {expected}, got {len(tokenizer)}{hint}")
+        raise CheckpointError.at(f"base model {processor}", expected, f"{len(tokenizer)}{hint}")
     _check_tokens(config, tokenizer, processor)
     return _collator(config, tokenizer, preprocessor, processor)
 
@@ -104,10 +104,9 @@ def check_tokens(
     for token, number in expected.items():
         got = tokenizer.convert_tokens_to_ids(token)
         if got != number:
-            raise CheckpointError(
-                f"base model {processor}: {token}: expected token {number}, with which the checkpoint was trained, got "
-                f"{got}; name the base model as it was published with --base-model"
-            )
+            where = f"base model {processor}: {token}"
+            remedy = "name the base model as it was published with --base-model"
+            raise CheckpointError.at(where, f"token {number}, with which the checkpoint was trained", got, remedy)
 
 
 def _tokenizer(folder: Path) -> Any:

@@ -395,4 +395,4 @@ def check_attention(backbone: Any) -> None:
     """Raise CheckpointError for a language model with layers that do not attend to all earlier tokens."""
     kinds = set(getattr(backbone.config.get_text_config(), "layer_types", None) or [FULL_ATTENTION])
     if kinds != {FULL_ATTENTION}:
-        raise CheckpointError(f"text_config.layer_types: expected {FULL_ATTENTION} alone, got {sorted(kinds)}")
+        raise CheckpointError.at("text_config.layer_types", f"{FULL_ATTENTION} alone", sorted(kinds))

@@ -82,8 +82,8 @@ class Nf4Linear(RoundedLinear):
         try:
             from bitsandbytes import functional
         except ImportError as error:
-            expected = "expected bitsandbytes, which decodes weights in NF4, got none"
-            raise CheckpointError(f"weights: {expected}; {INSTALL}") from error
+            expected = "bitsandbytes, which decodes weights in NF4"
+            raise CheckpointError.at("weights", expected, "none", INSTALL) from error
         self._bitsandbytes: Any = functional
         count = self.out_features * self.in_features
         self._block_size = nf4.block_size(count, len(scale))

@@ -45,10 +45,10 @@ def read_published(folder: Path, is_nf4: bool) -> tuple[dict[str, Tensor], int]:
     num_nf4 = dequantize(tensors, may_be_rounded)
     quantized = next((name for name in tensors if QUANTIZED.search(name)), None)
     if quantized is not None:
-        raise CheckpointError(f"{folder}: expected weights in full precision, got {shown(quantized)}; {UNQUANTIZED}")
+        raise CheckpointError.at(folder, "weights in full precision", shown(quantized), UNQUANTIZED)
     if is_nf4 and not num_nf4:
         got = "none; if they are meant in full precision, remove it"
-        raise CheckpointError(f"{folder / NETWORK_CONFIG}: quantization_config: expected weights in NF4, got {got}")
+        raise CheckpointError.at(f"{folder / NETWORK_CONFIG}: quantization_config", "weights in NF4", got)
     return tensors, num_nf4
 
 

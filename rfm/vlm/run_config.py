@@ -27,6 +27,7 @@ from rfm.checkpoint.run_config import find_run_config, frame_count
 from rfm.vlm.backbone import DEQUANTIZED, QWEN_2_5
 from rfm.vlm.lora import MERGE, Scaling
 from rfm.vlm.network import VlmConfig
+from rfm_client.contract.checks import require
 
 HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, generated text
 DTYPES = ("float32", "bfloat16", "float16")
@@ -75,19 +76,19 @@ class RunConfig:
         """
         file = find_run_config(folder)
         if file is None:
-            raise CheckpointError(
-                f"{folder}: expected {RUN_CONFIG} of the training run there, in the folder above, or on main of its "
-                "Hub repository, got none: weights do not tell how the model was shown frames; "
+            raise CheckpointError.at(
+                folder,
+                f"{RUN_CONFIG} of the training run there, in the folder above, or on main of its Hub repository",
+                "none: weights do not tell how the model was shown frames",
                 f"copy the run's {RUN_CONFIG} into the folder; with an ordinary vision-language model, say --as which "
-                "reward model it is asked"
+                "reward model it is asked",
             )
         content = read_run_config(file)
         sections = {name: content.get(name) or {} for name in _SECTIONS}
         for name, section in sections.items():
             if not isinstance(section, dict):
-                raise CheckpointError(f"{file}: {name}: expected a mapping, got {shown(section)}")
-        if not sections["model"]:
-            raise CheckpointError(f"{file}: model: expected the settings of the training run, got none")
+                raise CheckpointError.at(f"{file}: {name}", "a mapping", shown(section))
+        require(f"{file}: model", bool(sections["model"]), "the settings of the training run", "none", CheckpointError)
         return cls(file, file_name(file, folder), sections)
 
     def check_model_type(self) -> None:
@@ -99,12 +100,12 @@ class RunConfig:
                 "in different ways, and upstream's successor dropped the type"
             )
         if model_type != HEADS:
-            raise CheckpointError(f"{self.file}: model.model_type: expected {HEADS}, got {shown(model_type)}{why}")
+            raise CheckpointError.at(f"{self.file}: model.model_type", HEADS, f"{shown(model_type)}{why}")
         for section in ("model", "data"):
             for key in _DROPPED:
                 if self.get(f"{section}.{key}", False):
                     expected = "false (upstream dropped this way to prompt a model)"
-                    raise CheckpointError(f"{self.file}: {section}.{key}: expected {expected}, got true")
+                    raise CheckpointError.at(f"{self.file}: {section}.{key}", expected, "true")
 
     def network(self) -> dict[str, Any]:
         """Return the fields of VlmConfig about the network and its prompts, except the frame size.
@@ -114,7 +115,7 @@ class RunConfig:
         temperature = self.get("model.frame_pooling_attn_temperature", 1.0)
         if not 0 < temperature < math.inf:
             where = f"{self.file}: {self.shown('model.frame_pooling_attn_temperature')}"
-            raise CheckpointError(f"{where}: expected a number above 0, got {shown(temperature)}")
+            raise CheckpointError.at(where, "a number above 0", shown(temperature))
         return {
             "dtype": self._one_of("model.torch_dtype", "bfloat16", DTYPES),
             "multi_image": self._of_either("multi_image"),
@@ -140,7 +141,7 @@ class RunConfig:
         keys = ("resized_height", "resized_width")
         for key in keys:
             if key not in self.sections["data"]:  # upstream's default changed from 224 to null
-                raise CheckpointError(f"{self.file}: data.{key}: expected a number or null, got no such key")
+                raise CheckpointError.at(f"{self.file}: data.{key}", "a number or null", "no such key")
         height, width = (frame_count(self.sections["data"].get(key), f"{self.file}: data.{key}") for key in keys)
         return None if height is None or width is None else (height, width)
 
@@ -174,15 +175,12 @@ class RunConfig:
         if type(value) is int and type(default) is float:
             value = float(value)
         if type(value) is not type(default):
-            raise CheckpointError(
-                f"{self.file}: {self.shown(place)}: expected {type(default).__name__}, got {shown(value)}"
-            )
+            raise CheckpointError.at(f"{self.file}: {self.shown(place)}", f"{type(default).__name__}", shown(value))
         return value
 
     def _one_of(self, place: str, default: str, known: tuple[str, ...]) -> str:
         value = self.get(place, default).removeprefix("torch.")
-        if value not in known:
-            raise CheckpointError(f"{self.file}: {self.shown(place)}: expected one of {known}, got {shown(value)}")
+        require(f"{self.file}: {self.shown(place)}", value in known, f"one of {known}", shown(value), CheckpointError)
         return value
 
     def _of_either(self, setting: str) -> bool:
@@ -192,7 +190,7 @@ class RunConfig:
         if len(set(values.values())) > 1:
             got = " and ".join(f"{place} {str(value).lower()}" for place, value in values.items())
             mend = "set both to how the run showed frames"
-            raise CheckpointError(f"{self.file}: expected {' and '.join(places)} to agree, got {got}; {mend}")
+            raise CheckpointError.at(self.file, f"{' and '.join(places)} to agree", got, mend)
         return any(values.values())
 
 
@@ -204,23 +202,20 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
     """
     base = run.get("model.base_model_id", "")
     if not base:
-        raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
+        raise CheckpointError.at(run.file, "model.base_model_id (or --base-model)", "none")
     named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
+    where = f"{folder / ADAPTER_CONFIG}: base_model_name_or_path"
     if isinstance(named, str) and _FEW_BITS.search(named):
-        expected = f"base_model_name_or_path: expected weights in full precision, got {shown(named)}"
-        raise CheckpointError(f"{folder / ADAPTER_CONFIG}: {expected}; {DEQUANTIZED.format(base=named)}")
+        remedy = DEQUANTIZED.format(base=named)
+        raise CheckpointError.at(where, "weights in full precision", shown(named), remedy)
     if named and _model_name(str(named)) != _model_name(base):
-        raise CheckpointError(
-            f"{folder / ADAPTER_CONFIG}: base_model_name_or_path: expected {cut(base)}, the model.base_model_id of "
-            f"{run.file}, got {shown(named)}; name the one that the adapter was trained on with --base-model"
-        )
+        remedy = "name the one that the adapter was trained on with --base-model"
+        raise CheckpointError.at(where, f"{cut(base)}, the model.base_model_id of {run.file}", shown(named), remedy)
     began_with = run.get("training.load_from_checkpoint", "")
     if began_with:
-        raise CheckpointError(
-            f"{run.file}: training.load_from_checkpoint: expected none beside an adapter, got {shown(began_with)}: the "
-            f"adapter may change its weights in place of those of {cut(base)}; {MERGE}; if it does change those of "
-            f"{cut(base)}, name them with --base-model"
-        )
+        got = f"{shown(began_with)}: the adapter may change its weights in place of those of {cut(base)}"
+        remedy = f"{MERGE}; if it does change those of {cut(base)}, name them with --base-model"
+        raise CheckpointError.at(f"{run.file}: training.load_from_checkpoint", "none beside an adapter", got, remedy)
     return base
 
 

@@ -273,12 +273,18 @@ LENGTHS = "expected a length (8), several (4,8,16) or a range (4-16)"
 USAGE: dict[str, tuple[list[str], str]] = {
     "no videos": (["score"], "Missing argument"),
     "unknown option": (["score", "a.mp4", "--what"], "No such option"),
-    "url": (["sample", "--url", "localhost:8001"], URL),
+    "url": (["sample", "--url", "localhost:8001"], f"Invalid value for '--url': {URL}"),
     "port of a url": (["status", "--url", "http://localhost:99999"], URL),
     "json over a video": (["score", "--json", "a.mp4", "b.mp4"], "expected a file that ends in .json or -, got a.mp4"),
-    "json nowhere": (["status", "--json", "/dev/null/a.json"], "'--json': expected a folder at /dev/null, got: "),
-    "key before": (["--api-key-file", "/nowhere", "status"], "api_key_file: expected a text file, got [Errno 2]"),
-    "key after": (["status", "--api-key-file", "/nowhere"], "api_key_file: expected a text file, got [Errno 2]"),
+    "json nowhere": (["status", "--json", "/dev/null/a.json"], "'--json': expected a folder at /dev/null, got "),
+    "key before": (
+        ["--api-key-file", "/nowhere", "status"],
+        "Invalid value for '--api-key-file': expected a text file, got [Errno 2]",
+    ),
+    "key after": (
+        ["status", "--api-key-file", "/nowhere"],
+        "Invalid value for '--api-key-file': expected a text file, got [Errno 2]",
+    ),
     "seconds": (["wait", "--timeout", "0"], "'--timeout': expected at least 0.001, got 0.0"),
     "picture": (["score", "a.mp4", "--plot", "a.gif"], "expected a file that ends in .png, .pdf, .svg, got a.gif"),
     "many pictures": (["score", *["a.mp4"] * 41, "--plot", "a.png"], "expected at most 40 videos, got 41"),
@@ -291,7 +297,7 @@ USAGE: dict[str, tuple[list[str], str]] = {
     "nothing to compare": (["compare", "a.mp4"], "expected at least 2 videos, got 1"),
     "metrics": (
         ["status", "--url", "http://a:1", "--url", "http://b:1", "--metrics-url", "http://a:2"],
-        "expected one --url with it, got several",
+        "--metrics-url needs a single --url",
     ),
 }
 

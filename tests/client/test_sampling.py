@@ -152,9 +152,13 @@ def test_score_scores_each_frame_on_its_prefix(served: Served, video: Path, rule
 
 
 CONTRADICTIONS = {
-    "a number without a rule": (["--frames", 4], "Invalid value for '--frames': expected --sampling with it, got none"),
-    "two ways of sampling": (["--sampling", "all", "--frame-steps", 4], "expected no --frame-steps with it, got 4"),
-    "a number that the rule does not take": (["--sampling", "all", "--frames", 4], "expected none with the rule all"),
+    "a number without a rule": (["--frames", 4], "Error: Invalid value: --frames needs --sampling\n"),
+    "two ways of sampling": (["--sampling", "all", "--frame-steps", 4], "--sampling conflicts with --frame-steps"),
+    "a limit beside a rule": (["--sampling", "all", "--max-frames", 4], "--sampling conflicts with --max-frames"),
+    "a number that the rule does not take": (
+        ["--sampling", "all", "--frames", 4],
+        "Invalid value for '--frames': expected none with the rule all",
+    ),
 }
 
 

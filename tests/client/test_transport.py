@@ -23,7 +23,7 @@ from rfm_client import (
     ServerUnavailableError,
     Trajectory,
 )
-from rfm_client.contract.triton import error_of
+from rfm_client.contract.triton import error_of, invalid_sample
 from rfm_client.transport.connection import grpc_options
 from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.request_size import check_size
@@ -173,7 +173,7 @@ def test_what_goes_through_shared_memory_does_not_count() -> None:
     ],
 )
 def test_which_errors_a_request_may_have_caused(message: str, may_have_ended: bool) -> None:
-    error = error_of("StatusCode.UNAVAILABLE", message, InvalidSampleError)
+    error = error_of("StatusCode.UNAVAILABLE", message, invalid_sample)
     assert isinstance(error, ServerUnavailableError)
     assert error.may_have_ended_server is may_have_ended
 

@@ -106,7 +106,7 @@ BAD = {  # text, and what the message says behind the file's name
         r"server_url: expected an IP address without port \(http_port\), such as .*, got 'localhost:8000'",
     ),
     "a host by name": ("serve: {host: gpu.example}", r"serve\.host: expected an IP address .*, got 'gpu\.example'"),
-    "half a certificate": ("serve: {grpc_key: a}", r"serve\.grpc_certificate, grpc_key: expected both or none, got one"),
+    "half a certificate": ("serve: {grpc_key: a}", r"serve\.grpc_key needs serve\.grpc_certificate$"),
     "a name that is a path": ("export: {name: ../rfm}", r"export\.name: expected letters, digits, _ and -, got '\.\./rfm'"),
     "a list": ("- 1", "expected keys and values, got list"),
     "no YAML": ("a: [", "expected a YAML file, got"),
@@ -128,7 +128,7 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_options_win_over_the_file(tmp_path: Path) -> None:
     config = read(tmp_path, SECTIONED).with_options(serve={"http_port": 9000}, gateway={"timeout_s": 5.0})
     assert (config.serve.http_port, config.serve.host, config.gateway.timeout_s) == (9000, "127.0.0.1", 5.0)
-    with pytest.raises(ConfigError, match=r"^gateway\.certificate, key: expected both or none, got one"):
+    with pytest.raises(ConfigError, match=r"^gateway\.key needs gateway\.certificate$"):
         config.with_options(gateway={"key": Path("key.pem")})
     with pytest.raises(ConfigError, match=r"^ports: expected different ones, got"):
         config.with_options(gateway={"port": 9000 + 1}, serve={"grpc_port": 9000 + 1})
@@ -242,8 +242,8 @@ def test_a_gateway_takes_from_the_server_what_its_section_leaves_open(started: A
 
 
 WORDS: dict[str, tuple[list[str], str]] = {
-    "no folder": ([], "FOLDER: expected it, or --repository, got none"),
-    "two folders": (["a", "--repository", "b"], "FOLDER: expected it, or --repository, got both"),
+    "no folder": ([], "Invalid value: give FOLDER or --repository\n"),
+    "two folders": (["a", "--repository", "b"], "Invalid value: give FOLDER or --repository, not both"),
     "an option of Triton alone": (["a", "--log-verbose=1"], "No such option: --log-verbose"),
 }
 
@@ -266,7 +266,7 @@ def test_what_follows_two_dashes_goes_to_triton() -> None:
 def test_a_checkpoint_is_named_once() -> None:
     result = invoke("export", "org/name", "--checkpoint", "org/other", "--repository", "nowhere")
     assert result.exit_code == 2
-    assert "expected CHECKPOINT or --checkpoint, got both" in result.stderr
+    assert "give CHECKPOINT or --checkpoint, not both" in result.stderr
     nothing = invoke("export", "--repository", "nowhere")
     told = "rfm: CHECKPOINT: expected a checkpoint, here or as export.checkpoint in --config, got none\n"
     assert (nothing.exit_code, nothing.stderr) == (1, told)

@@ -78,7 +78,7 @@ def test_a_lack_of_room_is_told_in_a_line() -> None:
     with pytest.raises(rfm_export.ExportError) as error, needing_room(torch.device("cuda", 0)):
         raise torch.OutOfMemoryError(reason)
     assert str(error.value) == (
-        "device: expected room on cuda:0 to compare the export with the checkpoint, got: CUDA out of memory; "
+        "device: expected room on cuda:0 to compare the export with the checkpoint, got CUDA out of memory; "
         "--device names another one"
     )
 

@@ -167,7 +167,7 @@ def test_a_checkpoint_that_gives_no_numbers_is_not_published(tmp_path: Path) -> 
     weights["progress_head.4.weight"] = torch.full_like(weights["progress_head.4.weight"], torch.finfo().max)
     file.chmod(0o644)
     save_file(weights, file, {"format": "pt"})
-    expected = "probe 0: expected scores of the checkpoint, got: the network gave a score that is not finite"
+    expected = "probe 0: expected scores of the checkpoint, got the network gave a score that is not finite"
     with pytest.raises(ExportDiffersError, match=expected):
         rfm_export.export(checkpoint, tmp_path / "repository", serve_config(EMBEDDINGS))
     assert list((tmp_path / "repository").iterdir()) == []

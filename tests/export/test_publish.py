@@ -95,7 +95,7 @@ def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path, room: int) -> N
     assert files_in(tmp_path) == before
     assert not list(tmp_path.rglob(".*"))
     expected = (
-        r"rfm: .*/model_repository: expected room for the exported files, got: .*[Ff]ile too large.*; the versions that "
+        r"rfm: .*/model_repository: expected room for the exported files, got .*[Ff]ile too large.*; the versions that "
         r"are served stay as they are; make room there, or name another --repository"
     )
     assert result.exit_code == 1
@@ -107,9 +107,9 @@ def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path, room: int) -> N
     [
         (
             lambda folder: folder.mkdir(0o555),
-            "this user may change, got: Permission denied; --repository names another",
+            "this user may change, got Permission denied; --repository names another",
         ),
-        (lambda folder: folder.write_text(""), "this user may change, got: File exists; --repository names another"),
+        (lambda folder: folder.write_text(""), "this user may change, got File exists; --repository names another"),
         (lambda folder: shutil.copytree(REPOSITORY / "rfm", folder), "got a model of one: --repository ."),
     ],
     ids=["read-only", "a file", "a model"],

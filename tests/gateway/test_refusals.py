@@ -90,7 +90,7 @@ BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
     "too many frames": (
         but(video_embeddings=np.ones((17, 48))),
         "num_frames",
-        "expected at most 16 .*, got 17: .*sampling rule",
+        "expected at most 16 .*, got 17; .*sampling rule",
     ),
     "a sliver": (of_frames(np.ones((1, 2, 200, 3), int)), "frames", "expected frames at most 50 times as long .*"),
     "names of images": (of_frames(["0.png", "1.png"]), "trajectory frames 0", NO_FILES),

@@ -261,8 +261,11 @@ def test_what_the_run_did_not_train_is_told(output: Path) -> None:
 WRONG = {
     "a format": (["--format", "csv"], "'--format': expected one of progress, signals, hdf5, got 'csv'"),
     "an option that contradicts": (["--shard", "3/3"], "'--shard': expected i/n with i from 0 to n - 1, got 3/3"),
-    "an orientation": (["--orient", "up"], "orient: expected one of none, rotate180, "),
-    "an order of colours": (["--channels", "a=gbr"], "channels: expected one of rgb, bgr, got 'gbr'"),
+    "an orientation": (["--orient", "up"], "Invalid value for '--orient': expected one of none, rotate180, "),
+    "an order of colours": (
+        ["--channels", "a=gbr"],
+        "Invalid value for '--channels': expected one of rgb, bgr, got 'gbr'",
+    ),
     "a camera twice": (["--orient", "a=none", "--orient", "a=rotate90"], "expected each camera once, got 'a=rotate90'"),
 }
 

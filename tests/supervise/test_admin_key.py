@@ -16,11 +16,12 @@ from typer.testing import CliRunner
 
 from commands import REPOSITORY
 from reference_server import Served
-from rfm.launch.admin_key import VARIABLE, AdminKeyError, take_key
+from rfm.launch.admin_key import VARIABLE, take_key
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import Installation, ServerStartError, find_installation
 from rfm.launch.triton_options import MAX_HTTP_BYTES, size_limits
 from rfm.launch.triton_server import TritonServer
+from rfm_client.contract.errors import InvalidValueError
 from rfm_commands.cli import app
 from rfm_serve import KEY
 
@@ -56,7 +57,7 @@ def test_the_server_changes_nothing_without_its_key(served: Served, tmp_path: Pa
 @pytest.mark.parametrize(
     ("content", "user", "mode", "message"),
     [
-        pytest.param(None, 0, 0, "expected a text file at FILE, got: No such file or directory", id="missing"),
+        pytest.param(None, 0, 0, "expected a text file at FILE, got No such file or directory", id="missing"),
         pytest.param("k" * 16, 0, 0o604, "FILE: expected mode 640 or less of a root's file, got 604", id="others"),
         pytest.param(
             "k" * 16, 0, 0o660, "FILE: expected mode 640 or less of a root's file, got 660", id="group writes"
@@ -77,7 +78,7 @@ def test_a_key_file_that_cannot_be_used_is_told(
         file.write_text(content)
         file.chmod(mode)
     owned_by(user, monkeypatch)
-    with pytest.raises(AdminKeyError) as caught:
+    with pytest.raises(InvalidValueError) as caught:
         take_key(file, {})
     assert str(caught.value).startswith("--admin-key-file: " + message.replace("FILE", str(file)))
     assert "kkk" not in str(caught.value)

@@ -174,7 +174,7 @@ def test_a_port_that_is_taken_is_named_with_its_option(option: str, what: str) -
         port = taken.getsockname()[1]
         words = command(REPOSITORY, Endpoints.free())[1:]
         done = CliRunner().invoke(app, [*words, "--host=::1", f"--{option}-port={port}"])
-    told = f"rfm: {what}: expected a free port of this machine at [::1]:{port}, got: Address already in use; "
+    told = f"rfm: {what}: expected a free port of this machine at [::1]:{port}, got Address already in use; "
     assert done.exit_code == 1
     assert done.stderr.splitlines()[-1] == f"{told}--{option}-port names another port"
 
@@ -246,7 +246,7 @@ def test_triton_may_have_as_many_files_and_connections_open_as_its_user(tmp_path
     ("program", "told"),
     [
         (None, "expected a program at .*/tritonserver, got none"),
-        ("\x7fELF no program", "expected a program at .*/tritonserver, got: Exec format"),
+        ("\x7fELF no program", "expected a program at .*/tritonserver, got Exec format"),
         ("#!/bin/sh\nexit 3\n", "expected to run, got exit status 3"),
         ("#!/bin/sh\nexec sleep 0.1\n", "expected to run, got exit status 0"),
     ],

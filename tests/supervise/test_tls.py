@@ -264,14 +264,14 @@ BAD = {
         lambda p: {"url": "grpc://h:1", "ca_file": p.ca},
         "url: expected grpcs:// or https://",
     ),
-    "half a pair": (lambda p: {"client_key": p.key}, "client_certificate, client_key: expected both or none, got one"),
-    "no file": (lambda p: {"ca_file": "/nowhere"}, "ca_file: expected certificates .* got: No such file"),
+    "half a pair": (lambda p: {"client_key": p.key}, "client_key needs client_certificate"),
+    "no file": (lambda p: {"ca_file": "/nowhere"}, "ca_file: expected certificates .* got No such file"),
     "no certificate": (lambda p: {"ca_file": p.key}, "ca_file: expected certificates"),
     "another's key": (
         lambda p: {"client_certificate": p.certificate, "client_key": p.client_key},
-        "client_certificate, client_key: expected a certificate and its key .* got: KEY_VALUES_MISMATCH",
+        "client_certificate: expected a certificate and its key .* got KEY_VALUES_MISMATCH",
     ),
-    "a line break": (lambda p: {"api_key": f"{KEY}\n"}, "authorization: expected visible ASCII characters"),
+    "a line break": (lambda p: {"api_key": f"{KEY}\n"}, "api_key: expected visible ASCII characters"),
     "a header's name": (lambda p: {"headers": {"a b": "1"}}, "headers: expected letters"),
 }
 
@@ -355,7 +355,16 @@ def test_half_a_certificate_of_the_gateway_is_refused(papers: Papers) -> None:
     words = ["gateway", "--triton", "grpc://127.0.0.1:1", "--certificate", str(papers.certificate)]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 2
-    assert "'--certificate, --key': expected both or none, got one" in done.stderr
+    assert "Invalid value: --certificate needs --key" in done.stderr
+
+
+def test_a_file_for_triton_that_is_not_there_is_refused_with_the_gateway_s_option() -> None:
+    done = CliRunner().invoke(app, ["gateway", "--triton", "grpcs://127.0.0.1:1", "--triton-ca-file", "/nowhere"])
+    assert done.exit_code == 2
+    told = (
+        "Invalid value for '--triton-ca-file': expected certificates (PEM) at /nowhere, got No such file or directory"
+    )
+    assert told in done.stderr
 
 
 def test_rfm_serve_heals_with_tls(mutual: Endpoints, papers: Papers, running: Serving, repository: Path) -> None:

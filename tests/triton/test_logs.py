@@ -147,7 +147,8 @@ def test_what_is_refused_is_told_with_its_request_and_logged_at_debug(running: R
     request_id = str(raised.value.request_id)
     assert re.fullmatch(f"{RANDOM_ID.pattern}-1", request_id)
     assert str(raised.value) == f"{raised.value.message} (request {request_id})"
-    reason = raised.value.message.partition(": score some")[0]  # the remedy is the client's
+    assert raised.value.remedy.startswith("score some of them")  # by the client
+    reason = f"{raised.value.where}: expected {raised.value.expected}, got {raised.value.got}"
     assert running.said_of(request_id) == [("DEBUG", f"refused (progress): {reason}")]
 
 

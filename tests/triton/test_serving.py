@@ -338,7 +338,7 @@ def test_a_model_from_before_pairs_of_two_frame_sizes_says_so(served: Served) ->
     assert isinstance(two_sizes, InvalidSampleError)
     assert two_sizes.message == (
         "second_frames: expected a model that takes pairs of two frame sizes, "
-        "got one that was exported before there was this input: export it again, or resize a trajectory"
+        "got one that was exported before there was this input; export it again, or resize a trajectory"
     )
     assert not isinstance(one_size, RewardError)
     assert not isinstance(another_size, RewardError)

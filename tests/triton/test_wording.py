@@ -40,7 +40,7 @@ class Asker:
         self.module = tritonclient.grpc if protocol == "grpc" else tritonclient.http
         self.client = self.module.InferenceServerClient(served.url(protocol).partition("://")[2])
 
-    def infer(self, model: str, tensors: wire.Tensors, region: str | None = None) -> Any:
+    def infer(self, model: str, tensors: wire.Tensors, region: str | None = None, output: str = wire.PROGRESS) -> Any:
         inputs = []
         for name, array in tensors.items():
             inputs.append(self.module.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
@@ -48,7 +48,8 @@ class Asker:
                 inputs[-1].set_shared_memory(region, array.nbytes)
             else:
                 inputs[-1].set_data_from_numpy(array)
-        return self.client.infer(model, inputs, request_id="a-request")
+        outputs = [self.module.InferRequestedOutput(output)]
+        return self.client.infer(model, inputs, outputs=outputs, request_id="a-request")
 
 
 @pytest.fixture
@@ -78,6 +79,12 @@ PHRASES: dict[str, tuple[Callable[[Asker], Any], str, type[RewardError], str]] =
         InvalidSampleError,
         r"^video_embeddings: expected \[-1,768\], got \[2,65\]$",
     ),
+    "an unknown output": (
+        lambda a: a.infer(MODEL, embedded(), output=wire.UNCLEAR),
+        "unexpected inference output",
+        InvalidSampleError,
+        f"^{wire.UNCLEAR}: ",
+    ),
     "an ensemble": (
         lambda a: a.infer(f"{FRAMES_MODEL}_frames", NO_FRAMES),
         f"in ensemble '{FRAMES_MODEL}_frames', ",
@@ -99,7 +106,9 @@ def test_triton_says_so_in_these_words(asker: Asker, name: str) -> None:
     ask, phrase, kind, meant = PHRASES[name]
     status, message = failure(lambda: ask(asker))
     assert phrase in message
-    error = triton.error_of(status, message, ModelNotFoundError if kind is ModelNotFoundError else InvalidSampleError)
+    error = triton.error_of(
+        status, message, ModelNotFoundError if kind is ModelNotFoundError else triton.invalid_sample
+    )
     assert type(error) is kind
     assert "a-request" not in error.message
     with pytest.raises(kind, match=meant):
@@ -120,7 +129,7 @@ def test_a_dead_process_and_an_unloaded_model_are_told_apart(served: Served, ask
     def says(phrase: str, kind: type[RewardError]) -> None:
         status, message = failure(lambda: asker.infer(model, embedded()))
         assert phrase in message
-        assert type(triton.error_of(status, message, InvalidSampleError)) is kind
+        assert type(triton.error_of(status, message, triton.invalid_sample)) is kind
 
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
         api.load(model)

@@ -81,7 +81,7 @@ def field_errors(error: ValidationError) -> list[dict[str, Any]]:
     """
     if error.error_count() > MAX_ERRORS:
         raise invalid((), f"expected no faulty fields, got {error.error_count()}")
-    return [_field_error(each) for each in error.errors(include_url=False, include_context=False)]
+    return [_field_error(each) for each in error.errors(include_url=False)]
 
 
 @dataclass(frozen=True)
@@ -288,9 +288,9 @@ def _checked(samples: list[Any], arrays: Mapping[str, Callable[[], np.ndarray[An
 def _field_error(error: Any) -> dict[str, Any]:
     kind, message, given = error["type"], error["msg"], error["input"]
     if kind == "value_error":
-        message = message.removeprefix("Value error, ")
+        message = str(error["ctx"]["error"])
     elif kind == "json_invalid":
-        message = f"expected JSON, got: {message.removeprefix('Invalid JSON: ')}"
+        message = f"expected JSON, got: {error['ctx']['error']}"
     else:
         given = given.get("sample_type") if "union_tag" in kind else given
         expected = _EXPECTED.get(kind) or _AROUND_EXPECTED.sub("", message)

@@ -70,22 +70,29 @@ class GatewayConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if (self.certificate is None) != (self.key is None):
-            raise ConfigError("certificate, key", "expected both or none, got one")
+        ConfigError.require_both(self, "certificate", "key")
         for name in self.allow_host:
             if not _HOST_NAME.fullmatch(name):
-                raise ConfigError("allow_host", f"expected a host name without scheme and port, got {name!r}")
+                raise ConfigError.at("allow_host", "a host name without scheme and port", repr(name))
         for origin in self.cors_origin:
             if not _ORIGIN.fullmatch(origin):
-                expected = "expected * or an origin in lower case without a path, such as http://lab.example:3000"
-                raise ConfigError("cors_origin", f"{expected}, got {origin!r}")
+                expected = "* or an origin in lower case without a path, such as http://lab.example:3000"
+                raise ConfigError.at("cors_origin", expected, repr(origin))
 
     @property
     def triton_url(self) -> str:
         """URL of Triton. Raises ConfigError if there is none."""
         if self.triton is None:
-            raise ConfigError("triton", "expected the URL of a Triton, got none")
+            raise ConfigError.at("triton", "the URL of a Triton", "none")
         return self.triton
+
+    @property
+    def credentials(self) -> Credentials:
+        """Credentials for Triton. Raises ConfigError for unusable files."""
+        try:
+            return Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key)
+        except ConfigError as error:
+            raise error.named(lambda name: f"triton_{name.removeprefix('client_')}") from None
 
     @property
     def address(self) -> ListenAddress:
@@ -108,28 +115,25 @@ class GatewayConfig(Settings):
             timeout_s=self.timeout_s,
             retry=False,  # the caller gets the error at once, and may retry
             max_in_flight=self.max_in_flight,
-            ca_file=self.triton_ca_file,
-            client_certificate=self.triton_certificate,
-            client_key=self.triton_key,
+            **self.credentials.options,
         )
 
     async def status(self, timeout_s: float) -> ServerStatus:
         """Read the state of Triton and of its devices. Raises ServerError."""
-        credentials = Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key)
         return await asyncio.to_thread(
             read_status,
             self.triton_url,
             metrics_url=self.metrics_url,
             timeout_s=timeout_s,
-            credentials=credentials,
+            credentials=self.credentials,
         )
 
     @property
     def tls(self) -> dict[str, Any]:
-        """Arguments of uvicorn for TLS. Raises ValueError for unusable files."""
+        """Arguments of uvicorn for TLS. Raises ConfigError for unusable files."""
         if self.certificate is None or self.key is None:
             return {}
-        check_certificate(self.certificate, self.key, "certificate, key")
+        check_certificate(self.certificate, self.key, "certificate")
         return {"ssl_certfile": self.certificate, "ssl_keyfile": self.key}
 
     def api_key(self, environment: Mapping[str, str]) -> str | None:
@@ -137,7 +141,7 @@ class GatewayConfig(Settings):
         try:
             key = environment.get(KEY_VARIABLE) if self.api_key_file is None else self.api_key_file.read_text()
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError("api_key_file", f"expected a text file, got {error}") from None
+            raise ConfigError.at("api_key_file", "a text file", error) from None
         if key is not None and not key.strip():
-            raise ConfigError("api_key_file", f"expected a key, here or in {KEY_VARIABLE}, got no character")
+            raise ConfigError.at("api_key_file", f"a key, here or in {KEY_VARIABLE}", "no character")
         return None if key is None else key.strip()

@@ -61,6 +61,6 @@ def page_of(config: GatewayConfig) -> AddPage | None:
     """
     found = list(entry_points(group="rfm_gateway.page")) if config.viewer else []
     if config.viewer and config.dataset and not found:
-        raise ConfigError("dataset", f"expected the package rfm-page, which shows it, got none: {INSTALL}")
+        raise ConfigError.at("dataset", "the package rfm-page, which shows it", f"none: {INSTALL}")
     page: AddPage | None = found[0].load() if found else None
     return page

@@ -266,9 +266,9 @@ def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError
     """Return an error that lists all invalid samples, under the caller's field names."""
     details: list[Any] = []
     for index, error in errors.items():
-        where, _, message = error.message.partition(": ")
-        path: list[str | int] = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in where.split(".")]
-        details += invalid(("samples", index, *path), message).errors()
+        words = error.where.split(".")
+        path = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in words]
+        details += invalid(("samples", index, *path), error.problem).errors()
     return RequestValidationError(details)
 
 

@@ -131,7 +131,8 @@ def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: 
             known = {**known, **file.check(plan, dataset, known)}
         except DatasetError as error:
             if not overwrite:
-                raise DatasetError(f"{error}: choose another {file.option}, or --overwrite") from error
+                told = f"{error.problem}: choose another {file.option}, or --overwrite"
+                raise DatasetError(told, error.where) from error
             lost = f"; its labels of {len(file.digests)} episodes are replaced" if file.digests else ""
             watch.note(f"--overwrite: {error}{lost}")
     if len(known) > len(plan.items):

@@ -13,7 +13,7 @@ from rfm_client import (
     RewardError,
 )
 from rfm_client.frames import Fuse, Rule
-from rfm_client.options import ConfigError, Settings, checked_count, checked_finite, setting
+from rfm_client.options import ConfigError, InvalidValueError, Settings, checked_count, checked_finite, setting
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import listed, require
 
@@ -56,7 +56,7 @@ def parse_episodes(text: str) -> list[int]:
     for part in text.split(","):
         match = _RANGE.fullmatch(part.strip())
         if match is None or (match[2] and int(match[2]) <= int(match[1])):
-            raise ValueError(f"episodes: expected numbers and ranges such as 0:100,205, got {text!r}")
+            raise InvalidValueError.at("episodes", "numbers and ranges such as 0:100,205", repr(text))
         numbers += range(int(match[1]), int(match[2])) if match[2] else [int(match[1])]
     return sorted(set(numbers))
 
@@ -65,7 +65,7 @@ def parse_shard(text: str) -> tuple[int, int]:
     """Return i and n of ``i/n``. Raises ValueError."""
     match = re.fullmatch(r"(\d+)/(\d+)", text)
     if match is None:
-        raise ValueError(f"shard: expected i/n, for example 0/8, got {text!r}")
+        raise InvalidValueError.at("shard", "i/n, for example 0/8", repr(text))
     return int(match[1]), int(match[2])
 
 
@@ -140,16 +140,16 @@ class LabelOptions(Settings):
         for name in ("name", "alias"):
             value = getattr(self, name)
             if value is not None and not _NAME.fullmatch(value):
-                raise ConfigError(name, f"expected 1 to 64 letters, digits, _ or -, got {value!r}")
+                raise ConfigError.at(name, "1 to 64 letters, digits, _ or -", repr(value))
         for each in self.formats:
             if each not in FORMATS:
-                raise ConfigError("formats", f"expected one of {', '.join(FORMATS)}, got {each!r}")
+                raise ConfigError.at("formats", f"one of {', '.join(FORMATS)}", repr(each))
         if len(set(self.cameras)) != len(self.cameras):
-            raise ConfigError("cameras", f"expected each once, got {', '.join(self.cameras)}")
+            raise ConfigError.at("cameras", "each once", ", ".join(self.cameras))
         if self.mode == "whole" and self.sampling not in (None, "all"):
-            raise ConfigError("sampling", f"expected all in mode whole, which shows every frame, got {self.sampling}")
+            raise ConfigError.at("sampling", "all in mode whole, which shows every frame", self.sampling)
         if self.shard is not None and self.shard[0] >= self.shard[1]:
-            raise ConfigError("shard", f"expected i/n with i from 0 to n - 1, got {self.shard[0]}/{self.shard[1]}")
+            raise ConfigError.at("shard", "i/n with i from 0 to n - 1", f"{self.shard[0]}/{self.shard[1]}")
 
 
 DEFAULTS = LabelOptions()

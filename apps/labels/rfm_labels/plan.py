@@ -13,7 +13,7 @@ from typing import Any
 
 from rfm_client import InvalidSampleError, RewardError
 from rfm_client.frames import ChannelOrder, Correction, Fuse, Orientation, Sampling
-from rfm_client.options import first_names
+from rfm_client.options import InvalidValueError, first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import FaultsError, listed, require
 from rfm_labels.datasets.stored_files import digest_of
@@ -61,8 +61,9 @@ class Recipe:
         padding = checkpoint.trained_padding
         try:
             sampling = Sampling.of(rule, options.frames, checkpoint.max_frames, trained_padding=padding)
-        except ValueError as error:
-            raise InvalidSampleError(f"{error}: name them (--frames), or show all (--sampling all)") from error
+        except InvalidValueError as error:
+            told = f"{error.problem}: name them (--frames), or show all (--sampling all)"
+            raise InvalidSampleError(told, error.where) from error
         return cls(
             checkpoint,
             cameras,

@@ -39,8 +39,8 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         from rfm_page.datasets import ShownLeRobot
         from rfm_page.hdf5_datasets import ShownHdf5
     except ModuleNotFoundError as error:
-        told = f"expected the package {error.name}, which reads it, got none: pip install ./apps/labels"
-        raise ConfigError("dataset", told) from None
+        expected = f"the package {error.name}, which reads it"
+        raise ConfigError.at("dataset", expected, "none: pip install ./apps/labels") from None
     datasets: list[ShownDataset] = []
     try:
         for path in config.dataset:
@@ -48,5 +48,5 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
             datasets.append(ShownHdf5(dataset) if isinstance(dataset, Hdf5Dataset) else ShownLeRobot(dataset))
             datasets[-1].check()
     except (DatasetError, ImportError) as error:
-        raise ConfigError("dataset", str(error)) from None
+        raise ConfigError(str(error), "dataset") from None
     return datasets

@@ -23,6 +23,7 @@ from starlette.datastructures import UploadFile
 
 from rfm_client import InvalidSampleError, ModelInfo, Trajectory
 from rfm_client.frames import ChannelOrder, Correction, Orientation, Rule, Sampling, frame_times_s, read_video
+from rfm_client.options import InvalidValueError
 from rfm_gateway.mounting import field_errors, invalid
 
 DEFAULT_FPS = 3.0  # the default of rfm-client score
@@ -80,9 +81,8 @@ class VideoRequest(BaseModel):
             raise invalid(("sampling",), f"expected all: the scores of {info.kind} are relative to the whole episode")
         try:
             return Sampling.of(rule, self.frames, info.max_frames, trained_padding=info.trained_padding)
-        except ValueError as error:
-            where, _, message = str(error).partition(": ")
-            raise invalid((where,), message) from None
+        except InvalidValueError as error:
+            raise invalid((error.where,), error.problem) from None
 
     async def video(self, uploads: Mapping[str, UploadFile], name: str, take: Callable[[int], object]) -> ShownVideo:
         """Read the uploaded video of this name. Raises RequestValidationError, and what ``take`` raises.
@@ -94,8 +94,7 @@ class VideoRequest(BaseModel):
         try:
             return await asyncio.to_thread(self._read, uploads[name], take)
         except InvalidSampleError as error:
-            where, _, message = error.message.partition(": ")
-            raise invalid((name if where == "video" else where,), message) from None
+            raise invalid((name if error.where == "video" else error.where,), error.problem) from None
 
     def _read(self, upload: UploadFile, take: Callable[[int], object]) -> ShownVideo:
         name = upload.filename or "the video"
@@ -112,7 +111,7 @@ class VideoRequest(BaseModel):
                 frames = read_video(file, self.fps, take=take, container=container)
                 times_s = frame_times_s(file, len(frames), container=container)
             except InvalidSampleError as error:
-                raise InvalidSampleError(str(error).replace(str(file), name)) from None
+                raise InvalidSampleError.like(error, source=name) from None
         frames = Correction(self.orient, self.channels).applied(frames)
         return ShownVideo(Trajectory(frames=frames, task=self.task), times_s)
 

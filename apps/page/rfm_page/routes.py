@@ -202,8 +202,7 @@ async def _preferences(client: AsyncRewardClient, asked: _Asked) -> dict[str, An
     try:
         results = await asyncio.gather(preferred(first, second), preferred(second, first))
     except InvalidSampleError as error:
-        where, _, message = error.message.partition(": ")
-        raise invalid((where,), message) from None
+        raise invalid((error.where,), error.problem) from None
     pair = PreferenceResult.of_both_orders(*results)
     asked_orders = (("first", "second"), ("second", "first"))
     return {

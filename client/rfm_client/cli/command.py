@@ -129,10 +129,8 @@ class OptionsOf:
             value = values.pop(self.name(each))
             if value in (None, []):
                 continue
-            try:
+            with usage_errors(self.option(each)):
                 value = each.parse(value) if each.parse else value
-            except ValueError as error:
-                raise typer.BadParameter(str(error), param_hint=f"'{self.option(each)}'") from None
             given[each.name] = tuple(value) if isinstance(value, list) else value
         return given
 
@@ -173,7 +171,6 @@ class Command(TyperCommand):
     """
 
     program = "rfm-client"
-    expected: tuple[type[Exception], ...] = (errors.RewardError, OSError)
     has_codes = True  # False: every error ends the command with 1
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -217,7 +214,7 @@ class Command(TyperCommand):
             raise
         except ImportError as error:
             code, lines = ExitCode.FAILED, [missing_package(error)]
-        except self.expected as error:
+        except (errors.LocatedError, errors.RewardError, OSError) as error:
             code = exit_code(error) if self.has_codes else ExitCode.FAILED
             lines = str(error).split("\n")
         for line in lines:
@@ -255,7 +252,7 @@ def usage_errors(option: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from error
+        raise typer.BadParameter(str(getattr(error, "problem", error)), param_hint=f"'{option}'") from error
 
 
 def missing_package(error: ImportError) -> str:
@@ -267,12 +264,13 @@ def missing_package(error: ImportError) -> str:
 
 def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:
     """Wrong usage of the options whose settings the error names; the error itself for other settings."""
-    keys = error.key.split(", ")
-    for mark in marks:
-        options = {each.name: mark.option(each) for each in mark.chosen}
-        if options.keys() >= set(keys):
-            return typer.BadParameter(error.expected, param_hint=f"'{', '.join(options[key] for key in keys)}'")
-    return error
+    options = {each.name: mark.option(each) for mark in marks for each in mark.chosen}
+    if not {error.where, error.other or error.where} <= options.keys():
+        return error
+    named = error.named(options.__getitem__)
+    if error.other:
+        return typer.BadParameter(str(named))
+    return typer.BadParameter(named.problem, param_hint=f"'{named.where}'")
 
 
 def _mark(hint: Any) -> OptionsOf | None:

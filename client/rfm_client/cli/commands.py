@@ -93,7 +93,7 @@ def score(
     """Score each frame of one or more videos: progress and success. A failed video does not stop the others."""
     output.begin(videos)
     if prefix.sampling is not None and video.max_frames is not None:
-        raise ConfigError("sampling", f"expected no --max-frames with it, got {video.max_frames}")
+        raise ConfigError.of_two("sampling", "conflicts with", "max_frames")
     rows = StreamedTable(scoring.COLUMNS, videos)
     arrays = output.array_files(scoring.unique_stems(videos))
 
@@ -181,10 +181,10 @@ def status(
     from rfm_client.transport.status import read_status
 
     if metrics_url is not None and len(server.urls) > 1:
-        raise typer.BadParameter("expected one --url with it, got several", param_hint="'--metrics-url'")
+        raise typer.BadParameter("--metrics-url needs a single --url")
     output.make_folders()
     credentials = credentials_of(context, files)
-    with usage_errors("'--url'"):
+    with usage_errors("--url"):
         statuses = [
             read_status(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=credentials)
             for url in server.urls

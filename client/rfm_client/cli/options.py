@@ -16,6 +16,7 @@ from rfm_client.cli.command import STANDARD_OUTPUT, Given, OptionsOf, usage_erro
 from rfm_client.client import RewardClient
 from rfm_client.client_options import DEFAULT_TIMEOUT_S
 from rfm_client.contract import errors
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
@@ -48,12 +49,15 @@ class CredentialFiles(Settings):
     )
 
     def read(self) -> Credentials:
-        """Return the credentials in the files. Raises ValueError for an unusable file."""
+        """Return the credentials in the files. Raises ConfigError for an unusable file."""
         try:
             api_key = None if self.api_key_file is None else self.api_key_file.read_text().strip()
         except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"api_key_file: expected a text file, got {error}") from None
-        return Credentials(self.ca_file, self.client_certificate, self.client_key, api_key=api_key)
+            raise ConfigError.at("api_key_file", "a text file", error) from None
+        try:
+            return Credentials(self.ca_file, self.client_certificate, self.client_key, api_key=api_key)
+        except ConfigError as error:
+            raise error.named(lambda name: "api_key_file" if name == "api_key" else name) from None
 
 
 # Options after a subcommand, which win over those before it and over variables.
@@ -61,10 +65,9 @@ CredentialsGiven: TypeAlias = Annotated[Given, OptionsOf(CredentialFiles, reads_
 
 
 def credentials_of(context: typer.Context, given: Given) -> Credentials:
-    """Return the credentials of a subcommand: the given files, else those before it. Raises typer.BadParameter."""
+    """Return the credentials of a subcommand: the given files, else those before it. Raises ConfigError."""
     before: CredentialFiles = context.obj
-    with usage_errors("--ca-file, --client-certificate, --client-key, --api-key-file"):
-        return replace(before, **given).read()
+    return replace(before, **given).read()
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ class ServerOptions(Settings):
 
     def client(self, credentials: Credentials, **options: Any) -> RewardClient:
         """Return a client. Raises typer.BadParameter for an invalid URL."""
-        with usage_errors("'--url'"):
+        with usage_errors("--url"):
             return RewardClient(
                 self.urls, model=self.model, **{"timeout_s": self.timeout_s, **credentials.options, **options}
             )
@@ -171,17 +174,17 @@ class PrefixOptions(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if 0 < self.frame_steps < MIN_FRAME_STEPS:
-            raise ConfigError("frame_steps", f"expected 0 or at least {MIN_FRAME_STEPS}, got {self.frame_steps}")
+            raise ConfigError.at("frame_steps", f"0 or at least {MIN_FRAME_STEPS}", self.frame_steps)
         if self.sampling is None:
             if self.frames is not None:
-                raise ConfigError("frames", "expected --sampling with it, got none")
+                raise ConfigError.of_two("frames", "needs", "sampling")
             return
         if self.frame_steps:
-            raise ConfigError("sampling", f"expected no --frame-steps with it, got {self.frame_steps}")
+            raise ConfigError.of_two("sampling", "conflicts with", "frame_steps")
         try:
             Sampling.of(self.sampling, self.frames, trained_frames=1)
-        except ValueError as error:
-            raise ConfigError("frames", str(error).removeprefix("frames: ")) from None
+        except InvalidValueError as error:
+            raise ConfigError.like(error) from None
 
     @property
     def rule(self) -> str:
@@ -225,9 +228,9 @@ class OutputOptions(Settings):
                 continue
             if Path(value).suffix not in endings:
                 instead = " or -" if name == "json" else ""
-                raise ConfigError(name, f"expected a file that ends in {', '.join(endings)}{instead}, got {value}")
+                raise ConfigError.at(name, f"a file that ends in {', '.join(endings)}{instead}", value)
         if self.npy is not None and not self.npy.is_dir() and self.npy.suffix not in ("", ".npy"):
-            raise ConfigError("npy", f"expected a .npy file or a folder, got {self.npy}")
+            raise ConfigError.at("npy", "a .npy file or a folder", self.npy)
 
     @property
     def prints_tables(self) -> bool:
@@ -243,15 +246,15 @@ class OutputOptions(Settings):
             try:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
-                raise ConfigError(name, f"expected a folder at {folder}, got: {error.strerror}") from None
+                raise ConfigError.at(name, f"a folder at {folder}", error.strerror) from None
 
     def begin(self, videos: Sequence[str]) -> None:
         """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
         for name in ("plot", "strips"):
             if getattr(self, name) is not None and len(videos) > MAX_PICTURED:
-                raise ConfigError(name, f"expected at most {MAX_PICTURED} videos, got {len(videos)}")
+                raise ConfigError.at(name, f"at most {MAX_PICTURED} videos", len(videos))
         if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
-            raise ConfigError("npy", f"expected a folder for {len(videos)} videos, got {self.npy}")
+            raise ConfigError.at("npy", f"a folder for {len(videos)} videos", self.npy)
         self.make_folders()
 
     def array_files(self, stems: Sequence[str]) -> list[Path]:

@@ -26,6 +26,7 @@ from rfm_client.client import RewardClient
 from rfm_client.contract.errors import (
     DeadlineExceededError,
     InvalidSampleError,
+    InvalidValueError,
     ProcessEndedError,
     RewardError,
     ServerUnavailableError,
@@ -174,8 +175,9 @@ class SourceScorer:
         except ImportError as error:
             return Failed(name, error, missing_package(error))
         except (RewardError, OSError) as error:
-            message = str(error).removesuffix(f" ({name})")  # the report names the source
-            return Failed(name, error, message, is_server_gone=self._is_server_gone(error))
+            if isinstance(error, InvalidSampleError) and error.source == name:  # which the report names
+                error.source = ""
+            return Failed(name, error, str(error), is_server_gone=self._is_server_gone(error))
         if self.record is not None:
             self.record(number, source, result)
         return Scored(
@@ -251,8 +253,8 @@ def _evaluate(
     info.check_scores_prefixes()
     try:
         sampling = Sampling.of(prefix.sampling, prefix.frames, info.max_frames)
-    except ValueError as error:  # the options are valid: the checkpoint lacks the number
-        raise InvalidSampleError(f"--{error}") from error
+    except InvalidValueError as error:  # the options are valid: the checkpoint lacks the number
+        raise InvalidSampleError.like(error, where=f"--{error.where}") from error
     samples = sampling.samples(sent.trajectory)
     results: list[Result] = []
     while part := list(itertools.islice(samples, PREFIXES_AT_A_TIME)):

@@ -8,6 +8,9 @@ import re
 import ssl
 from pathlib import Path
 
+from rfm_client.contract.errors import InvalidValueError
+from rfm_client.contract.settings import ConfigError
+
 MAX_PORT = 65535
 
 _URL = re.compile(
@@ -24,10 +27,10 @@ def split_url(url: str) -> tuple[str, str]:
     scheme, _, address = url.rstrip("/").partition("://")
     for host, port in (address.rpartition(":")[::2], (address, str(_PORTS.get(scheme.removesuffix("s"), 8000)))):
         if _is_ipv6(host):
-            raise ValueError(f"url: expected brackets around an IPv6 address, {scheme}://[{host}]:{port}, got {url!r}")
+            raise InvalidValueError.at("url", f"brackets around an IPv6 address, {scheme}://[{host}]:{port}", repr(url))
     match = _URL.fullmatch(url)
     if match is None or int(match["port"]) > MAX_PORT:
-        raise ValueError(f"url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got {url!r}")
+        raise InvalidValueError.at("url", "grpc://host:port or http://host:port, or grpcs:// or https://", repr(url))
     return match["scheme"] or "grpc", match["address"]
 
 
@@ -52,25 +55,25 @@ def _is_ipv6(host: str) -> bool:
 
 
 def check_certificate(certificate: str | Path, key: str | Path, where: str) -> None:
-    """Raise ValueError (``where: ...``) unless a server can serve with this certificate and key (PEM)."""
+    """Raise ConfigError of the setting ``where`` unless a server can serve with this certificate and key (PEM)."""
     load_certificate(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), certificate, key, where)
 
 
 def check_authorities(file: str | Path, where: str) -> None:
-    """Raise ValueError (``where: ...``) unless the file holds certificates of authorities (PEM)."""
+    """Raise ConfigError of the setting ``where`` unless the file holds certificates of authorities (PEM)."""
     try:
         ssl.create_default_context(cafile=file)
     except OSError as error:
-        raise ValueError(f"{where}: expected certificates (PEM) at {file}, got: {_reason(error)}") from None
+        raise ConfigError.at(where, f"certificates (PEM) at {file}", _reason(error)) from None
 
 
 def load_certificate(context: ssl.SSLContext, certificate: str | Path, key: str | Path, where: str) -> None:
-    """Load a certificate and its key (PEM) into the context. Raises ValueError (``where: ...``)."""
+    """Load a certificate and its key (PEM) into the context. Raises ConfigError of the setting ``where``."""
     try:
         context.load_cert_chain(certificate, key, password="")  # else OpenSSL prompts for a password
     except OSError as error:
         expected = f"a certificate and its key (PEM, unencrypted) at {certificate} and {key}"
-        raise ValueError(f"{where}: expected {expected}, got: {_reason(error)}") from None
+        raise ConfigError.at(where, expected, _reason(error)) from None
 
 
 def _reason(error: OSError) -> str:

@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""The form of messages about invalid values: ``where: expected X, got Y``."""
+"""Checks of values, and lists of names for messages."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 
+from rfm_client.contract.errors import InvalidValueError, LocatedError
 
-def require(where: object, condition: bool, expected: str, got: object, error: type[Exception] = ValueError) -> None:
-    """Raise ``error`` with the message ``where: expected X, got Y`` unless the condition holds."""
+
+def require(
+    where: object, condition: bool, expected: str, got: object, error: type[LocatedError] = InvalidValueError
+) -> None:
+    """Raise ``error`` unless the condition holds."""
     if not condition:
-        raise error(f"{where}: expected {expected}, got {got}")
+        raise error.at(where, expected, got)
 
 
 def first_names(names: Collection[object], most: int = 5) -> str:

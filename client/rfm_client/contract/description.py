@@ -10,9 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.frame_size import FrameSize
 
 DESCRIPTION_PARAMETER = "description"  # of config.pbtxt
+_WHERE = f"parameter {DESCRIPTION_PARAMETER}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,28 +128,27 @@ class Description(Origin):
 
     @classmethod
     def parse(cls, text: str) -> Description:
-        """Return the description of the parameter DESCRIPTION_PARAMETER. Raises ValueError."""
-        expected = f"parameter {DESCRIPTION_PARAMETER}: expected the JSON object of an export"
+        """Return the description of the parameter DESCRIPTION_PARAMETER. Raises InvalidValueError."""
+        expected = "the JSON object of an export"
         try:
             told = json.loads(text)
         except ValueError as error:
-            raise ValueError(f"{expected}, got {f'{text!r:.80}: {error}' if text else 'none'}") from None
-        if not isinstance(told, dict):
-            raise ValueError(f"{expected}, got {text!r:.80}")
+            raise InvalidValueError.at(_WHERE, expected, f"{text!r:.80}: {error}" if text else "none") from None
+        require(_WHERE, isinstance(told, dict), expected, f"{text!r:.80}")
         kinds = typing.get_type_hints(cls)
         return cls(**{name: _read(name, value, kinds[name]) for name, value in told.items() if name in kinds})
 
 
 def _read(name: str, value: Any, kind: Any) -> Any:
-    """Return the field ``name`` of type ``kind``. Raises ValueError for a value of another type."""
+    """Return the field ``name`` of type ``kind``. Raises InvalidValueError for a value of another type."""
     is_union = typing.get_origin(kind) in (types.UnionType, typing.Union)
     parts = tuple(typing.get_origin(part) or part for part in (typing.get_args(kind) if is_union else (kind,)))
     try:
         read = FrameSize.parse(value) if FrameSize in parts and isinstance(value, str) else value
         read = tuple(read) if tuple in parts and isinstance(read, list) else read
-    except ValueError as error:
-        raise ValueError(f"parameter {DESCRIPTION_PARAMETER}: {error}") from None
+    except InvalidValueError as error:
+        raise InvalidValueError.like(error, where=f"{_WHERE}: {error.where}") from None
     if not isinstance(read, parts):
         expected = " or ".join("null" if part is types.NoneType else part.__name__ for part in parts)
-        raise ValueError(f"parameter {DESCRIPTION_PARAMETER}: {name}: expected {expected}, got {value!r:.80}")
+        raise InvalidValueError.at(f"{_WHERE}: {name}", expected, f"{value!r:.80}")
     return read

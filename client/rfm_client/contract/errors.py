@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Errors of a call to the server.
+"""Errors of invalid values, which carry fields, and errors of a call to the server.
 
     RewardError
     +-- InvalidSampleError        the sample is at fault; a retry gives the same answer
@@ -16,6 +16,55 @@ An error never becomes a number.
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class LocatedError(Exception):
+    """An invalid value at a place, reported as ``where: expected X, got Y; remedy``.
+
+    where: the field, setting or file; empty: unknown
+    expected, got, remedy: parts of ``problem``; empty if its text comes from elsewhere
+    """
+
+    where = expected = got = remedy = ""
+
+    def __init__(self, problem: str, where: object = "") -> None:
+        super().__init__(problem)
+        self.where = str(where)
+
+    @classmethod
+    def at(cls, where: object, expected: str, got: object, remedy: str = "") -> Self:
+        """Return the error of a value that is not as expected."""
+        error = cls(f"expected {expected}, got {got}{'; ' if remedy else ''}{remedy}", where)
+        error.expected, error.got, error.remedy = expected, str(got), remedy
+        return error
+
+    @classmethod
+    def like(cls, error: LocatedError, **changed: Any) -> Self:
+        """Return an error of this class with the fields of another, some of them changed."""
+        made = cls(*error.args)
+        vars(made).update({**vars(error), **changed})
+        return made
+
+    @property
+    def problem(self) -> str:
+        """The message without ``where``."""
+        return str(self.args[0])
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.problem}" if self.where else self.problem
+
+    def inside(self, where: object) -> Self:
+        """Return the error with the name of the object around its field: ``where.field: ...``."""
+        return type(self).like(self, where=f"{where}.{self.where}" if self.where else str(where))
+
+
+class InvalidValueError(LocatedError, ValueError):
+    """An invalid argument or setting."""
 
 
 class RewardError(Exception):
@@ -37,19 +86,15 @@ class RewardError(Exception):
         return self.message if self.request_id is None else f"{self.message} (request {self.request_id})"
 
 
-class InvalidSampleError(RewardError, ValueError):
-    """An invalid sample, reported as ``where: expected X, got Y``."""
+class InvalidSampleError(RewardError, InvalidValueError):
+    """An invalid sample. source: its video or picture, named at the end of the message; empty: none"""
 
-    @classmethod
-    def at(cls, where: str, expected: str, got: str) -> InvalidSampleError:
-        """Return the error at the field ``where``."""
-        return cls(f"{where}: expected {expected}, got {got}")
+    source = ""
 
-    def inside(self, where: str) -> InvalidSampleError:
-        """Return the error with the name of the object around its field: ``where.field: ...``."""
-        located = type(self)(f"{where}.{self.message}")
-        located.request_id = self.request_id
-        return located
+    @property
+    def problem(self) -> str:
+        """The message without the field."""
+        return f"{super().problem} ({self.source})" if self.source else super().problem
 
 
 class ClientClosedError(RewardError, RuntimeError):
@@ -71,7 +116,9 @@ class ProcessEndedError(ServerUnavailableError):
 
 
 class DeadlineExceededError(ServerError, TimeoutError):
-    """No answer came within the caller's time limit."""
+    """No answer came within the caller's time limit. server: the URL, and its proxy; empty: unknown"""
+
+    server = ""
 
 
 class ModelNotFoundError(ServerError):

@@ -7,6 +7,8 @@ import re
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, cast
 
+from rfm_client.contract.errors import InvalidValueError
+
 Rule: TypeAlias = Literal["shortest", "exact"]
 
 _FORMS = "'shortest PX' or 'exact HEIGHTxWIDTH'"
@@ -30,7 +32,7 @@ class FrameSize:
         """Parse ``shortest 256`` or ``exact 224x320``, as ``str`` writes them. Raises ValueError."""
         match = _TEXT.fullmatch(text)
         if match is None:
-            raise ValueError(f"frame_size: expected {_FORMS}, got {text!r}")
+            raise InvalidValueError.at("frame_size", _FORMS, repr(text))
         rule, *edges = (part for part in match.groups() if part)
         return cls(cast(Rule, rule), tuple(map(int, edges)))
 

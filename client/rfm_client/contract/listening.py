@@ -9,6 +9,7 @@ import socket
 from dataclasses import dataclass
 
 from rfm_client.contract.addresses import is_loopback
+from rfm_client.contract.errors import InvalidValueError
 
 
 def in_url(host: str) -> str:
@@ -38,7 +39,7 @@ class ListenAddress:
         return f"{scheme}://{in_url(from_here(self.host))}:{self.port}"
 
     def check_free(self, where: str, *, port_option: str, host_option: str = "--host") -> None:
-        """Raise ValueError (``where: ...``) unless a server can listen here. The message names the option to change."""
+        """Raise InvalidValueError unless a server can listen here. The message names the option to change."""
         try:
             family = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)[0][0]
             socket.create_server((self.host, self.port), family=family).close()
@@ -48,4 +49,4 @@ class ListenAddress:
             is_of_port = number in (errno.EADDRINUSE, errno.EACCES)
             remedy = f"{port_option} names another port" if is_of_port else f"{host_option} names another address"
             expected = f"a free port of this machine at {in_url(self.host)}:{self.port}"
-            raise ValueError(f"{where}: expected {expected}, got: {reason}; {remedy}") from None
+            raise InvalidValueError.at(where, expected, reason, remedy) from None

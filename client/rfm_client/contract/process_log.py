@@ -42,7 +42,7 @@ def write_log(process: str, environment: Mapping[str, str]) -> None:
     """
     level = environment.get(LEVEL_VARIABLE, "INFO").upper()
     if level not in _LEVELS:
-        raise ConfigError(LEVEL_VARIABLE, f"expected one of {', '.join(_LEVELS)}, got {level!r:.100}")
+        raise ConfigError.at(LEVEL_VARIABLE, f"one of {', '.join(_LEVELS)}", f"{level!r:.100}")
     handler = _StandardError()
     handler.setFormatter(LogLines(process))
     logging.basicConfig(handlers=[handler], level=logging.INFO)

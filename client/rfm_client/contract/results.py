@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_type_h
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import Float32Array
@@ -253,6 +254,6 @@ def _preferred(preference: float) -> Literal["first", "second"] | None:
 
 
 def _known(name: str, scores: Float32Array) -> Float32Array:
-    if np.isnan(scores).any():
-        raise ValueError(f"{name}: expected a score of each frame, got NaN: this checkpoint does not predict it")
+    is_known = not np.isnan(scores).any()
+    require(name, is_known, "a score of each frame", "NaN: this checkpoint does not predict it")
     return scores

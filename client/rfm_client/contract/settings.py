@@ -11,6 +11,9 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
 
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import InvalidValueError
+
 Texts: TypeAlias = tuple[str, ...]
 
 _PLAIN: dict[Any, tuple[type, ...]] = {Path: (str,), float: (int, float), Texts: (list,)}  # else the type itself
@@ -19,17 +22,33 @@ _UNBOUNDED = 2**31 - 1  # a bound that only the number's type sets
 _NAMES: dict[Any, str] = {types.NoneType: "null", Path: "str", Texts: "list of str"}
 
 
-class ConfigError(ValueError):
-    """A setting with an invalid value.
+class ConfigError(InvalidValueError):
+    """An invalid setting, or two settings that do not fit together.
 
-    key: name of the setting, or several names with commas between
-    expected: ``expected X, got Y``
+    where: name of the setting
+    other: name of the second setting; empty: none
     """
 
-    def __init__(self, key: str, expected: str) -> None:
-        super().__init__(f"{key}: {expected}")
-        self.key = key
-        self.expected = expected
+    other = ""
+
+    @classmethod
+    def of_two(cls, name: str, relation: str, other: str) -> ConfigError:
+        """Return the error of two settings: ``name needs other``, for example."""
+        return cls.like(cls(relation, name), other=other)
+
+    @classmethod
+    def require_both(cls, settings: object, name: str, other: str) -> None:
+        """Raise the error of a pair of settings of which only one is given."""
+        for given, missing in ((name, other), (other, name)):
+            if getattr(settings, given) is not None and getattr(settings, missing) is None:
+                raise cls.of_two(given, "needs", missing)
+
+    def named(self, name_of: Callable[[str], str]) -> ConfigError:
+        """Return the error under the names that the settings have elsewhere."""
+        return self.like(self, where=name_of(self.where), other=name_of(self.other) if self.other else "")
+
+    def __str__(self) -> str:
+        return f"{self.where} {self.problem} {self.other}" if self.other else super().__str__()
 
 
 @dataclass(frozen=True)
@@ -68,20 +87,17 @@ class Setting:
         for kind in self._kinds:
             if _spells(value, kind):
                 return None if value is None else kind(value)
-        raise ConfigError(self.name, f"expected {self._expected}, got {value!r:.200}")
+        raise ConfigError.at(self.name, self._expected, f"{value!r:.200}")
 
     def check(self, value: Any) -> None:
         """Raise ConfigError for a value out of bounds or not among the choices."""
         if value is None:
             return
-        if self._choices and value not in self._choices:
-            raise ConfigError(self.name, f"expected {self._expected}, got {value!r:.200}")
-        if self.least is not None and not _is_number(value):
-            raise ConfigError(self.name, f"expected a finite number, got {value!r:.200}")
-        if self.least is not None and value < self.least:
-            raise ConfigError(self.name, f"expected at least {self.least}, got {value}")
-        if self.most is not None and value > self.most:
-            raise ConfigError(self.name, f"expected at most {self.most}, got {value}")
+        got = f"{value!r:.200}"
+        require(self.name, not self._choices or value in self._choices, self._expected, got, ConfigError)
+        require(self.name, self.least is None or _is_number(value), "a finite number", got, ConfigError)
+        require(self.name, self.least is None or value >= self.least, f"at least {self.least}", value, ConfigError)
+        require(self.name, self.most is None or value <= self.most, f"at most {self.most}", value, ConfigError)
 
     @property
     def placeholder(self) -> str | None:

@@ -8,12 +8,14 @@ real Triton say each of its phrases.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
-from typing import Any
+from collections.abc import Callable, Collection
+from typing import Any, TypeAlias
 from urllib.parse import urljoin
 
 from rfm_client.contract import errors
-from rfm_client.contract.wire import SECOND_FRAMES
+from rfm_client.contract.wire import NUM_FRAMES, SECOND_FRAMES
+
+BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 
 UNAVAILABLE = ("StatusCode.UNAVAILABLE", "503")
 OUT_OF_TIME = ("StatusCode.DEADLINE_EXCEEDED", "504")
@@ -38,7 +40,6 @@ NO_VERSIONS = "no available versions"  # the model failed, or is being loaded ag
 LOST_REGION = "Unable to find shared memory region"  # the server was restarted
 REGION_IN_USE = "it is currently in use"  # a region to unmap: tests/client/test_shared_memory_faults.py
 RESTRICTED = "is restricted, expecting header"  # the API needs a key
-LATE = "no answer in time"
 
 _NO_CONNECTION = re.compile(  # gRPC's own words: nothing was sent
     "failed to connect|connections to all backends failing|errors resolving|resolution failed"
@@ -50,9 +51,11 @@ _WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not m
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
 )
 _NO_SECOND_FRAMES = re.compile(rf"expected \d+ inputs but got .*'{SECOND_FRAMES}'|unexpected .*input '{SECOND_FRAMES}'")
-_TOO_MANY_FRAMES = re.compile(r"\bnum_frames: expected at most \d")
+_NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
+_FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as ``LocatedError`` writes them
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
 
+_FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
 _START = "start the server there (rfm serve), or give the URL of one that runs"
 _NO_PROXY = "unset that variable, or add the server's host to no_proxy"
 _SHOW_KEY = "show the key that it wants with api_key (--api-key-file) or headers"
@@ -64,17 +67,30 @@ _TRUST = {
 }
 
 
+def invalid_sample(text: str) -> errors.InvalidSampleError:
+    """Return the error with its fields, which the server sent as text."""
+    output = _NO_OUTPUT.search(text)
+    if output is not None:
+        return errors.InvalidSampleError(text, output[1])
+    fields = _FIELDS.fullmatch(text)
+    if fields is None:
+        return errors.InvalidSampleError(text)
+    where, expected, got = fields.groups()
+    has_too_many = where.endswith(NUM_FRAMES) and expected.startswith("at most ")
+    return errors.InvalidSampleError.at(where, expected, got, _FEWER_FRAMES if has_too_many else "")
+
+
 def error_from(
     raised: Exception,
     url: str,
     *,
     proxy: str | None = None,
-    bad_request: type[errors.RewardError] = errors.InvalidSampleError,
+    bad_request: BadRequest = invalid_sample,
 ) -> errors.RewardError | None:
     """Translate an exception of tritonclient or of a library below it; None: another exception.
 
     proxy: proxy of the call (``grpc_proxy``)
-    bad_request: error for the status INVALID_ARGUMENT, which Triton also gives for an unknown model
+    bad_request: makes the error for the status INVALID_ARGUMENT, which Triton also gives for an unknown model
     """
     where = f"{url} through {proxy}" if proxy else url
     for kind in type(raised).__mro__:  # by name, since these libraries may not be imported
@@ -82,7 +98,9 @@ def error_from(
             case "InferenceServerException":
                 return _error_of_answer(raised, url, proxy, bad_request)
             case "TimeoutError":  # asyncio has its own class in Python 3.10
-                return errors.DeadlineExceededError(f"{where}: {LATE}")
+                late = errors.DeadlineExceededError(f"{where}: no answer in time")
+                late.server = where
+                return late
             case "SSLError" | "ClientSSLError":
                 return denied(url, "", str(raised))
             case "ClientResponseError":
@@ -98,9 +116,7 @@ def error_from(
     return None
 
 
-def _error_of_answer(
-    answer: Any, url: str, proxy: str | None, bad_request: type[errors.RewardError]
-) -> errors.RewardError:
+def _error_of_answer(answer: Any, url: str, proxy: str | None, bad_request: BadRequest) -> errors.RewardError:
     status, message = str(answer.status()), answer.message() or ""
     if is_denied(status, message):
         return denied(url, status, message)
@@ -109,24 +125,22 @@ def _error_of_answer(
     return error_of(status, message, bad_request)
 
 
-def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -> errors.RewardError:
+def error_of(status: str, message: str, bad_request: BadRequest) -> errors.RewardError:
     """Translate Triton's status and message; ``bad_request`` as in ``error_from``."""
     text = _PREFIX.sub("", message or "no reason given")
     shape = _WRONG_SHAPE.search(text)
     if shape is not None:
-        return bad_request(f"{shape['name']}: expected [{shape['expected']}], got [{shape['got']}]")
+        return errors.InvalidSampleError.at(shape["name"], f"[{shape['expected']}]", f"[{shape['got']}]")
     if _NO_SECOND_FRAMES.search(text):
         expected = "a model that takes pairs of two frame sizes"
-        got = "one that was exported before there was this input: export it again, or resize a trajectory"
-        return bad_request(f"{SECOND_FRAMES}: expected {expected}, got {got}")
+        got, remedy = "one that was exported before there was this input", "export it again, or resize a trajectory"
+        return errors.InvalidSampleError.at(SECOND_FRAMES, expected, got, remedy)
     if PROCESS_ENDED in text and "Stub process" in text:
         return errors.ProcessEndedError(text)
     if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: a retry may succeed
         return errors.ServerUnavailableError(text)
-    if _TOO_MANY_FRAMES.search(text):
-        text += ": score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
     kind = _ERROR_OF.get(status, errors.InferenceFailedError)
-    error = (bad_request if kind is errors.InvalidSampleError else kind)(text)
+    error = bad_request(text) if kind is errors.InvalidSampleError else kind(text)
     if isinstance(error, errors.ServerUnavailableError):
         is_lost = _LOST_CONNECTION.search(text) is not None and not _NO_CONNECTION.search(text)
         error.may_have_ended_server = is_lost or status in BAD_GATEWAY

@@ -9,7 +9,9 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.samples import UInt8Array
+from rfm_client.contract.settings import ConfigError
 
 Orientation: TypeAlias = Literal["none", "rotate180", "flip-vertical", "flip-horizontal", "rotate90", "rotate270"]
 ChannelOrder: TypeAlias = Literal["rgb", "bgr"]
@@ -37,8 +39,7 @@ def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
 
 def _check(name: str, values: tuple[str, ...], value: object) -> None:
     """Raise ValueError unless the value is one of the option's values."""
-    if value not in values:
-        raise ValueError(f"{name}: expected one of {', '.join(values)}, got {value!r}")
+    require(name, value in values, f"one of {', '.join(values)}", repr(value), ConfigError)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.samples import UInt8Array
 
 _UPRIGHT = {  # Pillow's name by EXIF orientation
@@ -30,17 +31,13 @@ _BROKEN = (OSError, SyntaxError, ValueError)  # Pillow's errors for broken pixel
 _DEEP = ";16"  # Pillow's mark of 16 bits a channel, which it cuts to 8
 
 
-class FrameFileError(ValueError):
-    """A file that is not one readable video or picture. ``expected`` and ``got`` are the parts of a message.
+class FrameFileError(InvalidValueError):
+    """A file that is not one readable video or picture. where: place in it, such as ``frame 3``; empty: the file"""
 
-    where: place in the file, such as ``frame 3``; empty: the whole file
-    """
-
-    def __init__(self, expected: str, got: object, where: str = "") -> None:
-        super().__init__(expected, got, where)
-        self.expected = expected
-        self.got = got
-        self.where = where
+    @classmethod
+    def of(cls, expected: str, got: object) -> FrameFileError:
+        """Return the error of the whole file."""
+        return cls.at("", expected, got)
 
 
 class Picture:
@@ -95,12 +92,12 @@ def opened_picture(picture: bytes | Path) -> Any:
     try:
         opened = Image.open(_file_of(picture))
     except (*_BROKEN, Image.DecompressionBombError) as error:
-        raise FrameFileError("an image", error) from error
+        raise FrameFileError.of("an image", error) from error
     is_deep = _DEEP in str(opened.tile)
     if is_deep or opened.mode not in _COLOURS:
         opened.close()
         expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
-        raise FrameFileError(expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
+        raise FrameFileError.of(expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
     return opened
 
 
@@ -110,7 +107,7 @@ def decoded_picture(picture: Any) -> UInt8Array:
         try:
             return np.asarray(upright_picture(picture).convert("RGB"))
         except _BROKEN as error:
-            raise FrameFileError("an image", error) from error
+            raise FrameFileError.of("an image", error) from error
 
 
 def upright_picture(picture: Any) -> Any:

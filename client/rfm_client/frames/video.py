@@ -17,7 +17,8 @@ from urllib.error import HTTPError
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
 from rfm_client.contract.numbers import checked_finite, checked_positive
 from rfm_client.contract.proxies import open_url
 from rfm_client.contract.samples import UInt8Array
@@ -106,15 +107,15 @@ def read_video(
                 return picture[np.newaxis]
             packets = read_packets(file, container)
             if not packets.fps and (is_part or fps is not None):
-                raise FrameFileError("a frame rate", "none")
+                raise FrameFileError.of("a frame rate", "none")
             if is_part:
                 frames = _part(file, packets, _within(packets, start_s, end_s), fps, take, container)
             else:
                 frames = _whole(file, packets, fps, take, container)
         if not frames:
-            raise FrameFileError("at least one frame", "none")
+            raise FrameFileError.of("at least one frame", "none")
         if len({frame.shape for frame in frames}) > 1:
-            raise FrameFileError("frames of one size", "several")
+            raise FrameFileError.of("frames of one size", "several")
         take(sum(frame.nbytes for frame in frames))
         return np.stack(frames)
 
@@ -138,11 +139,12 @@ def _errors_of(source: str | Path) -> Iterator[None]:
     try:
         yield
     except FrameFileError as error:
-        raise InvalidSampleError.at("video", error.expected, f"{error.got} ({source})") from error
+        raise InvalidSampleError.like(error, where="video", source=str(source)) from error
     except InvalidSampleError as error:
-        raise InvalidSampleError(f"{error} ({source})") from error
+        raise InvalidSampleError.like(error, source=str(source)) from error
     except (import_av().FFmpegError, OSError) as error:
-        raise InvalidSampleError.at("video", _EXPECTED, f"{error.strerror or error} ({source})") from error
+        told = InvalidSampleError.at("video", _EXPECTED, error.strerror or error)
+        raise InvalidSampleError.like(told, source=str(source)) from error
 
 
 def _check_numbers(fps: float | None, start_s: float | None, end_s: float | None, timeout_s: float) -> None:
@@ -151,10 +153,10 @@ def _check_numbers(fps: float | None, start_s: float | None, end_s: float | None
         for where, number in (("fps", fps), ("end_s", end_s)):
             if number is not None:
                 checked_positive(where, number)
-        if start_s is not None and checked_finite("start_s", start_s) < 0:
-            raise ValueError(f"start_s: expected 0 or more, got {start_s}")
-    except ValueError as error:
-        raise InvalidSampleError(str(error)) from None
+        if start_s is not None:
+            require("start_s", checked_finite("start_s", start_s) >= 0, "0 or more", start_s)
+    except InvalidValueError as error:
+        raise InvalidSampleError.like(error) from None
 
 
 def _spread(total: int, count: int) -> npt.NDArray[np.int64]:
@@ -187,7 +189,7 @@ def _still(file: BinaryIO) -> UInt8Array | None:
     picture = opened_picture(file.read())
     num_pictures = 1 if picture.format == _WITH_PREVIEWS else getattr(picture, "n_frames", 1)
     if num_pictures > 1:
-        raise FrameFileError("a video, or a single picture", f"{num_pictures} pictures in a {picture.format} file")
+        raise FrameFileError.of("a video, or a single picture", f"{num_pictures} pictures in a {picture.format} file")
     return decoded_picture(picture)
 
 
@@ -201,7 +203,7 @@ def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
     except (OSError, HTTPException, ValueError) as error:
         if isinstance(error, HTTPError):
             error.close()  # an HTTPError holds the connection
-        raise FrameFileError(_EXPECTED, str(error)) from error
+        raise FrameFileError.of(_EXPECTED, str(error)) from error
 
 
 def _within(packets: Packets, start_s: float | None, end_s: float | None) -> tuple[int, int]:
@@ -229,9 +231,9 @@ def _whole(
     total = len(times_s)
     if packets.num_hidden and not _rises(times_s):  # those hidden are others than the video means
         expected = f"{packets.count + packets.num_hidden} frames ({_REMUX})"
-        raise FrameFileError(expected, f"{total}, and time stamps in another order than the frames")
+        raise FrameFileError.of(expected, f"{total}, and time stamps in another order than the frames")
     if total < packets.count:
-        raise FrameFileError(f"{packets.count} frames, one for each packet", f"{total} ({_LOST})")
+        raise FrameFileError.of(f"{packets.count} frames, one for each packet", f"{total} ({_LOST})")
     if total > packets.count:  # a packet may hold several frames
         wanted = set(_picked(0, total, packets, fps).tolist())
         frames, _ = _decoded(file, lambda number, _: number in wanted, take, container)
@@ -246,12 +248,12 @@ def _part(
     begin_s, last_s = packets.times_s[part[0]], packets.times_s[part[1] - 1]
     frames, times_s = _decoded(file, lambda _, time_s: time_s in wanted_s, take, container)
     if packets.count != len(packets.times_s) or None in times_s:
-        raise FrameFileError(f"{packets.count} frames with time stamps", f"{len(packets.times_s)}")
+        raise FrameFileError.of(f"{packets.count} frames with time stamps", f"{len(packets.times_s)}")
     if not _rises(times_s):
-        raise FrameFileError(f"frames in the order of their time stamps ({_REMUX})", "another order")
+        raise FrameFileError.of(f"frames in the order of their time stamps ({_REMUX})", "another order")
     expected, total = part[1] - part[0], sum(begin_s <= time_s <= last_s for time_s in times_s if time_s is not None)
     if total != expected:
-        raise FrameFileError(f"{expected} frames in this part, one for each packet", f"{total} ({_LOST})")
+        raise FrameFileError.of(f"{expected} frames in this part, one for each packet", f"{total} ({_LOST})")
     return frames
 
 
@@ -288,4 +290,4 @@ def _judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
             yield each
             num_given += 1
     except import_av().FFmpegError as error:
-        raise FrameFileError(f"frame {num_given} to be decoded ({REENCODE})", str(error.strerror)) from error
+        raise FrameFileError.of(f"frame {num_given} to be decoded ({REENCODE})", str(error.strerror)) from error

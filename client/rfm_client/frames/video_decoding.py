@@ -55,12 +55,12 @@ def video_stream(container: Any) -> Any:
     attached = import_av().stream.Disposition.attached_pic
     videos = {n: stream for n, stream in enumerate(container.streams.video) if not stream.disposition & attached}
     if not videos:
-        raise FrameFileError("a file with a video stream", "none")
+        raise FrameFileError.of("a file with a video stream", "none")
     if len(videos) > 1:
         codecs = {n: stream.codec_context for n, stream in videos.items()}
         told = ", ".join(f"0:v:{n} ({codec.name}, {codec.width}x{codec.height})" for n, codec in codecs.items())
-        raise FrameFileError(
-            "one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)", f"{len(videos)}: {told}"
+        raise FrameFileError.at(
+            "", "one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)", f"{len(videos)}: {told}"
         )
     (stream,) = videos.values()
     _check_colours(stream.codec_context.format)
@@ -101,7 +101,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     """
     missing = broken_off(file)
     if missing is not None:
-        raise FrameFileError("a whole video file", missing)
+        raise FrameFileError.of("a whole video file", missing)
     file.seek(0)
     timed: list[tuple[float, int]] = []
     count = num_hidden = 0
@@ -114,12 +114,12 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
                 and not packet.is_keyframe
                 and stream.codec_context.name == "hevc"
             ):
-                raise FrameFileError(*_HEADLESS)  # FFmpeg 7 makes pictures up to the first key frame, without a mark
+                raise FrameFileError.of(*_HEADLESS)  # FFmpeg 7 makes pictures up to the first key frame, without a mark
             if not packet.size or packet.is_discard:
                 num_hidden += bool(packet.size)
                 continue
             if packet.is_corrupt:
-                raise FrameFileError("a whole video file", f"one whose packet {count} is broken ({REENCODE})")
+                raise FrameFileError.of("a whole video file", f"one whose packet {count} is broken ({REENCODE})")
             if packet.pts is not None:
                 timed.append((float(packet.pts * packet.time_base), packet.size))
             count += 1
@@ -145,7 +145,9 @@ class Upright:
             image, matrix = self._rgb(frame), frame.side_data.get("DISPLAYMATRIX")
         except ValueError as error:  # PyAV 17.1 and newer fail at the EXIF data of a Motion JPEG video
             remedy = "encode it anew: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
-            raise FrameFileError(f"frames without EXIF data, which PyAV cannot read ({remedy})", str(error)) from error
+            raise FrameFileError.of(
+                f"frames without EXIF data, which PyAV cannot read ({remedy})", str(error)
+            ) from error
         return image if matrix is None else np.ascontiguousarray(_shown(image, np.frombuffer(bytes(matrix), np.int32)))
 
     def _rgb(self, frame: Any) -> UInt8Array:
@@ -178,7 +180,7 @@ def _check_colours(pixels: Any) -> None:
     has_one = len(pixels.components) <= 2 and max(component.bits for component in pixels.components) > _BITS
     if has_one or "f16" in pixels.name or "f32" in pixels.name:
         remedy = "leave a depth camera out (--cameras), or convert the video: ffmpeg -i IN -pix_fmt yuv420p OUT"
-        raise FrameFileError(f"a video of colours ({remedy})", f"{pixels.name}, as depth maps have")
+        raise FrameFileError.of(f"a video of colours ({remedy})", f"{pixels.name}, as depth maps have")
 
 
 def _known_matrix(frame: Any) -> int:
@@ -202,7 +204,7 @@ def _shown(image: UInt8Array, matrix: npt.NDArray[np.int32]) -> UInt8Array:
     is_turned = max(abs(a), abs(d)) < _NEARLY * min(abs(b), abs(c))
     if not is_turned and max(abs(b), abs(c)) > _NEARLY * min(abs(a), abs(d)):
         got = f"one that is turned by {abs(math.degrees(math.atan2(b, a))):.0f} degrees, or skewed"
-        raise FrameFileError("a video that is shown upright or by quarter turns (turn it: ffmpeg -i IN OUT)", got)
+        raise FrameFileError.of("a video that is shown upright or by quarter turns (turn it: ffmpeg -i IN OUT)", got)
     across, down = (c, b) if is_turned else (a, d)
     image = image.swapaxes(0, 1) if is_turned else image
     return image[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1]

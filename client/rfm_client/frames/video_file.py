@@ -59,9 +59,9 @@ class Video:
             with self.file.open("rb") as opened:
                 return read_packets(opened, self.container)
         except FileNotFoundError as error:
-            raise FrameFileError("a video file", "none") from error
+            raise FrameFileError.of("a video file", "none") from error
         except (av.FFmpegError, OSError) as error:
-            raise FrameFileError("a whole video file", error.strerror or error) from error
+            raise FrameFileError.of("a whole video file", error.strerror or error) from error
 
     @contextmanager
     def opened(self) -> Iterator[tuple[Any, Any]]:
@@ -84,11 +84,11 @@ class Video:
                 frames = _from(container, stream, float(times_s[0]), tolerance_s)
                 for frame, is_damaged in _at(times_s, tolerance_s, judged(frames)):
                     if is_damaged:
-                        raise FrameFileError(UNDAMAGED, DAMAGED, f"frame {num_given}")
+                        raise FrameFileError.at(f"frame {num_given}", UNDAMAGED, DAMAGED)
                     yield upright(frame)
                     num_given += 1
         except (import_av().FFmpegError, OSError) as error:
-            raise FrameFileError(f"frame {num_given} to be decoded", error.strerror or error) from error
+            raise FrameFileError.of(f"frame {num_given} to be decoded", error.strerror or error) from error
 
 
 def _from(container: Any, stream: Any, first_s: float, tolerance_s: float) -> Iterator[Any]:
@@ -114,5 +114,5 @@ def _at(
         found = next((each for each in left if each[0].time > time_s - tolerance_s), None)
         if found is None or found[0].time > time_s + tolerance_s:
             got = "none" if found is None else f"the next at {found[0].time:.4f} s"
-            raise FrameFileError(f"frame {t} at {time_s:.4f} s", got)
+            raise FrameFileError.of(f"frame {t} at {time_s:.4f} s", got)
         yield found

@@ -9,6 +9,7 @@ from copy import copy
 from typing import TypedDict
 
 from rfm_client.contract import wire
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.transport.deadline import Deadline
 
 _ID_BYTES = 8  # random bytes in the ids of a call's requests
@@ -62,7 +63,7 @@ class Call:
         request_id: str | None = None,
     ) -> None:
         if request_id is not None and not wire.REQUEST_ID.fullmatch(request_id):
-            raise ValueError(f"request_id: expected 1 to 64 letters, digits or any of ._:/+=@-, got {request_id!r}")
+            raise InvalidValueError.at("request_id", "1 to 64 letters, digits or any of ._:/+=@-", repr(request_id))
         prefix = request_id or secrets.token_hex(_ID_BYTES)
         self.deadline = deadline
         self.request_ids = (f"{prefix}-{number}" for number in itertools.count(1))

@@ -167,7 +167,7 @@ class SampleScorer:
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
             error.request_id = request_id
-            if any(name in str(error) for name in more):  # the server has an older export now
+            if isinstance(error, InvalidSampleError) and error.where in more:  # the server has an older export now
                 self._infos.pop(model, None)
                 return await self._request(model, samples, call, asks_given=False)
             if len(samples) == 1:

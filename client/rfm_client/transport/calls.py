@@ -17,6 +17,7 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client.contract import errors, triton
 from rfm_client.contract.addresses import split_url
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.proxies import grpc_proxy
 from rfm_client.contract.wire import Tensors
@@ -89,7 +90,7 @@ class TritonTransport:
         self._scheme, self._address = split_url(url)
         self._credentials = credentials
         if credentials.uses_tls and self._scheme not in SECURE_SCHEMES:
-            raise ValueError(f"url: expected grpcs:// or https:// with certificates, got {url}")
+            raise InvalidValueError.at("url", "grpcs:// or https:// with certificates", url)
         self._shared_memory = SharedMemory(url) if shared_memory else None
         self._connection: Connection | None = None
         self._left: list[Connection] = []  # perhaps not closed yet
@@ -163,7 +164,7 @@ class TritonTransport:
         request: Callable[[Any], Awaitable[Answered]],
         timeout_s: float,
         *,
-        bad_request: type[errors.RewardError] = errors.InvalidSampleError,
+        bad_request: triton.BadRequest = triton.invalid_sample,
     ) -> Answered:
         """Return the answer to ``request`` within ``timeout_s``; ``bad_request`` as in ``triton.error_from``."""
         try:

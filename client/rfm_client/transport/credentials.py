@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rfm_client.contract.addresses import check_authorities, load_certificate
+from rfm_client.contract.settings import ConfigError
 
 SECURE_SCHEMES = ("grpcs", "https")
 AUTHORIZATION = "authorization"
@@ -22,7 +23,7 @@ _VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII, with spaces inside
 
 @dataclass(frozen=True)
 class Credentials:
-    """Credentials of a client. Raises ValueError for unusable values, without showing a key.
+    """Credentials of a client. Raises ConfigError for unusable values, without showing a key.
 
     ca_file: certificates (PEM) of authorities that may vouch for the server; None: the system's
     client_certificate, client_key: files (PEM) that identify this client (mutual TLS); both or neither
@@ -37,13 +38,13 @@ class Credentials:
     api_key: str | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if (self.client_certificate is None) != (self.client_key is None):
-            raise ValueError("client_certificate, client_key: expected both or none, got one")
+        ConfigError.require_both(self, "client_certificate", "client_key")
         for name, value in self.shown.items():
             if not _NAME.fullmatch(name) or name.endswith("-bin"):  # binary metadata in gRPC
-                raise ValueError(f"headers: expected letters, digits and any of ._- as a name, got {name!r:.100}")
+                raise ConfigError.at("headers", "letters, digits and any of ._- as a name", f"{name!r:.100}")
             if not _VALUE.fullmatch(value):
-                raise ValueError(f"{name}: expected visible ASCII characters, got others or none")
+                where = "api_key" if name == AUTHORIZATION and self.api_key is not None else name
+                raise ConfigError.at(where, "visible ASCII characters", "others or none")
         if self.uses_tls:
             self.ssl_context  # noqa: B018  # reports an unreadable file now, not at first use
 
@@ -71,7 +72,7 @@ class Credentials:
         context = ssl.create_default_context(cafile=self.ca_file)
         if self.client_certificate is not None:
             assert self.client_key is not None  # by __post_init__
-            load_certificate(context, self.client_certificate, self.client_key, "client_certificate, client_key")
+            load_certificate(context, self.client_certificate, self.client_key, "client_certificate")
         return context
 
     def grpc_options(self, scheme: str) -> dict[str, Any]:

@@ -22,6 +22,7 @@ import time
 from collections.abc import Awaitable, Callable, Collection, Sequence
 from typing import TypeVar
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import (
     AccessDeniedError,
     ClientClosedError,
@@ -33,7 +34,6 @@ from rfm_client.contract.errors import (
     ServerUnavailableError,
 )
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.triton import LATE
 from rfm_client.contract.wire import Tensors
 from rfm_client.transport.calls import Answer, Transport, TritonTransport
 from rfm_client.transport.deadline import Deadline
@@ -115,8 +115,7 @@ class Servers:
     """Several servers that share the requests, for one event loop. retry: True: send failed requests again"""
 
     def __init__(self, transports: Sequence[Transport], *, retry: bool) -> None:
-        if not transports:
-            raise ValueError("url: expected at least one, got none")
+        require("url", len(transports) > 0, "at least one", "none")
         self._servers = [KnownServer(transport) for transport in transports]
         self._retry = retry
         self._is_closed = False
@@ -237,8 +236,7 @@ class Servers:
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
                     raise failed from failed.__cause__  # the reason for most of the lost time
-                where = error.message.rpartition(f": {LATE}")[0] or server.transport.url
-                raise deadline.exceeded(where) from error
+                raise deadline.exceeded(error.server or server.transport.url) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
                 if not self._retry:

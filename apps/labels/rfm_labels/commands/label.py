@@ -26,7 +26,7 @@ from rfm_client.command_line import (
     with_options,
 )
 from rfm_client.frames import ChannelOrder, Orientation
-from rfm_client.options import ConfigError, Settings, Texts, setting
+from rfm_client.options import Settings, Texts, setting
 from rfm_labels.commands.progress_bar import ProgressBar, Say
 from rfm_labels.datasets.cameras import parsed_by_camera
 from rfm_labels.datasets.dataset import Dataset, SeveralTasks
@@ -100,10 +100,7 @@ class EpisodeTexts(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         for option in _OF_CAMERAS:
-            try:
-                parsed_by_camera(option, getattr(self, option))
-            except ValueError as error:
-                raise ConfigError(option, str(error)) from None
+            parsed_by_camera(option, getattr(self, option))
 
     @property
     def opening(self) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rfm_client.frames import ChannelOrder, Correction, Orientation
+from rfm_client.options import ConfigError
 from rfm_labels.datasets.faults import DatasetError
 
 _WORDS = frozenset(
@@ -35,16 +36,16 @@ def camera_named(name: str, cameras: Sequence[str]) -> str | None:
 def parsed_by_camera(option: str, texts: Iterable[str]) -> dict[str, Any]:
     """Parse values of an option of corrections, such as ``rotate180``, or ``agentview_rgb=rotate180`` for one camera.
 
-    The name of a value for all other cameras is empty. Raises ValueError.
+    The name of a value for all other cameras is empty. Raises ConfigError.
     """
     found: dict[str, Any] = {}
     for text in texts:
         camera, _, value = text.rpartition("=")
         if camera in found:
-            raise ValueError(f"{option}: expected each camera once, got {text!r} again")
+            raise ConfigError.at(option, "each camera once", f"{text!r} again")
         found[camera] = value
     for value in found.values():
-        Correction(**{option: value})  # raises ValueError
+        Correction(**{option: value})  # raises ConfigError
     return found
 
 
@@ -71,8 +72,8 @@ class AskedCorrections:
                 Correction(orient=turn)
             for order in asked.channels.values():
                 Correction(channels=order)
-        except ValueError as error:
-            raise DatasetError(str(error)) from None
+        except ConfigError as error:
+            raise DatasetError.like(error) from None
         return asked
 
     def of_cameras(

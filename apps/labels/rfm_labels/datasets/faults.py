@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 
 from rfm_client import RewardError
+from rfm_client.options import InvalidValueError
 from rfm_client.options import require as require_that
 
 _MOST_SHOWN = 20
@@ -49,13 +51,8 @@ def fault_lines(faults: Mapping[int, str], numbers: Sequence[int], num_without_t
     return lines
 
 
-class DatasetError(RewardError, ValueError):
-    """A contradictory or unreadable dataset, reported as ``where: expected X, got Y``."""
-
-    @classmethod
-    def at(cls, where: object, expected: str, got: object) -> DatasetError:
-        """Return the error at a file, or at a place in it."""
-        return cls(f"{where}: expected {expected}, got {got}")
+class DatasetError(RewardError, InvalidValueError):
+    """A contradictory or unreadable dataset. where: a file, or a place in it"""
 
 
 class MissingTaskError(DatasetError):
@@ -77,6 +74,4 @@ class FaultsError(DatasetError):
         return cls("\n".join(fault_lines(messages, numbers, len(without_task))))
 
 
-def require(where: object, condition: bool, expected: str, got: object) -> None:
-    """Raise DatasetError unless the condition holds."""
-    require_that(where, condition, expected, got, DatasetError)
+require = partial(require_that, error=DatasetError)

@@ -198,7 +198,7 @@ def _read(file: Path) -> Trajectory:
     try:
         trajectory = load_trajectory(file)
     except InvalidSampleError as error:
-        raise DatasetError(f"{file}: {error}") from error
+        raise DatasetError(str(error), file) from error
     got = "embeddings: score them with rfm-client score"
     require(file, trajectory.frames is not None, "frames, uint8 [T, H, W, 3]", got)
     return trajectory

@@ -15,7 +15,7 @@ from typing import Any
 
 from rfm_client import UInt8Array
 from rfm_client.frames import Picture, Video
-from rfm_client.options import checked_finite, first_names
+from rfm_client.options import InvalidValueError, checked_finite, first_names
 from rfm_labels.datasets.cameras import AskedCorrections
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
@@ -48,8 +48,8 @@ class LeRobotDataset(Dataset):
     ) -> None:
         try:
             self._tolerance_s = checked_finite("tolerance_s", tolerance_s, "a number above 0")
-        except ValueError as error:
-            raise DatasetError(str(error)) from None
+        except InvalidValueError as error:
+            raise DatasetError.like(error) from None
         require("tolerance_s", tolerance_s > 0, "a number above 0", tolerance_s)
         self.root = root
         self.source = source or root.resolve().name

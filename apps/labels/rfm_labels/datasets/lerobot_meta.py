@@ -249,7 +249,4 @@ def json_lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
 def number_in(where: str, line: Mapping[str, Any], name: str) -> int:
     """Return a whole number of 0 or more in a line of JSON. Raises DatasetError."""
-    try:
-        return checked_count(f"{where}: {name}", line.get(name), least=0)
-    except ValueError as error:
-        raise DatasetError(str(error)) from error
+    return checked_count(f"{where}: {name}", line.get(name), least=0, error=DatasetError)

@@ -125,7 +125,7 @@ def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset:
     if is_hdf5(path):
         return Hdf5Dataset(path, task=TaskOverride(is_needed=False))
     if not (path / INFO_FILE).is_file():
-        raise DatasetError(f"expected the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file, got {source}")
+        raise DatasetError.at("", f"the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file", source)
     task = TaskOverride(column=TASK_COLUMN, is_needed=False)
     return LeRobotDataset(path, task=task, tolerance_s=0.5 / Info.read(path).fps)
 

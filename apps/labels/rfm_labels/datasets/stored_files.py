@@ -71,8 +71,8 @@ def faults_at(where: object) -> Iterator[None]:
     try:
         yield
     except FrameFileError as error:
-        place = f"{where}: {error.where}" if error.where else where
-        raise DatasetError.at(place, error.expected, error.got) from error
+        place = f"{where}: {error.where}" if error.where else str(where)
+        raise DatasetError.like(error, where=place) from error
 
 
 @dataclass(frozen=True, eq=False)
