@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from encoding import encode
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.blank_frames import BlankFrames, is_blank
-from rfm_client.frames.video import read_video
+from rfm_client import UInt8Array
+from rfm_client.frames import BlankFrames, read_video
+from rfm_client.frames.blank_frames import is_blank
 
 VIDEOS = Path(__file__).parents[1] / "videos"
 SIZE = (48, 64, 3)

@@ -18,8 +18,8 @@ from gateways import Gateway, running
 from proxies import Proxy
 from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient, ServerUnavailableError
-from rfm_client.cli.command import ExitCode
 from rfm_client.cli.scoring import WORKERS
+from rfm_client.command_line import ExitCode
 from rfm_serve import wait_for
 
 pytestmark = pytest.mark.triton

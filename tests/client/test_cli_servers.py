@@ -39,12 +39,12 @@ from rfm_client import (
     FrameScores,
     ProgressResult,
 )
-from rfm_client.cli.command import EXIT_CODES, ExitCode
+from rfm_client.cli.command import EXIT_CODES
 from rfm_client.cli.commands import app
 from rfm_client.cli.documents import frame_document
 from rfm_client.cli.scoring import unique_stems
-from rfm_client.cli.show import number
 from rfm_client.cli.synthetic import SyntheticSamples, parse_lengths
+from rfm_client.command_line import ExitCode, number
 from rfm_client.contract.wire import encode_samples
 from rfm_serve import wait_for
 from trajectories import random_trajectory

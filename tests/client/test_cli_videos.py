@@ -32,13 +32,13 @@ from rfm_client import (
     PreferenceResult,
     RewardClient,
     Trajectory,
+    load_trajectory,
 )
-from rfm_client.cli.command import ExitCode
 from rfm_client.cli.comparing import LEGEND, Comparison, compare
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import Source
-from rfm_client.frames.inputs import load_trajectory
+from rfm_client.command_line import ExitCode
 from rfm_client.plot import plot_scores, save
 from shelves import Shelf
 from trajectories import random_trajectory

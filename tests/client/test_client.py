@@ -20,6 +20,7 @@ from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
     InvalidSampleError,
+    ModelInfo,
     ModelNotFoundError,
     PreferenceSample,
     ProgressResult,
@@ -31,12 +32,10 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.frames.resize import resize_frames
+from rfm_client.frames import resize_frames
+from rfm_client.serving import Credentials, Deadline
 from rfm_client.transport.calls import Answer, GrpcTransport
 from rfm_client.transport.concurrency import MAX_BYTES, ConcurrencyLimiter
-from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.deadline import Deadline
 from shelves import Shelf
 from trajectories import random_trajectory
 

@@ -15,13 +15,13 @@ from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
     InferenceFailedError,
+    ModelInfo,
     ModelNotFoundError,
     ProgressResult,
     RewardError,
     ServerUnavailableError,
 )
 from rfm_client.contract import wire
-from rfm_client.contract.model_info import ModelInfo
 from rfm_client.transport.calls import Answer
 from trajectories import random_trajectory
 

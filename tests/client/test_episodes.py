@@ -33,13 +33,13 @@ from rfm_client import (
     RewardClient,
     ServerUnavailableError,
     Trajectory,
+    UInt8Array,
 )
 from rfm_client.contract import wire
-from rfm_client.contract.samples import UInt8Array
 from rfm_client.episodes import Episode
-from rfm_client.frames.sampling import RULES, Rule, Sampling, of_prefixes, prefix_samples
+from rfm_client.frames import RULES, Rule, Sampling, of_prefixes, prefix_samples
+from rfm_client.serving import Credentials
 from rfm_client.transport.calls import Answer, GrpcTransport
-from rfm_client.transport.credentials import Credentials
 from rfm_serve import Serving, serving
 
 MODEL = "enc_c1_t1_disc10"

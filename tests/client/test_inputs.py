@@ -15,9 +15,7 @@ import torch
 from PIL import Image
 
 from pictures import TOP, WRIST
-from rfm_client import InvalidSampleError, Trajectory
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.inputs import as_trajectory, load_trajectory
+from rfm_client import InvalidSampleError, Trajectory, UInt8Array, as_trajectory, load_trajectory
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (4, 6, 8, 3), np.uint8)
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from coded_env import CodedEnv
-from rfm_client import InvalidSampleError, RewardClient
-from rfm_client.contract import FrameSize
+from rfm_client import FrameSize, InvalidSampleError, RewardClient
 from rfm_rl import RewardModelWrapper, RewardOptions
 from shelves import V1, V2, Shelf
 

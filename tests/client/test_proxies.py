@@ -15,7 +15,7 @@ from proxies import HttpProxy, Proxy
 from rfm.launch.triton_server import Endpoints
 from rfm_client import DeadlineExceededError, RewardClient
 from rfm_client.contract.proxies import grpc_proxy, open_url
-from rfm_client.transport.status import read_status
+from rfm_client.serving import read_status
 
 pytestmark = pytest.mark.triton
 

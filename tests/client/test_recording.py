@@ -17,10 +17,9 @@ from PIL import Image
 
 from client_commands import TASK, invoke
 from rfm.launch.triton_server import Endpoints
-from rfm_client import FrameScores
-from rfm_client.cli.command import ExitCode
-from rfm_client.frames.inputs import load_trajectory
-from rfm_client.frames.video import frame_times_s
+from rfm_client import FrameScores, load_trajectory
+from rfm_client.command_line import ExitCode
+from rfm_client.frames import frame_times_s
 from rfm_client.recording import FRAME, TIME, Recording
 
 JPEG_ERROR = 30  # of a pixel, by which the compressed picture may differ

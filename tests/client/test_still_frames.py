@@ -14,8 +14,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from coded_env import CodedEnv, Recorder
-from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError, UInt8Array
 from rfm_client.transport.calls import Answer
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
 from shelves import Shelf

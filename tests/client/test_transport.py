@@ -24,10 +24,9 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract.triton import error_of
+from rfm_client.serving import Credentials, read_status
 from rfm_client.transport.connection import grpc_options
-from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.request_size import check_size
-from rfm_client.transport.status import read_status
 from trajectories import random_trajectory
 
 TIMEOUT_S = 1.0

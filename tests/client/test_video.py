@@ -19,9 +19,8 @@ import pytest
 
 import clip
 from pictures import numbered, numbers, write_video
-from rfm_client import InvalidSampleError
-from rfm_client.frames.inputs import load_trajectory
-from rfm_client.frames.video import read_video
+from rfm_client import InvalidSampleError, load_trajectory
+from rfm_client.frames import read_video
 
 
 def test_a_video_is_read_whole_or_at_a_frame_rate(video: Path) -> None:

@@ -12,8 +12,9 @@ from typing import Any
 
 import pytest
 
-from rfm_client.contract.process_log import LEVEL_VARIABLE, write_log
-from rfm_client.contract.settings import ConfigError
+from rfm_client.contract.process_log import LEVEL_VARIABLE
+from rfm_client.options import ConfigError
+from rfm_client.serving import write_log
 
 HEAD = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z"
 PROGRAM = """

@@ -12,9 +12,9 @@ from engines import load_engine
 from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache, get_or_make
 from rfm.family import FrameEncoders
-from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
+from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, UInt8Array
 from rfm_client.contract.frame_refs import EncoderSampleRefs, TrajectoryRefs, frame_digest
-from rfm_client.contract.samples import EncoderSample, UInt8Array
+from rfm_client.contract.samples import EncoderSample
 from vlm import video
 
 TASK = "stack the cups"

@@ -20,9 +20,9 @@ from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.rewind.encoders import Encoders
 from rfm.roboreward import prompts
 from rfm.vlm.predictor import VlmPredictor
-from rfm_client import ProgressSample
+from rfm_client import ProgressSample, UInt8Array
 from rfm_client.contract.frame_refs import frame_digest
-from rfm_client.contract.samples import EncoderSample, UInt8Array
+from rfm_client.contract.samples import EncoderSample
 from rfm_serve import PATIENCE_S
 from vlm import PLAIN, assert_close, load, video
 

@@ -25,7 +25,7 @@ from engines import serve_config
 from rfm import families
 from rfm.checkpoint.content import MAX_HEADER_BYTES, MAX_JSON_BYTES, CheckpointError
 from rfm.plain_yaml import MAX_YAML_BYTES
-from rfm_client.contract.settings import ConfigError
+from rfm_client.options import ConfigError
 from rfm_commands.cli import app
 from rfm_commands.config import Config
 from spoilt import WEIGHTS, Spoil, copied, files_in, settings, text, text_settings, weights

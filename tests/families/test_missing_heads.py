@@ -33,7 +33,8 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client import SimilaritySample as Similarity
-from rfm_client.contract.synthetic import blank_trajectory, random_trajectory
+from rfm_client.contract.synthetic import random_trajectory
+from rfm_client.serving import blank_trajectory
 from rfm_commands.engine_scorer import EngineScorer
 from spoilt import convert, weights, without
 from vlm import assert_close

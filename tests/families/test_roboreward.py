@@ -25,8 +25,14 @@ from rfm.roboreward.predictor import RoboRewardPredictor, WrittenAnswer
 from rfm.roboreward.prompts import as_jpeg, is_unclear, parsed
 from rfm.vlm.qwen import ROOM
 from rfm.vlm.row import VlmRow
-from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Trajectory
-from rfm_client.contract import InferenceFailedError, InvalidSampleError
+from rfm_client import (
+    InferenceFailedError,
+    InvalidSampleError,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    Trajectory,
+)
 
 CASES = references("roboreward")
 CONFIGS = sorted({case.config for case in CASES})

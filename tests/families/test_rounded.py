@@ -28,8 +28,7 @@ from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.vlm import nf4
 from rfm.vlm.rounded import Int8Linear, Nf4Linear, RoundedLinear, fit, rounded
-from rfm_client import ProgressSample
-from rfm_client.contract.model_info import ModelInfo
+from rfm_client import ModelInfo, ProgressSample
 from rfm_commands.engine_scorer import EngineScorer
 from rfm_export.pbtxt import parse
 from rfm_export.verify import device_for

@@ -16,8 +16,7 @@ import torch
 import goldens
 from rfm import families
 from rfm.engine import Engine
-from rfm_client import ProgressResult, ProgressSample, Sample
-from rfm_client.contract.samples import Float32Array
+from rfm_client import Float32Array, ProgressResult, ProgressSample, Sample
 from vlm import BFLOAT16, video
 
 CLIP = ProgressSample(video(0, 5, 84, 112))

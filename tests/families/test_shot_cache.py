@@ -15,10 +15,9 @@ from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.vlm.predictor import VlmPredictor
-from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory
+from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory, UInt8Array
 from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs, frame_digest
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.sampling import RULES, Rule, Sampling
+from rfm_client.frames import RULES, Rule, Sampling
 from vlm import assert_close, load, video
 
 TASK = "stack the blocks"

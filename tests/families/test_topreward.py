@@ -19,9 +19,15 @@ from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
-from rfm_client import PreferenceSample, ProgressResult, ProgressSample, SimilaritySample, Trajectory
-from rfm_client.contract import InvalidSampleError
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import (
+    InvalidSampleError,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    SimilaritySample,
+    Trajectory,
+    UInt8Array,
+)
 
 FOLDER = ROOT / "topreward"
 CHECKPOINT = FOLDER / "checkpoints" / "vlm_fp32_untied"

@@ -19,8 +19,7 @@ from rfm.engine.execution import Execution
 from rfm.vlm import leaves, tree
 from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees
-from rfm_client import ProgressResult, ProgressSample, Trajectory
-from rfm_client.contract import InvalidSampleError
+from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
 from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs, frame_digest
 from vlm import load
 

@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from gateway_requests import filmed, progress
-from rfm_client import AsyncRewardClient
-from rfm_client.contract.model_info import ModelInfo
+from rfm_client import AsyncRewardClient, ModelInfo
 from rfm_gateway.body import Batch
 from rfm_gateway.schema import SAMPLES
 from rfm_gateway.scoring import Evaluator

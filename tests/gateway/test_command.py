@@ -17,8 +17,8 @@ from gateways import inside, running
 from rfm.launch.triton_server import Endpoints
 from rfm_client.contract.process_log import LogLines
 from rfm_commands.cli import app
+from rfm_gateway import GatewayConfig
 from rfm_gateway.command import page_link
-from rfm_gateway.config import GatewayConfig
 from rfm_gateway.state import TritonState
 
 KEY = "open sesame"

@@ -13,9 +13,9 @@ import pytest
 from gateway_requests import FIRST, dumped, failure, progress
 from gateways import TestClient, inside, running
 from rfm.launch.triton_server import Endpoints
-from rfm_client.contract.settings import ConfigError
 from rfm_client.episodes import StepScore
-from rfm_gateway.config import GatewayConfig
+from rfm_client.options import ConfigError
+from rfm_gateway import GatewayConfig
 from rfm_rl import LiveView
 from shown_datasets import copied
 

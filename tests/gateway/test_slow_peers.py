@@ -24,9 +24,9 @@ from uvicorn.server import ServerState
 from gateway_requests import FIRST, TINY, Triton, ask_json, failure, paused, post_body, progress
 from gateways import WITHIN_S, answers, free_port, poll, running
 from rfm_client.contract.descriptors import MOST
+from rfm_gateway import GatewayConfig
 from rfm_gateway.admission import PACE_BYTES, Room, Turn, arriving
 from rfm_gateway.app import create_app
-from rfm_gateway.config import GatewayConfig
 from rfm_gateway.connections import Connection
 
 KEY = "open sesame"

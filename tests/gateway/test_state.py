@@ -42,7 +42,7 @@ from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.launch.triton_server import Endpoints
 from rfm.rewind.network import RewindTransformer
 from rfm_client import InvalidSampleError, ModelNotFoundError, Trajectory
-from rfm_client.transport.status import read_status
+from rfm_client.serving import read_status
 
 pytestmark = pytest.mark.triton
 

@@ -19,7 +19,7 @@ from pyarrow import parquet
 from labelling import FEW, LEROBOT, WRIST, BrightnessScorer, Notes
 from pictures import numbered, write_video
 from rfm_client import RewardError
-from rfm_client.cli.command import ExitCode
+from rfm_client.command_line import ExitCode
 from rfm_labels import (
     DatasetError,
     LabelOptions,

@@ -12,7 +12,7 @@ from pyarrow import parquet
 
 from labelling import FEW, LEROBOT
 from rfm_client import InferenceFailedError, InvalidSampleError, ProgressResult, RewardClient
-from rfm_client.frames.sampling import Sampling, of_prefixes
+from rfm_client.frames import Sampling, of_prefixes
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
 from shelves import V1, V2, Kept, Shelf
 

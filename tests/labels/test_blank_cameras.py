@@ -23,8 +23,8 @@ from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
 from rfm_commands.cli import app
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset, parse_episodes
+from rfm_labels.datasets import chosen_cameras
 from rfm_labels.datasets.faults import listed
-from rfm_labels.datasets.protocol import chosen_cameras
 from rfm_labels.label import plan_labels
 from rfm_labels.ray_engine import EpisodeActor, RayJob
 

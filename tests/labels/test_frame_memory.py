@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from labelling import BrightnessScorer, PickyScorer
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 from rfm_labels import Dataset, DatasetEpisode, LabelOptions, Report, episode_scores, label, run
 from rfm_labels.episode_scores import FrameMemory
 

@@ -19,8 +19,8 @@ from pyarrow import parquet
 
 from labelling import BrightnessScorer, brightness
 from pictures import numbered, numbers
-from rfm_client.cli.command import ExitCode
-from rfm_client.frames.orientation import Orient
+from rfm_client.command_line import ExitCode
+from rfm_client.frames import Orient
 from rfm_labels import DatasetError, LabelOptions, RayOptions, Scorer, label, open_dataset
 from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
 

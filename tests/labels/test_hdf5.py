@@ -18,9 +18,10 @@ from pyarrow import parquet
 
 from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, brightness
 from rfm_client import ProgressResult, ProgressSample
-from rfm_client.frames.orientation import ORIENTATIONS, Correction, Orient, Orientation, turned
+from rfm_client.frames import ORIENTATIONS, Correction, Orient, Orientation
+from rfm_client.frames.orientation import turned
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
-from rfm_labels.datasets.protocol import chosen_cameras
+from rfm_labels.datasets import chosen_cameras
 
 LENGTHS = (5, 7, 3)
 TASK = "open the drawer"

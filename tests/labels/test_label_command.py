@@ -22,7 +22,7 @@ from gateways import free_port
 from labelling import FRONT, LEROBOT
 from paths import ROOT
 from rfm.launch.triton_server import Endpoints
-from rfm_client.cli.command import ExitCode
+from rfm_client.command_line import ExitCode
 from rfm_commands.cli import app
 from toy_world import Task, make_clip
 

@@ -17,7 +17,7 @@ import goldens
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
 from rfm_client import ProgressSample, RewardClient, Trajectory
-from rfm_client.frames.sampling import RULES, Sampling
+from rfm_client.frames import RULES, Sampling
 from rfm_commands.engine_scorer import EngineScorer
 from rfm_labels import (
     ClientScorer,

@@ -30,8 +30,8 @@ from encoding import encode, encode_here
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer
 from pictures import write_video
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
-from rfm_labels.datasets import lerobot
-from rfm_labels.datasets.protocol import chosen_cameras, digest_of
+from rfm_labels.datasets import chosen_cameras, lerobot
+from rfm_labels.datasets.protocol import digest_of
 from rfm_labels.datasets.video_frames import video_packets
 
 HUB_ID = "org/name"

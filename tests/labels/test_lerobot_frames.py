@@ -19,7 +19,7 @@ from client_commands import invoke
 from encoding import encode_here
 from labelling import FRONT, LEROBOT, BrightnessScorer, Notes
 from pictures import write_video
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 FPS = 10

@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 from encoding import encode_here
-from rfm_client import InvalidSampleError
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.inputs import load_trajectory
-from rfm_client.frames.video import read_video
+from rfm_client import InvalidSampleError, UInt8Array, load_trajectory
+from rfm_client.frames import read_video
 from rfm_labels import DatasetError, open_dataset
 
 NUM_FRAMES = 40

@@ -19,7 +19,7 @@ from pyarrow import parquet
 
 from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, redness
 from pictures import numbered, numbers
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 from rfm_labels import Channels, DatasetError, LabelOptions, Orient, label, open_dataset
 from rfm_labels.datasets.frame_names import in_order_of_numbers
 from rfm_labels.datasets.protocol import digest_of

@@ -13,7 +13,7 @@ import pytest
 
 from labelling import FEW, LEROBOT, BrightnessScorer, picky, slow, without_cost
 from rfm_client import ProgressResult, RewardError
-from rfm_client.frames.orientation import Channels, Orient
+from rfm_client.frames import Channels, Orient
 from rfm_labels import LabelOptions, RayOptions, Scorer, Watch, label, label_with_ray, open_dataset
 from rfm_labels.label import plan_labels
 from rfm_labels.ray_engine import EpisodeActor, RayJob

@@ -15,8 +15,7 @@ import pytest
 from pyarrow import parquet
 
 from labelling import LEROBOT, WRIST, BrightnessScorer, Notes
-from rfm_client import ProgressResult, ProgressSample, Trajectory
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import ProgressResult, ProgressSample, Trajectory, UInt8Array
 from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, label, open_dataset, read_episode_labels
 from rfm_labels.datasets.lerobot_v30 import read_tasks
 

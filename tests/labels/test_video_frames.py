@@ -15,9 +15,8 @@ import pytest
 
 from encoding import encode_here
 from pictures import TURNS, Matrix, numbered, numbers, turn, write_video
-from rfm_client import InvalidSampleError
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.video import frame_times_s, read_video
+from rfm_client import InvalidSampleError, UInt8Array
+from rfm_client.frames import frame_times_s, read_video
 from rfm_labels import DatasetError, open_dataset
 
 NUM_FRAMES = 40

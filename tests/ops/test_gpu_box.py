@@ -31,8 +31,7 @@ from paths import ROOT
 from rfm.config import ServeConfig
 from rfm.launch.endpoints import Endpoints
 from rfm_client import AccessDeniedError, RewardClient, ServerUnavailableError, Trajectory
-from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.status import read_status
+from rfm_client.serving import Credentials, read_status
 from rfm_commands.cli import app
 from rfm_serve import Serving, serving, wait_for
 

@@ -15,8 +15,7 @@ from selenium.webdriver import ActionChains
 from browsers import Browser
 from gateways import Gateway, free_port, poll, running
 from rfm.launch.triton_server import Endpoints
-from rfm_client import RewardClient
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import RewardClient, UInt8Array
 from rfm_client.episodes import StepScore
 from rfm_rl import LiveView
 from toy_world import Task, make_clip

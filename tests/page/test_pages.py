@@ -17,7 +17,7 @@ import pytest
 
 from gateways import TestClient, inside
 from paths import ROOT
-from rfm_client.frames.video import read_video
+from rfm_client.frames import read_video
 from toy_world import Task, make_clip
 
 GATEWAY, PAGE = ROOT / "apps" / "gateway" / "rfm_gateway", ROOT / "apps" / "page" / "rfm_page"

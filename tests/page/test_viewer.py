@@ -14,7 +14,7 @@ import requests
 import clip
 from gateway_requests import ENCODERS, TINY, TOLERANCE, VLM, Triton, check_refused, failure
 from gateways import Gateway, poll, running
-from rfm_client.frames.sampling import RULES
+from rfm_client.frames import RULES
 from viewer_requests import COMPARE, SCORE, SERVED, by_command_line, curve_of, events, post
 
 pytestmark = pytest.mark.triton

@@ -25,11 +25,11 @@ from gateway_requests import failure
 from gateways import inside
 from labelling import LEROBOT, BrightnessScorer
 from pictures import TURNS, turn
-from rfm_client.contract.settings import ConfigError
-from rfm_client.frames.orientation import Channels, Orient
-from rfm_gateway.config import GatewayConfig
+from rfm_client.frames import Channels, Orient
+from rfm_client.options import ConfigError
+from rfm_gateway import GatewayConfig
 from rfm_labels import LabelOptions, label, open_dataset
-from rfm_labels.datasets.lerobot import LeRobotDataset
+from rfm_labels.datasets import LeRobotDataset
 from rfm_labels.options import Format
 from rfm_page.page import shown_datasets
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew

@@ -18,8 +18,8 @@ import pytest
 from gateway_requests import failure
 from gateways import inside
 from labelling import LEROBOT, BrightnessScorer
-from rfm_client.contract.settings import ConfigError
-from rfm_gateway.config import GatewayConfig
+from rfm_client.options import ConfigError
+from rfm_gateway import GatewayConfig
 from rfm_labels import LabelOptions, label, open_dataset, read_episode_labels
 from rfm_page.page import shown_datasets
 

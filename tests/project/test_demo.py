@@ -21,7 +21,7 @@ from commands import nothing_left_behind
 from paths import ROOT, VIDEOS
 from rfm.config import ExportConfig
 from rfm_client import load_trajectory
-from rfm_client.frames.video import read_video
+from rfm_client.frames import read_video
 from rfm_commands.cli import app
 from toy_world import Task, make_clip
 

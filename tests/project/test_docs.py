@@ -31,7 +31,8 @@ from rfm.launch.triton_server import Endpoints
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.cli.commands import app
 from rfm_client.contract import wire
-from rfm_client.contract.settings import Setting, settings_of
+from rfm_client.contract.settings import Setting
+from rfm_client.options import settings_of
 from rfm_commands.cli import app as rfm
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
@@ -193,7 +194,7 @@ def test_every_command_of_the_client_is_shown() -> None:
 
 
 def test_every_exit_code_is_shown() -> None:
-    from rfm_client.cli.command import ExitCode
+    from rfm_client.command_line import ExitCode
 
     guide = CLIENT_GUIDE.read_text()
     for code in ExitCode:

@@ -16,7 +16,7 @@ from typer.main import get_command
 from rfm.config import ServeConfig
 from rfm_client.cli.commands import app as rfm_client
 from rfm_commands.cli import app as rfm
-from rfm_gateway.config import GatewayConfig
+from rfm_gateway import GatewayConfig
 
 COMMON = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
 

@@ -16,13 +16,14 @@ import pytest
 from typer.testing import CliRunner
 
 from commands import REPOSITORY, nothing_left_behind
-from rfm.config import ConfigError, ServeConfig
+from rfm.config import ServeConfig
 from rfm.launch import endpoints
 from rfm.launch.endpoints import PORTS, Endpoints, GrpcTls, check_version, free_ports
 from rfm.launch.installation import ServerStartError
 from rfm.launch.model_processes import children_of, has_ended
 from rfm.launch.triton_server import TritonServer
 from rfm.supervise.status import NO_REASON, Status, StatusServer
+from rfm_client.options import ConfigError
 from rfm_commands.cli import app
 from rfm_serve import wait_for
 from secured import Papers, other_program

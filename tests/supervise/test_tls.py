@@ -30,9 +30,8 @@ from rfm.launch.endpoints import Endpoints, GrpcTls
 from rfm.launch.triton_options import MAX_HTTP_BYTES
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
 from rfm_client.cli.commands import app as client_app
-from rfm_client.transport.credentials import Credentials
+from rfm_client.serving import Credentials, read_status
 from rfm_client.transport.loop_thread import LoopThread
-from rfm_client.transport.status import read_status
 from rfm_commands.cli import app
 from rfm_serve import KEY, PATIENCE_S, Serving, serving, wait_for
 from secured import PUBLIC_HOST, Papers, other_program

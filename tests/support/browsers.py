@@ -18,7 +18,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.remote.webelement import WebElement
 
 from gateways import poll
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 
 IMAGES_VARIABLE = "RFM_IMAGES"  # a folder for new pictures of the documents
 AXE = Path(__file__).parents[1] / "page" / "vendored" / "axe-core" / "axe.min.js"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 
 TASK = "put the red block in the bowl"
 NUM_FRAMES = 32

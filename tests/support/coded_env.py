@@ -9,8 +9,7 @@ from typing import Any, ClassVar, TypeAlias
 import gymnasium as gym
 import numpy as np
 
-from rfm_client import RewardClient, ServerUnavailableError
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import RewardClient, ServerUnavailableError, UInt8Array
 from rfm_client.episodes.windows import Window
 from shelves import Shelf
 

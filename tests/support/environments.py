@@ -13,12 +13,11 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import AddRenderObservation
 
-from rfm_client import ProgressResult, RewardClient, Trajectory
+from rfm_client import ProgressResult, RewardClient, Trajectory, UInt8Array
 from rfm_client.contract import wire
-from rfm_client.contract.samples import UInt8Array
 from rfm_client.episodes.windows import Window
+from rfm_client.serving import Credentials
 from rfm_client.transport.calls import Answer, GrpcTransport
-from rfm_client.transport.credentials import Credentials
 
 MODEL = "enc_c1_t1_disc10"
 MAX_FRAMES = 16  # of that checkpoint

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from pyarrow import parquet
 
-from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory, UInt8Array
 from rfm_labels import CheckpointFacts, DatasetEpisode, LabelOptions, Scorer, Watch, label, open_dataset
 
 LEROBOT = Path(__file__).parents[1] / "lerobot"

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.resize import as_jpeg
+from rfm_client import UInt8Array
+from rfm_client.frames import as_jpeg
 
 Json = dict[str, Any]
 

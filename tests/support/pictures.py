@@ -11,7 +11,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rfm_client import ModelNotFoundError
-from rfm_client.contract import FrameSize, wire
-from rfm_client.contract.model_info import ModelInfo
+from rfm_client import FrameSize, ModelInfo, ModelNotFoundError
+from rfm_client.contract import wire
 from rfm_client.transport.calls import Answer
 
 

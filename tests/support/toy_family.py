@@ -23,7 +23,7 @@ from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import RowScores, frame_scores, of_rows, prefix_indices
 from rfm.family import NETWORK, Description, EncodersDescription, Family, Options
-from rfm_client.contract import (
+from rfm_client import (
     FrameScores,
     InvalidSampleError,
     ProgressSample,

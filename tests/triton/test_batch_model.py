@@ -34,7 +34,7 @@ from rfm_client import (
     Sample,
 )
 from rfm_client.contract import wire
-from rfm_client.contract.names import PROBE_PREFIX
+from rfm_client.serving import PROBE_PREFIX
 from rfm_serve import PATIENCE_S
 from trajectories import random_trajectory
 

@@ -27,6 +27,7 @@ from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import Endpoints
 from rfm_client import (
     InvalidSampleError,
+    ModelInfo,
     PreferenceSample,
     ProgressResult,
     ProgressSample,
@@ -34,9 +35,8 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.cli.commands import app
-from rfm_client.contract.model_info import ModelInfo
+from rfm_client.serving import Credentials
 from rfm_client.transport.calls import GrpcTransport
-from rfm_client.transport.credentials import Credentials
 from viewer_requests import SCORE, curve_of, events, post
 
 pytestmark = pytest.mark.triton

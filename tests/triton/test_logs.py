@@ -36,8 +36,8 @@ from rfm_client import (
     ServerUnavailableError,
 )
 from rfm_client.contract import wire
-from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.process_log import LEVEL_VARIABLE
+from rfm_client.serving import PROBE_PREFIX
 from rfm_serve import Serving, children, serving, wait_for
 from trajectories import random_trajectory
 

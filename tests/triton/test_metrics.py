@@ -33,7 +33,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
-from rfm_client.transport.status import read_status
+from rfm_client.serving import read_status
 from rfm_serve import wait_for
 from tensors import infer
 from trajectories import random_trajectory
