@@ -18,6 +18,7 @@ from rfm_client import (
     ModelInfo,
     ModelNotFoundError,
     ProgressResult,
+    ProgressSample,
     RewardError,
     ServerUnavailableError,
 )
@@ -39,6 +40,8 @@ class Stand:
         self.num_ends = 0  # of its next requests: under each its connection ends
         self.down_s = 0.0  # for so long after each end it takes no connection
         self.is_silent = False  # it takes connections, and answers nobody
+        self.max_batch_size = 64
+        self.sizes: list[int] = []  # samples of each request that it answers
         self._up_s = 0.0
         self.version = 1
         self.asked: Counter[str] = Counter()
@@ -62,6 +65,7 @@ class Stand:
         if self.error is not None:
             raise self.error
         shape = inputs[wire.NUM_FRAMES].shape[0], wire.num_positions(inputs)
+        self.sizes.append(shape[0])
         tensors = {name: np.full(shape, 0.5, np.float32) for name in outputs}
         return Answer(tensors, str(self.version))
 
@@ -69,7 +73,7 @@ class Stand:
         self.asked["model_info"] += 1
         if self.error is not None:
             raise self.error
-        return ModelInfo(model, (str(self.version),), 64, None, None, None, None, None)
+        return ModelInfo(model, (str(self.version),), self.max_batch_size, None, None, None, None, None)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         return self.error is None and not self.is_down
@@ -123,6 +127,33 @@ def ask(stands: list[Stand], calls: int = 1, *, timeout_s: float = 4.0) -> list[
             return await asyncio.gather(*(client.progress(SEEN) for _ in range(calls)), return_exceptions=True)
 
     return asyncio.run(asyncio.wait_for(outcomes(), WITHIN_S))
+
+
+def test_a_request_has_no_more_samples_than_a_batch() -> None:
+    stand = Stand()
+    stand.max_batch_size = 3
+
+    async def evaluate() -> None:
+        async with AsyncRewardClient("", transports=[stand]) as client:
+            assert len(await client.evaluate([ProgressSample(SEEN)] * 7)) == 7
+
+    asyncio.run(asyncio.wait_for(evaluate(), WITHIN_S))
+    assert sorted(stand.sizes) == [1, 3, 3]
+
+
+def test_pauses_double_and_half_of_each_is_random(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Callers of a server that is down would come back together without chance."""
+    drawn: list[tuple[float, float]] = []
+
+    def lowest(low: float, high: float) -> float:
+        drawn.append((low, high))
+        return low
+
+    monkeypatch.setattr("random.uniform", lowest)
+    stand = Stand()
+    stand.go_down(0.3)
+    assert kinds(ask([stand])) == {ProgressResult}
+    assert drawn[:3] == [(0.05, 0.1), (0.1, 0.2), (0.2, 0.4)]
 
 
 def kinds(outcomes: list[object]) -> set[type]:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 import grpc
 import numpy as np
 import pytest
+from tritonclient.grpc import service_pb2
 
 from rfm_client import (
     DeadlineExceededError,
@@ -175,6 +176,46 @@ def test_which_errors_a_request_may_have_caused(message: str, may_have_ended: bo
     error = error_of("StatusCode.UNAVAILABLE", message, InvalidSampleError)
     assert isinstance(error, ServerUnavailableError)
     assert error.may_have_ended_server is may_have_ended
+
+
+def test_triton_is_told_the_time_of_a_call_in_microseconds() -> None:
+    """By this bound Triton drops requests from a queue that was exported with ``queue_timeout_ms``."""
+    told_us: list[int] = []
+
+    def infer(request: service_pb2.ModelInferRequest, context: grpc.ServicerContext) -> None:
+        told_us.append(request.parameters["timeout"].int64_param)
+        context.abort(grpc.StatusCode.INVALID_ARGUMENT, "enough")
+
+    handlers = {
+        "ModelInfer": grpc.unary_unary_rpc_method_handler(
+            infer, request_deserializer=service_pb2.ModelInferRequest.FromString
+        )
+    }
+    server = grpc.server(ThreadPoolExecutor(1))
+    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("inference.GRPCInferenceService", handlers)])
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    try:
+        with RewardClient(f"grpc://127.0.0.1:{port}") as client, pytest.raises(InvalidSampleError, match="enough"):
+            client.progress(random_trajectory(0, 2), timeout_s=WITHIN_S)
+    finally:
+        server.stop(None)
+    (waits_us,) = told_us
+    assert 0.5 * WITHIN_S < waits_us / 1e6 <= WITHIN_S
+
+
+def test_a_second_of_silence_costs_a_connection_its_later_calls() -> None:
+    connections: list[socket.socket] = []
+
+    def dumb(connection: socket.socket) -> None:
+        connections.append(connection)
+        silent(connection)
+
+    with listening(dumb) as port, RewardClient(f"grpc://127.0.0.1:{port}", retry=False) as client:
+        for timeout_s in (1.1, 0.2):
+            with pytest.raises(DeadlineExceededError):
+                client.progress(random_trajectory(0, 2), timeout_s=timeout_s)
+        assert len(connections) == 2
 
 
 def test_requests_are_spread_over_the_addresses_of_a_name() -> None:

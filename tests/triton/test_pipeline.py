@@ -113,6 +113,18 @@ def test_execute_returns_when_less_than_a_batch_waits(tmp_path: Path) -> None:
         taken.result(PATIENCE_S)
 
 
+def test_a_batch_has_no_more_samples_than_triton_s_largest_batch(tmp_path: Path) -> None:
+    model = Ahead(tmp_path)
+    first = model.begin()
+    many = [request(5) for _ in range(MAX_BATCH + 1)]
+    with ThreadPoolExecutor(1) as pool:  # the call waits until less than a batch waits
+        pool.submit(model.take, *many)
+        wait_for(lambda: len(model.prepared) == len(first) + len(many))
+        model.open(*first, *many)
+    assert max(model.batches) <= MAX_BATCH
+    assert sum(model.batches) == len(first) + len(many)
+
+
 def test_a_batch_has_no_more_tokens_than_its_budget(tmp_path: Path) -> None:
     model = Ahead(tmp_path, settings={"token_budget": "12"})
     first = model.begin()
