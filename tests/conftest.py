@@ -14,14 +14,11 @@ import goldens
 import rfm_export
 from commands import RUN
 from engines import load_engine, serve_config
-from one_model import CRASHES, BriefServer
 from paths import ROOT
 from patients import references  # noqa: F401  a fixture
-from reference_server import Served
 from rfm.engine import Engine
 from rfm.launch import endpoints
-from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints
+from servers import CRASHES, Endpoints, Served, start_triton
 
 SHARED = ("served", "triton")  # fixtures that start a server for the tests of many files
 LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the others run meanwhile
@@ -47,10 +44,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
     for config in goldens.SERVED:
         rfm_export.export(config.checkpoint, repository, serve_config(config, config.name))
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-    ):
+    with start_triton(repository) as server:
         yield Served(server)
 
 

@@ -12,8 +12,8 @@ import pytest
 import clip
 from environments import MODEL, LateClient
 from paths import ROOT
-from reference_server import Served
 from rfm_client import RewardClient
+from servers import Served
 
 
 @pytest.fixture(scope="session")

@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client_commands import RFM_CLIENT, invoke, rows, web_server
+from client_commands import RFM_CLIENT, invoke, rows
 from gateways import Gateway, running
 from proxies import Proxy
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient, ServerUnavailableError
 from rfm_client.cli.scoring import WORKERS
 from rfm_client.command_line import ExitCode
-from rfm_serve import wait_for
+from servers import Endpoints, folder_server, wait_for
 
 pytestmark = pytest.mark.triton
 
@@ -79,7 +78,7 @@ def test_a_gateway_is_no_triton(gateway: Gateway, scheme: str) -> None:
 
 
 def test_the_port_of_something_else_is_not_told_wrong(tmp_path: Path) -> None:
-    with web_server(tmp_path) as url:
+    with folder_server(tmp_path) as url:
         result = invoke("sample", "--url", url)
     assert result.exit_code != ExitCode.OK
     assert "expected Triton's" not in result.stderr

@@ -31,10 +31,7 @@ from client_commands import (
     invoke,
     rows,
     run,
-    web_server,
 )
-from reference_server import Served
-from rfm.launch.repository_api import RepositoryApi
 from rfm_client import (
     FrameScores,
     ProgressResult,
@@ -46,7 +43,7 @@ from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.synthetic import SyntheticSamples, parse_lengths
 from rfm_client.command_line import ExitCode, number
 from rfm_client.contract.wire import encode_samples
-from rfm_serve import wait_for
+from servers import RepositoryApi, Served, folder_server, wait_for
 from trajectories import random_trajectory
 from vlm import PLAIN as VLM
 
@@ -118,7 +115,7 @@ def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) ->
             for instance, value in enumerate(values)
         )
     )
-    with web_server(tmp_path) as url:
+    with folder_server(tmp_path) as url:
         result = invoke("status", "--url", served.url("grpc"), "--metrics-url", f"{url}/metrics")
     assert result.exit_code == 0
     requests, batches = rows(result.stdout, f"{MODEL} ")

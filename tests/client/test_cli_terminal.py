@@ -13,11 +13,11 @@ from rich.console import Console
 
 import clip
 from client_commands import RFM_CLIENT, TASK
-from rfm.launch.triton_server import Endpoints
 from rfm_client.cli.show import shortened, status_tables
 from rfm_client.command_line import ExitCode, table
 from rfm_client.serving import ServerStatus
 from rfm_client.transport.status import ModelStatus
+from servers import Endpoints
 from terminals import WIDTH, on_terminal
 
 pytestmark = pytest.mark.triton

@@ -23,9 +23,7 @@ from client_commands import (
     columns,
     rows,
     run,
-    web_server,
 )
-from reference_server import Served
 from rfm_client import (
     FrameScores,
     InferenceFailedError,
@@ -40,6 +38,7 @@ from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import Source
 from rfm_client.command_line import ExitCode
 from rfm_client.plot import plot_scores, save
+from servers import Served, folder_server
 from shelves import Shelf
 from trajectories import random_trajectory
 
@@ -182,7 +181,7 @@ def test_score_and_compare_swap_red_and_blue_as_they_are_told(served: Served, vi
 
 
 def test_score_reads_videos_behind_urls(served: Served, video: Path) -> None:
-    with web_server(video.parent) as url:
+    with folder_server(video.parent) as url:
         result = ask(served, "score", f"{url}/clip.mp4", video, "--task", TASK, "--json", "-")
     remote, local = json.loads(result.stdout)["videos"]
     np.testing.assert_allclose(remote["progress"], local["progress"], rtol=0, atol=TOLERANCE)

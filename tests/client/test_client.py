@@ -15,7 +15,6 @@ import pytest
 
 from engines import load_engine
 from mixtures import FRAMES_MODEL, MODEL, TOLERANCE, assert_same, mixed_samples, plug
-from reference_server import Served
 from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
@@ -36,6 +35,7 @@ from rfm_client.frames import resize_frames
 from rfm_client.serving import Credentials, Deadline
 from rfm_client.transport.calls import Answer, GrpcTransport
 from rfm_client.transport.concurrency import MAX_BYTES, ConcurrencyLimiter
+from servers import Served
 from shelves import Shelf
 from trajectories import random_trajectory
 

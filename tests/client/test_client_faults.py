@@ -18,11 +18,8 @@ import pytest
 
 from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
 from mixtures import MODEL, assert_same, plug, wait_until_at_work
-from one_model import OneModelServer, answered
 from proxies import Proxy
-from reference_server import Served
 from repositories import bound_queue, configure
-from rfm.launch.triton_server import Endpoints
 from rfm_client import (
     DeadlineExceededError,
     ProgressResult,
@@ -31,7 +28,7 @@ from rfm_client import (
     RewardClient,
     ServerUnavailableError,
 )
-from rfm_serve import wait_for
+from servers import Endpoints, OneModelServer, Served, answered, wait_for
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 

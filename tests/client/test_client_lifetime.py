@@ -27,7 +27,6 @@ import pytest
 
 from mixtures import MODEL, assert_same, plug
 from paths import ROOT
-from reference_server import Served
 from rfm_client import (
     AsyncRewardClient,
     ClientClosedError,
@@ -37,6 +36,7 @@ from rfm_client import (
     RewardError,
 )
 from rfm_rl import RewardModelWrapper
+from servers import Served
 from trajectories import random_trajectory
 
 

@@ -23,7 +23,6 @@ import goldens
 import rfm_export
 from engines import serve_config
 from mixtures import TOLD_S
-from reference_server import Served
 from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,
@@ -40,7 +39,7 @@ from rfm_client.episodes import Episode
 from rfm_client.frames import RULES, Rule, Sampling, of_prefixes, prefix_samples
 from rfm_client.serving import Credentials
 from rfm_client.transport.calls import Answer, GrpcTransport
-from rfm_serve import Serving, serving
+from servers import Served, Serving, serving
 
 MODEL = "enc_c1_t1_disc10"
 IMAGES, VIDEO = "q3_tok_disc10", "q25_video_avg_disc10"

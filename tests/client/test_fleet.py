@@ -16,7 +16,7 @@ from rfm_client import (
     ProgressSample,
     RewardClient,
 )
-from rfm_serve import MODEL, PATIENCE_S, Serving, serving
+from servers import MODEL, PATIENCE_S, Serving, serving
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 

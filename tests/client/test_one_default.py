@@ -11,10 +11,10 @@ import pytest
 from pyarrow import parquet
 
 from client_commands import invoke
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient, load_trajectory
 from rfm_client.frames import Sampling
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
+from servers import Endpoints
 from toy_world import Task, make_clip
 from toy_world.video import write_video
 

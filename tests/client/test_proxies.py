@@ -12,10 +12,10 @@ import pytest
 from client_commands import invoke
 from gateways import running
 from proxies import HttpProxy, Proxy
-from rfm.launch.triton_server import Endpoints
 from rfm_client import DeadlineExceededError, RewardClient
 from rfm_client.contract.proxies import grpc_proxy, open_url
 from rfm_client.serving import read_status
+from servers import Endpoints
 
 pytestmark = pytest.mark.triton
 

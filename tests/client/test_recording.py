@@ -16,11 +16,11 @@ import rerun
 from PIL import Image
 
 from client_commands import TASK, invoke
-from rfm.launch.triton_server import Endpoints
 from rfm_client import FrameScores, load_trajectory
 from rfm_client.command_line import ExitCode
 from rfm_client.frames import frame_times_s
 from rfm_client.recording import FRAME, TIME, Recording
+from servers import Endpoints
 
 JPEG_ERROR = 30  # of a pixel, by which the compressed picture may differ
 NS_PER_S = 1e9

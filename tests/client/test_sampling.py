@@ -14,10 +14,10 @@ import pytest
 import goldens
 from client_commands import MODEL, TASK, ask, assert_scores, invoke
 from paths import GOLDEN
-from reference_server import Served
 from rfm_client import ProgressSample, Trajectory, load_trajectory
 from rfm_client.frames import RULES, Sampling
 from rfm_client.frames.sampling import thinned
+from servers import Served
 
 VECTORS = GOLDEN / "sampling-vectors.json"
 ELSEWHERE = goldens.ROOT.parent / VECTORS.name  # beside the further reference cases, where there are some

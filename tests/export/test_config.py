@@ -15,13 +15,13 @@ from typer.testing import CliRunner, Result
 from labelling import LEROBOT
 from paths import ROOT
 from rfm.config import ExportConfig, ServeConfig
-from rfm.launch.triton_server import Endpoints
 from rfm.supervise.supervisor import GatewayProcess, Supervisor
 from rfm_client.options import ConfigError, settings_of
 from rfm_commands import cli
 from rfm_commands.config import SECTIONS, Config
 from rfm_gateway import GatewayConfig
 from rfm_gateway.command import OPTIONS
+from servers import Endpoints
 
 REPOSITORY = ROOT / "model_repository"
 

@@ -21,14 +21,13 @@ import goldens
 import rfm_export
 from commands import REPOSITORY
 from engines import serve_config
-from reference_server import Served
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm_commands.cli import app
 from rfm_export import ExportError
 from rfm_export.publish import alone, read_config, staging
-from rfm_serve import model_processes, wait_for
+from servers import Served, model_processes, wait_for
 from spoilt import WEIGHTS, copied, files_in, weights
 
 PLAIN, SMALL = goldens.config("c1_t1_disc10"), goldens.config("legacy_keys_l2")

@@ -20,14 +20,12 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 import rfm_export
 import toy_family
-from one_model import BriefServer
 from paths import ROOT
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.launch.installation import Installation, find_installation
-from rfm.launch.triton_server import Endpoints
 from rfm.parameters import FAMILY_PARAMETER
 from rfm_client import (
     InferenceFailedError,
@@ -41,6 +39,7 @@ from rfm_client import (
 from rfm_client.contract import wire
 from rfm_export.layout import CONFIG_FILE
 from rfm_export.pbtxt import parse, render
+from servers import start_triton
 
 TESTS = ROOT / "tests" / "support"
 DEMO = ROOT / "model_repository"
@@ -97,10 +96,7 @@ def running(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
         file.write_text(render(config))
     rfm_export.export(checkpoint, repository, TOY, family=toy_family.__name__)
     installation = with_family(find_installation(), folder / "environment")
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), installation, log=log) as server,
-    ):
+    with start_triton(repository, installation) as server:
         yield Running(repository, server.endpoints.grpc_url)
 
 

@@ -23,7 +23,7 @@ from rfm.vlm.predictor import VlmPredictor
 from rfm_client import ProgressSample, UInt8Array
 from rfm_client.contract.frame_refs import frame_digest
 from rfm_client.contract.samples import EncoderSample
-from rfm_serve import PATIENCE_S
+from servers import PATIENCE_S
 from vlm import PLAIN, assert_close, load, video
 
 THREE = FrameThreads(3)

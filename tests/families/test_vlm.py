@@ -15,7 +15,6 @@ import torch
 
 import goldens
 from engines import TRANSFORMERS, load_engine
-from reference_server import Served
 from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.engine.layers import progress_from_logits
@@ -34,6 +33,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
+from servers import Served
 from vlm import BFLOAT16, PLAIN, assert_close, load, predictor_of, upstream_inputs, video
 
 PIXEL_TOLERANCE = 1e-6  # relative, of a sum over all pixels

@@ -24,14 +24,12 @@ from gateway_requests import (
     ask_npy,
     fixture_of,
 )
-from one_model import BriefServer
 from proxies import Proxy
 from rfm.config import ExportConfig
 from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
-from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
+from servers import Endpoints, start_triton
 
 
 @pytest.fixture(scope="package")
@@ -51,8 +49,7 @@ def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfo
     ours = f"{REGION_PREFIX}_{os.getpid()}_*"  # others test beside us
     regions = set(SHARED_MEMORY.glob(ours))
     with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        start_triton(repository) as server,
         Proxy(server.endpoints.http_port) as http,
         Proxy(server.endpoints.grpc_port) as grpc,
         Proxy(server.endpoints.metrics_port) as metrics,

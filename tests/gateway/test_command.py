@@ -14,12 +14,12 @@ import pytest
 from typer.testing import CliRunner
 
 from gateways import inside, running
-from rfm.launch.triton_server import Endpoints
 from rfm_client.contract.process_log import LogLines
 from rfm_commands.cli import app
 from rfm_gateway import GatewayConfig
 from rfm_gateway.command import page_link
 from rfm_gateway.state import TritonState
+from servers import Endpoints
 
 KEY = "open sesame"
 

@@ -12,11 +12,11 @@ import pytest
 
 from gateway_requests import FIRST, dumped, failure, progress
 from gateways import TestClient, inside, running
-from rfm.launch.triton_server import Endpoints
 from rfm_client.episodes import StepScore
 from rfm_client.options import ConfigError
 from rfm_gateway import GatewayConfig
 from rfm_rl import LiveView
+from servers import Endpoints
 from shown_datasets import copied
 
 SAMPLE, KEY, LAB = dumped(progress(FIRST)), "open sesame", "http://lab.example"

@@ -5,11 +5,7 @@ their own that leads to it. No Triton is needed.
 
 from __future__ import annotations
 
-import functools
-import threading
 from collections.abc import Iterator
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,9 +13,9 @@ import pytest
 from browsers import REBOUND, Browser
 from gateway_requests import Json
 from gateways import Gateway, poll, running
-from rfm.launch.triton_server import Endpoints
 from rfm_client.episodes import StepScore
 from rfm_rl import LiveView
+from servers import Endpoints, folder_server
 from shown_datasets import copied
 
 pytestmark = pytest.mark.slow
@@ -51,11 +47,6 @@ const shown = (element) => new Promise((resolve) => {
 """
 
 
-class _Page(SimpleHTTPRequestHandler):
-    def log_message(self, *_arguments: Any) -> None:
-        """Stay silent."""
-
-
 @pytest.fixture(scope="module")
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     folder = tmp_path_factory.mktemp("gateway")
@@ -68,12 +59,8 @@ def other_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """The port of another server of this machine, which serves a page."""
     folder = tmp_path_factory.mktemp("other")
     (folder / "index.html").write_text("<!doctype html><title>another page</title>")
-    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Page, directory=str(folder))) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield server.server_port
-        server.shutdown()
-        thread.join()
+    with folder_server(folder) as url:
+        yield int(url.rpartition(":")[2])
 
 
 @pytest.fixture

@@ -39,10 +39,10 @@ from gateway_requests import (
 from gateways import WITHIN_S, Gateway, answers, free_port, poll, running
 from rfm.checkpoint.content import read_run_config
 from rfm.launch.cleanup import SHARED_MEMORY
-from rfm.launch.triton_server import Endpoints
 from rfm.rewind.network import RewindTransformer
 from rfm_client import InvalidSampleError, ModelNotFoundError, Trajectory
 from rfm_client.serving import read_status
+from servers import Endpoints
 
 pytestmark = pytest.mark.triton
 

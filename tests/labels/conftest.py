@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
+from servers import Endpoints
 
 
 @pytest.fixture

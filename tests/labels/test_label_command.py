@@ -21,9 +21,9 @@ from client_commands import invoke
 from gateways import free_port
 from labelling import FRONT, LEROBOT
 from paths import ROOT
-from rfm.launch.triton_server import Endpoints
 from rfm_client.command_line import ExitCode
 from rfm_commands.cli import app
+from servers import Endpoints
 from toy_world import Task, make_clip
 
 DATASET = LEROBOT / "toy_v30_many"

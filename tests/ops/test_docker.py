@@ -31,9 +31,9 @@ import rfm_export
 from engines import serve_config
 from paths import ROOT
 from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints
 from rfm_commands.config import Config
 from rfm_export.batches import MOST_SAMPLES
+from servers import Endpoints
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 

@@ -29,11 +29,10 @@ import clip
 from commands import RFM
 from paths import ROOT
 from rfm.config import ServeConfig
-from rfm.launch.endpoints import Endpoints
 from rfm_client import AccessDeniedError, RewardClient, ServerUnavailableError, Trajectory
 from rfm_client.serving import Credentials, read_status
 from rfm_commands.cli import app
-from rfm_serve import Serving, serving, wait_for
+from servers import Endpoints, Serving, serving, wait_for
 
 pytestmark = pytest.mark.slow
 

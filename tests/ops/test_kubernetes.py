@@ -32,10 +32,9 @@ from paths import ROOT
 from repositories import kill_model
 from rfm.launch import admin_key
 from rfm.launch.ending import KILL_AFTER_S
-from rfm.launch.triton_server import Endpoints
 from rfm_commands.cli import app
 from rfm_gateway.command import STOP_WITHIN_S
-from rfm_serve import wait_for
+from servers import Endpoints, wait_for
 
 pytestmark = pytest.mark.slow
 

@@ -26,9 +26,8 @@ import yaml
 
 from paths import ROOT
 from repositories import kill_model
-from rfm.launch.triton_server import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
-from rfm_serve import MODEL, serving, wait_for
+from servers import MODEL, Endpoints, serving, wait_for
 from trajectories import random_trajectory
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]

@@ -17,7 +17,6 @@ from PIL import Image
 from gateway_requests import failure
 from gateways import TestClient, inside, running
 from live_reports import Json, episode, identity, jpeg, picture, report, step
-from rfm.launch.triton_server import Endpoints
 from rfm_client.episodes import StepScore, live
 from rfm_page.live import (
     FORGOTTEN_AFTER_S,
@@ -27,6 +26,7 @@ from rfm_page.live import (
     LiveReport,
 )
 from rfm_rl import LiveView
+from servers import Endpoints
 
 KEY = "open sesame"
 

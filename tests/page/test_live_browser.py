@@ -14,10 +14,10 @@ from selenium.webdriver import ActionChains
 
 from browsers import Browser
 from gateways import Gateway, free_port, poll, running
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient, UInt8Array
 from rfm_client.episodes import StepScore
 from rfm_rl import LiveView
+from servers import Endpoints
 from toy_world import Task, make_clip
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]

@@ -24,8 +24,8 @@ from browsers import Browser
 from gateway_requests import TOLERANCE
 from gateways import Gateway, poll, running
 from paths import VIDEOS
-from rfm.launch.triton_server import Endpoints
 from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, ChannelOrder, Correction, Orientation
+from servers import Endpoints
 from toy_world import Task, make_clip
 from viewer_requests import by_command_line
 

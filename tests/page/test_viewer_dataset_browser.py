@@ -22,12 +22,12 @@ from browsers import Browser
 from gateway_requests import TOLERANCE
 from gateways import poll, running
 from labelling import BrightnessScorer
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
 from rfm_client.frames import Channels, Orient
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset, summarise
 from rfm_labels.datasets import LeRobotDataset
 from rfm_rl import LiveView
+from servers import Endpoints
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, large
 from toy_world import Task, make_clip
 from viewer_requests import run_line

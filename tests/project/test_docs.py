@@ -27,7 +27,6 @@ import clip
 import toy_dataset
 from labelling import LEROBOT
 from paths import ROOT
-from rfm.launch.triton_server import Endpoints
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.cli.commands import app
 from rfm_client.contract import wire
@@ -36,6 +35,7 @@ from rfm_client.options import settings_of
 from rfm_commands.cli import app as rfm
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
+from servers import Endpoints
 
 pytestmark = pytest.mark.triton
 

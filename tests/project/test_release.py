@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from paths import ROOT
-from rfm.launch.endpoints import Endpoints
+from servers import Endpoints
 
 DISTRIBUTIONS = (ROOT / "client", *(file.parent for file in ROOT.glob("apps/*/pyproject.toml")), ROOT)
 

@@ -27,9 +27,9 @@ from environments import (
     scores,
     two_cameras,
 )
-from reference_server import Served
 from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError
 from rfm_rl import RewardModelWrapper, RewardOptions, SuccessRule
+from servers import Served
 
 
 @pytest.mark.parametrize(

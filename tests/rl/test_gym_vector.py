@@ -24,9 +24,9 @@ from environments import (
     progress,
     two_cameras,
 )
-from reference_server import Served
 from rfm_client import InvalidSampleError, RewardClient
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
+from servers import Served
 
 NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 

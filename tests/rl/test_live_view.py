@@ -30,10 +30,10 @@ from coded_env import CodedEnv, Recorder
 from environments import MODEL, TASK, cart_pole, play
 from gateways import poll
 from live_reports import Taker, picture, taking
-from reference_server import Served
 from rfm_client import RewardClient, ServerUnavailableError
 from rfm_client.episodes import StepScore, SuccessRule, live
 from rfm_rl import LiveView, RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
+from servers import Served
 
 
 @pytest.fixture

@@ -15,9 +15,9 @@ from gymnasium.error import ResetNeeded
 
 from coded_env import Code, CodedEnv, Recorder
 from environments import TASK, cart_pole, cart_pole_with_pixels
-from reference_server import Served
 from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError, UInt8Array
 from rfm_rl import RewardModelWrapper, RewardOptions, SuccessRule
+from servers import Served
 
 pytest.importorskip("stable_baselines3", reason="the extra sb3 is not installed")
 

@@ -15,14 +15,12 @@ from tritonclient.utils import InferenceServerException
 from typer.testing import CliRunner
 
 from commands import REPOSITORY
-from reference_server import Served
 from rfm.launch.admin_key import VARIABLE, AdminKeyError, take_key
-from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import Installation, ServerStartError, find_installation
 from rfm.launch.triton_options import MAX_HTTP_BYTES, size_limits
 from rfm.launch.triton_server import TritonServer
 from rfm_commands.cli import app
-from rfm_serve import KEY
+from servers import KEY, Endpoints, Served
 
 ADMINISTRATION: dict[str, tuple[Any, ...]] = {
     "get_model_repository_index": (),

@@ -13,12 +13,12 @@ from typer.testing import CliRunner
 
 from commands import REPOSITORY, nothing_left_behind
 from repositories import changing
-from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.repository_check import fault_in
 from rfm.launch.triton_server import TritonServer
 from rfm.parameters import EXPORT_PARAMETER, PYTHON_PARAMETERS
 from rfm_commands.cli import app
+from servers import Endpoints
 
 FOREIGN = 'name: "foreign"\nbackend: "python"\nmax_batch_size: 1\na_field_of_a_newer_triton: 1\n'
 

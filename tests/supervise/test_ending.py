@@ -17,8 +17,7 @@ from commands import RFM, is_alive
 from patients import make_repository
 from rfm.launch import cleanup
 from rfm.launch.ending import ProcessGroup, how_it_ended
-from rfm.launch.endpoints import Endpoints
-from rfm_serve import PATIENCE_S, Serving, children, wait_for
+from servers import PATIENCE_S, Endpoints, Serving, children, wait_for
 
 AT_ONCE_S = 10.0  # a model process used to stay for two minutes
 GROUP = """

@@ -25,8 +25,8 @@ from rfm.launch.triton_server import TritonServer
 from rfm.supervise.status import NO_REASON, Status, StatusServer
 from rfm_client.options import ConfigError
 from rfm_commands.cli import app
-from rfm_serve import wait_for
 from secured import Papers, other_program
+from servers import wait_for
 
 
 @pytest.mark.parametrize(

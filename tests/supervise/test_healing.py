@@ -21,7 +21,6 @@ import pytest
 from patients import CALLERS, MARK, TOLERANCE, Callers, answering, make_repository, trajectory
 from rfm.launch import cleanup
 from rfm.launch.cleanup import SHARED_MEMORY
-from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import find_installation
 from rfm.launch.repository_api import RepositoryApiError
 from rfm.launch.triton_server import TritonServer
@@ -29,11 +28,12 @@ from rfm.supervise.status import NO_REASON
 from rfm.supervise.supervisor import MOST, STEADY_S, BackOff, CrashLoopError
 from rfm.triton_model.watchdog import FAILED_BATCHES
 from rfm_client import InferenceFailedError, ServerUnavailableError
-from rfm_serve import (
+from servers import (
     MODEL,
     PATIENCE_S,
     RFM,
     TRUTH_S,
+    Endpoints,
     Serving,
     administered,
     children,

@@ -29,8 +29,8 @@ from rfm_commands import rollout as rfm_rollout
 from rfm_commands.cli import app
 from rfm_commands.rollout import Rollout, RolloutError
 from rfm_export.publish import read_config
-from rfm_serve import Serving, administered, wait_for
 from rollout import CALLERS, NAME, WITH_ENCODERS, callers, difference
+from servers import Serving, administered, wait_for
 from trajectories import random_trajectory
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]

@@ -32,7 +32,7 @@ from rfm.launch.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.contract.descriptors import MOST
 from rfm_commands.cli import app
-from rfm_serve import children, model_processes, wait_for
+from servers import children, model_processes, wait_for
 
 VIDEO = ROOT / "tests/videos/jaco_play_pick_up_green_cup.mp4"
 DEMO = ["demo", f"--repository={REPOSITORY}", f"--video={VIDEO}", f"--task={clip.TASK}"]

@@ -24,7 +24,6 @@ from typer.testing import CliRunner
 
 import goldens
 from engines import load_engine
-from one_model import BriefServer
 from repositories import kill_model
 from rfm.launch.endpoints import Endpoints, GrpcTls
 from rfm.launch.triton_options import MAX_HTTP_BYTES
@@ -33,8 +32,8 @@ from rfm_client.cli.commands import app as client_app
 from rfm_client.serving import Credentials, read_status
 from rfm_client.transport.loop_thread import LoopThread
 from rfm_commands.cli import app
-from rfm_serve import KEY, PATIENCE_S, Serving, serving, wait_for
 from secured import PUBLIC_HOST, Papers, other_program
+from servers import KEY, PATIENCE_S, Serving, serving, start_triton, wait_for
 from trajectories import random_trajectory
 
 PLAIN = goldens.config("c1_t1_disc10")
@@ -71,7 +70,7 @@ def secure(repository: Path, papers: Papers, tmp_path_factory: pytest.TempPathFa
     folder = tmp_path_factory.mktemp("secure")
     endpoints = replace(Endpoints.free(), grpc_tls=GrpcTls(papers.certificate, papers.key))
     program = other_program(folder, f"--grpc-restricted-protocol={GATED}:gate={KEY}")
-    with (folder / "log").open("wb") as log, BriefServer(repository, endpoints, program, log=log):
+    with start_triton(repository, program, endpoints):
         yield endpoints
 
 

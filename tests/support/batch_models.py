@@ -30,7 +30,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.contract.process_log import LEVEL_VARIABLE, LogLines
-from rfm_serve import wait_for
+from servers import wait_for
 from trajectories import random_trajectory
 
 WIDTHS = (4, 3)

@@ -7,11 +7,6 @@ import os
 import re
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +14,11 @@ import numpy as np
 from typer.testing import CliRunner, Result
 
 import clip
-from reference_server import Served
 from rfm_client import (
     FrameScores,
 )
 from rfm_client.cli.commands import app
+from servers import Served
 
 RFM_CLIENT = Path(sys.executable).parent / "rfm-client"
 
@@ -76,19 +71,3 @@ def columns(output: str, row: str) -> list[str]:
 def assert_scores(document: dict[str, Any], scores: FrameScores) -> None:
     np.testing.assert_allclose(document["progress"], scores.progress, rtol=0, atol=TOLERANCE)
     np.testing.assert_allclose(document["success"], scores.success, rtol=0, atol=TOLERANCE)
-
-
-@contextmanager
-def web_server(folder: Path) -> Iterator[str]:
-    class Silent(SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Silent, directory=str(folder))) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}"
-        finally:
-            server.shutdown()
-            thread.join()

@@ -7,11 +7,11 @@ import numpy as np
 import tritonclient.grpc
 
 from commands import in_shared_memory
-from rfm.launch.triton_server import Endpoints
 from rfm_client import (
     Trajectory,
 )
 from rfm_client.transport.shared_memory import MIN_SHARED_BYTES
+from servers import Endpoints
 
 
 def url_of(endpoints: Endpoints, protocol: str) -> str:

@@ -21,8 +21,8 @@ import requests
 
 from gateways import Gateway, running
 from proxies import Proxy
-from rfm.launch.triton_server import Endpoints
 from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from servers import Endpoints
 from small_network import SMALL
 
 Json: TypeAlias = dict[str, Any]

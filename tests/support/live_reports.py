@@ -6,16 +6,16 @@ from __future__ import annotations
 import base64
 import json
 import ssl
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from typing import Any
 
 import numpy as np
 
 from rfm_client import UInt8Array
 from rfm_client.frames import as_jpeg
+from servers import web_server
 
 Json = dict[str, Any]
 
@@ -76,14 +76,5 @@ def taking(context: ssl.SSLContext | None = None) -> Iterator[Taker]:
         def log_message(self, *_: Any) -> None:
             """Says nothing of its requests."""
 
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        if context is not None:
-            server.socket = context.wrap_socket(server.socket, server_side=True)
-        taker.url = f"{'http' if context is None else 'https'}://127.0.0.1:{server.server_port}"
-        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
-        thread.start()
-        try:
-            yield taker
-        finally:
-            server.shutdown()
-            thread.join()
+    with web_server(Handler, context) as taker.url:
+        yield taker

@@ -14,7 +14,6 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import goldens
 from commands import running
-from reference_server import Served
 from rfm_client import (
     PreferenceSample,
     ProgressSample,
@@ -22,7 +21,7 @@ from rfm_client import (
     Sample,
     SimilaritySample,
 )
-from rfm_serve import wait_for
+from servers import Served, wait_for
 from trajectories import random_trajectory
 
 TOLERANCE = 1e-5

@@ -15,7 +15,7 @@ from paths import ROOT
 from repositories import configure
 from rfm.engine import Engine
 from rfm_client import ProgressSample, RewardClient, Trajectory
-from rfm_serve import MODEL, wait_for
+from servers import MODEL, wait_for
 
 CALLERS = 16
 TOLERANCE = 1e-5

@@ -35,7 +35,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.serving import PROBE_PREFIX
-from rfm_serve import PATIENCE_S
+from servers import PATIENCE_S
 from trajectories import random_trajectory
 
 REASON = "scoring failed; the server's log has the reason"

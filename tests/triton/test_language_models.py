@@ -18,13 +18,10 @@ from typer.testing import CliRunner
 import rfm_export
 from faulty_servers import url_of
 from gateways import metric_at, poll, running
-from one_model import BriefServer
 from paths import VIDEOS
 from reward_models import BASE, ROOT, Reference, as_before_marks, references
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints
 from rfm_client import (
     InvalidSampleError,
     ModelInfo,
@@ -37,6 +34,7 @@ from rfm_client import (
 from rfm_client.cli.commands import app
 from rfm_client.serving import Credentials
 from rfm_client.transport.calls import GrpcTransport
+from servers import Endpoints, start_triton
 from viewer_requests import SCORE, curve_of, events, post
 
 pytestmark = pytest.mark.triton
@@ -66,10 +64,7 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     rfm_export.export(LEROBOT, repository, of_lerobot)
     rfm_export.export(ROBO, repository, ExportConfig(name="robo_old", num_gpus=0, reward_model="roboreward"))
     as_before_marks(repository / "robo_old_frames" / "config.pbtxt")
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-    ):
+    with start_triton(repository) as server:
         yield Served(server.endpoints)
 
 

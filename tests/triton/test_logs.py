@@ -6,11 +6,11 @@ from __future__ import annotations
 import os
 import pickle
 import re
-import threading
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from functools import partial
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ from engines import serve_config
 from gateways import answers, poll
 from paths import ROOT
 from rfm.launch.admin_key import VARIABLE
-from rfm.launch.endpoints import Endpoints
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
@@ -38,7 +37,7 @@ from rfm_client import (
 from rfm_client.contract import wire
 from rfm_client.contract.process_log import LEVEL_VARIABLE
 from rfm_client.serving import PROBE_PREFIX
-from rfm_serve import Serving, children, serving, wait_for
+from servers import Endpoints, Serving, children, serving, wait_for, web_server
 from trajectories import random_trajectory
 
 CONFIG = goldens.config("c1_t1_disc10")
@@ -82,19 +81,15 @@ class Running:
         return found()
 
 
-class Collector(ThreadingHTTPServer):
-    """What an OpenTelemetry collector is to Triton: it takes what comes."""
+class Collector(BaseHTTPRequestHandler):
+    """Takes traces, as an OpenTelemetry collector does."""
 
-    def __init__(self) -> None:
-        self.traces: list[bytes] = []
-        super().__init__(("127.0.0.1", 0), Taker)
-
-
-class Taker(BaseHTTPRequestHandler):
-    server: Collector
+    def __init__(self, traces: list[bytes], *connection: Any) -> None:
+        self.traces = traces
+        super().__init__(*connection)
 
     def do_POST(self) -> None:
-        self.server.traces.append(self.rfile.read(int(self.headers["Content-Length"])))
+        self.traces.append(self.rfile.read(int(self.headers["Content-Length"])))
         self.send_response(200)
         self.end_headers()
 
@@ -121,18 +116,17 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     rfm_export.export(CONFIG.checkpoint, repository, serve_config(CONFIG))
     model = repository / "rfm" / "1" / "model.py"
     model.write_text(model.read_text() + FAULTY)
-    with Collector() as collector, pytest.MonkeyPatch.context() as environment:
-        threading.Thread(target=collector.serve_forever).start()
+    traces: list[bytes] = []
+    with web_server(partial(Collector, traces)) as collector, pytest.MonkeyPatch.context() as environment:
         environment.setitem(os.environ, VARIABLE, KEY)
         environment.setitem(os.environ, LEVEL_VARIABLE, "debug")
-        options = documented_options(f"http://127.0.0.1:{collector.server_address[1]}/v1/traces")
+        options = documented_options(f"{collector}/v1/traces")
         port = Endpoints.free().http_port
         with serving(repository, f"--gateway-port={port}", "--", *options) as served:
             served.wait_ready()
             gateway = f"http://127.0.0.1:{port}"
             poll(lambda: answers(gateway))
-            yield Running(served, collector.traces, gateway)
-        collector.shutdown()
+            yield Running(served, traces, gateway)
 
 
 GOOD = ProgressSample(random_trajectory(0, 3))

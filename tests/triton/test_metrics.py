@@ -18,9 +18,7 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from mixtures import TOLD_S, mixed_samples
-from reference_server import Served
 from rfm.engine.execution import Execution
-from rfm.launch.repository_api import RepositoryApi
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
 from rfm_client import (
@@ -34,7 +32,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.serving import read_status
-from rfm_serve import wait_for
+from servers import RepositoryApi, Served, wait_for
 from tensors import infer
 from trajectories import random_trajectory
 

@@ -17,7 +17,7 @@ import pytest
 from batch_models import BREAKS, CONFIG, MODELS, REFUSED, Model, Request, backend, request  # noqa: F401  a fixture
 from rfm.engine.execution import Execution
 from rfm_client import Result, RewardError, Sample
-from rfm_serve import PATIENCE_S, wait_for
+from servers import PATIENCE_S, wait_for
 
 MAX_BATCH = 8
 assert CONFIG["max_batch_size"] == MAX_BATCH

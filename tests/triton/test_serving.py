@@ -19,10 +19,8 @@ import rfm_export
 from engines import load_engine, serve_config
 from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, mixed_samples, plug, wait_until_at_work
 from patients import answering_after
-from reference_server import Served
 from repositories import bound_queue, configure, forget_input
 from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
-from rfm.launch.repository_api import RepositoryApi
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,
@@ -35,6 +33,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
+from servers import RepositoryApi, Served
 from tensors import TOLERANCE, infer
 from trajectories import random_trajectory
 

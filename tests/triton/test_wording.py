@@ -16,9 +16,7 @@ import goldens
 import rfm_export
 from engines import serve_config
 from mixtures import FRAMES_MODEL, MODEL
-from reference_server import Served
 from repositories import kill_model
-from rfm.launch.repository_api import RepositoryApi
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,
@@ -28,6 +26,7 @@ from rfm_client import (
     ServerUnavailableError,
 )
 from rfm_client.contract import triton, wire
+from servers import RepositoryApi, Served
 from trajectories import random_trajectory
 
 pytestmark = pytest.mark.triton

@@ -1,34 +1,141 @@
 # SPDX-License-Identifier: MIT
-"""An ``rfm serve`` of a test's own: starts it, watches it, and sees that nothing of it is left."""
+"""The servers that tests start: Triton, ``rfm serve``, and stand-ins for web servers."""
 
 from __future__ import annotations
 
+import os
 import re
+import signal
+import ssl
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
+from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import httpx
 import psutil
+import tritonclient.grpc
 from prometheus_client.parser import text_string_to_metric_families
 
 from commands import RFM, running
-from one_model import CRASHES
 from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.launch.endpoints import Endpoints
+from rfm.launch.installation import Installation, find_installation
 from rfm.launch.model_processes import children_of
 from rfm.launch.repository_api import RepositoryApi
+from rfm.launch.triton_server import TritonServer
 from rfm_client import RewardClient
 
+CRASHES: list[Path] = []  # repositories whose Triton has ended with SIGABRT, by itself, or whose start was repeated
 MODEL = "rfm"
 KEY = "a-key-that-only-tests-know"  # an admin key
 PATIENCE_S = 60.0
 TRUTH_S = 5.0  # within which readiness tells what is so
+
+
+class BriefServer(TritonServer):
+    """A server that is killed when its test is over: Triton takes a second for each model process to end in order."""
+
+    _num_stops = 0
+
+    def start_ready(self, served: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+        before = self._num_stops
+        super().start_ready(served)
+        if self._num_stops > before:  # the first start hung for a minute: too long for callers with a deadline
+            CRASHES.append(self.repository)
+
+    def stop(self) -> None:
+        self._num_stops += 1
+        super().stop()
+
+    def __exit__(self, *raised: Any) -> None:
+        if self.exit_status == -signal.SIGABRT:
+            CRASHES.append(self.repository)
+        if self.exit_status is None:
+            self.kill()
+        super().__exit__(*raised)
+
+
+@contextmanager
+def start_triton(
+    repository: Path, installation: Installation | None = None, endpoints: Endpoints | None = None
+) -> Iterator[BriefServer]:
+    """Serve the repository with a Triton that is ready. Its log is a file beside the repository."""
+    program, ports = installation or find_installation(), endpoints or Endpoints.free()
+    with (
+        (repository.parent / "tritonserver.log").open("wb") as log,
+        BriefServer(repository, ports, program, log=log) as server,
+    ):
+        yield server
+
+
+class OneModelServer(BriefServer):
+    """A server of the demo's ``rfm`` alone; with more arguments, and killed if asked."""
+
+    def __init__(self, repository: Path, endpoints: Endpoints, *arguments: str) -> None:
+        log = (repository.parent / "tritonserver.log").open("ab")
+        super().__init__(repository, endpoints, find_installation(), log=log, more_arguments=arguments)
+        self._own_log = log
+
+    def signal(self, number: signal.Signals) -> None:
+        os.killpg(os.getpgid(self.pid), number)
+
+    def kill(self) -> None:
+        super().kill()
+        self.stop()
+
+    def __enter__(self) -> TritonServer:
+        try:
+            return super().__enter__()
+        except BaseException:
+            self._own_log.close()
+            raise
+
+    def __exit__(self, *raised: Any) -> None:
+        super().__exit__(*raised)
+        self._own_log.close()  # not in `stop`: a start that Triton has spoilt is stopped and repeated
+
+
+def answered(endpoints: Endpoints) -> int:
+    with tritonclient.grpc.InferenceServerClient(endpoints.grpc_url.removeprefix("grpc://")) as client:
+        stats = client.get_inference_statistics("rfm").model_stats[0]
+    return int(stats.inference_stats.success.count)
+
+
+@dataclass(frozen=True)
+class Served:
+    """A running server with every reference checkpoint under its own name."""
+
+    server: TritonServer
+
+    @property
+    def repository(self) -> Path:
+        return self.server.repository
+
+    @property
+    def endpoints(self) -> Endpoints:
+        return self.server.endpoints
+
+    def url(self, protocol: str) -> str:
+        return self.endpoints.grpc_url if protocol == "grpc" else self.endpoints.http_url
+
+    def client(self, protocol: str, model: str = "c1_t1_disc10") -> RewardClient:
+        return RewardClient(self.url(protocol), model=model)
+
+    def revive(self) -> None:
+        """Starts the server again if it has crashed, as ``rfm serve`` would: Triton 2.51 does, once in thousands of
+        calls that are cancelled over gRPC (triton-inference-server/server, issue 7368), and takes no other test along.
+        """
+        if self.server.exit_status is not None:
+            self.server.stop()
+            self.server.start_ready()
 
 
 def wait_for(is_so: Callable[[], Any], within_s: float = PATIENCE_S) -> float:
@@ -152,3 +259,30 @@ def administered(repository: Path, *more: str, **settings: int) -> Iterator[Serv
         served.wait_ready()
         yield served
     assert KEY not in served.log.read_text(errors="replace")
+
+
+class FolderRequest(SimpleHTTPRequestHandler):
+    """Answers with a file of the folder ``directory``, and logs nothing."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@contextmanager
+def web_server(handler: Callable[..., BaseHTTPRequestHandler], context: ssl.SSLContext | None = None) -> Iterator[str]:
+    """Answer HTTP requests by ``handler``, over TLS with ``context``. Yields the URL."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        if context is not None:
+            server.socket = context.wrap_socket(server.socket, server_side=True)
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield f"{'http' if context is None else 'https'}://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def folder_server(folder: Path) -> AbstractContextManager[str]:
+    """Serve the files of a folder. Yields the URL."""
+    return web_server(partial(FolderRequest, directory=str(folder)))
