@@ -14,6 +14,18 @@ from rfm.checkpoint.run_config import HEADS, SIMILARITY, constant_heads, trainin
 from rfm.checkpoint.weights import check_values
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, VideoPrompt, Weights
 
+__all__ = [
+    "FAMILIES",
+    "CheckpointError",
+    "choose",
+    "encoders_of",
+    "find",
+    "load",
+    "load_from",
+    "named",
+    "notes",
+]
+
 # Packages in the order in which they are tried. ReWiND comes last: its first checkpoints do not name their network.
 FAMILIES = ("rfm.topreward", "rfm.roboreward", "rfm.vlm", "rfm.rewind")
 

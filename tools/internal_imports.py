@@ -32,7 +32,7 @@ def constant(tree: ast.Module, name: str) -> list[str] | dict[str, set[str]]:
 
 PUBLIC = {  # modules
     f"{package}.{inner}".rstrip(".") for package, modules in constant(STRUCTURE, "PUBLIC").items() for inner in modules
-} | {"rfm.engine", "rfm_export", "rfm_rl"}
+}
 
 
 @lru_cache
@@ -48,14 +48,10 @@ def internals(file: Path) -> Iterator[str]:
     """Yield the internal names that a file imports."""
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in PLACES:
-            public = public_names(node.module)
-            yield from (f"{node.module}.{alias.name}" for alias in node.names if alias.name not in public)
+            names = {alias.name for alias in node.names} - public_names(node.module)
+            yield from {f"{node.module}.{name}" for name in names} - PUBLIC
         elif isinstance(node, ast.Import):
-            yield from (
-                alias.name
-                for alias in node.names
-                if alias.name.partition(".")[0] in PLACES and alias.name not in PUBLIC
-            )
+            yield from {alias.name for alias in node.names if alias.name.partition(".")[0] in PLACES} - PUBLIC
 
 
 def main() -> int:

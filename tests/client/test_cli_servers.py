@@ -32,12 +32,12 @@ from client_commands import (
     rows,
     run,
 )
+from in_process import rfm_client_app
 from rfm_client import (
     FrameScores,
     ProgressResult,
 )
 from rfm_client.cli.command import EXIT_CODES
-from rfm_client.cli.commands import app
 from rfm_client.cli.documents import frame_document
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.synthetic import SyntheticSamples, parse_lengths
@@ -319,7 +319,7 @@ def test_every_command_and_option_has_help_and_exit_codes_are_documented() -> No
     assert EXIT_CODES in general
     for code in ExitCode:
         assert re.search(rf"\b{code.value} ", EXIT_CODES), code
-    commands = get_command(app).commands  # type: ignore[attr-defined]
+    commands = get_command(rfm_client_app).commands  # type: ignore[attr-defined]
     assert commands.keys() == {
         "score",
         "compare",

@@ -32,12 +32,10 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.frames import resize_frames
-from rfm_client.serving import Credentials, Deadline
-from rfm_client.transport.calls import Answer, GrpcTransport
-from rfm_client.transport.concurrency import MAX_BYTES, ConcurrencyLimiter
 from servers import Served
 from shelves import Shelf
 from trajectories import random_trajectory
+from transports import Answer, Connection
 
 NOBODY = "grpc://127.0.0.1:1"  # a port where nothing listens
 KINDS: dict[type, str] = {
@@ -126,25 +124,6 @@ def test_a_cancelled_future_disturbs_no_other(served: Served) -> None:
             future.result()
 
 
-def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> None:
-    async def ask() -> None:
-        room = ConcurrencyLimiter(10).room
-        async with room(MAX_BYTES // 2, Deadline(1)), room(MAX_BYTES // 2 - 1, Deadline(1)):
-            with pytest.raises(DeadlineExceededError):
-                async with room(2, Deadline(0.05)):
-                    pytest.fail("there was no room")
-            async with room(1, Deadline(1)):
-                pass
-        async with room(3 * MAX_BYTES, Deadline(1)):
-            with pytest.raises(DeadlineExceededError):
-                async with room(0, Deadline(0.05)):
-                    pytest.fail("there was no room")
-        async with room(MAX_BYTES, Deadline(1)):  # what was given up was given back
-            pass
-
-    asyncio.run(ask())
-
-
 def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(served: Served) -> None:
     video = ProgressSample(Trajectory(frames=np.zeros((1, 8, 8, 3), np.uint8), task="none"))
     with served.client("grpc") as client:  # MODEL has no encoders
@@ -153,7 +132,7 @@ def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(se
 
 
 def test_requests_in_flight_are_bounded(served: Served) -> None:
-    class Counting(GrpcTransport):
+    class Counting(Connection):
         now = most = 0
 
         async def infer(self, *arguments: object, **options: object) -> Answer:
@@ -164,7 +143,7 @@ def test_requests_in_flight_are_bounded(served: Served) -> None:
             finally:
                 self.now -= 1
 
-    transport = Counting(served.url("grpc"), Credentials(), shared_memory=False)
+    transport = Counting(served.url("grpc"))
     with RewardClient("", transports=[transport], model=MODEL, max_in_flight=3) as client:
         for future in [client.submit(sample) for sample in mixed_samples(30)]:
             future.result()

@@ -22,9 +22,8 @@ from rfm_client import (
     RewardError,
     ServerUnavailableError,
 )
-from rfm_client.contract import wire
-from rfm_client.transport.calls import Answer
 from trajectories import random_trajectory
+from transports import Answer, Tensors
 
 NUM_FRAMES = 4
 SEEN = random_trajectory(0, NUM_FRAMES)
@@ -47,7 +46,7 @@ class Stand:
         self.asked: Counter[str] = Counter()
 
     async def infer(
-        self, model: str, inputs: wire.Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+        self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
         self.asked["infer"] += 1
         if self.is_down:
@@ -64,7 +63,7 @@ class Stand:
             raise lost()
         if self.error is not None:
             raise self.error
-        shape = inputs[wire.NUM_FRAMES].shape[0], wire.num_positions(inputs)
+        shape = len(inputs["num_frames"]), inputs["num_frames"].sum(axis=1).max()
         self.sizes.append(shape[0])
         tensors = {name: np.full(shape, 0.5, np.float32) for name in outputs}
         return Answer(tensors, str(self.version))

@@ -21,6 +21,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import goldens
 import rfm_export
+import transports
 from engines import serve_config
 from mixtures import TOLD_S
 from rfm_client import (
@@ -34,12 +35,10 @@ from rfm_client import (
     Trajectory,
     UInt8Array,
 )
-from rfm_client.contract import wire
 from rfm_client.episodes import Episode
 from rfm_client.frames import RULES, Rule, Sampling, of_prefixes, prefix_samples
-from rfm_client.serving import Credentials
-from rfm_client.transport.calls import Answer, GrpcTransport
 from servers import Served, Serving, serving
+from transports import Answer, Tensors
 
 MODEL = "enc_c1_t1_disc10"
 IMAGES, VIDEO = "q3_tok_disc10", "q25_video_avg_disc10"
@@ -70,21 +69,13 @@ def assert_same(
     np.testing.assert_allclose(scores, (expected.progress, expected.success), rtol=0, atol=tolerance)
 
 
-class Recording(GrpcTransport):
-    """To the real server; notes the inputs of each request."""
-
-    def __init__(self, url: str) -> None:
-        super().__init__(url, Credentials(), shared_memory=False)
-        self.requests: list[wire.Tensors] = []
-
-    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **more: str) -> Answer:
-        self.requests.append(inputs)
-        return await super().infer(model, inputs, outputs, timeout_s, **more)
+class Recording(transports.Recording):
+    """A connection to the real server."""
 
     @property
     def digests(self) -> set[bytes]:
         """Digests of all frames in the requests."""
-        return {row.tobytes() for inputs in self.requests for row in inputs[wire.FRAME_DIGESTS].reshape(-1, 32)}
+        return {row.tobytes() for inputs in self.requests for row in inputs["frame_digests"].reshape(-1, 32)}
 
     @property
     def most_bytes(self) -> int:
@@ -144,10 +135,10 @@ def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: S
     firsts = {}
     for model in encoders:
         transport, firsts[model] = step(model)
-        assert [len(inputs[wire.FRAMES][0]) for inputs in transport.requests] == [1] * 2 * len(frames)
+        assert [len(inputs["frames"][0]) for inputs in transport.requests] == [1] * 2 * len(frames)
         assert transport.most_bytes < frames[0].nbytes + 512
         repeated = transport.requests[len(frames) :]
-        assert {inputs[wire.FRAMES].shape for inputs in repeated} == {(1, 1, 1, 1, 3)}  # known: not even sent
+        assert {inputs["frames"].shape for inputs in repeated} == {(1, 1, 1, 1, 3)}  # known: not even sent
     for model in encoders:  # another client sends them, and a caller of plain tensors uses the cache, too
         np.testing.assert_allclose(step(model)[1], firsts[model], rtol=0, atol=VLM_TOLERANCE)
     with served.client("http", MODEL) as plain:
@@ -174,7 +165,7 @@ class Failing(Recording):
 
     is_down = False
 
-    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **more: str) -> Answer:
+    async def infer(self, model: str, inputs: Tensors, outputs: Any, timeout_s: float, **more: str) -> Answer:
         if self.is_down:
             raise ServerUnavailableError("Connection refused")
         return await super().infer(model, inputs, outputs, timeout_s, **more)
@@ -190,7 +181,7 @@ def test_episodes_are_shared_out_among_servers_and_stay(served: Served) -> None:
         episodes = client.episodes(6, TASK, frames=4)
         added = [episodes.add(frames) for frames in videos]
         for transport in transports:
-            assert [len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests] == [2] * len(videos)
+            assert [len(inputs["num_frames"]) for inputs in transport.requests] == [2] * len(videos)
             assert transport.most_bytes < 2 * (videos[0, 0].nbytes + 512)
         first, second, third = (transport.digests for transport in transports)
         assert len(first | second | third) == len(first) + len(second) + len(third) == videos[:, :, 0, 0, 0].size
@@ -201,7 +192,7 @@ def test_episodes_are_shared_out_among_servers_and_stay(served: Served) -> None:
             transport.requests.clear()
         episodes.reset([True, True, True, False, False, False])
         episodes.add(videos[0])
-        asked = [sum(len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests) for transport in transports]
+        asked = [sum(len(inputs["num_frames"]) for inputs in transport.requests) for transport in transports]
         assert asked == [2, 2, 2]  # the new ones went to the servers with the fewest
 
 
@@ -361,7 +352,7 @@ def test_large_frames_go_in_several_requests(transport: Recording, client: Rewar
     large = video(116, 5, (700, 700))  # 1.5 MB each
     episodes = client.episodes(5, TASK, frames=2)
     scores = episodes.add(large)
-    assert sorted(len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests) == [1, 2, 2]
+    assert sorted(len(inputs["num_frames"]) for inputs in transport.requests) == [1, 2, 2]
     expected = [offline(client, large[[index]], Sampling("rint_pad", 2)).progress[0] for index in range(5)]
     np.testing.assert_allclose(scores.progress, expected, atol=TOLERANCE)
     alike = client.episodes(5, TASK, frames=2)
@@ -371,15 +362,15 @@ def test_large_frames_go_in_several_requests(transport: Recording, client: Rewar
 
 def test_a_request_of_very_many_frames_is_refused_before_memory_is_taken(transport: Recording) -> None:
     inputs = {
-        wire.FRAMES: np.zeros((1, 1, 1, 1, 3), np.uint8),
-        wire.FRAME_DIGESTS: np.zeros((1, 140_000, 32), np.uint8),
-        wire.NUM_FRAMES: np.array([[140_000, 0]], np.int32),
-        wire.TASK: np.array([[TASK.encode()]], np.object_),
+        "frames": np.zeros((1, 1, 1, 1, 3), np.uint8),
+        "frame_digests": np.zeros((1, 140_000, 32), np.uint8),
+        "num_frames": np.array([[140_000, 0]], np.int32),
+        "task": np.array([[TASK.encode()]], np.object_),
     }
 
     async def ask() -> None:
         try:
-            await transport.infer(f"{MODEL}_encoder", inputs, [wire.VIDEO_EMBEDDINGS], 30)
+            await transport.infer(f"{MODEL}_encoder", inputs, ["video_embeddings"], 30)
         finally:
             await transport.close()
 

@@ -15,9 +15,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from coded_env import CodedEnv, Recorder
 from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError, UInt8Array
-from rfm_client.transport.calls import Answer
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
 from shelves import Shelf
+from transports import Answer
 
 TASK = "stack the cups"
 COUNT = 10

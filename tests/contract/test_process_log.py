@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from rfm_client.contract.process_log import LEVEL_VARIABLE
 from rfm_client.options import ConfigError
 from rfm_client.serving import write_log
 
@@ -64,6 +63,6 @@ sys.exit(7)
 
 
 def test_the_level_is_a_variable() -> None:
-    assert run('log.debug("told")', env={**os.environ, LEVEL_VARIABLE: "debug"}).stderr.endswith(": told\n")
+    assert run('log.debug("told")', env={**os.environ, "RFM_LOG_LEVEL": "debug"}).stderr.endswith(": told\n")
     with pytest.raises(ConfigError, match="RFM_LOG_LEVEL: expected one of DEBUG, INFO, WARNING, ERROR, got 'LOUD'"):
-        write_log("rfm-serve", {LEVEL_VARIABLE: "loud"})
+        write_log("rfm-serve", {"RFM_LOG_LEVEL": "loud"})

@@ -11,18 +11,17 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
-from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from captures import CalledAgain
 from engines import serve_config
+from in_process import rfm
 from labelling import LEROBOT
 from rfm import families
 from rfm.engine import Engine
 from rfm.engine.graphs import Captured, Function, Graphs
 from rfm.family import NETWORK
-from rfm_commands.cli import app
 from rfm_export import ExportDiffersError
 from rfm_export.verify import WORKING_ROOM, device_for, device_named, needing_room, verify_graphs
 
@@ -85,10 +84,10 @@ def test_a_lack_of_room_is_told_in_a_line() -> None:
 def test_the_command_says_where_it_compares(tmp_path: Path) -> None:
     words = ["export", "--repository", str(tmp_path / "models"), "--checkpoint", str(LARGE.checkpoint)]
     words += ["--base-model", str(LARGE.base_model)]
-    done = CliRunner().invoke(app, [*words, "--num-gpus", "0", "--device", "cpu"])
+    done = rfm(*words, "--num-gpus", "0", "--device", "cpu")
     assert done.exit_code == 0, done.output
     assert "the export's scores are compared with the checkpoint's on cpu (--device names another one)" in done.output
-    refused = CliRunner().invoke(app, [*words, "--device", "tpu"])
+    refused = rfm(*words, "--device", "tpu")
     assert (refused.exit_code, "device: expected one of cpu" in refused.output) == (1, True)
 
 
@@ -145,6 +144,6 @@ def test_a_configuration_names_graphs_only_if_they_are_on(tmp_path: Path, cuda_g
 def test_label_refuses_a_device_that_is_not_there(free_bytes: list[float]) -> None:
     assert not free_bytes  # no GPU
     words = ["label", str(LEROBOT / "toy_v21"), "--checkpoint", str(SMALL.checkpoint), "--device", "0"]
-    done = CliRunner().invoke(app, words)
+    done = rfm(*words)
     assert done.exit_code == 1
     assert "rfm: device: expected one of cpu, got 0: PyTorch " in done.stderr

@@ -14,17 +14,16 @@ import yaml
 from google.protobuf import text_format
 from safetensors.torch import load_file, save_file
 from tritonclient.grpc import model_config_pb2 as pb
-from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from engines import serve_config
+from in_process import rfm
 from paths import ROOT
 from repositories import forget_input
 from rfm.checkpoint.content import CheckpointError, read_run_config
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm_client.contract import wire
-from rfm_commands.cli import app
 from rfm_export import ExportDiffersError, ExportError
 from rfm_export.about import origin_of
 
@@ -288,11 +287,11 @@ def test_upstream_s_file_exports_whatever_its_batch_size_unless_it_names_gpus_th
     file.write_text(EVAL_CONFIG_SERVER.replace("num_gpus: 1", f"num_gpus: {there + 1}"))
     command = ["export", "--config", str(file), "--checkpoint", str(EMBEDDINGS.checkpoint)]
     command += ["--repository", str(repository)]
-    refused = CliRunner().invoke(app, command)
+    refused = rfm(*command)
     assert refused.exit_code == 1
     assert f"rfm: num_gpus: expected at most {there}, got {there + 1}; --other-machine exports" in refused.stderr
     assert not repository.exists()
-    exported = CliRunner().invoke(app, [*command, "--other-machine"])
+    exported = rfm(*command, "--other-machine")
     assert exported.exit_code == 0, exported.output
     config = read(repository, "rfm")
     assert list(config.instance_group[0].gpus) == list(range(there + 1))

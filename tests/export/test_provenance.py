@@ -15,16 +15,15 @@ import pytest
 import torch
 import yaml
 from transformers import AutoTokenizer
-from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from engines import serve_config
+from in_process import rfm
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.provenance import PROVENANCE, Decision
 from rfm.config import ExportConfig
-from rfm_commands.cli import app
+from rfm.families import CheckpointError
 
 PLAIN, VIDEO, POOLED, ADAPTER = (
     "q3_tok_disc10",
@@ -292,7 +291,7 @@ def test_an_adapter_of_a_run_that_began_with_a_checkpoint_needs_its_base_named(
 def test_explain_prints_the_table_and_writes_nothing(tmp_path: Path) -> None:
     folder, repository = goldens.config(REWIND).checkpoint, tmp_path / "repository"
     command = ["export", "--checkpoint", str(folder), "--repository", str(repository), "--num-gpus", "0"]
-    result = CliRunner().invoke(app, [*command, "--explain"])
+    result = rfm(*command, "--explain")
     assert result.exit_code == 0, result.output
     assert [line.split()[0] for line in result.stdout.splitlines()] == [*explained(folder)[0], "computation"]
     assert not repository.exists()

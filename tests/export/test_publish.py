@@ -15,16 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from commands import REPOSITORY
 from engines import serve_config
+from in_process import rfm
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
-from rfm_commands.cli import app
 from rfm_export import ExportError
 from rfm_export.publish import alone, read_config, staging
 from servers import Served, model_processes, wait_for
@@ -88,7 +87,7 @@ def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path, room: int) -> N
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
     try:
         words = ["export", "--checkpoint", str(SMALL.checkpoint), "--repository", str(repository)]
-        result = CliRunner().invoke(app, words)
+        result = rfm(*words)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert files_in(tmp_path) == before

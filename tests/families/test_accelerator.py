@@ -15,8 +15,7 @@ from engines import TRANSFORMERS, load_engine
 from pretended import CUDA, SECOND, Seen, pretended
 from reward_models import ROOT, references
 from rfm import families
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.triton_model.placement import Placement
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Sample
 from vlm import PLAIN, assert_close, video

@@ -28,9 +28,9 @@ import local_hub
 import reward_models
 from paths import ROOT
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.hub import best_tag, find
 from rfm.checkpoint.run_config import find_run_config
+from rfm.families import CheckpointError
 from rfm.rewind.network import RewindConfig
 from rfm.vlm.network import VlmConfig
 from spoilt import Spoil, conversion, convert, copied, in_json, settings, text, weights
@@ -573,7 +573,7 @@ from __future__ import annotations
 import json, sys
 from dataclasses import asdict
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 
 {inspect.getsource(said)}
 print(json.dumps(said(sys.argv[1:])))
@@ -782,7 +782,7 @@ def test_a_hub_that_does_not_answer_is_told_in_words(tmp_path: Path) -> None:
 READ_BASE = """
 import json, sys
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 told = []
 for base in ("org/base", "org/other"):
     try:

@@ -15,7 +15,7 @@ import goldens
 from engines import load_engine
 from rfm import families
 from rfm.checkpoint.content import PREPROCESSOR_CONFIG, CheckpointError
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
 from rfm_client import (
     BatchTiming,

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from paths import ROOT
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.engine.predictor import RowScores
 from rfm_client import (
     FrameScores,
@@ -152,7 +151,7 @@ import numpy as np, torch
 from small_network import SMALL
 from trajectories import random_trajectory
 from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.rewind.predictor import RewindPredictor
 from rfm.rewind.network import RewindTransformer
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample

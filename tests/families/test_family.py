@@ -22,9 +22,9 @@ import rfm_export
 import toy_family
 from paths import ROOT
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
 from rfm.config import ExportConfig
 from rfm.engine import Engine
+from rfm.families import CheckpointError
 from rfm.launch.installation import Installation, find_installation
 from rfm.parameters import FAMILY_PARAMETER
 from rfm_client import (

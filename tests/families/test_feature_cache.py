@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from engines import load_engine
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.engine.feature_cache import FeatureCache, get_or_make
 from rfm.family import FrameEncoders
 from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, UInt8Array

@@ -15,7 +15,7 @@ import torch
 
 import goldens
 from paths import GOLDEN
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 from spoilt import copied, settings, weights
 from vlm import load
 

@@ -17,16 +17,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from engines import serve_config
+from in_process import rfm
 from rfm import families
 from rfm.checkpoint.content import MAX_HEADER_BYTES, MAX_JSON_BYTES, CheckpointError
 from rfm.plain_yaml import MAX_YAML_BYTES
 from rfm_client.options import ConfigError
-from rfm_commands.cli import app
 from rfm_commands.config import Config
 from spoilt import WEIGHTS, Spoil, copied, files_in, settings, text, text_settings, weights
 
@@ -158,7 +157,7 @@ def refused(checkpoint: Path, repository: Path, message: str, *options: str) -> 
     """`rfm export` says one line, with exit status 1, soon, in little memory, and the repository stays as it is."""
     before, largest_kib = files_in(repository), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     arguments = ["export", "--checkpoint", str(checkpoint), "--repository", str(repository), *options]
-    result = CliRunner().invoke(app, arguments)
+    result = rfm(*arguments)
     assert result.exit_code == 1, result.output
     assert isinstance(result.exception, SystemExit)
     below_bar = result.stderr.rpartition("\r")[2].partition("\n")[2]  # of transformers 5, which loads a base model

@@ -16,8 +16,8 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from few_bits import TOLERANCES, as_bytes, case, change_config, in_both_forms
-from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
+from rfm.families import CheckpointError
 from rfm.vlm import nf4
 from rfm_client import ProgressSample
 from vlm import PLAIN, assert_close, load, video

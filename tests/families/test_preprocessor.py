@@ -14,7 +14,7 @@ import pytest
 import goldens
 import reward_models
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 from spoilt import Spoil, copied, in_json, settings
 from vlm import PLAIN, load
 

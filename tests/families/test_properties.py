@@ -21,7 +21,7 @@ from hypothesis.extra import numpy as arrays
 
 import goldens
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 from rfm.family import Options
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer

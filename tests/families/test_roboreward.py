@@ -18,9 +18,8 @@ from PIL import Image
 
 from reward_models import Reference, references
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
+from rfm.families import CheckpointError
 from rfm.roboreward.predictor import RoboRewardPredictor, WrittenAnswer
 from rfm.roboreward.prompts import as_jpeg, is_unclear, parsed
 from rfm.vlm.qwen import ROOM

@@ -23,9 +23,9 @@ from few_bits import rounded as in_nf4
 from pretended import CUDA, pretended
 from reward_models import ROOT
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
 from rfm.config import ExportConfig
 from rfm.engine import Engine
+from rfm.families import CheckpointError
 from rfm.vlm import nf4
 from rfm.vlm.rounded import Int8Linear, Nf4Linear, RoundedLinear, fit, rounded
 from rfm_client import ModelInfo, ProgressSample

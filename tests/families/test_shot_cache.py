@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.vlm.predictor import VlmPredictor
 from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory, UInt8Array

@@ -16,9 +16,8 @@ from safetensors.torch import load_file, save_file
 from paths import GOLDEN
 from reward_models import ROOT, Reference, references
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
+from rfm.families import CheckpointError
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,

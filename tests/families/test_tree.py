@@ -14,8 +14,7 @@ import torch
 from pretended import CUDA, Seen, pretended
 from reward_models import ROOT
 from rfm import families
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.vlm import leaves, tree
 from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees

@@ -15,8 +15,7 @@ import torch
 
 import goldens
 from engines import TRANSFORMERS, load_engine
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.engine.layers import progress_from_logits
 from rfm.vlm.backbone import QWEN_2_5
 from rfm.vlm.collator import QwenCollator

@@ -19,8 +19,7 @@ from transformers.models.qwen2_5_vl.configuration_qwen2_5_vl import Qwen2_5_VLVi
 
 import goldens
 from engines import TRANSFORMERS, load_engine
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.engine.pixels import Normalisation
 from rfm.vlm.backbone import QWEN_2_5
 from rfm.vlm.collator import QwenCollator

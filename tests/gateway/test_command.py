@@ -11,11 +11,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from gateways import inside, running
+from in_process import rfm
 from rfm_client.contract.process_log import LogLines
-from rfm_commands.cli import app
 from rfm_gateway import GatewayConfig
 from rfm_gateway.command import page_link
 from rfm_gateway.state import TritonState
@@ -60,7 +59,7 @@ BAD_OPTIONS = {
 @pytest.mark.parametrize(("options", "message"), BAD_OPTIONS.items())
 def test_wrong_options_are_refused(options: str, message: str) -> None:
     given = ["gateway", "--triton", "grpc://localhost:1", *options.split()]
-    result = CliRunner().invoke(app, given, env={"COLUMNS": "200"})
+    result = rfm(*given, env={"COLUMNS": "200"})
     assert result.exit_code == 2
     assert message in result.output
 

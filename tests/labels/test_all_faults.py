@@ -6,8 +6,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +14,17 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from labelling import FEW, LEROBOT, WRIST, BrightnessScorer, Notes
+from labelling import FEW, LEROBOT, WRIST, BrightnessScorer, Notes, command
 from pictures import numbered, write_video
 from rfm_client import RewardError
 from rfm_client.command_line import ExitCode
 from rfm_labels import (
     DatasetError,
     LabelOptions,
-    RayOptions,
-    Scorer,
     label,
     open_dataset,
     parse_episodes,
 )
-from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
 
 TASK = "stack the cups"
 
@@ -37,15 +32,9 @@ TASK = "stack the cups"
 class Asked(BrightnessScorer):
     """Counts what it scores, also in a run by the command."""
 
-    def run(self, source: Path, labels: LabelOptions, *, dry_run: bool = False, task: str | None = None) -> ExitCode:
-        @contextmanager
-        def connect() -> Iterator[Scorer]:
-            yield self
-
+    def run(self, source: Path, labels: LabelOptions, *, dry_run: bool = False, task: str | None = None) -> int:
         self.said: list[str] = []
-        options = RunOptions(dry_run=dry_run, picture=False)
-        texts = EpisodeTexts(task=task)
-        return LabelCommand(str(source), texts, labels, options, RayOptions(), connect, self.said.append).run()
+        return command(source, labels, self, self.said.append, dry_run=dry_run, picture=False, task=task)
 
 
 def broken(folder: Path) -> Path:

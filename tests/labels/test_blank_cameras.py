@@ -15,13 +15,12 @@ import h5py
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 from client_commands import invoke
 from encoding import encode
+from in_process import rfm
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
-from rfm_commands.cli import app
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset, parse_episodes
 from rfm_labels.datasets import chosen_cameras
 from rfm_labels.datasets.faults import listed
@@ -146,7 +145,7 @@ def test_a_report_of_labels_tells_it_too(tmp_path: Path, write: Callable[[Path],
 def test_a_dry_run_tells_of_the_episodes_that_it_tries(tmp_path: Path) -> None:
     root = with_black_wrist(tmp_path, 1)
     words = [root, *ENGINE, "--dry-run", "--workers", 2, "--frames", 2]
-    result = CliRunner().invoke(app, ["label", *map(str, words)])
+    result = rfm("label", *words)
     assert result.exit_code == 0, result.output
     assert f"note: {WRIST}: black pictures, in 1 of 2 episodes (1): {ADVICE}" in result.stderr
 

@@ -16,10 +16,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from typer.testing import CliRunner
 
+from in_process import rfm_client
 from labelling import FEW, BrightnessScorer
-from rfm_client.cli.commands import app
 from rfm_labels import (
     DatasetError,
     LabelOptions,
@@ -154,7 +153,7 @@ def test_a_file_that_does_not_say_its_cost_has_none(tmp_path: Path) -> None:
     file = labels(tmp_path / "a.parquet", {0: RISING})
     (found,) = evaluate_labels([file]).evaluations
     assert found.frames_per_s is None
-    done = CliRunner().invoke(app, ["evaluate", str(tmp_path), "--labels", str(file)])
+    done = rfm_client("evaluate", tmp_path, "--labels", file)
     assert re.search(r"frames/s.*\n.*\n  a .* -\s", done.stdout), done.output
     for told in ("soon", "[]", '{"frames": 3}', '{"frames": 0, "seconds": 1.0}', '{"frames": 3, "seconds": NaN}'):
         assert Cost.parse(told.encode()) is None
@@ -235,18 +234,18 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
     numbers = [episode.index for episode in open_dataset(root).episodes]
     rows = "".join(f"{number},{number % 2}\n" for number in numbers)
     outcomes = written(tmp_path / "outcomes.csv", f"episode,success\n{rows}")
-    done = CliRunner().invoke(app, ["evaluate", str(root), "--outcome", outcomes])
+    done = rfm_client("evaluate", root, "--outcome", outcomes)
     assert done.exit_code == 0, done.output
     assert all(
         word in done.stdout
         for word in ("short", "long", f"{sum(number % 2 for number in numbers)} successes", "agreement", "AUROC")
     )
     json_file, picture = tmp_path / "out.json", tmp_path / "out.png"
-    done = CliRunner().invoke(app, ["evaluate", str(root), "--json", str(json_file), "--plot", str(picture)])
+    done = rfm_client("evaluate", root, "--json", json_file, "--plot", picture)
     assert done.exit_code == 0, done.output
     document = json.loads(json_file.read_text())
     assert [each["name"] for each in document["evaluations"]] == ["long", "short"]
     assert document["is_success"] is None
     assert picture.read_bytes().startswith(b"\x89PNG")
-    empty = CliRunner().invoke(app, ["evaluate", str(tmp_path)])
+    empty = rfm_client("evaluate", tmp_path)
     assert (empty.exit_code, "expected label files, NAME_progress.parquet" in empty.stderr) == (1, True)

@@ -17,9 +17,8 @@ from PIL import Image
 from pyarrow import parquet
 
 from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, brightness
-from rfm_client import ProgressResult, ProgressSample
+from rfm_client import ProgressResult, ProgressSample, UInt8Array
 from rfm_client.frames import ORIENTATIONS, Correction, Orient, Orientation
-from rfm_client.frames.orientation import turned
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 from rfm_labels.datasets import chosen_cameras
 
@@ -129,8 +128,7 @@ def test_a_file_that_contradicts_itself_is_refused(
     assert scorer.num_samples == 0
 
 
-TURNED_BY_PILLOW: dict[Orientation, Image.Transpose | None] = {
-    "none": None,
+TURNED_BY_PILLOW: dict[Orientation, Image.Transpose] = {
     "rotate180": Image.Transpose.ROTATE_180,
     "flip-vertical": Image.Transpose.FLIP_TOP_BOTTOM,
     "flip-horizontal": Image.Transpose.FLIP_LEFT_RIGHT,
@@ -139,14 +137,20 @@ TURNED_BY_PILLOW: dict[Orientation, Image.Transpose | None] = {
 }
 
 
-@pytest.mark.parametrize(("orientation", "transpose"), TURNED_BY_PILLOW.items(), ids=TURNED_BY_PILLOW)
-def test_a_picture_is_turned_as_pillow_turns_it(orientation: Orientation, transpose: Image.Transpose | None) -> None:
-    assert set(TURNED_BY_PILLOW) == set(ORIENTATIONS)
-    frames = frames_of(0, "agentview_rgb")
-    image = Image.fromarray(frames[0])
-    upright = np.asarray(image if transpose is None else image.transpose(transpose))
-    np.testing.assert_array_equal(turned(frames[0], orientation), upright)
-    np.testing.assert_array_equal(turned(frames, orientation)[0], upright)
+def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
+    """Return frames [T, H, W, 3] as Pillow turns them."""
+    if orientation == "none":
+        return frames
+    return np.stack([np.asarray(Image.fromarray(frame).transpose(TURNED_BY_PILLOW[orientation])) for frame in frames])
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_pictures_are_turned_as_pillow_turns_them(tmp_path: Path, orientation: Orientation) -> None:
+    file = write(tmp_path / "demos.hdf5", ROBOMIMIC, pictures())
+    dataset = open_dataset(file, task="lift the cube", orient=Orient.parse([orientation]))
+    for camera in CAMERAS:
+        read = np.stack(list(dataset.frames(dataset.episodes[0], camera)))
+        np.testing.assert_array_equal(read, turned(pictures()[camera], orientation))
 
 
 BOTH = ", ".join(CAMERAS)

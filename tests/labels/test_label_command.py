@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 import rerun
 from pyarrow import parquet
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from client_commands import invoke
 from gateways import free_port
+from in_process import rfm
 from labelling import FRONT, LEROBOT
 from paths import ROOT
 from rfm_client.command_line import ExitCode
-from rfm_commands.cli import app
 from servers import Endpoints
 from toy_world import Task, make_clip
 
@@ -38,7 +38,7 @@ ENGINE = (
 
 def own(*words: object) -> Result:
     """rfm label in this process."""
-    return CliRunner().invoke(app, ["label", *map(str, words)])
+    return rfm("label", *words)
 
 
 def cells(output: str) -> dict[str, str]:

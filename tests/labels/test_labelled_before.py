@@ -6,8 +6,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,8 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, without_cost
-from rfm_labels import DatasetError, LabelOptions, RayOptions, Scorer, label, open_dataset
-from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
+from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, command, without_cost
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 TOY = LEROBOT / "toy_v30_many"
 CAMERAS = (WRIST, FRONT)  # not in the order of their names
@@ -279,12 +277,7 @@ def test_a_dry_run_refuses_labels_of_another_recipe(output: Path) -> None:
 
 
 def dry_run(root: Path, options: LabelOptions) -> None:
-    @contextmanager
-    def connect() -> Iterator[Scorer]:
-        yield BrightnessScorer()
-
-    run = RunOptions(dry_run=True)
-    LabelCommand(str(root), EpisodeTexts(), options, run, RayOptions(), connect, lambda line: None).run()
+    command(root, options, BrightnessScorer(), dry_run=True)
 
 
 def test_a_dataset_that_has_grown_is_labelled_where_it_is_new(tmp_path: Path, output: Path) -> None:

@@ -28,11 +28,10 @@ import yaml
 from referencing import Registry, Resource
 from typer.main import get_command
 
+from in_process import rfm_app
 from paths import ROOT
 from repositories import kill_model
-from rfm.launch import admin_key
 from rfm.launch.ending import KILL_AFTER_S
-from rfm_commands.cli import app
 from rfm_gateway.command import STOP_WITHIN_S
 from servers import Endpoints, wait_for
 
@@ -105,7 +104,7 @@ def workloads(*folders: str) -> list[Any]:
 def parameters(words: list[str]) -> dict[str, Any]:
     """What ``rfm`` reads its words as; it runs nothing."""
     name, *arguments = words
-    return get_command(app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
+    return get_command(rfm_app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
 
 
 def selected(selector: dict[str, str], folder: str) -> list[Object]:
@@ -207,7 +206,7 @@ def test_keys_are_files_that_others_cannot_read(workload: Object) -> None:
 def test_kserve_s_key_is_a_variable() -> None:
     container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
     assert parameters(container["args"])["admin_key_file"] is None
-    (key,) = (one["valueFrom"]["secretKeyRef"] for one in container["env"] if one["name"] == admin_key.VARIABLE)
+    (key,) = (one["valueFrom"]["secretKeyRef"] for one in container["env"] if one["name"] == "RFM_ADMIN_KEY")
     assert_readme_creates(key["name"], key["key"])
 
 

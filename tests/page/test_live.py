@@ -17,7 +17,7 @@ from PIL import Image
 from gateway_requests import failure
 from gateways import TestClient, inside, running
 from live_reports import Json, episode, identity, jpeg, picture, report, step
-from rfm_client.episodes import StepScore, live
+from rfm_client.episodes import StepScore
 from rfm_page.live import (
     FORGOTTEN_AFTER_S,
     MOST_BODY_BYTES,
@@ -25,7 +25,7 @@ from rfm_page.live import (
     LiveEpisodes,
     LiveReport,
 )
-from rfm_rl import LiveView
+from rfm_rl import LiveView, live
 from servers import Endpoints
 
 KEY = "open sesame"

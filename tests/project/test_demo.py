@@ -13,16 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-from typer.testing import CliRunner
 
 import clip
 import rfm_export
 from commands import nothing_left_behind
+from in_process import rfm
 from paths import ROOT, VIDEOS
 from rfm.config import ExportConfig
 from rfm_client import load_trajectory
 from rfm_client.frames import read_video
-from rfm_commands.cli import app
 from toy_world import Task, make_clip
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -91,7 +90,7 @@ def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: p
         "--text-encoder": encoders / "text_encoder",
     }
     with nothing_left_behind():
-        result = CliRunner().invoke(app, ["demo", *(str(word) for pair in options.items() for word in pair)])
+        result = rfm("demo", *(str(word) for pair in options.items() for word in pair))
     assert result.exit_code == 0, result.output
     for shown in (clip.TASK, "clip.mp4", "32 frames", "batches"):
         assert shown in result.output
@@ -107,7 +106,7 @@ def test_a_repository_that_cannot_be_served_is_told(tmp_path: Path) -> None:
         (spaced, "a path without spaces, such as a link (ln -s)"),
     ):
         options = {"--video": tmp_path / "clip.mp4", "--task": "x", "--repository": repository, "--output": tmp_path}
-        result = CliRunner().invoke(app, ["demo", *(str(word) for pair in options.items() for word in pair)])
+        result = rfm("demo", *(str(word) for pair in options.items() for word in pair))
         assert result.exit_code == 1
         assert result.stderr.startswith(f"rfm: repository: expected {told}, got {repository}")
 

@@ -25,14 +25,13 @@ from typer.main import get_command
 
 import clip
 import toy_dataset
+from in_process import rfm_app, rfm_client_app
 from labelling import LEROBOT
 from paths import ROOT
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
-from rfm_client.cli.commands import app
 from rfm_client.contract import wire
 from rfm_client.contract.settings import Setting
 from rfm_client.options import settings_of
-from rfm_commands.cli import app as rfm
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
 from servers import Endpoints
@@ -189,7 +188,7 @@ def check_gateway(endpoints: Endpoints, command: str) -> None:
 
 def test_every_command_of_the_client_is_shown() -> None:
     guide = CLIENT_GUIDE.read_text()
-    for name in get_command(app).commands:  # type: ignore[attr-defined]
+    for name in get_command(rfm_client_app).commands:  # type: ignore[attr-defined]
         assert f"rfm-client {name}" in guide
 
 
@@ -224,7 +223,7 @@ def test_every_command_line_is_one_that_the_commands_take(command: str) -> None:
     if "..." in words or any("[" in word for word in words):
         return  # a pattern
     program, *arguments = itertools.takewhile(lambda word: word not in ENDS, words)
-    parse(get_command(rfm if Path(program).name == "rfm" else app), arguments)
+    parse(get_command(rfm_app if Path(program).name == "rfm" else rfm_client_app), arguments)
 
 
 def parse(command: Command, arguments: Sequence[str], parent: Context | None = None) -> None:
@@ -238,7 +237,7 @@ def parse(command: Command, arguments: Sequence[str], parent: Context | None = N
 
 def test_every_command_and_option_is_documented() -> None:
     configuration = CONFIGURATION.read_text()
-    for name, command in get_command(rfm).commands.items():  # type: ignore[attr-defined]
+    for name, command in get_command(rfm_app).commands.items():  # type: ignore[attr-defined]
         assert command.help, name
         assert f"`rfm {name}`" in configuration
         for parameter in options(command):

@@ -13,9 +13,8 @@ from click import Command
 from click.testing import CliRunner
 from typer.main import get_command
 
+from in_process import rfm_app, rfm_client_app
 from rfm.config import ServeConfig
-from rfm_client.cli.commands import app as rfm_client
-from rfm_commands.cli import app as rfm
 from rfm_gateway import GatewayConfig
 
 COMMON = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
@@ -28,7 +27,7 @@ def commands(name: str, command: Command) -> Iterator[tuple[str, Command]]:
         yield from commands(f"{name} {inner}", below)
 
 
-COMMANDS = {**dict(commands("rfm", get_command(rfm))), **dict(commands("rfm-client", get_command(rfm_client)))}
+COMMANDS = {**dict(commands("rfm", get_command(rfm_app))), **dict(commands("rfm-client", get_command(rfm_client_app)))}
 
 
 def assert_whole(shown: str, command: Command) -> None:

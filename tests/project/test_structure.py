@@ -34,6 +34,9 @@ PUBLIC = {  # modules, each of which lists its names in __all__
     "rfm_client": {"", "command_line", "episodes", "frames", "options", "plot", "recording", "serving"},
     "rfm_gateway": {"", "mounting"},
     "rfm_labels": {"", "datasets"},
+    "rfm_rl": {"", "sb3"},
+    "rfm_export": {""},
+    "rfm": {"config", "engine", "families"},
 }
 MOST_NAMES = 149  # of the client's public modules together
 # Package, module, or folder of programs -> what of ours it may import besides itself; "!": what of that it may not.

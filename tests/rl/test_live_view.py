@@ -31,8 +31,8 @@ from environments import MODEL, TASK, cart_pole, play
 from gateways import poll
 from live_reports import Taker, picture, taking
 from rfm_client import RewardClient, ServerUnavailableError
-from rfm_client.episodes import StepScore, SuccessRule, live
-from rfm_rl import LiveView, RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
+from rfm_client.episodes import StepScore, SuccessRule
+from rfm_rl import LiveView, RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, live
 from servers import Served
 
 

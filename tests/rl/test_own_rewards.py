@@ -20,7 +20,6 @@ from coded_env import CodedEnv, Recorder
 from environments import TASK
 from goal_env import LENGTH, Reach
 from rfm_client import ProgressResult, RewardClient
-from rfm_client.episodes.windows import Window
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 
 pytest.importorskip("stable_baselines3", reason="the extra sb3 is not installed")
@@ -146,7 +145,7 @@ def test_a_normalization_inside_is_refused(recorder: Recorder) -> None:
 class Pleased(Recorder):
     """Sees a success in each frame."""
 
-    def score_windows(self, windows: Sequence[Window], **options: Any) -> Any:
+    def score_windows(self, windows: Sequence[Any], **options: Any) -> Any:
         ones = [np.ones(len(window.frames), np.float32) for window in windows]
         return [ProgressResult(progress=each, success=each) for each in ones]
 

@@ -14,7 +14,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from coded_env import CodedEnv, Recorder
 from rfm_client import ProgressResult
-from rfm_client.episodes.windows import Window
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 
 PROGRESS = (0.1, 0.4, 0.3, 0.3, 0.8)  # of an episode's frames
@@ -31,7 +30,7 @@ class Judge(Recorder):
         super().__init__()
         self.predicts_success = predicts_success
 
-    def score_windows(self, windows: Sequence[Window], **options: Any) -> Any:
+    def score_windows(self, windows: Sequence[Any], **options: Any) -> Any:
         super().score_windows(windows, **options)
         return [self._scored([int(frame.pixels[0, 0, 2]) for frame in window.frames]) for window in windows]
 

@@ -12,14 +12,13 @@ import pytest
 import tritonclient.grpc
 import tritonclient.http
 from tritonclient.utils import InferenceServerException
-from typer.testing import CliRunner
 
 from commands import REPOSITORY
+from in_process import rfm
 from rfm.launch.admin_key import VARIABLE, AdminKeyError, take_key
 from rfm.launch.installation import Installation, ServerStartError, find_installation
 from rfm.launch.triton_options import MAX_HTTP_BYTES, size_limits
 from rfm.launch.triton_server import TritonServer
-from rfm_commands.cli import app
 from servers import KEY, Endpoints, Served
 
 ADMINISTRATION: dict[str, tuple[Any, ...]] = {
@@ -46,7 +45,7 @@ def test_the_server_changes_nothing_without_its_key(served: Served, tmp_path: Pa
     key_file.touch(0o600)
     key_file.write_text(shown or "")
     words = ["--url", url, *(["--admin-key-file", str(key_file)] if shown else [])]
-    done = CliRunner().invoke(app, ["models", "list", *words])
+    done = rfm("models", "list", *words)
     hint = f"(--admin-key-file or {VARIABLE}), got {'another' if shown else 'none'}"
     assert (done.exit_code, done.stderr) == (1, f"rfm: admin key: expected that of the server at {url} {hint}\n")
 

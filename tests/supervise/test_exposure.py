@@ -13,9 +13,9 @@ from typing import Any
 
 import httpx
 import pytest
-from typer.testing import CliRunner
 
 from commands import REPOSITORY, nothing_left_behind
+from in_process import rfm
 from rfm.config import ServeConfig
 from rfm.launch import endpoints
 from rfm.launch.endpoints import PORTS, Endpoints, GrpcTls, check_version, free_ports
@@ -24,7 +24,6 @@ from rfm.launch.model_processes import children_of, has_ended
 from rfm.launch.triton_server import TritonServer
 from rfm.supervise.status import NO_REASON, Status, StatusServer
 from rfm_client.options import ConfigError
-from rfm_commands.cli import app
 from secured import Papers, other_program
 from servers import wait_for
 
@@ -38,14 +37,14 @@ from servers import wait_for
     ids=["open", "half a pair"],
 )  # fmt: skip
 def test_rfm_serve_says_what_others_may_not_reach(words: tuple[str, ...], told: str) -> None:
-    done = CliRunner().invoke(app, ["serve", "--repository", str(REPOSITORY), *words])
+    done = rfm("serve", "--repository", REPOSITORY, *words)
     assert (done.exit_code, done.stderr[: len(told)]) == (1, told)
     assert ("--accept-known-vulnerabilities" in done.stderr) == ("known remote vul" in told)
 
 
 def test_a_triton_with_known_vulnerabilities_is_warned_about(caplog: pytest.LogCaptureFixture) -> None:
     words = ["serve", "/nowhere", "--host", "0.0.0.0", "--accept-known-vulnerabilities"]
-    assert CliRunner().invoke(app, words).exit_code == 1
+    assert rfm(*words).exit_code == 1
     accepted = "0.0.0.0 is no loopback address, and a Triton with known remote vulnerabilities is accepted"
     assert caplog.messages[0].startswith(accepted)
 

@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 import safetensors.torch
 from tritonclient.grpc import model_config_pb2 as pb
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import goldens
 import rfm_export
 import rollout
 from engines import load_engine, serve_config
+from in_process import rfm
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm.supervise.status import NO_REASON
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_commands import rollout as rfm_rollout
-from rfm_commands.cli import app
 from rfm_commands.rollout import Rollout, RolloutError
 from rfm_export.publish import read_config
 from rollout import CALLERS, NAME, WITH_ENCODERS, callers, difference
@@ -48,7 +48,7 @@ while not pathlib.Path({may_end!r}).exists():
 
 
 def models(command: str, *words: str) -> Result:
-    return CliRunner().invoke(app, ["models", command, *words])
+    return rfm("models", command, *words)
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ import httpx
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 import clip
 import rfm_export
 from commands import EXIT_S, REPOSITORY, RFM, command, is_alive, nothing_left_behind, wait_for_http
+from in_process import rfm
 from paths import ROOT
 from rfm.config import ExportConfig
 from rfm.launch import installation
@@ -31,7 +31,6 @@ from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.contract.descriptors import MOST
-from rfm_commands.cli import app
 from servers import children, model_processes, wait_for
 
 VIDEO = ROOT / "tests/videos/jaco_play_pick_up_green_cup.mp4"
@@ -173,7 +172,7 @@ def test_a_port_that_is_taken_is_named_with_its_option(option: str, what: str) -
     with nothing_left_behind(), socket.create_server(("::1", 0), family=socket.AF_INET6) as taken:
         port = taken.getsockname()[1]
         words = command(REPOSITORY, Endpoints.free())[1:]
-        done = CliRunner().invoke(app, [*words, "--host=::1", f"--{option}-port={port}"])
+        done = rfm(*words, "--host=::1", f"--{option}-port={port}")
     told = f"rfm: {what}: expected a free port of this machine at [::1]:{port}, got: Address already in use; "
     assert done.exit_code == 1
     assert done.stderr.splitlines()[-1] == f"{told}--{option}-port names another port"
@@ -259,7 +258,7 @@ def test_a_program_that_does_not_serve_is_told_and_is_no_crash_loop(
     if program is not None:
         executable(file, program)
     words = [*command(REPOSITORY, Endpoints.free())[1:], f"--status-port={free_ports(1)[0]}"]
-    done = CliRunner().invoke(app, [*words, "--tritonserver", str(file)])
+    done = rfm(*words, "--tritonserver", file)
     assert done.exit_code == 1
     assert re.search(rf"^rfm: tritonserver: {told}", done.stderr.splitlines()[-1])
 

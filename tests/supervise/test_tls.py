@@ -20,18 +20,16 @@ import aiohttp.web
 import httpx
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import goldens
 from engines import load_engine
+from in_process import rfm, rfm_client
 from repositories import kill_model
 from rfm.launch.endpoints import Endpoints, GrpcTls
 from rfm.launch.triton_options import MAX_HTTP_BYTES
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
-from rfm_client.cli.commands import app as client_app
 from rfm_client.serving import Credentials, read_status
 from rfm_client.transport.loop_thread import LoopThread
-from rfm_commands.cli import app
 from secured import PUBLIC_HOST, Papers, other_program
 from servers import KEY, PATIENCE_S, Serving, serving, start_triton, wait_for
 from trajectories import random_trajectory
@@ -171,9 +169,9 @@ def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, key_f
     own = ["--client-certificate", str(papers.client_certificate), "--client-key", str(papers.client_key)]
     trusted = ["--ca-file", str(papers.ca), *own]
     for given in ([*trusted, *list_models], [*list_models, *trusted]):
-        assert CliRunner().invoke(app, ["models", *given]).stdout.split() == ["rfm", "1", "READY"]
+        assert rfm("models", *given).stdout.split() == ["rfm", "1", "READY"]
     for credentials in (["--ca-file", str(papers.other_ca), *own], trusted[:2]):
-        refused = CliRunner().invoke(app, ["models", *credentials, *list_models])
+        refused = rfm("models", *credentials, *list_models)
         assert (refused.exit_code, refused.stdout) == (1, "")
         assert refused.stderr.startswith(f"rfm: {mutual.grpc_url}: failed to connect")
 
@@ -292,14 +290,14 @@ def test_the_command_has_the_same_options(mutual: Endpoints, proxied: str, paper
     words = [f"--{name.replace('_', '-')}={file}" for name, file in names.items()]
     wrong = f"--ca-file={papers.other_ca}"
     for given in ([*words, "sample"], ["sample", *words], [words[0], "sample", *words[1:]], [wrong, "sample", *words]):
-        done = CliRunner().invoke(client_app, [*given, "--url", mutual.grpc_url])
+        done = rfm_client(*given, "--url", mutual.grpc_url)
         assert done.exit_code == 0, done.output
     in_environment = {f"RFM_{name.upper()}": str(file) for name, file in {**names, "api_key_file": key_file}.items()}
     for name in ("sample", "status", "wait"):
-        done = CliRunner(env=in_environment).invoke(client_app, [name, "--url", proxied])
+        done = rfm_client(name, "--url", proxied, env=in_environment)
         assert done.exit_code == 0, done.output
     for given in ([wrong, "sample"], [*words, "sample", wrong]):
-        refused = CliRunner().invoke(client_app, [*given, "--url", mutual.grpc_url])
+        refused = rfm_client(*given, "--url", mutual.grpc_url)
         assert (refused.exit_code, "access denied" in refused.stderr) == (1, True)
 
 
@@ -351,7 +349,7 @@ def test_the_gateway_s_own_certificate_is_not_the_caller_s_fault(
 
 def test_half_a_certificate_of_the_gateway_is_refused(papers: Papers) -> None:
     words = ["gateway", "--triton", "grpc://127.0.0.1:1", "--certificate", str(papers.certificate)]
-    done = CliRunner().invoke(app, words)
+    done = rfm(*words)
     assert done.exit_code == 2
     assert "'--certificate, --key': expected both or none, got one" in done.stderr
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client import (
     InferenceFailedError,

@@ -7,17 +7,18 @@ import os
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import clip
+from in_process import rfm_client
 from rfm_client import (
     FrameScores,
 )
-from rfm_client.cli.commands import app
 from servers import Served
 
 RFM_CLIENT = Path(sys.executable).parent / "rfm-client"
@@ -35,9 +36,7 @@ TASK = clip.TASK
 TOLERANCE = 1e-5
 
 
-def invoke(*words: object) -> Result:
-    """The command in this process."""
-    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+invoke = partial(rfm_client, catch_exceptions=False)
 
 
 def ask(served: Served, *words: object, protocol: str = "grpc", model: str = MODEL) -> Result:

@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 
 from rfm_client import RewardClient, ServerUnavailableError, UInt8Array
-from rfm_client.episodes.windows import Window
 from shelves import Shelf
 
 SIZE_PX = 32
@@ -86,7 +85,7 @@ class Recorder(RewardClient):
         self.pixels: list[list[UInt8Array]] = []  # of each window
         self.failing = failing
 
-    def score_windows(self, windows: Sequence[Window], **options: Any) -> Any:
+    def score_windows(self, windows: Sequence[Any], **options: Any) -> Any:
         self.pixels += [[frame.pixels for frame in window.frames] for window in windows]
         codes = [[tuple(frame.pixels[0, 0].tolist()) for frame in window.frames] for window in windows]
         self.calls.append([(of_window, window.task) for of_window, window in zip(codes, windows, strict=True)])

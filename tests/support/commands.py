@@ -17,9 +17,9 @@ import psutil
 
 from paths import ROOT
 from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
+from rfm.launch.endpoints import Endpoints
 from rfm.launch.model_processes import has_ended
 from rfm_client import RewardClient
-from servers import Endpoints
 
 REPOSITORY = ROOT / "model_repository"
 RFM = Path(sys.executable).parent / "rfm"

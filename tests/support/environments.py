@@ -14,10 +14,7 @@ import numpy as np
 from gymnasium.wrappers import AddRenderObservation
 
 from rfm_client import ProgressResult, RewardClient, Trajectory, UInt8Array
-from rfm_client.contract import wire
-from rfm_client.episodes.windows import Window
-from rfm_client.serving import Credentials
-from rfm_client.transport.calls import Answer, GrpcTransport
+from transports import Answer, Connection, Tensors
 
 MODEL = "enc_c1_t1_disc10"
 MAX_FRAMES = 16  # of that checkpoint
@@ -107,15 +104,15 @@ def assert_close(left: Any, right: Any) -> None:
     np.testing.assert_allclose(left, right, rtol=0, atol=TOLERANCE)
 
 
-class SlowConnection(GrpcTransport):
+class SlowConnection(Connection):
     """To the real server; a question whose longest trajectory has a length that is held waits until it is let go."""
 
     def __init__(self, url: str) -> None:
-        super().__init__(url, Credentials(), shared_memory=False)
+        super().__init__(url)
         self.held: dict[int, Future[None]] = {}
 
-    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **_id: str) -> Answer:
-        length = int(inputs[wire.NUM_FRAMES].max())
+    async def infer(self, model: str, inputs: Tensors, outputs: Any, timeout_s: float, **_id: str) -> Answer:
+        length = int(inputs["num_frames"].max())
         if length in self.held:
             await asyncio.shield(asyncio.wrap_future(self.held[length]))  # several questions may wait for it
         return await super().infer(model, inputs, outputs, timeout_s)
@@ -133,7 +130,7 @@ class LateClient(RewardClient):
     def hold(self, *steps: int) -> None:
         self.connection.held |= {step + 1: Future() for step in steps}
 
-    def submit_window(self, window: Window) -> Future[ProgressResult]:
+    def submit_window(self, window: Any) -> Future[ProgressResult]:
         answer = super().submit_window(window)
         self.submitted.append(answer)
         self.answers[len(window.frames) - 1] = answer

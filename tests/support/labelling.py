@@ -10,8 +10,8 @@ import io
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 from pyarrow import parquet
 
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory, UInt8Array
-from rfm_labels import CheckpointFacts, DatasetEpisode, LabelOptions, Scorer, Watch, label, open_dataset
+from rfm_labels import CheckpointFacts, DatasetEpisode, LabelOptions, RayOptions, Scorer, Watch, label, open_dataset
 
 LEROBOT = Path(__file__).parents[1] / "lerobot"
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
@@ -94,6 +94,33 @@ class Notes(Watch):
 
     def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
         self.failures.append(f"{episode.name}: {error}")
+
+
+def command(
+    source: Path,
+    labels: LabelOptions,
+    scorer: Scorer,
+    say: Callable[[str], None] = print,
+    *,
+    task: str | None = None,
+    **run: bool,
+) -> int:
+    """Run ``rfm-client label`` with a scorer instead of a server. Return the exit code.
+
+    say: gets each line of its output; run: ``dry_run``, ``picture``
+    """
+    from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
+
+    texts, options = EpisodeTexts(task=task), RunOptions(**run)
+    return LabelCommand(str(source), texts, labels, options, RayOptions(), lambda: nullcontext(scorer), say).run()
+
+
+def tasks_of(root: Path) -> dict[int, str]:
+    """Return the sentences of a LeRobot v3.0 dataset by number."""
+    columns = parquet.read_table(root / "meta" / "tasks.parquet").to_pydict()
+    numbers = columns.pop("task_index")
+    (sentences,) = columns.values()
+    return dict(zip(numbers, sentences, strict=True))
 
 
 def without_cost(file: Path) -> bytes:

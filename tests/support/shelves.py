@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rfm_client import FrameSize, ModelInfo, ModelNotFoundError
-from rfm_client.contract import wire
-from rfm_client.transport.calls import Answer
+from transports import Answer, Tensors
 
 
 @dataclass(frozen=True)
@@ -50,16 +49,16 @@ class Shelf:
         return self.other if self.count >= self.after and model in self.parts else self.kept
 
     async def infer(
-        self, model: str, inputs: wire.Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+        self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
         now = self.of(model)
         if model == "rfm_encoder":
-            num_frames = int(inputs[wire.NUM_FRAMES][0, 0])
-            tensors = {wire.VIDEO_EMBEDDINGS: np.ones((1, num_frames, 4)), wire.TEXT_EMBEDDING: np.ones((1, 2))}
+            num_frames = int(inputs["num_frames"][0, 0])
+            tensors = {"video_embeddings": np.ones((1, num_frames, 4)), "text_embedding": np.ones((1, 2))}
             return Answer({name: array.astype(np.float32) for name, array in tensors.items()}, now.version)
         self.count += 1
-        self.shapes.append(inputs[wire.FRAMES if model == "rfm_frames" else wire.VIDEO_EMBEDDINGS].shape)
-        num_frames = inputs[wire.NUM_FRAMES].sum(axis=1)  # of both trajectories, which may lie in two arrays
+        self.shapes.append(inputs["frames" if model == "rfm_frames" else "video_embeddings"].shape)
+        num_frames = inputs["num_frames"].sum(axis=1)  # of both trajectories, which may lie in two arrays
         scores = np.full((len(num_frames), num_frames.max()), now.score)
         return Answer(dict.fromkeys(outputs, scores.astype(np.float32)), now.version)
 

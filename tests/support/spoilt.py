@@ -17,7 +17,7 @@ import pytest
 from safetensors.torch import load_file, save_file
 
 import goldens
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 
 WEIGHTS = "model.safetensors"
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS
 from rfm.checkpoint.provenance import Decision
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import RowScores, frame_scores, of_rows, prefix_indices
 from rfm.family import NETWORK, Description, EncodersDescription, Family, Options

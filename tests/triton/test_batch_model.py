@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from batch_models import BREAKS, CONFIG, FAILS, LOGGED, METRICS, REFUSED, WIDTHS, Model, Request, backend, request  # noqa: F401  a fixture
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.engine.threads import use_threads
 from rfm.probe_request import probe_request
 from rfm.triton_model import batch_model

@@ -24,7 +24,6 @@ import rfm_export
 from engines import serve_config
 from gateways import answers, poll
 from paths import ROOT
-from rfm.launch.admin_key import VARIABLE
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
@@ -34,10 +33,9 @@ from rfm_client import (
     RewardError,
     ServerUnavailableError,
 )
-from rfm_client.contract import wire
-from rfm_client.contract.process_log import LEVEL_VARIABLE
 from rfm_client.serving import PROBE_PREFIX
 from servers import Endpoints, Serving, children, serving, wait_for, web_server
+from tensors import encode_samples
 from trajectories import random_trajectory
 
 CONFIG = goldens.config("c1_t1_disc10")
@@ -118,8 +116,8 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     model.write_text(model.read_text() + FAULTY)
     traces: list[bytes] = []
     with web_server(partial(Collector, traces)) as collector, pytest.MonkeyPatch.context() as environment:
-        environment.setitem(os.environ, VARIABLE, KEY)
-        environment.setitem(os.environ, LEVEL_VARIABLE, "debug")
+        environment.setitem(os.environ, "RFM_ADMIN_KEY", KEY)
+        environment.setitem(os.environ, "RFM_LOG_LEVEL", "debug")
         options = documented_options(f"{collector}/v1/traces")
         port = Endpoints.free().http_port
         with serving(repository, f"--gateway-port={port}", "--", *options) as served:
@@ -198,7 +196,7 @@ def test_an_error_keeps_its_request_where_it_goes() -> None:
 def test_traces_name_the_request_and_continue_a_caller_s(running: Running) -> None:
     trace_id = "4bf92f3577b34da6a3ce929d0e0e4736"
     inputs = []
-    for name, array in wire.encode_samples([GOOD]).items():
+    for name, array in encode_samples([GOOD]).items():
         inputs.append(tritonclient.http.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
         inputs[-1].set_data_from_numpy(array)
     headers = {"traceparent": f"00-{trace_id}-00f067aa0ba902b7-01"}

@@ -18,7 +18,7 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from mixtures import TOLD_S, mixed_samples
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
 from rfm_client import (

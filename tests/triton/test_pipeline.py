@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from batch_models import BREAKS, CONFIG, MODELS, REFUSED, Model, Request, backend, request  # noqa: F401  a fixture
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm_client import Result, RewardError, Sample
 from servers import PATIENCE_S, wait_for
 
