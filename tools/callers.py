@@ -25,9 +25,9 @@ from rfm_client import (
     Sample,
     SimilaritySample,
 )
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
-TOLERANCE = 1e-5  # absolute up to 1; relative above, where only similarity can be
 PATIENCE_S = 60.0
 PAUSE_S = 0.1  # after a failed call
 WIDTHS = (64, 32)  # of the demo's checkpoint

@@ -13,17 +13,7 @@ import pytest
 from PIL import Image
 
 import clip
-from client_commands import (
-    MODEL,
-    TASK,
-    TOLERANCE,
-    WIDTHS,
-    ask,
-    assert_scores,
-    columns,
-    rows,
-    run,
-)
+from client_commands import MODEL, TASK, WIDTHS, ask, assert_scores, columns, rows, run
 from rfm_client import (
     FrameScores,
     InferenceFailedError,
@@ -40,6 +30,7 @@ from rfm_client.command_line import ExitCode
 from rfm_client.plot import plot_scores, save
 from servers import Served, folder_server
 from shelves import Shelf
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
 MAX_FRAMES = 16  # of that checkpoint

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from engines import load_engine
-from mixtures import FRAMES_MODEL, MODEL, TOLERANCE, assert_same, mixed_samples, plug
+from mixtures import FRAMES_MODEL, MODEL, assert_same, mixed_samples, plug
 from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
@@ -34,6 +34,7 @@ from rfm_client import (
 from rfm_client.frames import resize_frames
 from servers import Served
 from shelves import Shelf
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 from transports import Answer, Connection
 

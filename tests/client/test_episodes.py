@@ -38,13 +38,13 @@ from rfm_client import (
 from rfm_client.episodes import Episode
 from rfm_client.frames import RULES, Rule, Sampling, of_prefixes, prefix_samples
 from servers import Served, Serving, serving
+from tolerances import BATCHED_VLM_TOLERANCE, TOLERANCE
 from transports import Answer, Tensors
 
 MODEL = "enc_c1_t1_disc10"
 IMAGES, VIDEO = "q3_tok_disc10", "q25_video_avg_disc10"
 TASK = "stack the cups"
 FOUR = Sampling("rint_pad", 4)
-TOLERANCE, VLM_TOLERANCE = 1e-5, 1e-4
 
 
 def video(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array:
@@ -106,7 +106,7 @@ def test_steps_have_the_scores_of_the_whole(served: Served, model: str, rule: Ru
     frames = video(RULES.index(rule), 16 if rule == "all" else 40, (40, 56) if model == MODEL else (56, 84))
     with served.client(protocol, model) as client, client.episode(TASK, sampling=rule, frames=number) as episode:
         assert client.model_info(frames=True).by_digest
-        tolerance = TOLERANCE if model == MODEL else VLM_TOLERANCE
+        tolerance = TOLERANCE if model == MODEL else BATCHED_VLM_TOLERANCE
         assert_same(online(episode, frames), offline(client, frames, Sampling(rule, number)), tolerance)
 
 
@@ -128,7 +128,7 @@ def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: S
         with RewardClient([], transports=[transport], model=model) as client, client.episode(TASK, frames=4) as episode:
             first = online(episode, frames)
             episode.reset()
-            np.testing.assert_allclose(online(episode, frames), first, rtol=0, atol=VLM_TOLERANCE)
+            np.testing.assert_allclose(online(episode, frames), first, rtol=0, atol=BATCHED_VLM_TOLERANCE)
         return transport, first
 
     before = encoded()
@@ -140,7 +140,7 @@ def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: S
         repeated = transport.requests[len(frames) :]
         assert {inputs["frames"].shape for inputs in repeated} == {(1, 1, 1, 1, 3)}  # known: not even sent
     for model in encoders:  # another client sends them, and a caller of plain tensors uses the cache, too
-        np.testing.assert_allclose(step(model)[1], firsts[model], rtol=0, atol=VLM_TOLERANCE)
+        np.testing.assert_allclose(step(model)[1], firsts[model], rtol=0, atol=BATCHED_VLM_TOLERANCE)
     with served.client("http", MODEL) as plain:
         plain.progress(Trajectory(frames=frames[::-1], task=TASK))
     pairs = {tuple(pair) for t in range(12) for pair in FOUR.prefix(t).indices.reshape(-1, 2).tolist()}
@@ -438,7 +438,9 @@ def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(tmp
                 scores.append(episode.add(frames[len(scores)]))
         expected = offline(client, frames)
     assert [score.step for score in scores] == list(range(len(frames)))
-    assert_same(([score.progress for score in scores], [score.success for score in scores]), expected, VLM_TOLERANCE)
+    assert_same(
+        ([score.progress for score in scores], [score.success for score in scores]), expected, BATCHED_VLM_TOLERANCE
+    )
 
 
 @pytest.mark.slow

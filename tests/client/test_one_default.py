@@ -15,13 +15,13 @@ from rfm_client import RewardClient, load_trajectory
 from rfm_client.frames import Sampling
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
 from servers import Endpoints
+from tolerances import TOLERANCE
 from toy_world import Task, make_clip
 from toy_world.video import write_video
 
 pytestmark = pytest.mark.triton
 
 TASK = "put the red block in the bowl"
-TOLERANCE = 1e-5
 
 
 @pytest.fixture(scope="module")

@@ -17,10 +17,10 @@ from rfm.vlm.predictor import VlmPredictor
 from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory, UInt8Array
 from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs, frame_digest
 from rfm_client.frames import RULES, Rule, Sampling
+from tolerances import TOLERANCE
 from vlm import assert_close, load, video
 
 TASK = "stack the blocks"
-TOLERANCE = 1e-5
 TAKE_A_NUMBER = ("linspace_trunc", "linspace_round", "rint", "rint_pad")
 AS_VIDEO = " as video"  # no reference is a Qwen3-VL that reads videos
 MODELS = ["q3_tok_disc10", f"q3_tok_disc10{AS_VIDEO}", "q25_peft_adapter_disc10", "q25_video_avg_disc10"]

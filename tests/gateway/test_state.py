@@ -24,7 +24,6 @@ from gateway_requests import (
     FIRST,
     SECOND,
     TINY,
-    TOLERANCE,
     Triton,
     answered,
     ask_json,
@@ -43,6 +42,7 @@ from rfm.rewind.network import RewindTransformer
 from rfm_client import InvalidSampleError, ModelNotFoundError, Trajectory
 from rfm_client.serving import read_status
 from servers import Endpoints
+from tolerances import TOLERANCE
 
 pytestmark = pytest.mark.triton
 

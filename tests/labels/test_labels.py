@@ -29,8 +29,8 @@ from rfm_labels import (
     open_dataset,
     parse_episodes,
 )
+from tolerances import TOLERANCE
 
-TOLERANCE = 1e-5
 MODELS = ROOT / "model_repository"
 ELSEWHERE = goldens.ROOT.parent / "lerobot"
 DATASETS = [

@@ -33,6 +33,7 @@ from rfm.config import ServeConfig
 from rfm_client import AccessDeniedError, RewardClient, ServerUnavailableError, Trajectory
 from rfm_client.serving import Credentials, read_status
 from servers import Endpoints, Serving, serving, wait_for
+from tolerances import TOLERANCE
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +47,6 @@ VIEWER = ROOT / "apps" / "page" / "rfm_page" / "static"
 VENDORED = ROOT / "apps" / "page" / "rfm_page" / "vendored"
 FRAMES = np.random.default_rng(0).integers(0, 256, (16, 256, 256, 3), np.uint8)  # 3 MiB: nginx alone takes 1 MiB
 FILMED = Trajectory(frames=FRAMES, task=clip.TASK)
-TOLERANCE = 1e-5
 
 
 def section(heading: str) -> str:

@@ -12,9 +12,10 @@ import pytest
 import requests
 
 import clip
-from gateway_requests import ENCODERS, TINY, TOLERANCE, VLM, Triton, check_refused, failure
+from gateway_requests import ENCODERS, TINY, VLM, Triton, check_refused, failure
 from gateways import Gateway, poll, running
 from rfm_client.frames import RULES
+from tolerances import TOLERANCE
 from viewer_requests import COMPARE, SCORE, SERVED, by_command_line, curve_of, events, post
 
 pytestmark = pytest.mark.triton

@@ -21,11 +21,11 @@ from selenium.webdriver.support.select import Select
 
 import clip
 from browsers import Browser
-from gateway_requests import TOLERANCE
 from gateways import Gateway, poll, running
 from paths import VIDEOS
 from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, ChannelOrder, Correction, Orientation
 from servers import Endpoints
+from tolerances import SHOWN, TOLERANCE
 from toy_world import Task, make_clip
 from viewer_requests import by_command_line
 
@@ -36,7 +36,6 @@ TASK, OTHER_TASK = Task("red", "bowl").sentence(), Task("green", "plate").senten
 CLIPS = {"success": ("success", 2_000_000), "failure": ("dropped", 2_000_001)}
 FPS = 10
 SIGNALS = ("progress", "success")
-SHOWN = 5e-4  # three decimals
 PLAYERS = "#videos video, #time"  # the videos, then the slider
 
 

@@ -19,7 +19,6 @@ from selenium.webdriver import ActionChains, Keys
 from selenium.webdriver.support.select import Select
 
 from browsers import Browser
-from gateway_requests import TOLERANCE
 from gateways import poll, running
 from labelling import BrightnessScorer
 from rfm_client import RewardClient
@@ -29,12 +28,12 @@ from rfm_labels.datasets import LeRobotDataset
 from rfm_rl import LiveView
 from servers import Endpoints
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, large
+from tolerances import SHOWN, TOLERANCE
 from toy_world import Task, make_clip
 from viewer_requests import run_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
-SHOWN = 5e-4  # three decimals, and a tenth of a per cent
 KEY = "open sesame"
 OTHER = "brightness"  # the second reward of the first dataset
 NUM_LARGE = 10_000

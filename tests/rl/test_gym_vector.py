@@ -13,20 +13,11 @@ import pytest
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from environments import (
-    MODEL,
-    TASK,
-    TOLERANCE,
-    LateClient,
-    assert_close,
-    cart_pole,
-    cart_pole_with_pixels,
-    progress,
-    two_cameras,
-)
+from environments import MODEL, TASK, LateClient, assert_close, cart_pole, cart_pole_with_pixels, progress, two_cameras
 from rfm_client import InvalidSampleError, RewardClient
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 from servers import Served
+from tolerances import TOLERANCE
 
 NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 

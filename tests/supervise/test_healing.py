@@ -18,7 +18,7 @@ import httpx
 import numpy as np
 import pytest
 
-from patients import CALLERS, MARK, TOLERANCE, Callers, answering, make_repository, trajectory
+from patients import CALLERS, MARK, Callers, answering, make_repository, trajectory
 from rfm.launch import cleanup
 from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.launch.installation import find_installation
@@ -41,6 +41,7 @@ from servers import (
     serving,
     wait_for,
 )
+from tolerances import TOLERANCE
 
 pytestmark = pytest.mark.slow
 

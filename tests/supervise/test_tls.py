@@ -32,11 +32,11 @@ from rfm_client.serving import Credentials, read_status
 from rfm_client.transport.loop_thread import LoopThread
 from secured import PUBLIC_HOST, Papers, other_program
 from servers import KEY, PATIENCE_S, Serving, serving, start_triton, wait_for
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
 PLAIN = goldens.config("c1_t1_disc10")
 TRAJECTORY = random_trajectory(0, 5)
-TOLERANCE = 1e-5
 AT_ONCE_S = 20.0  # far less than the client would retry
 GATED = "inference,health,metadata,model-config,statistics"
 TRITON_GATE = "triton-grpc-protocol-gate"  # gRPC metadata that Triton was told to ask for

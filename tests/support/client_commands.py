@@ -20,6 +20,7 @@ from rfm_client import (
     FrameScores,
 )
 from servers import Served
+from tolerances import TOLERANCE
 
 RFM_CLIENT = Path(sys.executable).parent / "rfm-client"
 
@@ -31,9 +32,6 @@ WIDTHS = (48, 32)  # of its video and text embeddings
 
 
 TASK = clip.TASK
-
-
-TOLERANCE = 1e-5
 
 
 invoke = partial(rfm_client, catch_exceptions=False)

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.wrappers import AddRenderObservation
 
 from rfm_client import ProgressResult, RewardClient, Trajectory, UInt8Array
+from tolerances import TOLERANCE
 from transports import Answer, Connection, Tensors
 
 MODEL = "enc_c1_t1_disc10"
@@ -21,7 +22,6 @@ MAX_FRAMES = 16  # of that checkpoint
 TASK = "balance the pole"
 PUSH_RIGHT = 1  # the pole falls within ten steps
 SIZE = 240, 160  # pixels; fewer would not show the cart
-TOLERANCE = 1e-5
 
 Video = list[UInt8Array]
 

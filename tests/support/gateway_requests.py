@@ -24,6 +24,7 @@ from proxies import Proxy
 from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from servers import Endpoints
 from small_network import SMALL
+from tolerances import TOLERANCE
 
 Json: TypeAlias = dict[str, Any]
 Array: TypeAlias = npt.NDArray[Any]
@@ -35,7 +36,6 @@ TINY_CONFIG = replace(
 )  # fmt: skip
 ENCODER_DIMS = (48, 32)  # widths D and Dt of ENCODERS's encoders
 FRAME_STEPS = 4
-TOLERANCE = 1e-5  # where requests may share batches in different ways
 SIDES = {
     "progress": ("trajectory",),
     "preference": ("chosen_trajectory", "rejected_trajectory"),

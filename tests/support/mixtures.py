@@ -22,9 +22,9 @@ from rfm_client import (
     SimilaritySample,
 )
 from servers import Served, wait_for
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
-TOLERANCE = 1e-5
 TOLD_S = 1.0  # for a model to tell Triton what it has counted
 MODEL = "c1_t1_disc10"  # tokens, so T <= 16; discrete; all heads
 

@@ -16,9 +16,9 @@ from repositories import configure
 from rfm.engine import Engine
 from rfm_client import ProgressSample, RewardClient, Trajectory
 from servers import MODEL, wait_for
+from tolerances import TOLERANCE
 
 CALLERS = 16
-TOLERANCE = 1e-5
 MARK = 7.0  # in the text embedding of a sample that a model of this test dies of
 
 

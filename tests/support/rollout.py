@@ -34,13 +34,13 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.async_client import DEFAULT_TIMEOUT_S
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
 NAME = "rfm"
 WITH_ENCODERS = goldens.config("enc_c1_t1_disc10")
 WIDTHS = (48, 32)
 FRAME_PX = 48
-TOLERANCE = 1e-5
 CLEARLY = 1e-2  # versions differ by at least so much
 CALLERS = 32
 PAUSE_S = 0.2  # a control loop's step; without it they would take the processor from what is being loaded

@@ -33,7 +33,8 @@ from rfm_client import (
     Trajectory,
 )
 from servers import RepositoryApi, Served
-from tensors import TOLERANCE, Tensors, encode_samples, infer
+from tensors import Tensors, encode_samples, infer
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
 pytestmark = pytest.mark.triton
