@@ -8,14 +8,15 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from callers import Callers, Exam, progress_of
 from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
 from mixtures import MODEL, assert_same, plug, wait_until_at_work
 from proxies import Proxy
@@ -36,51 +37,10 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 PATIENCE_S = 60.0
 
 
-class Outcomes:
-    """What came of the calls of several threads."""
-
-    def __init__(self) -> None:
-        self._all: list[Result | Exception] = []
-        self._changed = threading.Condition()
-
-    def append(self, outcome: Result | Exception) -> None:
-        with self._changed:
-            self._all.append(outcome)
-            self._changed.notify_all()
-
-    def wait_for(self, kind: type, count: int = 20) -> None:
-        """Returns when ``count`` more of that kind have come."""
-        with self._changed:
-            start = len(self._all)
-            enough = lambda: sum(isinstance(outcome, kind) for outcome in self._all[start:]) >= count  # noqa: E731
-            assert self._changed.wait_for(enough, PATIENCE_S)
-
-    @property
-    def errors(self) -> list[Exception]:
-        return [outcome for outcome in self._all if isinstance(outcome, Exception)]
-
-
-@contextmanager
-def calling(client: RewardClient, threads: int = 2) -> Iterator[Outcomes]:
-    """Within it, threads ask without pause."""
-    outcomes = Outcomes()
-    stop = threading.Event()
-
-    def ask(seed: int) -> None:
-        while not stop.is_set():
-            try:
-                outcomes.append(client.progress(trajectory(seed)))
-            except Exception as error:  # noqa: BLE001  whatever it is, the test looks at it
-                outcomes.append(error)
-
-    with ThreadPoolExecutor(threads) as pool:
-        running = [pool.submit(ask, seed) for seed in range(threads)]
-        try:
-            yield outcomes
-        finally:
-            stop.set()
-            for thread in running:
-                thread.result()
+def calling(client: RewardClient, scores: list[np.ndarray[Any, Any]]) -> Callers:
+    """Return two threads that ask without pause. scores: of the trajectories 0 and 1"""
+    samples = [ProgressSample(trajectory(seed)) for seed in range(2)]
+    return Callers(progress_of(client), Exam(samples, scores), 2)
 
 
 def test_calls_survive_restarts_and_kills_of_servers(tmp_path: Path, repository: Path) -> None:
@@ -90,31 +50,28 @@ def test_calls_survive_restarts_and_kills_of_servers(tmp_path: Path, repository:
         first, second = (
             started.enter_context(OneModelServer(*server)) for server in zip(repositories, both, strict=True)
         )
-        outcomes: list[Outcomes] = []
-        clients: list[RewardClient] = []
+        sharing = callers.enter_context(RewardClient(both[0].grpc_url, timeout_s=PATIENCE_S, shared_memory=True))
+        scores = [sharing.progress(trajectory(number)).progress for number in range(2)]
+        shared = sharing.progress(heavy(), frame_steps=2)
+        asking: list[Callers] = []
         for protocol in ("grpc", "http"):
             urls = [url_of(endpoints, protocol) for endpoints in both]
             for servers in (urls[:1], urls):
                 client = callers.enter_context(RewardClient(servers, timeout_s=PATIENCE_S))
-                outcomes.append(callers.enter_context(calling(client)))
-                clients.append(client)
-        sharing = callers.enter_context(RewardClient(both[0].grpc_url, timeout_s=PATIENCE_S, shared_memory=True))
-        expected, shared = clients[0].progress(trajectory(0)), sharing.progress(heavy(), frame_steps=2)
+                asking.append(callers.enter_context(calling(client, scores)))
         wait_for(lambda: all(answered(endpoints) for endpoints in both))  # the load is shared
         first.stop()
         started.enter_context(OneModelServer(repositories[0], both[0]))
-        for each in outcomes:
-            each.wait_for(ProgressResult)
+        for each in asking:
+            each.wait_for_all()
         assert_same(sharing.progress(heavy(), frame_steps=2), shared)
         assert len(regions(both[0])) == 1
         second.kill()
-        for each in outcomes:
-            each.wait_for(ProgressResult)
+        for each in asking:
+            each.wait_for_all()
         started.enter_context(OneModelServer(repositories[1], both[1]))
         wait_for(lambda: answered(both[1]) > 0)  # it is asked again
-        assert [each.errors for each in outcomes] == [[]] * len(outcomes)
-        for client in clients:
-            assert_same(client.progress(trajectory(0)), expected)
+        assert [(each.lost, each.wrong) for each in asking] == [([], 0)] * len(asking)
 
 
 def test_a_server_that_hangs_costs_one_call_and_is_left_out(demo_server: Endpoints, protocol: str) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from patients import DEADLY, MARK, Callers, make_repository, references, trajectory
+from patients import CALLERS, DEADLY, MARK, calling, make_repository, references, trajectory
 from rfm_client import (
     ProgressSample,
     RewardClient,
@@ -47,7 +47,7 @@ def test_a_request_that_ends_its_process_ends_two_of_a_fleet(
     with (
         RewardClient(urls, timeout_s=LONG_S) as client,
         RewardClient(urls, timeout_s=LONG_S) as other,
-        Callers(client, references) as callers,
+        calling(client, references) as callers,
     ):
         callers.wait_for_all()
         # In one request with two others, which fail with it, and by another client beside those that are answered.
@@ -59,7 +59,7 @@ def test_a_request_that_ends_its_process_ends_two_of_a_fleet(
         assert sum(server.metric("rfm_serve_restarts_total", what=MODEL) for server in fleet) == 2
         lost = len(callers.lost)
         callers.wait_for_all()
-    assert callers.wrong == []
+    assert callers.wrong == 0
     # Who was in one batch with it twice is lost, too.
     assert all("ended twice during this request" in str(error) for error in callers.lost)
-    assert len(callers.lost) == lost < len(callers.answered)
+    assert len(callers.lost) == lost < CALLERS

@@ -18,7 +18,7 @@ import httpx
 import numpy as np
 import pytest
 
-from patients import CALLERS, MARK, Callers, answering, make_repository, trajectory
+from patients import CALLERS, MARK, answering, calling, make_repository, trajectory
 from rfm.launch import cleanup
 from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.launch.installation import find_installation
@@ -84,7 +84,7 @@ def test_what_dies_stops_hangs_or_is_silent_is_healed_and_no_call_is_lost_until_
     with administered(repository, hang_s=HANG_S, triton_silent_s=3) as served:
         assert httpx.get(f"{served.status_url}/live").status_code == 200
         assert httpx.get(f"{served.status_url}/other").status_code == 404
-        with served.client() as client, Callers(client, references) as callers:
+        with served.client() as client, calling(client, references) as callers:
             for fault, what in faults.items():
                 callers.wait_for_all()
                 before = served.restarts(what)
@@ -97,7 +97,7 @@ def test_what_dies_stops_hangs_or_is_silent_is_healed_and_no_call_is_lost_until_
                 served.wait_ready()
                 callers.wait_for_all()
                 assert served.restarts(what) == before + 1
-        assert (callers.lost, callers.wrong) == ([], [])
+        assert (callers.lost, callers.wrong) == ([], 0)
         assert served.metric("rfm_serve_probe_seconds_count", model=MODEL) > 3
         assert len(served.said) == len(faults), served.said
         assert served.said[-1] == "rfm: triton is started again: no answer for 3 s"
@@ -158,11 +158,11 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
         config = repository / MODEL / "config.pbtxt"
         one_version = config.read_text()
         config.write_text(one_version.replace("versions: 1", "versions: 1 versions: 2"))
-        with Callers(client, references) as callers:
+        with calling(client, references) as callers:
             with served.api() as api, pytest.raises(RepositoryApiError):
                 api.load(MODEL)
             callers.wait_for_all()
-        assert (callers.lost, callers.wrong) == ([], [])
+        assert (callers.lost, callers.wrong) == ([], 0)
         assert served.said == []
         config.write_text(one_version)
 
@@ -175,7 +175,7 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
         assert [ended.value.request_id in ids.split(",") for ids in inside] == [True, True]
         np.testing.assert_allclose(client.progress(trajectory(0)).progress, references[0], rtol=0, atol=TOLERANCE)
 
-        with Callers(client, references) as callers:
+        with calling(client, references) as callers:
             callers.wait_for_all()
             trigger.touch()
             wait_for(lambda: served.restarts(MODEL, "triton") == 3)
@@ -184,7 +184,7 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
             assert {type(error) for error in callers.lost} == {InferenceFailedError}
             callers.lost.clear()
             callers.wait_for_all()
-        assert (callers.lost, callers.wrong) == ([], [])
+        assert (callers.lost, callers.wrong) == ([], 0)
         assert "instance is broken" in served.log.read_text()
 
         deadly.touch()

@@ -4,19 +4,18 @@
 from __future__ import annotations
 
 import shutil
-import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from callers import Callers, Exam, progress_of
 from paths import ROOT
 from repositories import configure
 from rfm.engine import Engine
 from rfm_client import ProgressSample, RewardClient, Trajectory
-from servers import MODEL, wait_for
-from tolerances import TOLERANCE
+from servers import MODEL
 
 CALLERS = 16
 MARK = 7.0  # in the text embedding of a sample that a model of this test dies of
@@ -76,39 +75,8 @@ def references() -> list[np.ndarray[Any, Any]]:
     return [result.progress for result in engine.evaluate([ProgressSample(trajectory(n)) for n in range(CALLERS)])]  # type: ignore[union-attr]
 
 
-class Callers:
-    """16 threads that ask without pause, with the client's default retries, and compare what they get."""
-
-    def __init__(self, client: RewardClient, references: list[np.ndarray[Any, Any]]) -> None:
-        self._client = client
-        self._references = references
-        self._stop = threading.Event()
-        self.answered = [0] * CALLERS
-        self.wrong: list[int] = []
-        self.lost: list[Exception] = []
-        self._threads = [threading.Thread(target=self._ask, args=(number,)) for number in range(CALLERS)]
-
-    def _ask(self, number: int) -> None:
-        while not self._stop.is_set():
-            try:
-                progress = self._client.progress(trajectory(number)).progress
-                if np.abs(progress - self._references[number]).max() > TOLERANCE:
-                    self.wrong.append(number)
-                self.answered[number] += 1
-            except Exception as error:  # noqa: BLE001  whatever it is, it is lost
-                self.lost.append(error)
-
-    def wait_for_all(self) -> None:
-        """Each is answered twice more: the second answer is to a question that was asked from now on."""
-        before = list(self.answered)
-        wait_for(lambda: self.lost or all(now > then + 1 for now, then in zip(self.answered, before, strict=True)))
-
-    def __enter__(self) -> Callers:
-        for thread in self._threads:
-            thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        for thread in self._threads:
-            thread.join()
+def calling(client: RewardClient, references: list[np.ndarray[Any, Any]]) -> Callers:
+    """Return 16 threads that ask without pause and compare each answer with the engine's."""
+    return Callers(
+        progress_of(client), Exam([ProgressSample(trajectory(n)) for n in range(CALLERS)], references), CALLERS
+    )
