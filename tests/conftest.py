@@ -20,6 +20,7 @@ from rfm.engine import Engine
 from rfm.launch import endpoints
 from servers import CRASHES, Endpoints, Served, start_triton
 
+pytest_plugins = ["gateway_fixtures"]
 SHARED = ("served", "triton")  # fixtures that start a server for the tests of many files
 LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the others run meanwhile
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import clip
-from environments import MODEL, LateClient
+from environments import MODEL
 from paths import ROOT
 from rfm_client import RewardClient
 from servers import Served
@@ -33,12 +33,6 @@ def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def client(served: Served) -> Iterator[RewardClient]:
     with served.client("grpc", MODEL) as client:
-        yield client
-
-
-@pytest.fixture
-def late(served: Served) -> Iterator[LateClient]:
-    with LateClient(served.url("grpc")) as client:
         yield client
 
 

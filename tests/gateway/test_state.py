@@ -18,6 +18,7 @@ import schemathesis
 from hypothesis import HealthCheck, given, settings
 
 import goldens
+from commands import own_regions
 from gateway_requests import (
     ENCODER_DIMS,
     ENCODERS,
@@ -37,7 +38,6 @@ from gateway_requests import (
 )
 from gateways import WITHIN_S, Gateway, answers, free_port, poll, running
 from rfm.checkpoint.content import read_run_config
-from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.rewind.network import RewindTransformer
 from rfm_client import InvalidSampleError, ModelNotFoundError, Trajectory
 from rfm_client.serving import read_status
@@ -193,7 +193,7 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_si
         assert f"]: gateway is started again: {why}\n" in gateway.log
     assert len(set(started)) >= 5  # Triton, its model process, and three gateways
     assert not [child for child in started if child.is_running()]
-    assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
+    assert not own_regions(process.pid)
 
 
 def test_the_client_encodes_a_trajectory_once_for_many_questions(encoders: Gateway, tiny: Gateway) -> None:

@@ -50,6 +50,11 @@ def regions() -> set[str]:
     return names - {name for name, pid in owners.items() if is_alive(pid) and not is_ours(pid)}
 
 
+def own_regions(pid: int) -> set[Path]:
+    """Return files in shared memory of servers that a process has started."""
+    return set(SHARED_MEMORY.glob(f"{REGION_PREFIX}_{pid}_*"))
+
+
 def running(words: str, most: int | None = None) -> set[int]:
     """Ids of processes with these words in their command line, or in its first ``most`` words."""
     each = psutil.process_iter(["cmdline"])

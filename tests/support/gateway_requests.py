@@ -19,7 +19,10 @@ import numpy.typing as npt
 import pytest
 import requests
 
-from gateways import Gateway, running
+from gateway_fixtures import ENCODERS as ENCODERS
+from gateway_fixtures import TINY as TINY
+from gateway_fixtures import VLM as VLM
+from gateways import Gateway
 from proxies import Proxy
 from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from servers import Endpoints
@@ -29,7 +32,6 @@ from tolerances import TOLERANCE
 Json: TypeAlias = dict[str, Any]
 Array: TypeAlias = npt.NDArray[Any]
 Ask: TypeAlias = Callable[..., requests.Response]
-TINY, ENCODERS, VLM = "rfm", "encoders", "vlm"  # models: two numbers a frame; encoders; vision-language in video mode
 TINY_CONFIG = replace(
     SMALL, video_feature_dim=2, text_feature_dim=2, hidden_dim=8, num_layers=1, num_attention_heads=2, max_len=16,
     progress_bins=10,
@@ -48,16 +50,6 @@ class Triton:
     repository: Path
     endpoints: Endpoints
     proxies: Sequence[Proxy]  # in front of its ports
-
-
-def fixture_of(model: str, *options: str) -> Any:
-    @pytest.fixture(scope="package")
-    def gateway(triton: Triton, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
-        with running(triton.endpoints, tmp_path_factory.mktemp("gateway"), model, *options) as started:
-            yield started
-            assert not started.metric("requests_total", code="500")
-
-    return gateway
 
 
 def embedded(seed: int, num_frames: int, dims: tuple[int, int] = (2, 2), **fields: Any) -> Json:

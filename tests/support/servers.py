@@ -24,8 +24,7 @@ import psutil
 import tritonclient.grpc
 from prometheus_client.parser import text_string_to_metric_families
 
-from commands import RFM, running
-from rfm.launch.cleanup import SHARED_MEMORY
+from commands import RFM, own_regions, running
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import Installation, find_installation
 from rfm.launch.model_processes import children_of
@@ -245,7 +244,7 @@ def serving(repository: Path, *more: str, to: Path | None = None) -> Iterator[Se
         if process.poll() is None:
             process.terminate()
         process.wait(PATIENCE_S)
-    assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
+    assert not own_regions(process.pid)
 
 
 @contextmanager

@@ -16,11 +16,11 @@ from tritonclient.utils import np_to_triton_dtype
 
 import goldens
 import rfm_export
+from commands import own_regions
 from engines import load_engine, serve_config
 from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, mixed_samples, plug, wait_until_at_work
 from patients import answering_after
 from repositories import bound_queue, configure, forget_input
-from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,
@@ -300,7 +300,7 @@ def test_a_pair_of_two_frame_sizes_may_be_sent_through_shared_memory(served: Ser
 
 @pytest.mark.usefixtures("served")
 def test_no_other_user_can_read_the_shared_memory_of_a_server() -> None:
-    found = [path.stat() for path in SHARED_MEMORY.glob(f"{REGION_PREFIX}_{os.getpid()}_*")]
+    found = [path.stat() for path in own_regions(os.getpid())]
     assert any(stat.S_ISREG(each.st_mode) and each.st_size >= LEAST_REGION_BYTES for each in found)
     assert {stat.S_IMODE(each.st_mode) & 0o077 for each in found} == {0}
 
