@@ -314,27 +314,3 @@ def test_a_page_without_key_asks_for_it_and_goes_on_with_a_gateway_that_comes_ba
             assert "api_key=" in browser.run("return document.getElementById('live-code').textContent")
         told = browser.until("document.getElementById('errors').textContent")
         assert told.startswith("gateway: expected an answer, got none")
-
-
-def test_a_picture_of_the_page(
-    demo_server: Endpoints, client: RewardClient, quiet_browser: Browser, tmp_path: Path
-) -> None:
-    videos = [
-        FRAMES,
-        DROPPED,
-        make_clip("rewound", TASK, 2_000_002).frames,
-        make_clip("success", TASK, 2_000_003).frames,
-    ]
-    with running(demo_server, tmp_path) as gateway, LiveView(gateway.url, name="policy 7") as view:
-        page = Page(gateway.url, quiet_browser)
-        page.open()
-        episodes = client.episodes(len(videos), SENTENCE, live=view)
-        for frames in zip(*videos, strict=True):
-            episodes.add(list(frames))
-        episodes.reset([False, True, False, True])
-        for frame in FRAMES[:9]:
-            episodes.add([videos[3][0], frame, frame, videos[2][0]], [False, True, False, False])
-        poll(lambda: len(page.cards("policy 7")) == 5 and page.cards("policy 7")[1]["Step"] == "8")
-        poll(lambda: len(quiet_browser.run(PICTURES, "policy 7")) == 5)
-        quiet_browser.picture("page_live.png")
-        quiet_browser.driver.get("about:blank")  # before its gateway ends

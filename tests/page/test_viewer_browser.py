@@ -420,11 +420,3 @@ def test_axe_finds_nothing_in_either_theme(page: Page) -> None:
 def test_the_documentation_of_endpoints_needs_no_network(gateway: Gateway, quiet_browser: Browser) -> None:
     quiet_browser.driver.get(f"{gateway.url}/docs")
     quiet_browser.until("document.body.textContent.includes('/evaluate_batch_npy')")
-
-
-def test_a_picture_of_the_page(page: Page) -> None:
-    page.score("success", "failure")
-    page.browser["time"].send_keys(*[Keys.ARROW_RIGHT] * 12)
-    poll(lambda: page.is_at(1.2))
-    page.compare()
-    page.browser.picture("page.png")

@@ -605,10 +605,3 @@ def test_broken_episodes_are_marked_and_an_hdf5_dataset_is_watched(
         browser.until(f"document.querySelectorAll('{VIDEOS}').length === 1 && {ARE_THERE}")
         assert not browser["score-episode"].is_enabled()
         assert browser["use-words"].text.startswith("# LeRobot does not read HDF5")
-
-
-def test_a_picture_of_the_page(page: Page) -> None:
-    page.choose(DEMO)
-    page.at_rest(3)
-    page.move_to(1.2)
-    page.browser.picture("page_dataset.png")

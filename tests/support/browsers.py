@@ -20,7 +20,6 @@ from selenium.webdriver.remote.webelement import WebElement
 from gateways import poll
 from rfm_client import UInt8Array
 
-IMAGES_VARIABLE = "RFM_IMAGES"  # a folder for new pictures of the documents
 AXE = Path(__file__).parents[1] / "page" / "vendored" / "axe-core" / "axe.min.js"
 WINDOW_PX = (1280, 1400)
 PICTURE_PX = (1440, 900)
@@ -152,9 +151,8 @@ class Browser:
         finally:
             self.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
-    def picture(self, name: str) -> None:
-        """Saves a picture of the page for the documents."""
-        file = Path(os.environ.get(IMAGES_VARIABLE, self.downloads)) / name
+    def picture(self, file: Path) -> None:
+        """Save a picture of the page for the documents."""
         self.run("document.activeElement.blur()")
         with self.window(*PICTURE_PX):
             self.run("for (const each of document.querySelectorAll('.work')) each.scrollTo(0, 0)")
