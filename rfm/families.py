@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rfm.checkpoint.content import WEIGHTS, CheckpointError
 from rfm.checkpoint.hub import find as find
-from rfm.checkpoint.provenance import assumed
+from rfm.checkpoint.provenance import Decision, assumed
 from rfm.checkpoint.run_config import HEADS, SIMILARITY, constant_heads, training_notes
 from rfm.checkpoint.weights import check_values
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, VideoPrompt, Weights
@@ -17,6 +17,7 @@ from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, Vide
 __all__ = [
     "FAMILIES",
     "CheckpointError",
+    "Decision",
     "choose",
     "encoders_of",
     "find",

@@ -21,9 +21,8 @@ import rfm_export
 from engines import serve_config
 from in_process import rfm
 from rfm import families
-from rfm.checkpoint.provenance import PROVENANCE, Decision
 from rfm.config import ExportConfig
-from rfm.families import CheckpointError
+from rfm.families import CheckpointError, Decision
 
 PLAIN, VIDEO, POOLED, ADAPTER = (
     "q3_tok_disc10",
@@ -203,13 +202,13 @@ def test_an_export_keeps_the_table_beside_the_checkpoint_and_nothing_reads_it(tm
     settings = replace(serve_config(source), dtype="float32")
     rfm_export.export(source.checkpoint, repository, settings)
     checkpoint = repository / "rfm" / "1" / "checkpoint"
-    kept = [Decision(**row) for row in json.loads((checkpoint / PROVENANCE).read_text())]
+    kept = [Decision(**row) for row in json.loads((checkpoint / "provenance.json").read_text())]
     computed = f"float32, torch {torch.__version__}, scaled_dot_product_attention"
     told = [Decision("served_dtype", "float32", "--dtype"), Decision("computation", computed, "installed PyTorch")]
     assert kept == [*explained(source.checkpoint)[0].values(), *told]
 
     assert rfm_export.check(repository, settings) == []
-    (checkpoint / PROVENANCE).write_text("no JSON")
+    (checkpoint / "provenance.json").write_text("no JSON")
     assert rfm_export.check(repository, settings) == []  # which compares settings_digest
     assert families.load(checkpoint).config == families.load(source.checkpoint).config
 

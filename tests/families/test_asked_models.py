@@ -17,10 +17,9 @@ from torch import Tensor
 import rfm_export
 from reward_models import BASE, ROOT, as_before_marks
 from rfm import families
-from rfm.checkpoint.provenance import Decision
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.families import CheckpointError
+from rfm.families import CheckpointError, Decision
 from rfm_client import ProgressResult, ProgressSample, Trajectory
 
 CHECKPOINT = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"

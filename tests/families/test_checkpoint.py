@@ -12,7 +12,7 @@ import subprocess
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,13 +26,8 @@ from torch import Tensor
 import goldens
 import local_hub
 import reward_models
-from paths import ROOT
 from rfm import families
-from rfm.checkpoint.hub import best_tag, find
-from rfm.checkpoint.run_config import find_run_config
 from rfm.families import CheckpointError
-from rfm.rewind.network import RewindConfig
-from rfm.vlm.network import VlmConfig
 from spoilt import Spoil, conversion, convert, copied, in_json, settings, text, weights
 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
@@ -64,7 +59,6 @@ def test_config_yaml_may_be_called_otherwise(folder: Path, place: str) -> None:
     target.parent.mkdir(exist_ok=True)
     (folder / "config.yaml").rename(target)
     assert families.load(folder).config == expected
-    assert find_run_config(folder) == target.resolve()
 
 
 OTHER_RUNS = {
@@ -93,12 +87,6 @@ def test_config_yaml_of_another_run_above_the_checkpoint_is_refused(
     assert str(refusal.value).endswith(f"; copy the run's config.yaml into {folder}, also if it is this one")
     (folder / "config.yaml").write_text(right)
     families.load(folder, base_model=str(golden.base_model))
-
-
-@pytest.mark.parametrize("config", [VlmConfig, RewindConfig])
-def test_what_decides_each_setting_is_documented(config: type[VlmConfig | RewindConfig]) -> None:
-    documented = next((ROOT / "docs").rglob("checkpoints.md")).read_text()
-    assert [field.name for field in fields(config) if f"`{field.name}`" not in documented] == []
 
 
 def assert_same(after: Any, before: Any) -> None:
@@ -539,18 +527,6 @@ def test_yaml_constructs_nothing(folder: Path, tmp_path: Path) -> None:
     assert not mark.exists()
 
 
-TAGS = {
-    "the highest score": (["best-x-0.5-step-10", "best-x-0.75-step-5", "main"], "best-x-0.75-step-5"),
-    "the first of equals, below 0": (["best-a--0.2-step-9", "best-b--0.2-step-2", "best-c--0.9-step-2"], "best-a--0.2-step-9"),
-    "none": (["v1", "best-0.5", "best-a-1-step-2"], None),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("tags", "expected"), TAGS.values(), ids=TAGS)
-def test_the_best_tag(tags: list[str], expected: str | None) -> None:
-    assert best_tag(tags) == expected
-
-
 @pytest.mark.parametrize("source", ["nowhere", "/no/such/folder", "a/b/../c", "a/b@", ""])
 def test_what_is_neither_folder_nor_id_is_refused(source: str) -> None:
     with pytest.raises(CheckpointError, match="expected a folder that exists or a Hugging Face id"):
@@ -635,17 +611,6 @@ def test_config_yaml_is_found_on_main_of_the_hub_s_repository(from_hub: dict[str
     assert json.loads(from_hub[source]) == json.loads(json.dumps(expected))
 
 
-@pytest.mark.parametrize(("main", "is_found"), [("a" * 40, True), ("a" * 41, False), ("../other", False)])
-def test_main_of_the_hub_s_cache_is_a_commit(tmp_path: Path, main: str, is_found: bool) -> None:
-    snapshots = tmp_path / "snapshots"
-    for folder in (snapshots / "of-the-tag", snapshots / ("a" * 40), tmp_path / "refs"):
-        folder.mkdir(parents=True)
-    (snapshots / ("a" * 40) / "config.yaml").write_text("{}")
-    (tmp_path / "refs" / "main").write_text(main)
-    found = find_run_config(snapshots / "of-the-tag")
-    assert found == ((snapshots / ("a" * 40) / "config.yaml").resolve() if is_found else None)
-
-
 REFUSED_HUB = {
     "pickles alone": (
         PICKLED,
@@ -704,20 +669,19 @@ def test_a_repository_in_the_cache_is_found_offline_and_its_revision_is_said(
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     lines: list[str] = []
     commit = local_hub.commit_of(expected)
-    assert find("org/name", lines.append) == home / "snapshots" / commit
+    assert families.find("org/name", lines.append) == home / "snapshots" / commit
     used = (
         f"org/name@{expected} of the cache is used (commit {commit}), because HF_HUB_OFFLINE is set; the Hub may have a"
     )
     assert [line[: len(used)] for line in lines] == [used]
-    assert find(f"org/name@{expected}", lines.append) == home / "snapshots" / commit
+    assert families.find(f"org/name@{expected}", lines.append) == home / "snapshots" / commit
     assert len(lines) == 1
 
 
 READ_FROM_HUB = """
 import json, sys
 from rfm import families
-from rfm.checkpoint.hub import find
-folder = find("org/asked")
+folder = families.find("org/asked")
 files = sorted(str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file())
 print(json.dumps([files, families.load("org/asked", reward_model="roboreward").collator.example()]))
 """

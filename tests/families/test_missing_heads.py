@@ -20,9 +20,8 @@ import goldens
 import rfm_export
 from engines import serve_config
 from rfm import families
-from rfm.checkpoint.provenance import Decision
 from rfm.engine import Engine
-from rfm.families import CheckpointError
+from rfm.families import CheckpointError, Decision
 from rfm.family import Checkpoint, Options
 from rfm_client import (
     InvalidSampleError,

@@ -25,10 +25,10 @@ import rfm_export
 from paths import GOLDEN
 from reward_models import BASE, ROOT
 from rfm import families
-from rfm.checkpoint.provenance import Decision, assumed
+from rfm.checkpoint.provenance import assumed
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.families import CheckpointError
+from rfm.families import CheckpointError, Decision
 from rfm.vlm.video_prompt import WRAPPED_SINCE, decided
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Trajectory
 

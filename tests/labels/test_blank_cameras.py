@@ -21,9 +21,8 @@ from encoding import encode
 from in_process import rfm
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
-from rfm_labels import DatasetError, LabelOptions, label, open_dataset, parse_episodes
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 from rfm_labels.datasets import chosen_cameras
-from rfm_labels.datasets.faults import listed
 from rfm_labels.label import plan_labels
 from rfm_labels.ray_engine import EpisodeActor, RayJob
 
@@ -175,11 +174,6 @@ def test_many_episodes_are_abbreviated(tmp_path: Path) -> None:
     shown = [{"front": noise(3) if index % 2 else black(3)} for index in range(40)]
     (told,) = lines_of(hdf5(tmp_path / "demos.hdf5", shown), tmp_path / "labels")
     assert "in 20 of 40 episodes (0,2,4,6,8,10,12,14,16,18,20,22,...): " in told
-
-
-@pytest.mark.parametrize("numbers", [[0], [0, 1, 2], [3, 4, 9, 11, 12], [1, 3, 5]])
-def test_listed_episodes_can_be_given_to_the_option(numbers: list[int]) -> None:
-    assert parse_episodes(listed(numbers)) == numbers
 
 
 NO_COLOURS = ("agentview_depth", "depth_head", "seg_instance_id", "topDepth", "depth2", "optical-flow", "normals.0")

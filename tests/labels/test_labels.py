@@ -13,17 +13,18 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
+import engines
 import goldens
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
 from rfm_client import ProgressSample, RewardClient, Trajectory
 from rfm_client.frames import RULES, Sampling
-from rfm_commands.engine_scorer import EngineScorer
 from rfm_labels import (
     ClientScorer,
     DatasetError,
     LabelOptions,
     Report,
+    Scorer,
     iter_episodes,
     label,
     open_dataset,
@@ -46,9 +47,9 @@ DATASETS = [
 ]
 
 
-def engine_scorer(checkpoint: Path, encoders: Path) -> EngineScorer:
+def engine_scorer(checkpoint: Path, encoders: Path) -> Scorer:
     options = {name: str(encoders / name) for name in ("image_encoder", "text_encoder")}
-    return EngineScorer(str(checkpoint), **options)
+    return engines.scorer(str(checkpoint), **options)
 
 
 def test_a_checkpoint_is_another_with_other_settings(tmp_path: Path) -> None:

@@ -27,12 +27,10 @@ from pyarrow import parquet
 import goldens
 import local_hub
 from encoding import encode, encode_here
-from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer
+from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, digest_of
 from pictures import write_video
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
-from rfm_labels.datasets import chosen_cameras, lerobot
-from rfm_labels.datasets.protocol import digest_of
-from rfm_labels.datasets.video_frames import video_packets
+from rfm_labels.datasets import chosen_cameras
 
 HUB_ID = "org/name"
 ELSEWHERE = goldens.ROOT.parent / "lerobot"  # beside the further reference cases, where there are some
@@ -474,20 +472,3 @@ def test_a_dataset_of_the_hub_is_fetched_at_its_revision(tmp_path: Path) -> None
     expected = f"org/name: expected a local dataset or one of the Hub, got none: {endpoint} has no such revision of it"
     assert missing == expected
     assert "expected a LeRobot dataset's meta/info.json, got a LeRobot dataset of v1: convert it to v2.0 with " in of_v1
-
-
-def test_a_check_reads_the_packets_of_each_video_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also with more cameras than videos that otherwise stay in memory."""
-    read: list[Path] = []
-
-    def counted(file: Path, container: str | None = None) -> Any:
-        read.append(file)
-        return video_packets(file, container)
-
-    monkeypatch.setattr(lerobot, "video_packets", counted)
-    monkeypatch.setattr(lerobot, "_VIDEOS_AT_A_TIME", 1)
-    dataset = open_dataset(LEROBOT / "toy_v30_many")
-    for episode in dataset.episodes:
-        for camera in dataset.cameras:
-            dataset.check(episode, camera)
-    assert len(read) == len(set(read)) > len(dataset.cameras)

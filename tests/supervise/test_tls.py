@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import socket
 import ssl
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,13 +27,10 @@ import goldens
 from engines import load_engine
 from in_process import rfm, rfm_client
 from repositories import kill_model
-from rfm.launch.endpoints import Endpoints, GrpcTls
-from rfm.launch.triton_options import MAX_HTTP_BYTES
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
 from rfm_client.serving import Credentials, read_status
-from rfm_client.transport.loop_thread import LoopThread
 from secured import PUBLIC_HOST, Papers, other_program
-from servers import KEY, PATIENCE_S, Serving, serving, start_triton, wait_for
+from servers import KEY, PATIENCE_S, Endpoints, GrpcTls, Serving, serving, start_triton, wait_for
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
@@ -196,7 +195,7 @@ def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
             kept = {name: value for name, value in answer.headers.items() if name != "Content-Length"}
             return aiohttp.web.Response(status=answer.status, body=await answer.read(), headers=kept)
 
-    application = aiohttp.web.Application(client_max_size=MAX_HTTP_BYTES)
+    application = aiohttp.web.Application(client_max_size=2**28)
     application.router.add_route("*", "/{tail:.*}", forward)
     runner = aiohttp.web.AppRunner(application, access_log=None)
     bound = socket.create_server(("127.0.0.1", 0))
@@ -205,12 +204,17 @@ def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
         await runner.setup()
         await aiohttp.web.SockSite(runner, bound, ssl_context=context).start()
 
-    loop = LoopThread("proxy")
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
     try:
-        loop.wait(start())
+        asyncio.run_coroutine_threadsafe(start(), loop).result()
         yield f"https://127.0.0.1:{bound.getsockname()[1]}"
     finally:
-        loop.stop(runner.cleanup)
+        asyncio.run_coroutine_threadsafe(runner.cleanup(), loop).result()
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
 
 
 def test_http_through_a_proxy_with_tls_and_a_key(proxied: str, papers: Papers) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 import importlib.metadata
+from typing import Any
 
 import pytest
 
@@ -19,6 +20,13 @@ TRANSFORMERS = int(importlib.metadata.version("transformers").partition(".")[0])
 def serve_config(config: goldens.Config, name: str = "rfm") -> ExportConfig:
     """How the tests export a reference checkpoint."""
     return ExportConfig(name=name, num_gpus=0, torch_threads=1, **config.sources)
+
+
+def scorer(checkpoint: str, **options: str) -> Any:
+    """Return a scorer for labels that needs no server, as ``rfm label`` has it."""
+    from rfm_commands.engine_scorer import EngineScorer
+
+    return EngineScorer(checkpoint, **options)
 
 
 @functools.cache

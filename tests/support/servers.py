@@ -26,6 +26,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from commands import RFM, own_regions, running
 from rfm.launch.endpoints import Endpoints
+from rfm.launch.endpoints import GrpcTls as GrpcTls
 from rfm.launch.installation import Installation, find_installation
 from rfm.launch.model_processes import children_of
 from rfm.launch.repository_api import RepositoryApi
