@@ -372,6 +372,6 @@ def test_a_folder_that_is_no_dataset_is_refused_at_start(tmp_path: Path, name: s
 
 def test_a_missing_package_names_the_mend(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    message = r'dataset: expected pyarrow, which reads datasets, got none: pip install "./client\[label\]"'
+    message = r'dataset: expected pyarrow, which reads datasets, got none: pip install \./client \./apps/labels'
     with pytest.raises(ConfigError, match=message):
         GatewayConfig(triton="grpc://robot:8001", dataset=(str(LEROBOT / "toy_v21"),)).check({})
