@@ -26,7 +26,7 @@ LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the other
 
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start, which share the cores with other tests
-os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started
+os.environ[RUN] = uuid.uuid4().hex  # marks the processes of this run
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test asks the network
 worker, workers = os.getenv("PYTEST_XDIST_WORKER", "gw0"), os.getenv("PYTEST_XDIST_WORKER_COUNT", "1")
 endpoints.PORTS = endpoints.PORTS[int(worker.removeprefix("gw")) :: int(workers)]  # no two workers choose the same port
@@ -74,7 +74,7 @@ def protocol(request: pytest.FixtureRequest) -> str:
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
-    """Run a test once more if it failed while Triton 2.51 aborted or hung at its start, as it does now and then."""
+    """Run a failed test again if Triton 2.51 aborted or hung at the start, which happens now and then."""
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
     CRASHES.clear()
     reports = runtestprotocol(item, nextitem=nextitem, log=False)
@@ -89,9 +89,9 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whoever asks a shared server asks a Triton. Where several processes test, one of them has that server.
+    """Mark tests with a shared server ``triton``, and keep them in one of the test processes.
 
-    The tests of a file stay together, too, since they share what its fixtures start.
+    The tests of a file also stay together, since they share servers.
     """
     for item in items:
         shared = next((name for name in SHARED if name in getattr(item, "fixturenames", ())), None)

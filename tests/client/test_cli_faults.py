@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""rfm-client and servers that go away while it asks, and ports that are not the one that its URL says."""
+"""rfm-client when a server goes away during a request, and URLs with a wrong port."""
 
 from __future__ import annotations
 

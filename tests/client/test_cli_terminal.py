@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a person sees of rfm-client: tables on a terminal of 80 columns, and results as they come."""
+"""rfm-client on a terminal with 80 columns: tables, and results as they come."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Calls of the client: answers, errors, deadlines, what is asked of a served model."""
+"""Calls of the client: answers, errors, deadlines, and the description of a served model."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_deadline_ends_a_call_and_no_other(served: Served, protocol: str) -> N
     full = [ProgressSample(random_trajectory(0, 40), frame_steps=16) for _ in range(64)]
     with served.client(protocol) as client, ThreadPoolExecutor(3) as pool:
         plugs = [pool.submit(client.evaluate, full) for _ in range(3)]
-        next(as_completed(plugs))  # two more are to come before what is asked now
+        next(as_completed(plugs))  # two more come before the next call
         with pytest.raises(DeadlineExceededError, match=r"no answer within 0\.05 s"):
             client.progress(random_trajectory(0, 4), timeout_s=0.05)
         for each in plugs:
@@ -312,7 +312,7 @@ def test_an_async_client_tells_once_of_more_frames_than_in_training(
 
 
 class Described(Shelf):
-    """A server that counts the questions about its model. lacks_description: it answers none"""
+    """Counts the questions about the model. lacks_description: answers none"""
 
     num_described = 0
     lacks_description = False

@@ -160,7 +160,7 @@ def test_shared_memory_changes_no_answer(demo_server: Endpoints, protocol: str) 
             for answer, plain in zip(client.evaluate(samples), expected, strict=True):
                 assert_same(answer, plain)
         assert len(regions(demo_server) - mapped) == 1  # one, used again and again
-        assert ours_in_dev_shm() == named  # its name is gone while it is in use
+        assert ours_in_dev_shm() == named  # the name is gone during use
 
 
 @pytest.mark.usefixtures("nothing_shared_is_left")

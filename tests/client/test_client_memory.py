@@ -25,7 +25,7 @@ WITHIN_S = 30.0
 
 
 class Triton:
-    """Maps what it is told to. failure: of registering; answers: cleared, it registers and does not answer"""
+    """Maps regions. failure: raised on registering; answers: when cleared, it registers without an answer"""
 
     def __init__(self) -> None:
         self.mapped: list[str] = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Servers that go over to another version, and several of which one lacks the model. Stand-ins tell what they like."""
+"""Servers that change versions, and a server without the model. All are stand-ins."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class Stand:
     def __init__(self, url: str = "grpc://stand:1", error: RewardError | None = None) -> None:
         self.url = url
         self.error = error
-        self.num_ends = 0  # of its next requests: under each its connection ends
+        self.num_ends = 0  # the connection ends during the next N requests
         self.down_s = 0.0  # for so long after each end it takes no connection
-        self.is_silent = False  # it takes connections, and answers nobody
+        self.is_silent = False  # accepts connections and never answers
         self.max_batch_size = 64
         self.sizes: list[int] = []  # samples of each request that it answers
         self._up_s = 0.0
@@ -89,7 +89,7 @@ class Stand:
 
 
 def lost() -> ServerUnavailableError:
-    """What a call gets if its connection ends during it."""
+    """Return the error of a call whose connection ends."""
     error = ServerUnavailableError("Socket closed")
     error.may_have_ended_server = True
     return error
@@ -119,7 +119,7 @@ def test_what_is_known_of_a_model_is_forgotten_when_another_version_answers() ->
 
 
 def ask(stands: list[Stand], calls: int = 1, *, timeout_s: float = 4.0) -> list[object]:
-    """What comes of calls side by side."""
+    """Return the outcomes of concurrent calls."""
 
     async def outcomes() -> list[object]:
         async with AsyncRewardClient("", transports=stands, timeout_s=timeout_s) as client:

@@ -25,7 +25,7 @@ def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> Non
             with pytest.raises(DeadlineExceededError):
                 async with room(0, Deadline(0.05)):
                     pytest.fail("there was no room")
-        async with room(MAX_BYTES, Deadline(1)):  # what was given up was given back
+        async with room(MAX_BYTES, Deadline(1)):  # a call that gives up returns its bytes
             pass
 
     asyncio.run(ask())

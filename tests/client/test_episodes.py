@@ -313,7 +313,7 @@ def test_the_newest_frame_takes_the_place_of_one_that_waits(client: RewardClient
 
 
 def test_frames_stay_in_the_order_in_which_they_were_added(served: Served, client: RewardClient) -> None:
-    """Whether they are waited for or not, with a reset between them, and where somebody stops to wait for one."""
+    """With and without waiting, with a reset in between, and after a caller stops waiting."""
     frames = video(113, 5)
 
     async def play() -> tuple[list[float], list[int]]:
@@ -356,7 +356,7 @@ def test_large_frames_go_in_several_requests(transport: Recording, client: Rewar
     expected = [offline(client, large[[index]], Sampling("rint_pad", 2)).progress[0] for index in range(5)]
     np.testing.assert_allclose(scores.progress, expected, atol=TOLERANCE)
     alike = client.episodes(5, TASK, frames=2)
-    alike.add(np.repeat(video(117, 1, (700, 700)), 5, axis=0))  # each row of a request is as long as its longest
+    alike.add(np.repeat(video(117, 1, (700, 700)), 5, axis=0))  # all rows of a request have the length of the longest
     assert transport.most_bytes < 4 * 2**20
 
 

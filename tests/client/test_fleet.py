@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Several real servers of one checkpoint, and a request that ends its process."""
+"""Several servers of one checkpoint, and a request that ends the model process."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LONG_S = 4 * PATIENCE_S  # so that a machine that is slow to heal a model decide
 
 @pytest.fixture
 def fleet(tmp_path: Path) -> Iterator[list[Serving]]:
-    """Servers that heal themselves, each with a model that ends its process on a marked sample."""
+    """Servers that heal themselves. A marked sample ends the model process."""
     with ExitStack() as stack:
         folders = [tmp_path / f"server-{number}" for number in range(NUM_SERVERS)]
         served = [stack.enter_context(serving(make_repository(folder, more_code=DEADLY))) for folder in folders]

@@ -67,7 +67,7 @@ def test_score_records_frames_and_curves_on_one_timeline(demo_server: Endpoints,
     assert len(indices) == 7
     for name in ("progress", "success"):
         curve_times, values = logged(out, "video_time", f"/clip/{name}", "Scalar")
-        assert curve_times == [times[index] for index in indices]  # the video and its curves meet
+        assert curve_times == [times[index] for index in indices]  # video and curves meet
         np.testing.assert_array_equal(values, scores["clip"][name])
         steps, values = logged(out, "frame", f"/seen/{name}", "Scalar")
         assert steps == scores["seen"]["frame_indices"]

@@ -25,7 +25,7 @@ READINGS = {"rewind_pad16": ("rewind_pad16_online", "rewind_pad16_offline")}  # 
 
 
 def cases(file: Path) -> Iterator[tuple[Sampling, int, list[int]]]:
-    """A rule with its number of frames, the newest frame, and what the original shows of the frames up to it."""
+    """A rule with a number of frames, the newest frame, and the frames that the original picks."""
     for frames, lengths in json.loads(file.read_text()).items():
         for length, rules in lengths.items():
             for name, indices in rules.items():

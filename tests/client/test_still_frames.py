@@ -150,14 +150,14 @@ def test_the_warning_names_the_episode_and_the_camera(recorder: Recorder, caplog
 
 
 class Dim(CodedEnv):
-    """Its pictures are floats in 0..1 that became uint8."""
+    """The pictures are floats in 0..1 that became uint8."""
 
     def _drawn(self) -> UInt8Array:
         return dim(self.t, 1)
 
 
 class Dark(CodedEnv):
-    """Its pictures are black."""
+    """The pictures are black."""
 
     def _drawn(self) -> UInt8Array:
         return np.zeros((32, 32, 3), np.uint8)

@@ -93,7 +93,7 @@ def test_whatever_answers_the_error_is_ours(
     """Whether a server may have ended during a request over gRPC is asked of a real Triton in tests/triton."""
     with (
         listening(answer) as port,
-        # With retries the last try may be under way when its time is up, which is another error.
+        # With retries the last try may still run at the deadline, which is another error.
         RewardClient(f"{protocol}://127.0.0.1:{port}", timeout_s=TIMEOUT_S, retry=False) as client,
     ):
         if answer in (silent, dying):
@@ -104,7 +104,7 @@ def test_whatever_answers_the_error_is_ours(
 
 
 def test_a_redirect_is_told_and_never_followed() -> None:
-    """It would carry frames and headers to a server that nobody named."""
+    """It would carry frames and headers to an unknown server."""
     arrived: list[bytes] = []
 
     def stranger(connection: socket.socket) -> None:

@@ -36,7 +36,7 @@ def test_memory_is_told_before_it_is_taken(video: Path) -> None:
     frame_bytes = clip.SIZE_PX**2 * 3
     told: list[int] = []
     frames = read_video(video, 1, take=told.append)
-    assert len(told) > len(frames) + 1  # at each frame that is decoded, so that what it raises ends the reading soon
+    assert len(told) > len(frames) + 1  # called for each decoded frame, so an error there ends the reading soon
     assert [size for size in told if size] == [*[frame_bytes] * len(frames), frames.nbytes]
 
     def refuse(num_bytes: int) -> None:
@@ -77,7 +77,7 @@ def test_a_sound_is_no_video(tmp_path: Path) -> None:
 
 
 class FileRequest(FolderRequest):
-    """Serves the files of a folder, and notes what was asked for; ``/short/...`` ends before its end."""
+    """Serves the files of a folder and records the paths; ``/short/...`` ends early."""
 
     def __init__(self, asked: list[str], *connection: Any, **options: Any) -> None:
         self.asked = asked

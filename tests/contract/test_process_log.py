@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The log of `rfm serve`, the gateway and the model processes, each written by a process of its own."""
+"""The log lines of `rfm serve`, the gateway and the model processes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ with about(["a-1", "b\\n2,c"]):
 
 
 def test_a_log_that_cannot_be_written_ends_nothing() -> None:
-    """A full disk, a pipe that nobody reads, and no standard error at all."""
+    """A full disk, a pipe without a reader, and no standard error."""
     code = """
 for _ in range(1000):
     log.warning("a line")

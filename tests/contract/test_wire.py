@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The wire contract from both ends: what one side writes the other reads, without a server between them."""
+"""The wire contract without a server: one side writes, the other reads."""
 
 from __future__ import annotations
 
@@ -129,10 +129,10 @@ def lacking(name: str, row: int, at: slice) -> wire.Tensors:
 @pytest.mark.parametrize(
     ("name", "row", "at"),
     [
-        ("progress", 0, slice(0, 2)),  # what was asked
+        ("progress", 0, slice(0, 2)),  # the requested trajectory
         ("progress", 1, slice(0, 1)),  # all of a pair's first trajectory
         ("success", 0, slice(1, 2)),  # a part
-        ("success", 1, slice(0, 2)),  # a pair's first trajectory, and a part of its second
+        ("success", 1, slice(0, 2)),  # the first trajectory of a pair, and part of the second
         ("progress", 1, slice(2, 3)),
         ("preference", 1, slice(0, 1)),
         ("similarity", 2, slice(0, 1)),

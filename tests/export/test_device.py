@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where an export is compared with its checkpoint. GPUs that this machine has not are made up."""
+"""The device on which an export is compared with the checkpoint. Missing GPUs are made up."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PLAIN = goldens.config("q3_tok_disc10")
 
 @pytest.fixture
 def free_bytes(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """What is free on each GPU."""
+    """Free bytes on each GPU."""
     free: list[float] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: bool(free))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: len(free))
@@ -107,7 +107,7 @@ class Failing(CalledAgain):
 
 
 def compare(capture: CalledAgain) -> tuple[Graphs, list[str]]:
-    """Compare the graphs of a reference checkpoint with its plain passes; also return what is said."""
+    """Compare a reference checkpoint's graphs with plain passes. Also return the messages."""
     checkpoint, graphs, said = families.load(PLAIN.checkpoint, **PLAIN.sources), Graphs(capture), list[str]()
     engine = Engine(checkpoint.predictor(torch.device("cpu")), graphs=graphs)
     verify_graphs(lambda: engine, checkpoint.description, said.append)

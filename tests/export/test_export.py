@@ -156,7 +156,7 @@ def test_an_export_that_differs_from_its_checkpoint_is_not_published(
 
 
 def test_a_checkpoint_that_gives_no_numbers_is_not_published(tmp_path: Path) -> None:
-    """All of its weights are numbers; what the network makes of them is not."""
+    """All weights are numbers, but the network's output is not."""
     checkpoint = tmp_path / "checkpoint"
     shutil.copytree(EMBEDDINGS.checkpoint, checkpoint)
     file = checkpoint / "model.safetensors"
@@ -302,7 +302,7 @@ def parameter(repository: Path, model: str, name: str) -> str:
 
 
 def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
-    """That of an ensemble is of its parts' files, one after the other."""
+    """An ensemble's digest covers the files of all parts in order."""
 
     def digest(*folders: str) -> str:
         files = (file for folder in folders for file in sorted((exported / folder).rglob("*.safetensors")))

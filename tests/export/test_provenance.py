@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What decided each setting of a checkpoint: said, written beside it, and refused where it contradicts the run."""
+"""The source of each setting: printed, written beside the checkpoint, refused where it contradicts the run."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def rewritten(file: Path, change: Callable[[Any], object]) -> None:
 
 @pytest.fixture
 def vlm(tmp_path: Path) -> Callable[[str], tuple[Path, Path]]:
-    """Copies of a vision-language checkpoint and of its base model, whose folder has the name that the run gives it."""
+    """Copies of a vision-language checkpoint and the base model, in a folder with the name from the run."""
 
     def copy(name: str) -> tuple[Path, Path]:
         config = goldens.config(name)
@@ -62,7 +62,7 @@ def vlm(tmp_path: Path) -> Callable[[str], tuple[Path, Path]]:
 
 
 def explained(folder: Path, base: Path | None = None) -> tuple[dict[str, Decision], list[str]]:
-    """The decisions on the checkpoint by name, and what was said of assumptions and contradictions."""
+    """Decisions by name, and the messages about assumptions and contradictions."""
     said: list[str] = []
     settings = ExportConfig(num_gpus=0, base_model=None if base is None else str(base))
     decisions = {each.name: each for each in rfm_export.explain(folder, settings, say=said.append)}
@@ -156,7 +156,7 @@ def test_what_config_yaml_does_not_say_is_assumed_aloud(
     ("version", "source", "is_assumed"),
     [
         ("4.57.6", "config.json: transformers_version 4.57.6", False),
-        ("5.5.4", "default: no file names transformers 4", False),  # a line of its own tells
+        ("5.5.4", "default: no file names transformers 4", False),  # has a separate line
         (None, "default: no file names transformers 4", True),
     ],
 )

@@ -32,14 +32,14 @@ def engine_there(name: str, feature_cache_mib: int = 0, device: torch.device = C
     config = goldens.config(name)
     checkpoint = families.load(config.checkpoint, **config.sources)
     options = {"device": device, "dtype": torch.float32, "feature_cache_mib": feature_cache_mib}
-    with torch.inference_mode():  # what is made in it needs no views that count versions
+    with torch.inference_mode():  # tensors made in it need no version counters
         return Engine.of(checkpoint, encoders=checkpoint.encoders(), **options)
 
 
 # How often the host waits in a batch like one that was scored before: for values, and for copies to the device.
 # Of vision-language ones all scores are read at once; for SmolVLM transformers looks for images of zeros.
 WAITS = {
-    "c1_t1_disc10": (5, 11),  # progress, its logits, success, questions twice; the parts of a batch
+    "c1_t1_disc10": (5, 11),  # progress, logits, success, questions twice; the parts of a batch
     "legacy_keys_l2": (4, 11),
     "enc_c1_t1_disc10": (8, 15),
     **{config.name: (40 if config.name.startswith("smol") else 1, 0) for config in goldens.VLM},
@@ -137,7 +137,7 @@ MIXED: list[Sample] = [
 def test_batches_that_are_collated_while_others_are_scored_have_the_cpu_s_scores(seen: Seen, name: str) -> None:
     engine = engine_there(name, feature_cache_mib=1)
     engine.token_budget = 100
-    for _ in range(2):  # the second time, what was made of frames is kept on the device
+    for _ in range(2):  # the second time, frame features are on the device
         for result, expected in zip(engine.evaluate(MIXED), load_engine(name).evaluate(MIXED), strict=True):
             assert_close(result, expected, 1e-5)
     if not name.startswith("smol"):

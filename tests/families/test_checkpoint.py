@@ -31,7 +31,7 @@ from rfm.families import CheckpointError
 from spoilt import Spoil, conversion, convert, copied, in_json, settings, text, weights
 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
-MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # its configs say l2 and 32 bins, its weights 5 bins
+MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # the configs say l2 and 32 bins, the weights 5 bins
 IN_RUN_FOLDER = "c1_t1_disc10"  # config.yaml in the parent folder
 WITH_IMAGES = "q3_tok_disc10"  # a vision-language one: each frame an image, with a progress token
 ADAPTER = "q25_peft_adapter_disc10"
@@ -468,7 +468,7 @@ ASKED = {
 
 
 def first_half(folder: Path) -> None:
-    """What an unfinished download leaves: a file of its whole size, whose second half is 0."""
+    """Zero the second half of a file, as an unfinished download leaves it."""
     content = (folder / "model.safetensors").read_bytes()
     begin = 8 + int.from_bytes(content[:8], "little")
     kept = begin + (len(content) - begin) // 2
@@ -554,7 +554,7 @@ from rfm.families import CheckpointError
 {inspect.getsource(said)}
 print(json.dumps(said(sys.argv[1:])))
 """
-UNTAGGED, TAGGED, WITHOUT = "org/name", f"org/other@{TAG}", "org/without"  # repositories of their own
+UNTAGGED, TAGGED, WITHOUT = "org/name", f"org/other@{TAG}", "org/without"  # separate repositories
 IN_SUBFOLDER, PICKLED, PICKLED_WITHIN = "org/runs/one/ckpt=5@v1", "org/pickled", "org/runs/pickled@v1"
 LATE, LATE_ABOVE = "org/late/one/ckpt@v1", "org/late/two/ckpt@v1"
 NOT_THERE, ABSENT, OTHER_TAG = "org/runs/none@v1", "org/absent/folder@v1", "org/name@v9"

@@ -127,7 +127,7 @@ NOT_FINITE = {
 
 @pytest.mark.parametrize(("sample", "row"), NOT_FINITE.values(), ids=NOT_FINITE)
 def test_a_score_that_is_not_finite_fails_its_sample_alone(sample: Sample, row: RowScores) -> None:
-    """Whichever family gives it: the engine checks what all families return."""
+    """The engine checks the scores of every family."""
     neighbour = ProgressSample(PAIR[0])
     first, bad, last = Engine(Fixed([RowScores([GOOD]), row, RowScores([GOOD])])).evaluate(
         [neighbour, sample, neighbour]
@@ -182,7 +182,7 @@ for outcome, other in zip(outcomes, expected, strict=True):
 
 @pytest.mark.slow
 def test_a_cpu_out_of_memory_halves_the_batch_and_fails_a_lone_sample() -> None:
-    """A process of its own, since the limit on its memory is real and lasts; what is freed there is free at once."""
+    """Runs in a separate process, since a memory limit is real and permanent."""
     environment = {**os.environ, "MALLOC_MMAP_THRESHOLD_": str(2**16), "MALLOC_ARENA_MAX": "1"}
     subprocess.run(
         [sys.executable, "-c", IN_LITTLE_MEMORY], cwd=ROOT / "tests" / "support", env=environment, check=True

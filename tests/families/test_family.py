@@ -55,7 +55,7 @@ def video(red: list[float]) -> Trajectory:
 
 
 def progress(red: list[float]) -> np.ndarray:
-    """What the toy checkpoint says of ``video(red)``."""
+    """Return the toy checkpoint's progress for ``video(red)``."""
     return 1 / (1 + np.exp(2 - 4 * np.round(255 * np.array(red)) / 255))
 
 
@@ -76,7 +76,7 @@ class Running:
 
 
 def with_family(installation: Installation, folder: Path) -> Installation:
-    """The server with a Python environment that has the toy family installed, besides what this one has."""
+    """A server whose Python environment also has the toy family."""
     venv.create(folder)
     (packages,) = folder.glob("lib/python*/site-packages")
     ours = sysconfig.get_path("purelib")

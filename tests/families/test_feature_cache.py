@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Embeddings are made once for each frame and task, kept by what these show, and never wrong for it."""
+"""Embeddings are computed once per frame and task, cached by content, and never mixed up."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_a_black_frame_with_pixels_is_always_encoded(encoders: FrameEncoders) ->
 
 
 def test_a_sliver_is_refused_though_only_another_request_names_it(encoders: FrameEncoders) -> None:
-    """In one batch the second would bring what the first has sent to size."""
+    """The second request of a batch needs the features of the first."""
     sliver, cache, frames = np.zeros((1, 3000, 3), np.uint8), FeatureCache(2**20), frames_of(5, 1)
     encoders.encode([footage(frames)], Execution(), cache)
     sends = TrajectoryRefs((frame_digest(frames[0]),), {frame_digest(sliver): sliver}, TASK)

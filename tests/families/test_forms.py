@@ -32,7 +32,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def factors_twice(tensors: dict[str, Any]) -> None:
-    """What PEFT makes of PiSSA: the factors, and beside them those that the run began with; here the latter are 0."""
+    """Write PiSSA factors as PEFT does, beside the initial factors, which are 0 here."""
     for name in [name for name in tensors if ".lora_A." in name]:
         other = name.replace("lora_A", "lora_B")
         tensors[name] = torch.cat([tensors[name], tensors[name]])
@@ -104,7 +104,7 @@ def on_the_embedding(tensors: dict[str, Any]) -> None:
 
 
 def with_the_embedding_twice(tensors: dict[str, Any]) -> None:
-    """What PEFT writes by save_embedding_layers=True if modules_to_save names the embedding."""
+    """Write what PEFT's save_embedding_layers=True gives if modules_to_save names the embedding."""
     copies = {f"{EMBEDDING}.{name}.weight": torch.ones(9, 9) for name in ("original_module", "modules_to_save")}
     tensors.update(copies)
 

@@ -34,7 +34,7 @@ VLM = goldens.config("q25_mean_l2")
 ADAPTER = goldens.config("q25_peft_adapter_disc10")
 
 LONGEST_S = 30
-MOST_MEMORY_BYTES = 512 * 2**20  # beyond what the process had at its largest
+MOST_MEMORY_BYTES = 512 * 2**20  # above the process's peak
 
 
 @pytest.fixture(autouse=True)
@@ -140,7 +140,7 @@ HOSTILE: dict[str, tuple[Spoil, str]] = {
     # names
     "a shard elsewhere": (shards(a="../secret.safetensors"), r"expected names of files beside it, got '\.\./secret"),
     "a shard with a NUL": (shards(a="a\0.safetensors"), r"expected a file|not there"),
-    # what is no file
+    # not a file
     "a folder as weights": (instead(WEIGHTS, Path.mkdir), rf"{WEIGHTS}: expected a file, got a folder"),
     "a pipe as weights": (instead(WEIGHTS, os.mkfifo), rf"{WEIGHTS}: expected a file, got a pipe"),
     "a pipe as config.yaml": (instead("config.yaml", os.mkfifo), r"config\.yaml: expected a file, got a pipe"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Checkpoints without heads, down to the first ReWiND code's, which predicts progress alone: what is there is served."""
+"""Checkpoints without some heads, such as the first ReWiND code's with progress alone, serve the others."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_a_head_that_is_missing_is_not_said_to_be_untrained(tmp_path: Path) -> N
 
 
 class FirstCode(nn.Module):
-    """The network of the first ReWiND code, as its repository describes it, of a small width."""
+    """A narrow network of the first ReWiND code, as the repository describes it."""
 
     def __init__(self, max_length: int) -> None:
         super().__init__()
@@ -137,7 +137,7 @@ class FirstCode(nn.Module):
 
 @pytest.fixture(scope="module")
 def first_code(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FirstCode]:
-    """A network of it, saved as its training script does, and converted."""
+    """A checkpoint as the first training script saves it, converted."""
     torch.manual_seed(0)
     network = FirstCode(max_length=16)
     for parameter in network.parameters():
@@ -153,7 +153,7 @@ def first_code(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FirstCod
 
 @pytest.fixture
 def run(first_code: tuple[Path, FirstCode], tmp_path: Path) -> Path:
-    """A copy of its folder, to which a test may add."""
+    """A copy of the folder, which a test may change."""
     return shutil.copytree(first_code[0], tmp_path / "run")
 
 

@@ -35,7 +35,7 @@ def checkpoint(name: str) -> VlmCheckpoint:
 
 
 def with_fused_norms(network: nn.Module) -> int:
-    """Do on the CPU what ``speed_up`` does elsewhere; return the number of norms."""
+    """Apply ``speed_up``'s norms on the CPU. Return the number of norms."""
     found = [
         (module, name, child)
         for module in network.modules()

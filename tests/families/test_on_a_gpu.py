@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tests on a GPU of what else is tested with packages that a bare GPU machine lacks."""
+"""GPU tests that need only the packages of a bare GPU machine."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is computed as float32 is float32."""
+"""float32 products use no lower precision."""
 
 from __future__ import annotations
 

@@ -301,7 +301,7 @@ def test_the_gpu_gives_the_numbers_of_the_cpu(config: RewindConfig) -> None:
 
 
 def test_half_precision_scores_are_near_those_of_float32() -> None:
-    """ReWiND in bfloat16, where somebody asks for it."""
+    """ReWiND in bfloat16, on request."""
     checkpoint = goldens.config("c1_t1_disc10").checkpoint
     in_float32, in_bfloat16 = (Engine.from_checkpoint(checkpoint, dtype=dtype) for dtype in (None, torch.bfloat16))
     samples = [ProgressSample(random_trajectory(seed, 1 + seed)) for seed in range(8)]

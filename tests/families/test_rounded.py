@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Weights of 8 and 4 bits: what they stand for, and that scores depend on nothing else."""
+"""Weights of 8 and 4 bits: their values, on which alone scores depend."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def test_a_checkpoint_in_nf4_keeps_its_codes_and_is_labelled(tmp_path: Path, nam
 
     rfm_export.export(few_bits, tmp_path / "models", serve_config(goldens.config(name)))
     info = info_of(tmp_path / "models" / "rfm_frames")
-    assert (info.weights, info.weights_difference) == ("nf4", None)  # nobody has the weights before rounding
+    assert (info.weights, info.weights_difference) == ("nf4", None)  # the weights before rounding are unknown
 
 
 def _is_of(key: str, path: str) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a vision tower makes of a shot is made once, kept by what the shot shows, and never wrong for it."""
+"""Features of a shot are computed once, cached by content, and never mixed up."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""TOPReward: the numbers of LeRobot's code and of Robometer's baseline, and what it refuses."""
+"""TOPReward: the numbers of LeRobot's code and Robometer's baseline, and refusals."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_prefixes_share_the_vision_tower_s_work(lerobot: Engine) -> None:
     lerobot.predictor.cache.clear()
     execution, again = Execution(), Execution()
     lerobot.evaluate([progress(noise(8))], execution)
-    assert execution.num_encoded == 16  # 4 pairs, and 4 frames that fill up their pair themselves; not 72
+    assert execution.num_encoded == 16  # 4 pairs, and 4 frames that make up a pair alone; not 72
     lerobot.evaluate([progress(noise(8))], again)
     assert again.num_encoded == 0
 

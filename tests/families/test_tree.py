@@ -50,7 +50,7 @@ def values(outcomes: Any) -> list[Any]:
 def assert_as_separate(
     engine: Engine, samples: list[ProgressSample], monkeypatch: pytest.MonkeyPatch, tolerance: float = TOLERANCE
 ) -> None:
-    """The scores of trees are those of prefixes that have a row of their own, and fewer tokens give them."""
+    """A tree gives the scores of separate prefixes with fewer tokens."""
     of_trees, separate = Execution(), Execution()
     found = values(engine.evaluate(samples, of_trees))
     with monkeypatch.context() as changed:
@@ -87,7 +87,7 @@ def test_budget_and_metrics_count_the_tokens_of_a_tree() -> None:
     engine.score([prepared], execution)
     assert execution.num_tokens == prepared.num_tokens <= 7500
     assert execution.num_slots == execution.num_tokens
-    assert execution.num_encoded == 128  # 32 pairs, and 32 frames that fill up their pair themselves
+    assert execution.num_encoded == 128  # 32 pairs, and 32 frames that make up a pair alone
 
 
 MIXED = [sample(1), sample(16), sample(20, 48, 80), sample(24, 96, 64)]

@@ -21,7 +21,7 @@ PREPROCESSOR = "preprocessor_config.json"
 
 
 def published_image_encoder(folder: Path) -> None:
-    """The files of facebook/dinov2-base that decide embeddings, but for its weights."""
+    """The files of facebook/dinov2-base that decide embeddings, except the weights."""
     from transformers import Dinov2Config
 
     Dinov2Config().save_pretrained(folder)

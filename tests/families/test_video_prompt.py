@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The two forms of a Qwen3-VL's prompt with a video: the ids of transformers' own processor, and what decides the form."""
+"""The two forms of a Qwen3-VL video prompt: token ids of transformers' processor, and the choice of the form."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ PROGRESS, PAIR = ProgressSample(trajectory(5)), PreferenceSample(trajectory(3), 
 
 @dataclass(frozen=True)
 class Case:
-    """A model, its sample, and the numbers and rate of the frames that the processor is told, of each video."""
+    """A model, a sample, and the frame numbers and rate of each video for the processor."""
 
     source: Path
     shown: tuple[list[int], ...]
@@ -156,7 +156,7 @@ def test_the_form_changes_scores(name: str) -> None:
     np.testing.assert_array_equal(default, bare)  # transformers 4.57.6 and 5.5.4 wrote config.json
 
 
-VERSIONS: dict[str, tuple[str | None, str, str, bool]] = {  # form and end of its source by version; True: assumed
+VERSIONS: dict[str, tuple[str | None, str, str, bool]] = {  # form and end of the source by version; True: assumed
     "4.57": ("4.57.6", "bare", "transformers_version 4.57.6", False),
     "the last before": ("5.9.0", "bare", "transformers_version 5.9.0", False),
     "the first": ("5.10.1", "wrapped", "transformers_version 5.10.1", False),

@@ -95,7 +95,7 @@ def round_frequencies(network: torch.nn.Module) -> None:
 
 
 def excesses(engine: Engine, case: goldens.Case, *, bfloat16: bool, tolerances: tuple[float, float]) -> list[float]:
-    """How many times its tolerance each sample's largest difference is."""
+    """Return each sample's largest difference divided by the tolerance."""
     results = [outcome for outcome in engine.evaluate(case.samples()) if not isinstance(outcome, Exception)]
     pairs = zip(results, case.expected(bfloat16=bfloat16), strict=True)
     each = (goldens.differences(result, expected) for result, expected in pairs)
@@ -115,7 +115,7 @@ def test_bfloat16_is_the_original_s_bfloat16(case: goldens.Case) -> None:
 @pytest.mark.reference
 @pytest.mark.parametrize("case", [case for case in BFLOAT16_CASES if case.has_float32], ids=str)
 def test_a_network_in_bfloat16_holds_the_original_s_numbers(case: goldens.Case) -> None:
-    """Computed in float32, where a CPU's rounding is a thousandth of what a rounded frequency does."""
+    """In float32, where CPU rounding is a thousand times smaller than a rounded frequency's effect."""
     _, predictor = engine_in_bfloat16()
     engine = Engine(VlmPredictor(predictor.network.float(), predictor.collator, torch.device("cpu")))
     assert max(excesses(engine, case, bfloat16=False, tolerances=case.tolerances)) <= 1
@@ -143,7 +143,7 @@ def mixture(step: int = 1) -> list[Sample]:
         ("q25_peft_adapter_disc10", 65_536, 2),
         ("q25_attention_disc10", 65_536, 2),
         ("q25_video_last_l2", 65_536, 2),
-        (SMOL, 4096, 9),  # its squares take long on a CPU
+        (SMOL, 4096, 9),  # squares take long on a CPU
     ],
 )
 def test_a_mixture_equals_its_samples_alone(name: str, token_budget: int, step: int) -> None:
@@ -197,9 +197,9 @@ def pooled(network: Any, states: torch.Tensor) -> torch.Tensor:
 def test_a_pair_of_two_frame_sizes_is_scored_as_transformers_reads_it(
     make: Callable[[], VlmPredictor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its own forward of the backbone, given each image or video as upstream gives it; then the heads.
+    """Run the backbone's forward with each image or video as upstream does; then the heads.
 
-    Patches are embedded by our matrix product, because the order of sums in its convolution is another.
+    Our matrix product embeds the patches, because the convolution sums in another order.
     """
     predictor = make()
     if isinstance(predictor.collator, QwenCollator):
@@ -273,7 +273,7 @@ ASKED_AGAIN = {name: TWO_SIZES[name] for name in (PLAIN, "q25_video_last_l2", SM
 
 @pytest.mark.parametrize("make", ASKED_AGAIN.values(), ids=ASKED_AGAIN)
 def test_a_question_is_read_as_if_no_other_had_been_asked_before(make: Callable[[], VlmPredictor]) -> None:
-    """Questions differ in one thing each: the task, how many frames, their size, dense mode, the type, the order."""
+    """Questions differ in one property: task, number of frames, size, dense mode, type, or order."""
     one, other = video(0, 4, 56, 56), video(1, 3, 56, 84)
     questions: list[Sample] = [
         ProgressSample(one),
@@ -316,7 +316,7 @@ def test_a_network_that_reads_images_is_causal_and_one_that_reads_videos_is_not(
 
 
 def test_out_of_memory_halves_the_batch_and_fails_what_never_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The CPU has no memory of a device that could run out: the network refuses larger batches in its place."""
+    """A CPU has no device memory to exhaust, so the network itself refuses large batches."""
     engine, execution = Engine(load_engine(PLAIN).predictor), Execution()
     samples = [ProgressSample(video(seed, 2, 56, 56)) for seed in range(4)]
     expected = engine.evaluate(samples)
@@ -338,7 +338,7 @@ def test_out_of_memory_halves_the_batch_and_fails_what_never_fits(monkeypatch: p
 
 @pytest.mark.parametrize("name", ["q3_tok_disc10", "q25_video_avg_disc10"])
 def test_dense_mode_encodes_each_shot_once(name: str) -> None:
-    """Of a video a shot is a pair of frames; 5 of its frames, 4 at a time, make the pairs that are counted here."""
+    """A shot of a video is a pair of frames. 5 frames, 4 at a time, make the pairs below."""
     frames = np.random.default_rng(0).integers(0, 256, (5, 56, 84, 3), np.uint8)
     engine, execution = load_engine(name), Execution()
     (result,) = engine.evaluate([ProgressSample(Trajectory(frames=frames, task="stack"), frame_steps=4)], execution)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Vision-language checkpoints: what decides each setting, and what is refused."""
+"""Vision-language checkpoints: the source of each setting, and refusals."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def rename(
 
 
 def beside_its_adapter(folder: Path) -> None:
-    """What upstream writes of a LoRA run since its pull request 25."""
+    """Write a LoRA run as upstream does since pull request 25."""
     tensors = load_file(folder / "model.safetensors")
     adapter = {
         f"base_model.model.{name.split('.base_model.model.')[1].replace('.default.', '.')}": tensor

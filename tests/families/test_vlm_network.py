@@ -69,7 +69,7 @@ def test_shots_of_one_size_are_one_call_of_attention(name: str, monkeypatch: pyt
 
 @pytest.mark.parametrize("name", QWEN)
 def test_patches_are_embedded_without_a_convolution(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some versions of cuDNN compute the tower's Conv3d wrong in bfloat16; a matrix product gives its values."""
+    """Some versions of cuDNN compute the tower's Conv3d wrong in bfloat16; a matrix product is right."""
     predictor = predictor_of(name)
     batch = predictor.collate(predictor.rows(ProgressSample(video(0, 2, 84, 112)))).to(
         torch.device("cpu"), torch.float32

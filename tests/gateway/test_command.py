@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The command that runs a gateway: its options, its key, and what it tells when it starts. No Triton is needed."""
+"""The gateway command: options, the key, and the first lines. No Triton is needed."""
 
 from __future__ import annotations
 

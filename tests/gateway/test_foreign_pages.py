@@ -137,7 +137,7 @@ def test_refused_evaluations_are_counted_and_have_their_id(reason: str, headers:
 @pytest.mark.parametrize("headers", OF_OURS.values(), ids=OF_OURS)
 def test_the_page_and_programs_are_answered(gateway: TestClient, headers: dict[str, str]) -> None:
     for path in POSTS:
-        assert gateway.post(path, content=b"", headers=headers).status_code in (415, 422)  # as a wrong body is
+        assert gateway.post(path, content=b"", headers=headers).status_code in (415, 422)  # like a wrong body
     for path in GETS:
         assert gateway.get(path, headers=headers).status_code == 200
 

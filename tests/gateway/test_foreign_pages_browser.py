@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Pages of other origins in Chromium, which try to read from a gateway and to use it: by its address, and by a name of
-their own that leads to it. No Triton is needed.
+"""Pages of other origins in Chromium, which try to use a gateway by address and by a rebound name.
+No Triton is needed.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def loud_browser(browser: Browser) -> Iterator[Browser]:
 
 
 def tried(browser: Browser, base: str) -> Json:
-    """What a script gets in the page that is open."""
+    """Return the results of a script in the open page."""
     return dict(browser.driver.execute_async_script(TRY, base, [DATASETS, VIDEO, LIVE, "/metrics"], VIDEO, REPORT))
 
 

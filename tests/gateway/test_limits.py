@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies, waiting and callers beyond what the gateway takes."""
+"""Limits of the gateway: bodies, waiting requests, callers."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def test_scoring_is_healthy_without_triton_s_metrics(triton: Triton, tmp_path: P
 
 def test_a_server_that_hangs_is_unhealthy_with_the_reason(triton: Triton, strict: Gateway) -> None:
     assert requests.get(f"{strict.url}/health").ok
-    with paused(triton):  # what was found before is told for a second more
+    with paused(triton):  # the earlier state is reported for another second
         poll(lambda: requests.get(f"{strict.url}/health").status_code == 503)
         assert "no answer within" in failure(requests.get(f"{strict.url}/health"), 503)
     poll(lambda: requests.get(f"{strict.url}/health").ok)
@@ -191,7 +191,7 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_si
         process.wait(WITHIN_S)
     for why in ("killed by SIGKILL", "no answer for 4 s"):
         assert f"]: gateway is started again: {why}\n" in gateway.log
-    assert len(set(started)) >= 5  # Triton, its model process, and three gateways
+    assert len(set(started)) >= 5  # Triton, a model process, and three gateways
     assert not [child for child in started if child.is_running()]
     assert not own_regions(process.pid)
 

@@ -30,7 +30,7 @@ TASK = "stack the cups"
 
 
 class Asked(BrightnessScorer):
-    """Counts what it scores, also in a run by the command."""
+    """Counts samples, also in a run by the command."""
 
     def run(self, source: Path, labels: LabelOptions, *, dry_run: bool = False, task: str | None = None) -> int:
         self.said: list[str] = []
@@ -68,7 +68,7 @@ def refused(source: Path, output: Path, **more: Any) -> list[str]:
 
 
 def option(lines: list[str], name: str) -> str:
-    """What an option has in the lines, as a shell reads it."""
+    """Return an option's value in the lines, as a shell reads it."""
     (found,) = (match[1] for line in lines if (match := re.search(rf"{name} (\S+)$", line)))
     return str(found)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cameras that show nothing, or no colours: what labelling says of them, and which it leaves out."""
+"""Cameras with black frames or without colours: warnings, and the cameras that labelling leaves out."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def changed(file: Path, change: Callable[[Any], object]) -> Path:
 
 
 def put(path: str, value: Any) -> Callable[[Any], None]:
-    """Puts something in the place of what is at a path."""
+    """Replace the object at a path."""
 
     def change(opened: Any) -> None:
         opened.pop(path, None)
@@ -52,7 +52,7 @@ def put(path: str, value: Any) -> Callable[[Any], None]:
 
 
 def told(path: str, name: str, value: Any) -> Callable[[Any], None]:
-    """Gives an attribute to what is at a path."""
+    """Set an attribute of the object at a path."""
 
     def change(opened: Any) -> None:
         opened[path].attrs[name] = value

@@ -24,7 +24,7 @@ WORKERS = 4
 
 @pytest.fixture(autouse=True)
 def small_requests(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is sent together is small beside a video, as it is beside a real one."""
+    """Make requests small beside a video, as in reality."""
     monkeypatch.setattr(episode_scores, "MAX_BYTES", VIDEO_BYTES // 50)
 
 

@@ -60,7 +60,7 @@ def test_folders_of_frames_are_read_in_natural_order_by_one_task(tmp_path: Path,
 
 
 def test_labels_of_folders_of_frames_stay_and_new_folders_are_added(folders: Path) -> None:
-    """Also with the labels and their picture in the folder of the dataset."""
+    """Also with labels and picture in the dataset's folder."""
     scorer = BrightnessScorer()
     report = label(open_dataset(folders, task=TASK), scorer, LabelOptions(episodes=[0, 1]))
     (folders / "rfm_summary.png").write_bytes((folders / "0" / "frame_0.png").read_bytes())
@@ -189,7 +189,7 @@ def write_demos(file: Path, task: str, num_demos: int = 1) -> None:
 
 
 def asked(source: Path, labels: LabelOptions, *, dry_run: bool = False) -> tuple[int, list[str], set[str]]:
-    """Exit code, what it says, and the tasks that were scored."""
+    """Return the exit code, the output lines, and the scored tasks."""
     scorer, said = BrightnessScorer(), list[str]()
     return command(source, labels, scorer, said.append, dry_run=dry_run), said, scorer.tasks
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is finished stays finished: after a kill, beside another process, without a server, on a full disk."""
+"""Finished episodes stay finished: after a kill, beside another process, without a server, on a full disk."""
 
 from __future__ import annotations
 

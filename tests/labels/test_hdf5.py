@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 files: their demonstrations, which of their pictures are scored and which way up, and their labels."""
+"""HDF5 files: demonstrations, cameras, orientation, and labels."""
 
 from __future__ import annotations
 
@@ -359,7 +359,7 @@ class WithoutSuccess(BrightnessScorer):
 
 
 def rewards_in(file: Path) -> dict[str, list[str]]:
-    """Names of what is in each demonstration besides what was recorded."""
+    """Return the names of the labels in each demonstration."""
     with h5py.File(file) as opened:
         return {name: sorted({*demo} - {"actions", "obs"}) for name, demo in opened["data"].items()}
 
@@ -418,7 +418,7 @@ def test_in_place_the_file_is_whole_whoever_is_killed_and_whatever_is_full(
     assert demos.read_bytes() == before
     assert [file.name for file in demos.parent.iterdir() if "demos" in file.name] == ["demos.hdf5"]
 
-    replace, left = Path.replace, []  # what a kill at the last moment before the new file would leave
+    replace, left = Path.replace, []  # as a kill just before the new file leaves it
 
     def seen(self: Path, target: Path) -> Path:
         left.extend([demos.read_bytes()] if target == demos else [])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Labels that are there are kept: fewer episodes never replace more, and what has grown is labelled where it is new."""
+"""Existing labels are kept: fewer episodes never replace more, and only new episodes are labelled."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, command, w
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 TOY = LEROBOT / "toy_v30_many"
-CAMERAS = (WRIST, FRONT)  # not in the order of their names
+CAMERAS = (WRIST, FRONT)  # not in alphabetical order
 PROGRESS = "rfm_progress.parquet"
 EPISODE_FRAMES = [episode.num_frames for episode in open_dataset(TOY).episodes]
 
 
 def labelled(root: Path, output: Path, **options: Any) -> tuple[int, list[str]]:
-    """How many frames of each camera a run has scored, and what it has said."""
+    """Return the number of scored frames per camera, and the messages of a run."""
     scorer, notes = BrightnessScorer(), Notes()
     label(open_dataset(root), scorer, LabelOptions(output=output, cameras=CAMERAS, frames=2, **options), notes)
     return scorer.num_samples // len(CAMERAS), notes.lines

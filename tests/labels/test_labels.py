@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the labels of a dataset are: each frame's score on its prefix, through Triton, through the engine, by hand."""
+"""Labels are the scores of prefixes: through Triton, through the engine, by hand."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_all_of_a_causal_network_in_one_pass_is_what_its_prefixes_give(client: R
 
 @pytest.mark.parametrize("rule", RULES)
 def test_any_rule_labels_each_frame_with_the_slot_that_it_reads(rule: Any, output: Path) -> None:
-    """The scorer gives each slot its own frame's brightness: what a rule reads is always frame t, but for K = 1."""
+    """The scorer returns each slot's brightness: rules read frame t, except for K = 1."""
     dataset = open_dataset(LEROBOT / "toy_v21")
     scorer = BrightnessScorer(max_frames=None)
     frames = None if rule == "all" or rule.startswith("rewind") else 4

@@ -132,7 +132,7 @@ def test_a_depth_camera_counts_only_where_it_is_named(tmp_path: Path, mark: dict
 
 
 def saved(convert: Callable[[Any], Any] = lambda image: image, form: str = "PNG") -> Callable[[Any], bytes]:
-    """Makes a file of a picture. convert: what Pillow makes of it first"""
+    """Write a picture to a file. convert: mode in Pillow"""
 
     def save(image: Any) -> bytes:
         written = io.BytesIO()
@@ -209,7 +209,7 @@ def test_exif_data_turn_images_in_tables_and_change_the_identity_of_the_episode(
 
 
 def store_as_images(root: Path, camera: str, save: Callable[[Any], bytes]) -> list[np.ndarray[Any, Any]]:
-    """Episode 0's video of a camera goes into its table, as images in the rows and as files; gives its frames."""
+    """Replace a camera's video of episode 0 by images, in the table and as files. Return the frames."""
     frames = whole_video(root / "videos" / "chunk-000" / camera / "episode_000000.mp4")
     images = []
     (root / "images").mkdir()
@@ -457,7 +457,7 @@ def test_a_hub_that_cannot_be_reached_is_told_in_words(tmp_path: Path) -> None:
 
 
 def test_a_dataset_of_the_hub_is_fetched_at_its_revision(tmp_path: Path) -> None:
-    """By a process of its own: the Hub's library reads its settings when it is imported."""
+    """In a separate process, since the Hub's library reads settings at import."""
     old = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "old")
     (old / "meta").rename(old / "meta_data")
     revisions = {"main": LEROBOT / "toy_v30_many", "v1": LEROBOT / "toy_v21", "old": old}

@@ -149,7 +149,7 @@ def test_a_bare_stream_is_scored_but_not_labelled(tmp_path: Path) -> None:
 
 
 def test_a_transport_stream_that_ends_inside_a_packet_is_refused(tmp_path: Path) -> None:
-    """The decoder shows what is there of a still picture, unmarked."""
+    """The decoder returns part of a still picture without an error."""
     file = tmp_path / "video.ts"
     encode_here(file, moving()[:1].repeat(NUM_FRAMES, axis=0))
     assert len(read_video(file)) == NUM_FRAMES

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""LeRobot episodes with several tasks: each stretch of frames by its own task, or all by the first."""
+"""LeRobot episodes with several tasks: one task per stretch of frames, or the first for all."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rfm_client import ProgressResult, ProgressSample, Trajectory, UInt8Array
 from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, label, open_dataset, read_episode_labels
 
 CUTS = (0, 20, 30)  # first frames of the stretches of episode 0
-TASKS = (0, 4, 0)  # and their numbers
+TASKS = (0, 4, 0)  # and numbers
 
 
 class SinceTheFirst(BrightnessScorer):
@@ -108,7 +108,7 @@ def test_each_stretch_of_frames_is_scored_as_an_episode_of_its_task(
 
 
 def gains(table: Any, chunk: int) -> list[float]:
-    """What LeRobot's reward-aligned behaviour cloning reads of each frame: it weights the frame 0 if this is below 0."""
+    """Return the progress per frame that LeRobot's reward-aligned cloning reads; below 0 the weight is 0."""
     progress, episodes = table["progress_sparse"].to_numpy(), table["episode_index"].to_numpy()
     last = {episode: int(np.flatnonzero(episodes == episode)[-1]) for episode in set(episodes.tolist())}
     return [float(progress[min(i + chunk, last[episodes[i]])] - progress[i]) for i in range(len(progress))]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which sentence LeRobot rows have: columns to choose from, gaps in numbers, contradictions, and what is told of it."""
+"""The sentence of a LeRobot row: the column, gaps in numbers, contradictions, and notes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The guide "GPU box": its commands make the keys and the certificate, and a real nginx serves with them and its file."""
+"""The guide "GPU box": the commands make keys and a certificate, and a real nginx serves with the guide's file."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ UNIT_FILE = ROOT / "docker" / "systemd" / "rfm-serve.service"
 BIN = Path(sys.executable).parent
 NAME, IP = "localhost", "127.0.0.1"  # the box, as clients call it in these tests
 CALLER, LATER = "alice", "bob"
-PORTS = {"grpc": 8001, "http": 8000, "gateway": 8100, "proxy": 8443}  # in the guide and its files
+PORTS = {"grpc": 8001, "http": 8000, "gateway": 8100, "proxy": 8443}  # in the guide and the files
 VIEWER = ROOT / "apps" / "page" / "rfm_page" / "static"
 VENDORED = ROOT / "apps" / "page" / "rfm_page" / "vendored"
 FRAMES = np.random.default_rng(0).integers(0, 256, (16, 256, 256, 3), np.uint8)  # 3 MiB: nginx alone takes 1 MiB
@@ -60,7 +60,7 @@ def commands(heading: str) -> str:
 
 
 def shell(script: str, box: Path) -> subprocess.CompletedProcess[str]:
-    """Runs commands of the guide in ``box/keys``, without root: what they put into /etc is put into ``box/etc``."""
+    """Run commands of the guide in ``box/keys`` without root, with ``box/etc`` for /etc."""
     script = 'set -eu\nsudo() { "$@"; }\n' + script.replace("/etc/", f"{box}/etc/")
     environment = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}"}
     return subprocess.run(["bash", "-c", script], cwd=box / "keys", env=environment, capture_output=True, text=True)
@@ -132,7 +132,7 @@ def papers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def nginx(folder: Path, ports: dict[int, int]) -> Iterator[subprocess.Popen[bytes]]:
-    """Debian's nginx with the file of the guide, on other ports of this machine, and its own folders in ``folder``."""
+    """Run Debian's nginx with the guide's file on other ports and with folders in ``folder``."""
     program = shutil.which("nginx", path=f"{BIN}:{os.environ['PATH']}:/usr/sbin")
     assert program, "nginx: expected in PATH, got nothing (make ops-tools)"
     copied = folder / "etc" / "nginx" / "conf.d" / "rfm.conf"
@@ -309,7 +309,7 @@ def test_the_gateway_answers_by_any_name_of_the_box_also_its_page(box: Box) -> N
     with box.http(host=name, origin=f"https://{name}", **{"X-API-Key": box.key()}) as caller:
         caller.headers["Sec-Fetch-Site"] = "same-origin"
         assert [caller.get(path).status_code for path in ("/health", "/", "/model_info")] == [200] * 3
-        assert caller.post("/evaluate_batch", content=b"").status_code == 422  # as a wrong body is
+        assert caller.post("/evaluate_batch", content=b"").status_code == 422  # like a wrong body
 
 
 @pytest.mark.triton

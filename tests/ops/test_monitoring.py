@@ -36,7 +36,7 @@ PROMETHEUS = ROOT / "docker" / "prometheus"
 GRAFANA = ROOT / "docker" / "grafana"
 RUNBOOKS = ROOT / "docs" / "guides" / "operate.md"
 
-INTERVALS = {"15s": "1s", "1m": "10s"}  # of the files, and what they are here
+INTERVALS = {"15s": "1s", "1m": "10s"}  # in the files, and in the tests
 EMBEDDING_DIMS = (64, 32)  # D and Dt of the demo's checkpoint
 TOO_MANY_FRAMES = 100  # for it
 GATEWAY_CALLERS = 4
@@ -72,7 +72,7 @@ def program(name: str) -> str:
 
 @dataclass(frozen=True)
 class Monitored:
-    """A Prometheus, and what it scrapes."""
+    """A Prometheus with the scraped servers."""
 
     url: str
 
@@ -184,7 +184,7 @@ def loaded(endpoints: Endpoints, gateway_url: str) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def monitored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Monitored]:
-    """Once all is scraped, a model's process dies: what was never started again is in no metric."""
+    """After the first scrape a model process dies, since metrics of restarts appear with the first restart."""
     folder = tmp_path_factory.mktemp("monitored")
     repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
     free = Endpoints.free()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Running episodes at the gateway: what is kept of them, what is told, what is refused. No Triton is needed for that."""
+"""Running episodes at the gateway: storage, answers, refusals. No Triton is needed."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class Page:
         self.browser["live-tab"].click()
 
     def cards(self, run: str) -> list[dict[str, str]]:
-        """What the page shows of the episodes of a run, in its order."""
+        """Return the cards of a run's episodes in the page's order."""
         return list(self.browser.run(CARDS, run))
 
     def shows(self, run: str, *expected: dict[str, str]) -> None:
@@ -204,7 +204,7 @@ def test_a_page_that_is_loaded_later_shows_the_same(page: Page) -> None:
 
 @pytest.mark.parametrize("first", [1, 10**9])
 def test_an_episode_that_is_first_heard_of_late_is_shown(page: Page, first: int) -> None:
-    """Its one point leaves the axis of the chart no length of its own."""
+    """A single point leaves the chart's axis without a length."""
     with LiveView(page.url, name=f"late {first}") as view:
         view.episode("wait").add(FRAMES[0], StepScore(0.5, 0.25, False, first, 3.0))
         page.shows(f"late {first}", {"Step": f"{first}", "state": "running"})

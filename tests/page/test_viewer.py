@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the page asks about videos, before a real Triton."""
+"""The page's requests about videos, with a real Triton."""
 
 from __future__ import annotations
 

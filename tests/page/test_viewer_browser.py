@@ -51,7 +51,7 @@ class Page:
         self.browser.drop([self.videos / f"{name}.mp4" for name in names])
 
     def score(self, *names: str) -> None:
-        """Drops videos, and waits for their curves."""
+        """Drop videos and wait for the curves."""
         self.drop(*names)
         self.browser.until_text("status", f"{len(names)} of {len(names)} curves are done.")
 
@@ -62,7 +62,7 @@ class Page:
         return answer
 
     def saved(self) -> Any:
-        """What the page lets a person take along."""
+        """Return the JSON that the page saves."""
         self.browser["json"].click()
         return json.loads(self.browser.saved("curves.json"))
 
@@ -129,7 +129,7 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
 
 
 def picture(page: Page) -> Image.Image:
-    """What the page shows of its one video, without the box around it."""
+    """Return the picture of the only video, without the surrounding box."""
     (player,) = page.browser.all("#videos video")
     page.browser.run("arguments[0].scrollIntoView()", player)
     page.browser.draw()

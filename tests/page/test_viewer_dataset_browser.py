@@ -43,7 +43,7 @@ VIDEOS = "#episode-videos video"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
 BEYOND = """
 return [document.documentElement, ...document.querySelectorAll(".work")].map((each) => each.scrollWidth - each.clientWidth);
-"""  # how far the page and what each tab shows reach to the right of what can be seen
+"""  # pixels by which the page and each tab overflow to the right
 PICTURES_ARE_THERE = """[...document.querySelectorAll("#live-episodes article")]
   .filter((card) => card.getBoundingClientRect().top < innerHeight)
   .every((card) => card.querySelector("img").naturalWidth)"""  # the page fetches none that is out of sight
@@ -52,7 +52,7 @@ ARE_THERE = f"[...document.querySelectorAll('{VIDEOS}')].every((video) => !video
 
 @dataclass(frozen=True)
 class Page:
-    """The tab of datasets. folders: of the datasets, by their numbers"""
+    """The tab of datasets. folders: by number of the dataset"""
 
     url: str
     browser: Browser
@@ -73,12 +73,12 @@ class Page:
 
     @property
     def episodes(self) -> list[int]:
-        """The episodes of the table, in its order."""
+        """Return the episodes in the table's order."""
         return [int(row[1]) for row in self.rows]
 
     @property
     def numbers(self) -> list[list[float]]:
-        """Progress and success of each of the watched episode's curves, beside its lines."""
+        """Return progress and success beside each curve of the watched episode."""
         values = [self.browser.values("episode-chart", signal) for signal in ("progress", "success")]
         return [[float(of_signal[name]) for of_signal in values] for name in values[0]]
 
@@ -91,13 +91,13 @@ class Page:
         return dataset
 
     def watch(self, episode: int) -> None:
-        """Clicks an episode, and waits for its videos."""
+        """Click an episode and wait for the videos."""
         self.browser.run(f"document.querySelector('#episodes tr[data-episode=\"{episode}\"] button').click()")
         self.browser.until_text("episode-title", f"Episode {episode}")
         self.browser.until(f"document.querySelectorAll('{VIDEOS}').length === 2 && {ARE_THERE}")
 
     def at_rest(self, episode: int) -> None:
-        """Watches an episode, stops it, and goes back to its begin."""
+        """Watch an episode, stop it, and go back to the beginning."""
         self.watch(episode)
         self.move_to(0)
         self.browser.until_text("episode-play", "Play")
@@ -119,7 +119,7 @@ class Page:
         return len({round(time_s, 2) for time_s in self.browser.times_s(PLAYERS)}) == 1
 
     def score_episode(self) -> None:
-        """Puts the episode into the score tab, and waits for its curves."""
+        """Put the episode into the score tab and wait for the curves."""
         self.browser["score-episode"].click()
         assert self.browser["score-panel"].is_displayed()
         self.browser.until_text("status", "2 of 2 curves are done.")
@@ -253,7 +253,7 @@ def test_the_threshold_moves_counts_and_histogram_and_is_dragged_in_the_chart(pa
 
 
 def tick(page: Page, name: str, number: float | None = None) -> None:
-    """Sets a filter, and its number."""
+    """Set a filter and a number."""
     if number is not None:
         page.browser.write(f"number-{name}", f"{number}")
     page.browser[f"only-{name}"].click()
@@ -395,7 +395,7 @@ def test_ten_thousand_episodes_are_a_few_rows_of_the_document(
         page.browser.until_text("episode-title", f"Episode {NUM_LARGE - 1}")
         page.browser["episode-before"].click()
         page.browser.until_text("episode-title", f"Episode {NUM_LARGE - 2}")
-        quiet_browser.driver.get("about:blank")  # before its gateway ends
+        quiet_browser.driver.get("about:blank")  # before the gateway ends
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (1024, 700)], ids=str)
@@ -466,7 +466,9 @@ def test_an_episode_is_put_into_the_score_tab_and_scored(page: Page) -> None:
     page.score_episode()
     assert page.browser["tasks"].get_attribute("value") == dataset.episodes[0].task
     columns = columns_of(page.folders[DEMO], 0)
-    names = [each.get_attribute("title") for each in page.browser.all("#curves th[title]")]  # longer than what is shown
+    names = [
+        each.get_attribute("title") for each in page.browser.all("#curves th[title]")
+    ]  # longer than the visible part
     for name, row, camera in zip(names, page.browser.cells("#curves tr"), CAMERAS, strict=True):
         assert name == f"toy_v30_many_episode_000000.{camera.rpartition('.')[2]}.mp4"
         assert row[4] == f"{len(columns['index'])} of {len(columns['index'])}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the page asks of datasets: episodes, curves and videos, and what it is refused. No Triton is needed for that."""
+"""The page's requests about datasets: episodes, curves, videos, refusals. No Triton is needed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Get = Callable[[str], Any]
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Of the datasets, by their numbers."""
+    """Folders by number of the dataset."""
     folder = tmp_path_factory.mktemp("shelf")
     labelled = [copied(name, folder) for name in ("toy_v21", "toy_v30_many")]
     for root in labelled:
@@ -253,7 +253,7 @@ def test_a_folder_that_hides_its_links_is_refused(tmp_path: Path, monkeypatch: p
 
 
 def test_a_pipe_in_a_dataset_is_not_read(tmp_path: Path) -> None:
-    """Whoever opened it would wait for somebody to write."""
+    """Opening it would block until a writer comes."""
     root = copied("toy_v30_many", tmp_path)
     with serving(root) as get:
         (root / VIDEO).unlink()
@@ -270,7 +270,7 @@ def test_links_inside_a_dataset_are_followed(tmp_path: Path) -> None:
         check_frames(get, root, 1)
 
 
-BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, its content, the path that is asked, what is told
+BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, the content, the requested path, the message
     "no video": (VIDEO, None, "/0/episodes/0/videos/0", "file-000.mp4: expected a video file, got none"),
     "a play list": (
         VIDEO,
@@ -372,6 +372,6 @@ def test_a_folder_that_is_no_dataset_is_refused_at_start(tmp_path: Path, name: s
 
 def test_a_missing_package_names_the_mend(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    message = r'dataset: expected pyarrow, which reads datasets, got none: pip install \./client \./apps/labels'
+    message = r"dataset: expected pyarrow, which reads datasets, got none: pip install \./client \./apps/labels"
     with pytest.raises(ConfigError, match=message):
         GatewayConfig(triton="grpc://robot:8001", dataset=(str(LEROBOT / "toy_v21"),)).check({})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 datasets on the page: their labels beside and in place, their pictures as videos, and what is refused."""
+"""HDF5 datasets on the page: labels beside and in place, pictures as videos, refusals."""
 
 from __future__ import annotations
 

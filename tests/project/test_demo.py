@@ -31,7 +31,7 @@ PNG = b"\x89PNG"
 
 
 def example(name: str, *arguments: object) -> str:
-    """What a script of examples/ prints."""
+    """Return the output of a script in examples/."""
     command = [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)]
     environment = {**os.environ, "COLUMNS": "160"}
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, env=environment)
@@ -65,7 +65,7 @@ def test_a_policy_is_paid_by_the_served_checkpoint(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_the_served_checkpoint_keeps_its_bounds_on_clips_it_never_saw(tmp_path: Path) -> None:
-    """A part of what the model card tells, which is of 240 tasks."""
+    """A part of the model card's numbers, which cover 240 tasks."""
     output = tmp_path / "evaluation.json"
     with nothing_left_behind():
         shown = example("evaluate_demo_checkpoint.py", "--repository", REPOSITORY, "--clips", 48, "--output", output)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The documentation: its examples run as they stand there, and what it must tell it tells."""
+"""The documentation: examples run as they stand, and nothing required is missing."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ COMMAND = re.compile(r"^ {4,}(rfm-client [^#\n]*)", re.MULTILINE)
 ANY_COMMAND = re.compile(r"^ {4,}(?:[^#\n`]*[;&|] *)?((?:\.venv/bin/)?rfm(?:-client)? (?:\\\n|[^#\n])*)", re.MULTILINE)
 IN_A_SCRIPT = re.compile(r"^ {0,3}(rfm(?:-client)? (?:-|\w+ -)(?:\\\n|[^#\n])*)", re.MULTILINE)  # not indented: fenced
 VARIABLE = re.compile(r"\$\(\(.*?\)\)|\$\w+")
-ENDS = ("|", "||", "&", "&&", ";", ">")  # what follows is no argument
+ENDS = ("|", "||", "&", "&&", ";", ">")  # no arguments follow
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.*)", re.MULTILINE)
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
 PATH = re.compile(r"[` ](?!\.venv)([\w.-]+/[\w./-]*\w/?)(?=[` ])")
-SERVED_AS = {  # the guides' words, by what this server and this dataset have
+SERVED_AS = {  # placeholders of the guides, and values of this server and dataset
     "--model first": "--model rfm",
     "--model second": "--model rfm",
     "--episodes 0:20": "--episodes 0:8",
@@ -67,7 +67,7 @@ SERVED_AS = {  # the guides' words, by what this server and this dataset have
 
 
 def found(pattern: re.Pattern[str], files: Iterable[Path] = RUN) -> list[Any]:
-    """Each match in each document, named by file and number. What the guides show runs at night."""
+    """Return each match in each document as a parameter. Those of the guides run at night."""
     matches = [
         pytest.param(
             match,
@@ -106,7 +106,7 @@ def pictures(seed: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 
 def names() -> dict[str, Any]:
-    """What the examples take as given: the demo checkpoint reads embeddings of 64 and 32."""
+    """Names that the examples use; the demo checkpoint reads embeddings of 64 and 32."""
     random = np.random.default_rng(0)
     embeddings, text = random.standard_normal((8, 64), np.float32), random.standard_normal(32, np.float32)
     filmed = Trajectory(frames=pictures(1), task="stack the cups")
@@ -227,7 +227,7 @@ def test_every_command_line_is_one_that_the_commands_take(command: str) -> None:
 
 
 def parse(command: Command, arguments: Sequence[str], parent: Context | None = None) -> None:
-    """Raises click's UsageError for what the command does not take."""
+    """Raise click's UsageError for unknown options and wrong values."""
     subcommands: dict[str, Command] = getattr(command, "commands", {})
     end = next((index for index, word in enumerate(arguments, 1) if word in subcommands), len(arguments))
     context = command.make_context(command.name, list(arguments[:end]), parent)
@@ -246,7 +246,7 @@ def test_every_command_and_option_is_documented() -> None:
 
 
 def options(command: Command) -> Iterator[Parameter]:
-    """Those of a command and of its subcommands, each of which has a help text."""
+    """Return the options of a command and its subcommands, which all have a help text."""
     for parameter in command.params:
         if parameter.param_type_name == "option" and parameter.name not in COMPLETION:
             assert parameter.help, (command.name, parameter.name)  # type: ignore[attr-defined]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What ``--help`` shows, in the narrowest terminal that is common."""
+"""``--help`` in a narrow terminal."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COMMON = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
 
 
 def commands(name: str, command: Command) -> Iterator[tuple[str, Command]]:
-    """The command and all below it, by what one types."""
+    """Yield the command and all subcommands with the words to type."""
     yield name, command
     for inner, below in getattr(command, "commands", {}).items():
         yield from commands(f"{name} {inner}", below)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rewards for one Gymnasium environment, with steps that wait for their answers and steps that do not."""
+"""Rewards for one Gymnasium environment, with steps that wait for answers and steps that do not."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_gymnasium_s_own_check_passes_and_close_closes_only_a_client_that_it_mad
     env = RewardModelWrapper(cart_pole(), connect, TASK)
     assert made == []
     with pytest.warns(UserWarning) as warnings:
-        check_env(env, skip_render_check=True, skip_close_check=True)  # which would make it anew, from its name
+        check_env(env, skip_render_check=True, skip_close_check=True)  # which would make it anew from the name
     assert all("different from the unwrapped" in str(w.message) or "infinity" in str(w.message) for w in warnings)
     spec = RecordEpisodeStatistics(env).spec  # outer wrappers may ask for it
     assert spec is not None

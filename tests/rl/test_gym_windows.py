@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which frames the Gymnasium wrappers send: frames that say their environment, episode and step."""
+"""The frames that the Gymnasium wrappers send; each encodes environment, episode and step."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def vector_of(kind: Any, mode: AutoresetMode, client: Recorder, source: Any, reu
 
 
 def up_to(number: int, episode: int, step: int) -> tuple[list[Code], str]:
-    """The question about a step: all frames of its episode so far, and the environment's task."""
+    """Return the question about a step: all frames of the episode so far, and the task."""
     return [(number, episode, each) for each in range(step + 1)], TASKS[number]
 
 
@@ -83,7 +83,7 @@ def up_to(number: int, episode: int, step: int) -> tuple[list[Code], str]:
 def test_a_vector_sends_each_episode_s_own_frames(
     kind: Any, mode: AutoresetMode, source: Any, reuse: bool, failing: int | None
 ) -> None:
-    """Also after a call whose scoring failed: its frame is part of the episode."""
+    """Also after a failed call, whose frame is part of the episode."""
     with Recorder(failing) as client, closing(vector_of(kind, mode, client, source, reuse)) as env:
         expected = []
         for call, asked in enumerate(zip(*map(str.split, ASKED[mode]), strict=True)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An environment's own reward stays out of what an algorithm learns from and of what it shows."""
+"""The environment's reward stays out of learning and logs."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ WRAPPINGS: dict[str, Callable[[RewardClient], Any]] = {
 
 
 class Ledger(VecEnvWrapper):  # type: ignore[misc]
-    """Adds up what the reward model said about each step, whatever reward the step had."""
+    """Add up the reward model's rewards, whatever the environment paid."""
 
     def __init__(self, venv: Any) -> None:
         super().__init__(venv)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the wrappers pay for progress and success, by mode."""
+"""The wrappers' pay for progress and success, by mode."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TASK = "task 0"
 
 
 class Judge(Recorder):
-    """Scores each frame by its step."""
+    """Scores each frame by the step."""
 
     def __init__(self, predicts_success: bool = True) -> None:
         super().__init__()
@@ -124,7 +124,7 @@ def test_a_policy_that_hovers_earns_nothing_by_shaping(judge: Judge) -> None:
 @pytest.mark.parametrize("number", [0, 1], ids=["terminated", "truncated"])
 @pytest.mark.parametrize("kind", ["one", "vector", "VecEnv"])
 def test_shaping_of_another_reward_leaves_its_best_policies_as_they_are(judge: Judge, kind: str, number: int) -> None:
-    """What shaping adds to an episode that terminates depends on its reset alone; after a time limit, on its last state."""
+    """Shaping adds a sum that depends on the reset alone; after a time limit, also on the last state."""
     options = RewardOptions(
         mode="shaping", gamma=GAMMA, add_to_env_reward=True, sampling="all", frames_from="pixels", scale=2.0
     )

@@ -54,7 +54,7 @@ def coded(kind: Any = DummyVecEnv, *, rendered: bool = True, reuse: bool = False
 
 
 def up_to(number: int, episode: int, step: int) -> tuple[list[Code], str]:
-    """The question about a step: all frames of its episode so far, and the environment's task."""
+    """Return the question about a step: all frames of the episode so far, and the task."""
     return [(number, episode, each) for each in range(step + 1)], TASKS[number]
 
 
@@ -220,7 +220,7 @@ def test_steps_that_do_not_wait_end_with_the_score_of_the_last_frame(client: Rew
 
 
 class Dim(CodedEnv):
-    """Its pictures are floats in 0..1 that became uint8."""
+    """The pictures are floats in 0..1 that became uint8."""
 
     def _drawn(self) -> UInt8Array:
         return np.random.default_rng(self.t).integers(0, 2, (32, 32, 3), np.uint8)

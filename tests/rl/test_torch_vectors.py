@@ -42,7 +42,7 @@ def on_device(array: Any) -> OnDevice:
 
 
 class TensorVector(SyncVectorEnv):
-    """What it returns are tensors; with SAME_STEP as ManiSkillVectorEnv returns them.
+    """Returns tensors; with SAME_STEP as ManiSkillVectorEnv does.
 
     silent: leave out the last observations
     """

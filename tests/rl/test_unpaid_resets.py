@@ -38,7 +38,7 @@ def recorder() -> Iterator[Recorder]:
 
 @pytest.fixture
 def told(caplog: pytest.LogCaptureFixture) -> Any:
-    """What the client has logged so far."""
+    """Return the client's log so far."""
     return lambda: [record.message for record in caplog.records if record.levelno == logging.WARNING]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What ends with ``rfm serve``, however that ends, and with a log that nobody can write."""
+"""All processes end with ``rfm serve``, however it ends, also with a log that cannot be written."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_notes_of_requests_in_dead_processes_come_first_and_empty_notes_hide_non
         assert claim.requests_inside() == ["alive", "too"]
         Path(f"{claim.requests}{2**22 + 2}").write_bytes(b"dead\0\0")
         assert claim.requests_inside() == ["dead"]
-        assert claim.requests.parent.stat().st_mode & 0o077 == 0  # nobody else can write notes
+        assert claim.requests.parent.stat().st_mode & 0o077 == 0  # only the owner can write notes
     finally:
         claim.release()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where a server listens, and what others may reach of it."""
+"""Addresses that a server listens on, and the services that others reach."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_an_older_triton_that_listens_elsewhere_is_stopped(repository: Path, tmp
     free = Endpoints.free()
 
     class Open(Endpoints):
-        """Its address counts as open, but it listens on loopback."""
+        """The address counts as open, but the server listens on loopback."""
 
         @property
         def http_host(self) -> str:
@@ -158,7 +158,7 @@ def test_a_silent_connection_to_the_status_port_is_cut() -> None:
 
 
 def told(about: Status) -> dict[str, Any]:
-    """What the metrics tell of models, by their name and labels."""
+    """Return the metrics of models by name and labels."""
     lines = [line for line in about.metrics().decode().splitlines() if line.startswith("rfm_serve_")]
     return {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines) if "ready" in name}
 

@@ -196,7 +196,7 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
         assert np.isfinite(client.progress(trajectory(0)).progress).all()
         deadly.unlink()
         away = (repository / OTHER).rename(tmp_path / OTHER)
-        wait_for(lambda: served.reasons() == {MODEL: NO_REASON})  # without its folder it is forgotten
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON})  # without the folder it is forgotten
         away.rename(repository / OTHER)
         with served.api() as api:
             api.load(OTHER)
@@ -255,7 +255,7 @@ def test_a_start_is_repeated_when_a_model_process_is_killed(tmp_path: Path, impo
 @pytest.mark.triton
 @pytest.mark.alone
 def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the_rest(tmp_path: Path) -> None:
-    """In a container of its own, whose process ids mean nothing here, where this user may make one."""
+    """In a separate container, whose process ids mean nothing here, if this user may make one."""
     apart = ["unshare", "--map-root-user", "--pid", "--fork", "--kill-child", "--mount-proc"]
     if subprocess.run([*apart, "true"], check=False, stderr=subprocess.DEVNULL).returncode != 0:
         apart = []
@@ -287,7 +287,7 @@ def test_the_row_names_what_had_each_fault() -> None:
 
 
 def test_a_crash_loop_is_many_faults_each_soon_after_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What ran for long is no part of it; starts that fail are, however long they take."""
+    """A long run resets the count; failed starts do not, however long they take."""
     now_s = 0.0
     monkeypatch.setattr("time.monotonic", lambda: now_s)
 

@@ -69,7 +69,7 @@ class Running:
         return done.stdout
 
     def refused(self, command: str, *words: str) -> str:
-        """What it says where it fails."""
+        """Return the message of a failed command."""
         done = self.ask(command, *words)
         assert done.exit_code == 1, done.output
         (line,) = done.stderr.splitlines()
@@ -122,7 +122,7 @@ def test_a_name_is_loaded_listed_and_unloaded_beside_the_others(running: Running
 
 @contextmanager
 def loading(running: Running, name: str, folder: Path) -> Iterator[None]:
-    """Within it Triton is loading a model: its process waits for a file that comes at the end."""
+    """Keep Triton loading a model, whose process waits for a file that comes at the end."""
     running.export_plain(name)
     begun, may_end = folder / "begun", folder / "may_end"
     model_file = running.repository / name / "1" / "model.py"
@@ -154,7 +154,7 @@ def test_callers_are_answered_while_another_model_loads(running: Running, tmp_pa
         assert all(threads.map(ask, clients))  # they are connected: new connections would keep away from a busy thread
         with loading(running, "held", tmp_path):
             assert all(threads.map(ask, clients))
-            # What is told over gRPC does not wait either.
+            # Requests over gRPC do not wait either.
             assert ["held", "1", "LOADING"] in running.listed()
     running.models("unload", "held")
 
@@ -194,7 +194,7 @@ def test_a_server_that_cannot_be_reached_is_told(url: str, words: tuple[str, ...
 def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(
     running: Running, other: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that fails at its end, when the ensemble has gone over; one that succeeds, and its rollback."""
+    """A rollout that fails after the ensemble's change, one that succeeds, and a rollback."""
     samples = rollout.questions()
     expected = {"1": rollout.answers(WITH_ENCODERS.checkpoint, samples), "2": rollout.answers(other, samples)}
     assert min(difference(*pair) for pair in zip(expected["1"], expected["2"], strict=True)) > rollout.CLEARLY
@@ -299,7 +299,7 @@ def test_a_broken_version_is_never_asked_and_the_old_one_stays(running: Running,
         assert (running.served_by_restart(name), running.ready(name)) == ([1], ["1"])
     assert (tally.failed, tally.unlike, set(tally.by_version)) == ([], [], {"1"})
     with running.client(NAME) as client:
-        assert client.is_ready()  # what failed is no reason to ask nobody here
+        assert client.is_ready()  # a failed call is no reason to stop
     running.models("unload", name)
 
 

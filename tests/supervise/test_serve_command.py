@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm serve``: the process, its signals, and what it leaves behind."""
+"""``rfm serve``: the process, signals, and the remains."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def environment(pid: int) -> set[str]:
 @pytest.mark.triton
 @pytest.mark.slow
 def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At an IPv6 address. The gateway alone has its key."""
+    """At an IPv6 address. Only the gateway has the key."""
     keys = {name: f"a-secret-of-{name}" for name in ("RFM_ADMIN_KEY", "RFM_GATEWAY_API_KEY")}
     for name, key in keys.items():
         monkeypatch.setenv(name, key)
@@ -178,7 +178,7 @@ def test_a_port_that_is_taken_is_named_with_its_option(option: str, what: str) -
     assert done.stderr.splitlines()[-1] == f"{told}--{option}-port names another port"
 
 
-WRONG_FOLDERS: dict[str, tuple[str, str]] = {  # below a folder, by what it is
+WRONG_FOLDERS: dict[str, tuple[str, str]] = {  # below a folder
     "missing": ("nothing", "which is not there: rfm export --checkpoint CHECKPOINT --repository {folder} writes one"),
     "empty": ("empty", "which has none: rfm export --checkpoint CHECKPOINT --repository {folder} writes them"),
     "a file": ("models/rfm/config.pbtxt", "a file: --repository names the folder"),

@@ -156,7 +156,7 @@ def test_tls_on_one_side_alone_gives_no_connection(mutual: Endpoints, papers: Pa
 
 
 def test_the_gateway_beside_tls_listens_on_loopback_alone(mutual: Endpoints, gateway_port: int) -> None:
-    """Else whoever has no certificate would be served by it, in the clear."""
+    """Otherwise it would serve callers without a certificate, in the clear."""
     with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as caller:  # it starts after Triton
         assert caller.get(f"http://127.0.0.1:{gateway_port}/health", timeout=AT_ONCE_S).json()["status"] == "healthy"
     with pytest.raises(ConnectionRefusedError):

@@ -45,7 +45,7 @@ CONFIG = {
     "max_batch_size": 8,
     "instance_group": [{"count": 1}],
 }
-FINAL = 1  # what Triton wants with the last response to a request
+FINAL = 1  # Triton's flag of the last response to a request
 REFUSED, BREAKS, FAILS = 2, 3, 4  # numbers of frames that the model below cannot bear
 
 
@@ -65,7 +65,7 @@ class Tensor:
 
 @dataclass
 class Request:
-    """As Triton hands it over, and what is sent in answer."""
+    """A request as Triton hands it over, with the responses."""
 
     tensors: wire.Tensors
     id: str = ""
@@ -117,7 +117,7 @@ class Model(BatchModel[Sample, Result]):
         pass
 
     def respond(self, *requests: Request) -> list[Response]:
-        """What becomes of requests of which Triton hands over all at once."""
+        """Hand requests over at once. Return the responses."""
         self.take(*requests)
         wait_for(lambda: all(request.responses for request in requests))
         return [response for request in requests for response in request.responses]
@@ -149,7 +149,7 @@ class Model(BatchModel[Sample, Result]):
         return wire.encode_results(answers, wire.num_positions(tensors), outputs)
 
     def told(self, name: str) -> dict[tuple[str, ...], float]:
-        """What Triton was told of a metric, by the labels that do not name the instance."""
+        """Return a metric's values by the labels that do not name the instance."""
         self.finalize()
         own = {"model", "version", "device", "instance"}
         return {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Chromium without a window, which reaches this machine alone, and what it has asked for and complained about."""
+"""Headless Chromium that reaches only this machine, with the requests and complaints of a page."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Browser:
             self.driver.execute_cdp_cmd("Input.dispatchDragEvent", event)
 
     def until(self, script: str) -> Any:
-        """What a script gives, once it gives anything."""
+        """Return a script's result once it is true."""
         found: list[Any] = []
 
         def is_there() -> bool:
@@ -90,7 +90,7 @@ class Browser:
         self.driver.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
 
     def values(self, chart: str, signal: str) -> dict[str, str]:
-        """The numbers of a signal beside the lines of a chart, by the names of its curves."""
+        """Return a signal's numbers beside the lines of a chart by name of the curve."""
         spans = f"document.querySelectorAll('#{chart} .values span[data-signal={signal}]')"
         return dict(self.run(f"return [...{spans}].map((each) => [each.dataset.curve, each.textContent])"))
 
@@ -100,7 +100,7 @@ class Browser:
         return list(self.run(f"return [...document.querySelectorAll('{players}')].map((each) => {script})"))
 
     def pixels(self, pictures: Sequence[WebElement]) -> list[UInt8Array]:
-        """What images and videos show now, each uint8 [H, W, 3]."""
+        """Return the current frames of images and videos, each uint8 [H, W, 3]."""
         found = self.run(
             """
             return arguments[0].map((picture) => {
@@ -125,7 +125,7 @@ class Browser:
 
     @contextmanager
     def theme(self, name: str) -> Iterator[None]:
-        """The page as somebody sees it who prefers light or dark."""
+        """Show the page in the light or dark theme."""
         feature = {"name": "prefers-color-scheme", "value": name}
         self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
         try:
@@ -134,7 +134,7 @@ class Browser:
             self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
     def violations(self) -> list[tuple[str, str, list[str]]]:
-        """What axe finds on the page: each rule, how grave that is, and the elements that break it."""
+        """Return axe's findings: rule, impact, and the elements that break it."""
         self.run(AXE.read_text())
         found = self.driver.execute_async_script(
             "const done = arguments[0]; axe.run().then(({ violations }) => done(violations));"
@@ -161,7 +161,7 @@ class Browser:
         assert file.read_bytes().startswith(b"\x89PNG\r\n")
 
     def complaints(self) -> list[str]:
-        """What the console has shown since the last time: errors, and what the policy of the page forbids."""
+        """Return new errors in the console, also violations of the page's policy."""
         return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]
 
     def asked(self) -> list[str]:

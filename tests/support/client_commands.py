@@ -28,7 +28,7 @@ RFM_CLIENT = Path(sys.executable).parent / "rfm-client"
 MODEL = "enc_c1_t1_disc10"
 
 
-WIDTHS = (48, 32)  # of its video and text embeddings
+WIDTHS = (48, 32)  # of video and text embeddings
 
 
 TASK = clip.TASK

@@ -18,7 +18,7 @@ Code: TypeAlias = tuple[int, int, int]  # environment, episode, step
 
 
 def frame_of(*code: int) -> UInt8Array:
-    """A frame that says what it is of, and looks like no other."""
+    """Return a unique frame that encodes environment, episode and step."""
     frame = np.random.default_rng(code).integers(0, 256, (SIZE_PX, SIZE_PX, 3), np.uint8)
     frame[0, 0] = code
     return frame
@@ -27,7 +27,7 @@ def frame_of(*code: int) -> UInt8Array:
 class CodedEnv(gym.Env[Any, Any]):
     """Odd environments truncate, even ones terminate.
 
-    lengths: steps of its episodes, in turn
+    lengths: steps of the episodes, in turn
     reuse: all frames are drawn into the same array
     bad: of this code a picture is rendered that is none
     """
@@ -44,7 +44,7 @@ class CodedEnv(gym.Env[Any, Any]):
 
     @property
     def code(self) -> Code:
-        """Of what it shows now."""
+        """The current frame."""
         return self.number, self.episode, self.t
 
     @property

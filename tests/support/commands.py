@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm serve`` of the committed repository as a process, and what such processes leave."""
+"""``rfm serve`` of the committed repository as a process, and the remains of such processes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def own_regions(pid: int) -> set[Path]:
 
 
 def running(words: str, most: int | None = None) -> set[int]:
-    """Ids of processes with these words in their command line, or in its first ``most`` words."""
+    """Return ids of processes with these words in the command line, or in the first ``most`` words."""
     each = psutil.process_iter(["cmdline"])
     return {process.pid for process in each if words in " ".join((process.info["cmdline"] or [])[:most])}
 
@@ -67,7 +67,7 @@ def tritons() -> set[int]:
 
 
 def is_ours(pid: int) -> bool:
-    """Whether it is this process, or inherited what conftest.py wrote into the environment."""
+    """True for this process and those that inherited the mark of conftest.py."""
     if pid == os.getpid():
         return True
     try:

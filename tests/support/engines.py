@@ -31,7 +31,7 @@ def scorer(checkpoint: str, **options: str) -> Any:
 
 @functools.cache
 def load_engine(name: str) -> Engine:
-    """The engine of a reference checkpoint, with its encoders if it has some."""
+    """Return the engine of a reference checkpoint, with encoders if there are any."""
     if name.startswith("smol") and TRANSFORMERS >= 5:
         pytest.skip("SmolVLM is refused with transformers 5")
     config = goldens.config(name)

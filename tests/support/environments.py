@@ -27,7 +27,7 @@ Video = list[UInt8Array]
 
 
 class Camera(gym.Wrapper[Any, Any, Any, Any]):
-    """Videos each episode for the test: ``videos[-1][t]`` is what was to be seen after step t."""
+    """Records each episode: ``videos[-1][t]`` is the frame after step t."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -55,7 +55,7 @@ def cart_pole_with_pixels() -> gym.Env[Any, Any]:
 
 
 def two_cameras(observation: dict[str, Any]) -> dict[str, UInt8Array]:
-    """A frame of each of two cameras, of different sizes, and what is none."""
+    """Return frames of two cameras with different sizes, and an entry without a frame."""
     front = np.asarray(observation["pixels"], np.uint8)
     return {"front": front, "wrist": 255 - front[::2, ::2], "state": np.zeros(1, np.uint8)}
 

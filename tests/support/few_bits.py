@@ -48,7 +48,7 @@ def rounded(name: str, weight: Tensor) -> tuple[dict[str, Tensor], Tensor]:
 
 
 def in_both_forms(name: str, folder: Path) -> tuple[Path, Path]:
-    """A reference checkpoint with the linear weights of its backbone and heads in NF4; with these weights' values."""
+    """A reference checkpoint with linear weights in NF4, and the same with the NF4 values in full size."""
     few_bits: dict[str, Tensor] = {}
     full: dict[str, Tensor] = {}
     for key, tensor in load_file(goldens.config(name).checkpoint / "model.safetensors").items():

@@ -73,7 +73,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.fixture
 def quiet_browser(browser: Browser) -> Iterator[Browser]:
     """The browser; fails the test if the page asks another machine or the console shows an error."""
-    browser.driver.get("about:blank")  # the page of the test before asks its gateway no more
+    browser.driver.get("about:blank")  # the page of the last test asks no more
     browser.complaints()
     yield browser
     asked = browser.asked()

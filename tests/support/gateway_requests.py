@@ -95,7 +95,7 @@ def post_json(gateway: Gateway, document: Any) -> requests.Response:
 
 
 def ask_npy(gateway: Gateway, samples: Sequence[Json], **fields: Any) -> requests.Response:
-    """As the evaluation server's documentation tells: every array a part, in its place the name of that part."""
+    """Send every array as a part, as the evaluation server's documentation says."""
     files, form = {}, {name: str(value).lower() for name, value in fields.items()}
     for index, sample in enumerate(samples):
         shown: Json = dict(sample)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A goal environment with a reward of its own that no reward model would give."""
+"""A goal environment whose reward no reward model would give."""
 
 from __future__ import annotations
 

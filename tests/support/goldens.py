@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reference cases computed by the original code: a request, and what it must be answered."""
+"""Reference cases of the original code: requests and answers."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Config:
 
     @property
     def sources(self) -> dict[str, str]:
-        """What the checkpoint is loaded with: its base model, or its encoders, if it has some."""
+        """Arguments for loading the checkpoint: the base model or the encoders, if any."""
         names = ("base_model", "image_encoder", "text_encoder")
         return {name: str(source) for name in names if (source := getattr(self, name)) is not None}
 
@@ -122,7 +122,7 @@ class Config:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Scores of one sample: per trajectory progress [T], its logits [T, K] and success [T]; the answer about a pair."""
+    """Scores of one sample: per trajectory progress [T], logits [T, K] and success [T]; the answer about a pair."""
 
     progress: list[Array]
     progress_logits: list[Array] | None
@@ -132,7 +132,7 @@ class Expected:
 
 @dataclass(frozen=True)
 class Case:
-    """One request and its answer."""
+    """A request and the answer."""
 
     config: Config
     file: Path
@@ -181,7 +181,7 @@ class Case:
         ]
 
     def expected(self, *, bfloat16: bool = False) -> list[Expected]:
-        """From the raw arrays, which also tell what the original's answer leaves out.
+        """Read the raw arrays, which the original's answer does not contain in full.
 
         bfloat16: of a checkpoint in bfloat16 its scores in that type; else those in float32
         """
@@ -189,7 +189,7 @@ class Case:
         if not bfloat16 and self.has_float32:
             arrays = {key.removeprefix("fp32."): array for key, array in arrays.items() if key.startswith("fp32.")}
         read = _Reader(arrays, self.config)
-        if self.content["kind"] in ("ragg", "ragp", "ragged"):  # evaluated one by one, each with arrays of its own
+        if self.content["kind"] in ("ragg", "ragp", "ragged"):  # evaluated one by one, each with separate arrays
             return [read.expected(sample, 0, f"sample_{index}.") for index, sample in enumerate(self.samples())]
         rows = {"progress": 0, "preference": 0, "similarity": 0}
         expected = []
@@ -201,7 +201,7 @@ class Case:
         return expected
 
     def check_response(self, results: Sequence[Result]) -> None:
-        """Compares with the body that the original server sends, or should have sent."""
+        """Compare with the body that the original server sends, or should have sent."""
         body = self.content.get("response_fixed") or self.content["response"]
         raw_tolerance, tolerance = ROUNDED_TOLERANCES if self.config.is_bfloat16 else self.config.tolerances
         by_kind: dict[str, list[Any]] = {"progress": [], "success": [], "preference": [], "similarity": []}

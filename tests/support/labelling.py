@@ -29,7 +29,7 @@ FEW: dict[str, Any] = {"cameras": (WRIST,), "frames": 2}  # options with which a
 
 
 class BrightnessScorer:
-    """Progress is how bright the slot's frame is, success how red: what is read can be recomputed by hand."""
+    """Progress is the brightness of a slot's frame, success the redness, so tests can recompute both."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class PickyScorer(BrightnessScorer):
 
 
 class Notes(Watch):
-    """Keeps what a run says."""
+    """Keeps the messages of a run."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []

@@ -47,7 +47,7 @@ def jpeg(frame: UInt8Array) -> str:
 
 
 class Taker:
-    """What has come. status: what is answered"""
+    """The received reports. status: of the answers"""
 
     def __init__(self) -> None:
         self.bodies: list[Json] = []
@@ -74,7 +74,7 @@ def taking(context: ssl.SSLContext | None = None) -> Iterator[Taker]:
             self.end_headers()
 
         def log_message(self, *_: Any) -> None:
-            """Says nothing of its requests."""
+            """Log nothing."""
 
     with web_server(Handler, context) as taker.url:
         yield taker

@@ -37,7 +37,7 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
             place = "" if kind == "models" else f"/{kind}"
             words = self.path.removeprefix(f"/api/{kind}" if self.path.startswith("/api/") else place).split("/")
             repository = "/".join(words[1:3])
-            if repository not in repositories:  # what newer clients ask of the Hub itself
+            if repository not in repositories:  # a question of newer clients to the Hub itself
                 self._send(404, b"", with_body)
                 return
             revisions = repositories[repository]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples of all types for the reference server, and what it is to have done with them."""
+"""Samples of all types for the reference server, and the server's counts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from servers import Served, wait_for
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
-TOLD_S = 1.0  # for a model to tell Triton what it has counted
+TOLD_S = 1.0  # until a model has reported its counts to Triton
 MODEL = "c1_t1_disc10"  # tokens, so T <= 16; discrete; all heads
 
 
@@ -53,7 +53,7 @@ def plug() -> list[Sample]:
 
 
 def counts(served: Served, model: str) -> tuple[int, int]:
-    """Requests answered well, and executions of the model's pipeline, so far. Triton's own count is of its calls."""
+    """Return the number of good answers and of pipeline executions so far. Triton counts its own calls."""
     time.sleep(TOLD_S)
     with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as client:
         stats = client.get_inference_statistics(model).model_stats[0]

@@ -70,7 +70,7 @@ def trajectory(seed: int, num_frames: int = 8, mark: float = 0.0) -> Trajectory:
 
 @pytest.fixture(scope="module")
 def references() -> list[np.ndarray[Any, Any]]:
-    """What the engine answers, without Triton."""
+    """The engine's answers, without Triton."""
     engine = Engine.from_checkpoint(ROOT / "model_repository" / MODEL / "1" / "checkpoint")
     return [result.progress for result in engine.evaluate([ProgressSample(trajectory(n)) for n in range(CALLERS)])]  # type: ignore[union-attr]
 

@@ -52,7 +52,7 @@ def write_video(
 
 
 def numbered(count: int) -> UInt8Array:
-    """Grey frames [count, 32, 32, 3], each of its own brightness; ``numbers`` reads them back."""
+    """Return grey frames [count, 32, 32, 3] of increasing brightness; ``numbers`` reads them back."""
     grey = (np.arange(count) * 240 // count).astype(np.uint8)
     return np.ascontiguousarray(np.broadcast_to(grey[:, None, None, None], (count, 32, 32, 3)))
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 class Proxy:
     """Forwards TCP connections to a port, until it goes silent: connections stay open, and nothing comes over them.
 
-    It stands in for a network that drops packets, which needs a privilege to be had. ``reads``: what a client sends
+    It stands in for a network that drops packets, which needs a privilege. ``reads``: what a client sends
     over a silent connection is still acknowledged, and dropped; otherwise nothing more is taken from it.
     """
 
@@ -44,7 +44,7 @@ class Proxy:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Within it nothing comes over any connection, old or new; what was sent comes afterwards."""
+        """Hold all connections, old and new; the held bytes come afterwards."""
         self._flows.clear()
         try:
             yield
@@ -69,7 +69,7 @@ class Proxy:
                 threading.Thread(target=self._forward, args=(source, target, is_silent), daemon=True).start()
 
     def _greet(self, near: socket.socket) -> bool:
-        """Whether the connection goes on to the server after what comes before the server's own bytes."""
+        """Read the bytes before those for the server. Return True if the connection goes on to the server."""
         return True
 
     def _forward(self, source: socket.socket, target: socket.socket, is_silent: threading.Event) -> None:

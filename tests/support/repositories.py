@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What tests do to a model repository and its processes."""
+"""Changes of a model repository and its processes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rfm_export.pbtxt import parse, render
 
 @contextmanager
 def changing(model: Path) -> Iterator[ModelConfig]:
-    """What is changed within it is written into an exported model's configuration."""
+    """Change an exported model's configuration in place."""
     file = model / CONFIG_FILE
     config = parse(file.read_text())
     yield config

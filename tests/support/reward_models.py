@@ -23,7 +23,7 @@ BASE = ROOT / "bases" / "q3"
 
 @dataclass(frozen=True)
 class Reference:
-    """One request and its answer. file: ``SECTION/CONFIG/cases/CASE.json``"""
+    """A request and the answer. file: ``SECTION/CONFIG/cases/CASE.json``"""
 
     file: Path
 

@@ -43,15 +43,15 @@ WIDTHS = (48, 32)
 FRAME_PX = 48
 CLEARLY = 1e-2  # versions differ by at least so much
 CALLERS = 32
-PAUSE_S = 0.2  # a control loop's step; without it they would take the processor from what is being loaded
+PAUSE_S = 0.2  # a control loop's step; without it they would slow down the loading
 
 
 @dataclass
 class Tally:
-    """What became of requests.
+    """Outcomes of requests.
 
     unlike: answers that are neither version's, or not that of the version they name
-    failed: requests without an answer; late: those of them that were past their deadline
+    failed: requests without an answer; late: those past the deadline
     """
 
     asked: int = 0
@@ -75,7 +75,7 @@ class Tally:
 
 
 def other_checkpoint(folder: Path, source: Path = WITH_ENCODERS.checkpoint) -> Path:
-    """A copy of the checkpoint with other weights, in its encoders too."""
+    """Copy a checkpoint with other weights, also in the encoders."""
     folder.mkdir(parents=True)
     for file in source.iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
@@ -108,14 +108,14 @@ def questions() -> list[Sample]:
 
 
 def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
-    """What the checkpoint itself says."""
+    """Return the checkpoint's answers without a server."""
     serve = serve_config(WITH_ENCODERS)
     loaded = families.load(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
     return Engine.of(loaded, encoders=loaded.encoders()).evaluate(samples)
 
 
 def numbers(outcome: object) -> np.ndarray:
-    """Progress of the (first) trajectory, where there is one also its success."""
+    """Return progress and success of the (first) trajectory."""
     scores = getattr(outcome, "first", outcome)
     return np.concatenate([scores.progress, scores.success])  # type: ignore[attr-defined]
 

@@ -37,11 +37,11 @@ CRASHES: list[Path] = []  # repositories whose Triton has ended with SIGABRT, by
 MODEL = "rfm"
 KEY = "a-key-that-only-tests-know"  # an admin key
 PATIENCE_S = 60.0
-TRUTH_S = 5.0  # within which readiness tells what is so
+TRUTH_S = 5.0  # until readiness shows a change
 
 
 class BriefServer(TritonServer):
-    """A server that is killed when its test is over: Triton takes a second for each model process to end in order."""
+    """A server that is killed after the test: Triton takes a second to end each model process in order."""
 
     _num_stops = 0
 
@@ -67,7 +67,7 @@ class BriefServer(TritonServer):
 def start_triton(
     repository: Path, installation: Installation | None = None, endpoints: Endpoints | None = None
 ) -> Iterator[BriefServer]:
-    """Serve the repository with a Triton that is ready. Its log is a file beside the repository."""
+    """Serve the repository with a Triton that is ready. The log is a file beside the repository."""
     program, ports = installation or find_installation(), endpoints or Endpoints.free()
     with (
         (repository.parent / "tritonserver.log").open("wb") as log,
@@ -111,7 +111,7 @@ def answered(endpoints: Endpoints) -> int:
 
 @dataclass(frozen=True)
 class Served:
-    """A running server with every reference checkpoint under its own name."""
+    """A running server with every reference checkpoint by name."""
 
     server: TritonServer
 
@@ -148,7 +148,7 @@ def wait_for(is_so: Callable[[], Any], within_s: float = PATIENCE_S) -> float:
 
 
 def children(pid: int, program: str = "") -> list[int]:
-    """Processes that the process has started. program: part of their name"""
+    """Return the children of a process. program: part of the name"""
     found = []
     for child in children_of(pid):
         with suppress(psutil.NoSuchProcess):  # it has ended
@@ -215,7 +215,7 @@ class Serving:
 
     @property
     def said(self) -> list[str]:
-        """Messages of ``rfm serve`` itself, without the heads of its log, but for those about requests and readiness."""
+        """Messages of ``rfm serve`` without the heads of log lines, except those about requests and readiness."""
         log = re.sub(
             r"^\S+Z [A-Z]+ rfm-serve\[\d+\]: ", "rfm: ", self.log.read_text(errors="replace"), flags=re.MULTILINE
         )
@@ -224,7 +224,7 @@ class Serving:
 
 @contextmanager
 def serving(repository: Path, *more: str, to: Path | None = None) -> Iterator[Serving]:
-    """Within it, the repository is served. Nothing of it may be left behind. to: what takes its lines; None: a file"""
+    """Run ``rfm serve``, which may leave nothing behind. to: file or device for the log; None: a new file"""
     endpoints, status_port = Endpoints.free(), Endpoints.free().http_port
     ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
     options = [f"--{name}-port={port}" for name, port in (ports | {"status": status_port}).items()]

@@ -66,7 +66,7 @@ def text_settings(**changes: Any) -> Spoil:
 
 
 def conversion(load: Callable[[Path], object], folder: Path) -> str:
-    """What the refusal of ``load`` says to type."""
+    """Return the command that the refusal of ``load`` tells to type."""
     with pytest.raises(CheckpointError) as refusal:
         load(folder)
     (command,) = re.findall(r"python -c .*", str(refusal.value))

@@ -29,7 +29,7 @@ def on_terminal(*words: object, width: int = WIDTH) -> tuple[int, list[str]]:
         shown = b"".join(iter(lambda: _read(ours), b""))
         code = process.wait(timeout=60)
     os.close(ours)
-    # What a progress bar writes is written over, from the start of its line.
+    # A progress bar overwrites the line from the start.
     lines = (line.rpartition("\r\x1b[2K")[2].rstrip("\r") for line in shown.decode().split("\n"))
     return code, [_CONTROL.sub("", line).rstrip() for line in lines]
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A family that the product does not know: how red a frame is, is how far the task has come.
 
-Its encoders give each frame's mean colour, and of the task the number of its letters. Its network is one line.
+The encoders return each frame's mean colour and the number of letters of the task. The network is one line.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a client's ``transports`` are made of, for stand-ins that answer in place of a server or before one."""
+"""Parts of a client's ``transports`` for stand-ins."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the page asks the gateway, and the answers that the command line gives to the same questions."""
+"""The page's requests to the gateway, and the command line's answers to the same questions."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def curve_of(told: Sequence[tuple[str, Json]]) -> Json:
 
 
 def run_line(folder: Path, command: str) -> list[str]:
-    """Runs a command line of ``rfm-client`` in this folder, as a person does who copies it; gives its words."""
+    """Run a command line of ``rfm-client`` in this folder, as a user who copies it does. Return the words."""
     program, *words = shlex.split(command)
     assert program == "rfm-client"
     here = Path.cwd()
@@ -72,6 +72,6 @@ def run_line(folder: Path, command: str) -> list[str]:
 
 
 def by_command_line(folder: Path, command: str) -> Json:
-    """What a command line of ``rfm-client`` writes to the JSON file that it names, run in this folder."""
+    """Run a command line of ``rfm-client`` in this folder. Return the JSON that it writes."""
     words = run_line(folder, command)
     return dict(json.loads((folder / words[words.index("--json") + 1]).read_text()))

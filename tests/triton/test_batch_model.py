@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What becomes of the requests of one batch, with a stand-in for the module that Triton gives to a model."""
+"""The requests of one batch, with a stand-in for the module that Triton gives to a model."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_refused_and_failed_requests_fail_alone(tmp_path: Path) -> None:
         ("progress", "refused"): 3, ("progress", "scored"): 1, ("progress", "failed"): 1,
         ("unknown", "refused"): 1, ("unknown", "failed"): 1,
     }  # fmt: skip
-    assert model.told("frames_total") == {(): 1}  # of what was scored
+    assert model.told("frames_total") == {(): 1}  # of scored samples
     refused = [line for line in LOGGED if re.search(r" DEBUG rfm/1\[\d+\]: refused \((progress|unknown)\): ", line)]
     failed = [line for line in LOGGED if re.search(r" ERROR rfm/1\[\d+\]: failed \((progress|unknown)\): ", line)]
     assert (len(refused), len(failed)) == (3, 2)
@@ -145,7 +145,7 @@ class Slow(Model):
 
 
 def test_a_cancelled_request_is_not_scored(tmp_path: Path) -> None:
-    """Also if the batch before was split, and its last request alone took no time."""
+    """Also after a split batch whose last request took no time."""
     model = Slow(tmp_path)
     model.seconds = 1.5 * ASKING_S
     model.respond(request(1), request(BREAKS))
@@ -357,7 +357,7 @@ def test_what_is_loaded_is_computed_in_a_thread_that_ends() -> None:
     ((thread, num_threads),) = seen
     assert not thread.is_alive()
     assert num_threads == 3
-    assert torch.get_num_threads() == 1  # the calling thread starts no team of its own
+    assert torch.get_num_threads() == 1  # the calling thread starts no team
     with pytest.raises(RuntimeError, match="positive"):  # PyTorch's own words, not those of a pool of threads
         Placement(torch.device("cpu"), num_threads=0).run(lambda: None)
 

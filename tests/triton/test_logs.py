@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A request's id: in what the client raises, in Triton's log, in traces, and through the gateway."""
+"""The id of a request: in errors, in Triton's log, in traces, and through the gateway."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ RANDOM_ID = re.compile(r"[0-9a-f]{16}")
 KEY = "an-admin-key-that-nothing-logs"
 FAILING_STEPS = 7
 
-# A model with a fault in it, as nobody wants it to be.
+# A model with a fault.
 FAULTY = f"""
 
 class TritonPythonModel(TritonPythonModel):
@@ -60,14 +60,14 @@ class TritonPythonModel(TritonPythonModel):
 class Running:
     served: Serving
     traces: list[bytes]
-    gateway: str  # its URL
+    gateway: str  # URL
 
     def client(self, protocol: str = "grpc") -> RewardClient:
         endpoints = self.served.endpoints
         return RewardClient(endpoints.grpc_url if protocol == "grpc" else endpoints.http_url, retry=False)
 
     def said_of(self, request_id: str, process: str = "rfm/1") -> list[tuple[str, str]]:
-        """Level and message of each line about a request. A process may write it a moment after its answer."""
+        """Return level and message of each line about a request. A process may write it after the answer."""
         head = (
             rf"^\d{{4}}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{{3}}Z ([A-Z]+) {process}\[\d+\] request={re.escape(request_id)}: "
         )
@@ -96,7 +96,7 @@ class Collector(BaseHTTPRequestHandler):
 
 
 def documented_options(traces_url: str) -> list[str]:
-    """What docs/reference/logs_and_metrics.md tells to give tritonserver, but with this collector, and for every request."""
+    """Return the options for tritonserver from the documents, with this collector and for every request."""
     text = " ".join(
         re.findall(r"--trace-config=[^\s`]+", (ROOT / "docs" / "reference" / "logs_and_metrics.md").read_text())
     )
@@ -108,7 +108,7 @@ def documented_options(traces_url: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """An ``rfm serve`` that has its admin key from the environment, and a gateway beside."""
+    """An ``rfm serve`` with an admin key from the environment, and a gateway beside."""
     folder = tmp_path_factory.mktemp("logs")
     repository = folder / "repository"
     rfm_export.export(CONFIG.checkpoint, repository, serve_config(CONFIG))

@@ -77,7 +77,7 @@ class Scraped:
 
 
 def scrape(served: Served, told_s: float = TOLD_S) -> Scraped:
-    """What Triton has been told ``told_s`` from now, which is all but of requests that are under way."""
+    """Return Triton's metrics ``told_s`` from now, which cover all finished requests."""
     time.sleep(told_s)
     return Scraped(list(text_string_to_metric_families(httpx.get(served.endpoints.metrics_url).text)))
 
@@ -134,7 +134,7 @@ def test_samples_are_counted_by_type_and_by_what_became_of_them(served: Served) 
 
 
 def test_two_instances_count_apart_and_add_up(served_too: Served) -> None:
-    """What fails is counted, too: together with others, then alone, as the client asks again."""
+    """Failures are counted, too: in a batch, then alone, as the client asks again."""
     samples = mixed_samples(60)
     before = scrape(served_too)
     with client(served_too, TWICE) as asked, ThreadPoolExecutor(len(samples)) as pool:
@@ -151,7 +151,7 @@ def test_two_instances_count_apart_and_add_up(served_too: Served) -> None:
 
 
 def test_histograms_add_up_to_what_each_execution_took(served: Served) -> None:
-    """Asked one after the other, each request is an execution, and results tell its times."""
+    """Sequential requests are separate executions, and results tell the times."""
     engine = load_engine(MODEL)
     requests = [mixed_samples(count) for count in (1, 2, 5, 9)]
     expected_padding = 0.0
@@ -246,7 +246,7 @@ def test_the_served_checkpoint_is_told(served: Served) -> None:
 
 
 def test_a_model_that_is_loaded_again_counts_on(served_too: Served) -> None:
-    """Unloaded, its checkpoint is served no more; loaded in place, it is."""
+    """An unloaded checkpoint is served no more; one loaded in place is."""
     sample = ProgressSample(random_trajectory(0, 3))
     before = scrape(served_too)
 

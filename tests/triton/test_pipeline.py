@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A model that works ahead: what is scored together, when ``execute`` returns, and what becomes of what goes wrong."""
+"""A model that works ahead: batches, the return of ``execute``, and faults."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_lone_request_on_an_idle_model_is_answered_by_execute(tmp_path: Path) 
     lone = request(5)
     model.take(lone)
     assert [response.error for response in lone.responses] == [None]
-    assert model.prepared == []  # what is not prepared ahead is prepared in its turn
+    assert model.prepared == []  # other requests are prepared in turn
 
 
 def test_what_comes_while_a_batch_is_scored_is_prepared_and_makes_up_the_next(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_a_batch_has_no_more_tokens_than_its_budget(tmp_path: Path) -> None:
     first = model.begin()
     later = [request(5), request(6)]  # two frames more are too many
     more = request(7)
-    with ThreadPoolExecutor(1) as pool:  # the first call waits if its requests and one of the first fill a batch
+    with ThreadPoolExecutor(1) as pool:  # the first call waits if these requests and one of the first fill a batch
         pool.submit(model.take, *later)
         pool.submit(model.take, more)
         wait_for(lambda: 6 in model.prepared)

@@ -179,7 +179,7 @@ QUESTION: Tensors = {
 
 
 def second(**shape: int) -> Tensors:
-    """The second trajectory's frames in an array of their own."""
+    """Return the second trajectory's frames in a separate array."""
     frames = {"num": 2, "height": 8, "width": 6, "channels": 3, **shape}
     return {"frames": FRAMES[:, :3], "second_frames": np.ones((1, *frames.values()), np.uint8)}
 
@@ -265,7 +265,7 @@ def test_a_batch_of_no_samples_is_refused(served: Served, model: str) -> None:
 
 
 def test_a_rewound_trajectory_is_scored(served: Served) -> None:
-    """Its array has negative strides."""
+    """The array has negative strides."""
     forwards = random_trajectory(1, 6)
     backwards = Trajectory(video_embeddings=forwards.positions[::-1], text_embedding=forwards.text_embedding)
     copied = Trajectory(video_embeddings=forwards.positions[::-1].copy(), text_embedding=forwards.text_embedding)
@@ -307,7 +307,7 @@ def test_no_other_user_can_read_the_shared_memory_of_a_server() -> None:
 
 @pytest.mark.parametrize("model", [FRAMES_MODEL, VLM])
 def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) -> None:
-    """Whoever writes tensors may use the optional input for any pair, and for a sample without a second trajectory."""
+    """Tensors may use the optional input for any pair, and for a sample without a second trajectory."""
     frames = [np.random.default_rng(seed).integers(0, 256, (2, 56, 56, 3), np.uint8) for seed in (1, 2)]
     videos = [Trajectory(frames=each, task="lift") for each in frames]
     tensors = encode_samples([PreferenceSample(videos[0], videos[1]), ProgressSample(videos[0])])

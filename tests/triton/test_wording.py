@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Each phrase by which rfm_client.contract.triton knows what happened, from a real Triton."""
+"""Each phrase that rfm_client.contract.triton recognises, from a real Triton."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ PHRASES: dict[str, tuple[Callable[[Asker], Any], str, type[RewardError], str]] =
 
 
 def failure(ask: Callable[[], Any]) -> tuple[str, str]:
-    """Status and message of what Triton refuses."""
+    """Return status and message of a refusal by Triton."""
     with pytest.raises(InferenceServerException) as caught:
         ask()
     return str(caught.value.status()), caught.value.message()
