@@ -25,7 +25,7 @@ SHARED = ("served", "triton")  # fixtures that start a server for the tests of m
 LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the others run meanwhile
 
 torch.set_num_threads(1)
-os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start, which share the cores with other tests
+os.environ["OMP_NUM_THREADS"] = "1"  # of processes that tests start, since other tests need the cores
 os.environ[RUN] = uuid.uuid4().hex  # marks the processes of this run
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test asks the network
 worker, workers = os.getenv("PYTEST_XDIST_WORKER", "gw0"), os.getenv("PYTEST_XDIST_WORKER_COUNT", "1")
@@ -40,7 +40,7 @@ def engine() -> Callable[[str], Engine]:
 
 @pytest.fixture(scope="session")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """The one server of all tests that only ask: a reference checkpoint of each kind, and the demo's as ``rfm``."""
+    """The shared server: a reference checkpoint of each kind, and the demo's as ``rfm``."""
     folder = tmp_path_factory.mktemp("served")
     repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
     for config in goldens.SERVED:

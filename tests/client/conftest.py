@@ -38,7 +38,7 @@ def client(served: Served) -> Iterator[RewardClient]:
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    """The demo's checkpoint, which has one instance on one thread."""
+    """The demo's checkpoint with a single instance."""
     folder = tmp_path / "model_repository"
     shutil.copytree(ROOT / "model_repository" / "rfm", folder / "rfm")
     return folder

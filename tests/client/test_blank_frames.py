@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which frames show nothing: black ones and those of one colour, but no dark scene."""
+"""Blank frames: black or of a single colour, but no dark scene."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from trajectories import random_trajectory
 
 
 def test_compare_refuses_the_answers_of_two_versions(tmp_path: Path, video: Path) -> None:
-    np.save(tmp_path / "small.npy", np.zeros((2, 40, 30, 3), np.uint8))  # of another size: a request of its own
+    np.save(tmp_path / "small.npy", np.zeros((2, 40, 30, 3), np.uint8))  # of another size: a separate request
     with (
         RewardClient("", transports=[Shelf(after=1)]) as client,
         pytest.raises(InferenceFailedError, match=r"^model_version: expected one for all videos, got 1, 2: ask again$"),

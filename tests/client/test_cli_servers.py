@@ -54,7 +54,7 @@ def test_status_tells_what_triton_counts(served: Served) -> None:
         (server,) = json.loads(result.stdout)["servers"]
         return server, {model["name"]: model for model in server["models"]}
 
-    wait_for(lambda: (shown()[1][MODEL]["batches"] or {"count": 0})["count"])  # the model tells once a second
+    wait_for(lambda: (shown()[1][MODEL]["batches"] or {"count": 0})["count"])  # the model reports once a second
     server, models = shown()
     assert (server["ready"], server["version"], server["metrics_error"]) == (True, "2.51.0", None)
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
@@ -77,7 +77,7 @@ def test_status_tells_what_triton_counts(served: Served) -> None:
     assert 0 < cpu["memory_used_bytes"] < cpu["memory_total_bytes"]
 
 
-BATCHES = {  # of two instances: 40 batches, 120 samples; of each batch, the work
+BATCHES = {  # of two instances: 40 batches, 120 samples; the work of each batch
     "batch_samples_count": (10, 30),
     "batch_samples_sum": (30, 90),
     "collate_seconds_sum": (0.5, 0.5),

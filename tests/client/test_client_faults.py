@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Servers that stop, hang and come back, connections that die, and memory that is shared with them."""
+"""Servers that stop, hang and come back, dying connections, and shared memory."""
 
 from __future__ import annotations
 

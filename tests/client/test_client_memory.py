@@ -55,7 +55,7 @@ Test = Callable[[Triton, SharedMemory], Coroutine[Any, Any, None]]
 
 
 def run(test: Test) -> None:
-    """With a server and memory that is shared with it, of which nothing is left."""
+    """With a server and shared memory, of which nothing is left."""
 
     async def within() -> None:
         server, memory = Triton(), SharedMemory("grpc://stand:1")

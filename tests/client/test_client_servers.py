@@ -40,7 +40,7 @@ class Stand:
         self.down_s = 0.0  # for so long after each end it takes no connection
         self.is_silent = False  # accepts connections and never answers
         self.max_batch_size = 64
-        self.sizes: list[int] = []  # samples of each request that it answers
+        self.sizes: list[int] = []  # samples per answered request
         self._up_s = 0.0
         self.version = 1
         self.asked: Counter[str] = Counter()

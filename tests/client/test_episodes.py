@@ -111,7 +111,7 @@ def test_steps_have_the_scores_of_the_whole(served: Served, model: str, rule: Ru
 
 
 def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: Served) -> None:
-    """Of a model that reads videos, each new pair of frames is encoded, as a model that reads frames reads each."""
+    """A video model encodes each new pair of frames; an image model encodes each frame."""
     encoders = {MODEL: f"{MODEL}_encoder", IMAGES: f"{IMAGES}_frames", VIDEO: f"{VIDEO}_frames"}
     frames = video(100, 12, (56, 84))
 
@@ -412,7 +412,7 @@ def test_a_model_that_is_not_served_and_tasks_that_are_too_few_are_told(served: 
 
 @contextmanager
 def own(folder: Path, name: str, feature_cache_mib: int) -> Iterator[Serving]:
-    """An ``rfm serve`` of one model, whose process a test may kill."""
+    """An ``rfm serve`` with a model process that a test may kill."""
     config, repository = goldens.config(name), folder / "model_repository"
     export_config = replace(serve_config(config, name), feature_cache_mib=feature_cache_mib)
     rfm_export.export(config.checkpoint, repository, export_config)

@@ -50,7 +50,7 @@ def test_a_request_that_ends_its_process_ends_two_of_a_fleet(
         calling(client, references) as callers,
     ):
         callers.wait_for_all()
-        # In one request with two others, which fail with it, and by another client beside those that are answered.
+        # In a request with two others, which fail with it, by another client than the callers.
         batch = [ProgressSample(sample) for sample in (trajectory(0), POISON, trajectory(1))]
         outcomes = other.evaluate(batch, return_errors=True)
         assert all("ended twice during this request" in str(outcome) for outcome in outcomes), outcomes

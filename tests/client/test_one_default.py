@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The same clip has the same curve, whichever way it is asked for, where nothing but the task is said."""
+"""By default a clip gets the same curve through every door."""
 
 from __future__ import annotations
 

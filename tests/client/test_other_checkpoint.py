@@ -31,7 +31,7 @@ def test_as_many_frames_are_shown_as_the_checkpoint_was_trained_on_by_now(wraps:
             episode = client.episode(TASK)
             for _ in range(5):
                 episode.add(FRAME)
-    # the fourth answer tells that another checkpoint is served
+    # the fourth answer is by another checkpoint
     assert [shape[1] for shape in shelf.shapes] == [4, 4, 4, 4, 8]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Proxies that the environment names, and addresses of this machine that are IPv6's, before a real Triton."""
+"""Proxies from the environment, and local IPv6 addresses, with a real Triton."""
 
 from __future__ import annotations
 

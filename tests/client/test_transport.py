@@ -90,7 +90,7 @@ MISBEHAVING: dict[str, tuple[str, Misbehaviour, type[RewardError], bool]] = {
 def test_whatever_answers_the_error_is_ours(
     protocol: str, answer: Misbehaviour, kind: type[RewardError], may_have_ended: bool
 ) -> None:
-    """Whether a server may have ended during a request over gRPC is asked of a real Triton in tests/triton."""
+    """tests/triton asks a real Triton whether a server may have ended during a request over gRPC."""
     with (
         listening(answer) as port,
         # With retries the last try may still run at the deadline, which is another error.
@@ -145,7 +145,7 @@ def test_a_request_over_two_gib_is_refused_before_it_is_copied(protocol: str) ->
 
 
 def test_triton_is_told_the_time_of_a_call_in_microseconds() -> None:
-    """By this bound Triton drops requests from a queue that was exported with ``queue_timeout_ms``."""
+    """Triton drops later requests from a queue exported with ``queue_timeout_ms``."""
     told_us: list[int] = []
 
     def infer(request: service_pb2.ModelInferRequest, context: grpc.ServicerContext) -> None:

@@ -98,7 +98,7 @@ class FileRequest(FolderRequest):
 
 @contextmanager
 def serving(folder: Path) -> Iterator[tuple[str, list[str]]]:
-    """The URL of a server of the folder's files, and the paths that it is asked for."""
+    """Serve the folder's files. Yields the URL and the requested paths."""
     asked: list[str] = []
     with web_server(partial(FileRequest, asked, directory=str(folder))) as url:
         yield url, asked

@@ -223,7 +223,7 @@ def test_named_frames_arrive_with_those_that_are_sent(num_sent: int, shape: tupl
 
 
 def request(lengths: tuple[int, int], kind: int, steps: int = 0, stray: int = 0) -> wire.Tensors:
-    """Four positions. stray: so many behind the frames are no zeros"""
+    """Return a request with four positions. stray: number of nonzero positions behind the frames"""
     return {
         "sample_type": np.array([[kind]], np.uint8),
         "num_frames": np.array([lengths], np.int32),

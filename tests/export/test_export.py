@@ -36,7 +36,7 @@ def export(config: goldens.Config, repository: Path, **changes: Any) -> int:
 
 
 def read(repository: Path, name: str) -> pb.ModelConfig:
-    """As Triton reads it."""
+    """Parse the file like Triton."""
     return text_format.Parse((repository / name / "config.pbtxt").read_text(), pb.ModelConfig())
 
 
@@ -117,7 +117,7 @@ def test_frames_go_through_the_encoder_into_the_scorer(exported: Path) -> None:
 
 
 def test_two_instances_a_gpu_or_one_on_the_cpu(exported: Path, tmp_path: Path) -> None:
-    """Of a network over embeddings: one scores while the other reads."""
+    """Two instances of a network over embeddings: one scores while the other reads."""
     (group,) = read(exported, "rfm").instance_group
     assert (group.kind, group.count, list(group.gpus)) == (pb.ModelInstanceGroup.KIND_CPU, 1, [])
     settings = replace(serve_config(EMBEDDINGS), num_gpus=2)

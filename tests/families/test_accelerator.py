@@ -37,7 +37,7 @@ def engine_there(name: str, feature_cache_mib: int = 0, device: torch.device = C
 
 
 # How often the host waits in a batch like one that was scored before: for values, and for copies to the device.
-# Of vision-language ones all scores are read at once; for SmolVLM transformers looks for images of zeros.
+# Vision-language models read all scores at once; for SmolVLM transformers looks for images of zeros.
 WAITS = {
     "c1_t1_disc10": (5, 11),  # progress, logits, success, questions twice; the parts of a batch
     "legacy_keys_l2": (4, 11),

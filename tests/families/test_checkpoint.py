@@ -329,7 +329,7 @@ STATES = ("optimizer.pt", "scheduler.pt", "rng_state.pth", "rng_state_0.pth", "t
 
 
 def sharing_memory(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """As tied weights are; a safetensors file holds none that share."""
+    """Share memory between tensors, like tied weights; safetensors files cannot."""
     both = torch.stack([weights["first_embedding_A"], weights["first_embedding_B"]])
     return weights | {"first_embedding_A": both[0], "first_embedding_B": both[1]}
 
@@ -566,7 +566,7 @@ OFFLINE = (
 
 @pytest.fixture(scope="module")
 def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What a process of its own says of checkpoints, since huggingface_hub reads its environment once; then this one,
+    """Ask a separate process about checkpoints, since huggingface_hub reads the environment once; then this process,
     which is offline, with the same cache.
 
     They are multi-image ones as upstream uploads them: the tag's commit lacks config.yaml, which main has.

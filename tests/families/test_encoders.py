@@ -53,7 +53,7 @@ def encoders_of(name: str) -> Encoders:
 
 
 def encoded(outcome: EncoderSample | RewardError) -> tuple[np.ndarray, np.ndarray]:
-    """The embeddings of all frames, one trajectory after the other, and of the task."""
+    """Return the embeddings of all frames in order, and of the task."""
     assert isinstance(outcome, EncoderSample), outcome
     task = outcome.trajectories[0].text_embedding
     assert task is not None

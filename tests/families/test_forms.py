@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The forms of checkpoints that docs/reference/checkpoints.md lists: files as PEFT writes them, and the test of each row."""
+"""The forms of checkpoints in docs/reference/checkpoints.md: files as PEFT writes them, and a test for each row."""
 
 from __future__ import annotations
 

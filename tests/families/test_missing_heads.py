@@ -78,7 +78,7 @@ def test_what_is_there_is_scored_as_with_all_heads_and_the_rest_refused_alone(
 
 @pytest.mark.parametrize("name", [REWIND, VLM])
 def test_a_score_that_is_not_finite_is_still_an_error(tmp_path: Path, name: str) -> None:
-    """The value that stands for a missing head hides no fault of one that is there."""
+    """The value for a missing head hides no fault of the other heads."""
     for heads, spoilt in (((), "success_head"), (("success",), "progress_head")):
         folder = without(name, heads, tmp_path / spoilt)
         weights(lambda tensors, head=spoilt: tensors[f"{head}.4.bias"].fill_(torch.nan))(folder)
@@ -206,7 +206,7 @@ def test_a_checkpoint_of_the_first_rewind_code_is_exported_and_labels(run: Path,
 
 
 def test_a_checkpoint_of_the_first_rewind_code_is_causal_whatever_upstream_s_older_files_mean(run: Path) -> None:
-    """Upstream's configurations of before causal_mask, when no network of theirs had one, state all of these."""
+    """Upstream's configurations from before causal_mask state all of these."""
     fields = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len")
     config = families.load(run).config
     (run / "config.json").write_text(json.dumps({name: getattr(config, name) for name in fields}))

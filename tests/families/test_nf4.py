@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Weights that bitsandbytes rounded to NF4: the values that it makes of them, or a refusal."""
+"""Weights in bitsandbytes' NF4: the same values, or a refusal."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The RMSNorm of GPUs gives all bits of transformers' norms, which CPUs compute."""
+"""The RMSNorm for GPUs equals transformers' norms bit for bit on the CPU."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def requests(draw: st.DrawFn, *, frames: bool) -> dict[str, Array]:
 
 
 def told(error: InvalidSampleError) -> None:
-    """As all errors of input are told."""
+    """Like all errors of input."""
     assert ": expected " in str(error)
     assert ", got " in str(error)
     assert len(str(error)) < 1000

@@ -160,7 +160,7 @@ def test_no_mix_of_lengths_and_types_changes_a_result(config: RewindConfig, toke
 
 @pytest.mark.parametrize("lengths", [(32, 33), (33, 32), (32, 32, 32)], ids=str)
 def test_rows_of_as_many_tokens_as_a_batch_has_room_for_are_scored_as_alone(lengths: tuple[int, ...]) -> None:
-    """33 and 34 tokens lie in a batch of 68, as many as in two padded rows."""
+    """33 and 34 tokens lie in a batch of 68 tokens, like two padded rows."""
     engine = engine_of(build(replace(SMALL, use_per_frame_progress_token=False, max_len=40)))
     samples = [ProgressSample(trajectory(seed, length)) for seed, length in enumerate(lengths)]
     for sample, outcome in zip(samples, engine.evaluate(samples), strict=True):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Weights of 8 and 4 bits: their values, on which alone scores depend."""
+"""Weights of 8 and 4 bits: scores depend on the rounded values alone."""
 
 from __future__ import annotations
 

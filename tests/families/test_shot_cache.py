@@ -36,7 +36,7 @@ def engine(name: str, cache: FeatureCache[Any] | None = None) -> Engine:
 
 
 def of_both(name: str, cache: FeatureCache[Any] | None = None) -> tuple[Engine, Engine]:
-    """An engine with a cache, by default one that holds all, and one without."""
+    """Return an engine with a cache, by default large enough for all, and an engine without."""
     return engine(name, FeatureCache(64 * BYTES_PER_MIB) if cache is None else cache), engine(name)
 
 
@@ -65,7 +65,7 @@ def ask(served: Engine, sample: ProgressSampleRefs, execution: Execution | None 
 
 
 def assert_scored(outcome: Any, plain: Engine, frames: UInt8Array, frame_steps: int = 0) -> None:
-    """As by an engine without a cache that is given the whole video."""
+    """The scores equal those of an engine without a cache."""
     (expected,) = plain.evaluate([ProgressSample(Trajectory(frames=frames, task=TASK), frame_steps=frame_steps)])
     assert_close(outcome, expected, TOLERANCE)
 
@@ -137,7 +137,7 @@ def test_whole_videos_of_other_callers_fill_the_cache(name: str) -> None:
 
 
 def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames of very long videos are made smaller than those of short ones."""
+    """Frames of very long videos are downscaled more."""
     cached, plain = of_both(MODELS[3])
     frames = frames_of(6, 4, (448, 336))
     monkeypatch.setattr("rfm.vlm.images.VIDEO_TOTAL_TOKENS", 300.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The best tag of a repository on the Hub, the run of a snapshot, and documents of each setting."""
+"""The best tag on the Hub, the run of a snapshot, and the documents of settings."""
 
 from __future__ import annotations
 

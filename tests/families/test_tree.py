@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Prefixes of an episode as one tree: the scores of separate passes, fewer tokens, bounded masks."""
+"""Prefixes of an episode as a tree: scores as in separate passes, fewer tokens, bounded masks."""
 
 from __future__ import annotations
 

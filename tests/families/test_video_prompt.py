@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The two forms of a Qwen3-VL video prompt: token ids of transformers' processor, and the choice of the form."""
+"""The two forms of a Qwen3-VL video prompt: token ids as transformers' processor gives them, and the choice."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Metadata:
 
 @dataclass(frozen=True)
 class Videos:
-    """In the place of the video processor, which needs torchvision: the grid and the times of each video."""
+    """Return grid and times of each video in place of the processor, which needs torchvision."""
 
     grids: Sequence[tuple[int, int, int]]
     metadata: Sequence[Metadata]

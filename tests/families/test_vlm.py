@@ -304,7 +304,7 @@ def test_both_frames_of_a_group_carry_its_value() -> None:
 
 @pytest.mark.parametrize("config", goldens.VLM, ids=lambda config: config.name)
 def test_a_network_that_reads_images_is_causal_and_one_that_reads_videos_is_not(config: goldens.Config) -> None:
-    """As the documents say: there is no need to score each prefix of a trajectory that is read as images."""
+    """So callers need not score each prefix of a trajectory that is read as images."""
     trajectory = video(0, 5, 56, 56)
     prefix = replace(trajectory, frames=trajectory.positions[:3])
     whole, part = load_engine(config.name).evaluate([ProgressSample(trajectory), ProgressSample(prefix)])
@@ -333,7 +333,7 @@ def test_out_of_memory_halves_the_batch_and_fails_what_never_fits(monkeypatch: p
         assert_close(result, other, MIXED_TOLERANCE)
     assert isinstance(failed, InferenceFailedError)
     assert str(failed) == "the sample does not fit in the device's memory"
-    assert execution.out_of_memory_count == 4  # 5 rows, the 3 of them, 2 with the large one, that alone
+    assert execution.out_of_memory_count == 4  # 5 rows, then 3, then 2 with the large one, then that alone
 
 
 @pytest.mark.parametrize("name", ["q3_tok_disc10", "q25_video_avg_disc10"])

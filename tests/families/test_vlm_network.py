@@ -120,7 +120,7 @@ def test_a_gpu_gives_the_cpu_s_numbers_in_float32(name: str) -> None:
 
 @pytest.mark.gpu
 def test_the_host_waits_for_a_gpu_once_a_batch() -> None:
-    """PyTorch itself tells of each time that the host waits; to read the scores, it must."""
+    """PyTorch reports each wait of the host. Only reading the scores may wait."""
     config = goldens.config(BFLOAT16)
     engine = Engine.from_checkpoint(config.checkpoint, **config.sources, device="cuda")
     samples: list[Sample] = [ProgressSample(video(seed, 5, 84, 112)) for seed in range(3)]
@@ -137,7 +137,7 @@ def test_the_host_waits_for_a_gpu_once_a_batch() -> None:
 
 
 # Worked out by hand from qwen-vl-utils' rules: longest side 480 px, multiples of 56 px, then multiples of 28 px within
-# 128 to 768 tokens a frame, of which all pairs of frames together have 115,200; at least 1.05 times 128 stay allowed.
+# 128 to 768 tokens a frame, and 115,200 for all pairs of frames; at least 1.05 times 128 stay allowed.
 VIDEO_SIZES = {
     "a short video keeps its size": (2, (448, 336), [], (448, 336)),
     "a long side is scaled down first": (2, (540, 960), [(270, 480), (280, 504)], (280, 504)),

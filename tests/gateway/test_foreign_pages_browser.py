@@ -56,7 +56,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
 
 @pytest.fixture(scope="module")
 def other_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """The port of another server of this machine, which serves a page."""
+    """The port of another local server, which serves a page."""
     folder = tmp_path_factory.mktemp("other")
     (folder / "index.html").write_text("<!doctype html><title>another page</title>")
     with folder_server(folder) as url:

@@ -53,7 +53,7 @@ pytestmark = pytest.mark.triton
 
 
 def mixed(make: Callable[..., Json], *dims: Any) -> list[Json]:
-    """Each type twice, out of order, lengths that differ."""
+    """Return two samples of each type, out of order, with different lengths."""
     return [
         similarity(make(1, 2, *dims), make(2, 5, *dims)),
         progress(make(3, 7, *dims)),

@@ -156,7 +156,7 @@ def test_a_message_names_twenty_faults_and_counts_the_others(tmp_path: Path) -> 
 
 
 def write_demos(file: Path, *lengths: int, task: str | None = TASK) -> None:
-    """A file of demonstrations, each with 5 frames and this number of actions."""
+    """Write demonstrations with 5 frames and these numbers of actions."""
     with h5py.File(file, "w") as opened:
         opened.create_group("data").attrs["env_args"] = json.dumps({"env_name": "Lift", "lang": task})
         for index, length in enumerate(lengths):

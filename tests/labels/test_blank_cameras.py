@@ -53,7 +53,7 @@ def lines_of(source: Path, output: Path, **options: Any) -> list[str]:
 
 
 def blackened(video: Path) -> None:
-    """Codes a video anew with as many black frames."""
+    """Replace a video by the same number of black frames."""
     with av.open(str(video)) as container:
         frames = [frame.to_ndarray(format="rgb24") * 0 for frame in container.decode(video=0)]
     encode(video, frames, "libx264", {"g": "2", "bf": "0"})
@@ -121,7 +121,7 @@ def test_a_black_camera_of_a_lerobot_dataset_is_told_in_each_run_also_of_labels_
     expected = f"{WRIST}: black pictures, in 2 of 3 episodes (0:2): {ADVICE}"
     assert lines_of(root, output, limit=3) == [expected]
     assert lines_of(root, output, limit=3) == [expected]
-    shutil.rmtree(output / ".rfm_parts")  # now only the label files tell
+    shutil.rmtree(output / ".rfm_parts")  # now only the label files know
     assert lines_of(root, output, limit=3) == [expected]
     assert lines_of(root, output, limit=4) == [expected.replace("2 of 3 episodes (0:2)", "3 of 4 episodes (0:2,3)")]
 

@@ -120,7 +120,7 @@ def test_the_cost_is_that_of_the_frames_that_the_run_scored(tmp_path: Path) -> N
         return rate
 
     def check(episodes: range, watch: Watch = QUIET) -> float | None:
-        """Return the rate that the files tell, which is that of five episodes."""
+        """Return the rate in the files, which covers five episodes."""
         scorer, began_s = BrightnessScorer(request_s), time.monotonic()
         rate = frames_per_s(scorer, watch, episodes=episodes)
         took_s = time.monotonic() - began_s

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory of long videos, for a checkpoint that does not encode them first: each frame is held once, and few videos."""
+"""Memory of long videos for a checkpoint without encoders: few videos, and no frame twice."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def small_requests(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class LongVideos(Dataset):
-    """Episodes of one camera, whose frames are made when they are asked for."""
+    """Episodes of a single camera with frames made on demand."""
 
     kind, source, cameras = "made up", "long videos", ("front",)
 

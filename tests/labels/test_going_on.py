@@ -35,7 +35,7 @@ def parts_of(output: Path) -> list[str]:
 
 
 def goes_on(output: Path, undisturbed: list[bytes], **options: Any) -> int:
-    """How many frames the same call then scores, after which the labels are those of a run that nothing disturbed."""
+    """Repeat the call and compare with the labels of an undisturbed run. Return the number of scored frames."""
     rest = BrightnessScorer()
     label(open_dataset(ROOT), rest, LabelOptions(output=output, **FEW, **options))
     assert contents(output) == undisturbed

@@ -209,7 +209,7 @@ JPEG = np.frombuffer(b"\xff\xd8\xff\xe0" + bytes(60), np.uint8)
 def virtual(file: Path, *sources: tuple[str, str, int, slice]) -> None:
     """Replaces a camera of the first demonstration by a virtual dataset.
 
-    sources: file and name, the frames that are claimed to be there, and those of the camera that they make up
+    sources: file and name, the claimed frames, and the camera's frames that they make up
     """
     layout = h5py.VirtualLayout(FRAMES.shape, np.uint8)
     for name, dataset, count, part in sources:

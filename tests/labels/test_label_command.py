@@ -42,7 +42,7 @@ def own(*words: object) -> Result:
 
 
 def cells(output: str) -> dict[str, str]:
-    """The rows of the table of two columns that is shown."""
+    """Return the rows of the printed table with two columns."""
     rows = [re.split(r"\s{2,}", line.strip()) for line in output.splitlines()]
     return {row[0]: row[1] for row in rows if len(row) == 2}
 

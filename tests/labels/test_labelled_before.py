@@ -234,7 +234,7 @@ def shifted_row(root: Path) -> None:
 
 
 def damaged_in_silence(root: Path) -> None:
-    """Zeros in the index of a video of episode 3, whose size and time stay."""
+    """Zero the index of episode 3's video, without a change of size and time."""
     file = root / "videos" / "chunk-000" / WRIST / "episode_000003.mp4"
     status, content = file.stat(), bytearray(file.read_bytes())
     place = content.index(b"stsz")

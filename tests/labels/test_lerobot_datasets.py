@@ -191,7 +191,7 @@ def test_pictures_in_tables_are_of_8_bit_colours(
 
 
 def test_exif_data_turn_images_in_tables_and_change_the_identity_of_the_episode(tmp_path: Path) -> None:
-    """As LeRobot reads them, through ``datasets``."""
+    """LeRobot reads them the same way, through ``datasets``."""
     root, exif = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "dataset"), Image.Exif()
     exif[0x0112] = 6
 

@@ -59,7 +59,7 @@ STREAMS: dict[str, tuple[str, dict[str, str]]] = {
 def test_a_video_without_its_first_key_frame_is_refused_but_a_part_that_needs_none_is_read(
     tmp_path: Path, stream: str, suffix: str
 ) -> None:
-    """As cutting without encoding, or recording amid a stream, leaves it."""
+    """Cut a video without encoding, like a recording that starts amid a stream."""
     file = tmp_path / f"video.{suffix}"
     encode_here(tmp_path / "all.mp4", moving(), *STREAMS[stream])
     remux(tmp_path / "all.mp4", file, lambda packets: packets[13:])
@@ -104,7 +104,7 @@ DROPPED = {  # the kind that is written over the kind of a coded picture, unknow
 def test_frames_that_the_decoder_drops_amid_a_video_are_missed(
     tmp_path: Path, codec: str, options: dict[str, str], kind: int, refused: str
 ) -> None:
-    """As damage in the head of a slice does it."""
+    """Damage the head of a slice."""
     file = tmp_path / "video.mp4"
     encode_here(file, moving(), codec, options)
     assert len(read_video(file)) == NUM_FRAMES

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Folders of pictures: names tell the order, EXIF data which way is up; and pictures stored as BGR."""
+"""Folders of pictures: order by name, orientation by EXIF data, and pictures stored as BGR."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def rows_of(root: Path) -> list[Path]:
 
 
 def with_columns(folder: Path, source: Path = V30, **columns: Callable[[int, int], Any]) -> Path:
-    """A copy whose rows have further columns, made of the episode and the frame of a row."""
+    """Copy a dataset and add columns computed from the episode and frame of a row."""
     root = Path(shutil.copytree(source, folder / "toy"))
     for file in rows_of(root):
         table = parquet.read_table(file, partitioning=None)

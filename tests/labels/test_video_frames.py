@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Videos that are turned, that break off, that are damaged: labels and scores judge them alike."""
+"""Turned, broken and damaged videos: labels and scores judge them alike."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def noise(count: int = NUM_FRAMES) -> UInt8Array:
 
 
 def labelled(file: Path) -> UInt8Array:
-    """The frames that ``label`` shows of a folder that holds this video."""
+    """Return the frames that ``label`` reads from a folder with this video."""
     (file.parent / "tasks.csv").write_text(f"video,task\n{file.name},stack the cups\n")
     dataset = open_dataset(file.parent)
     episode = dataset.episodes[0]
@@ -73,7 +73,7 @@ def test_packets_that_are_not_shown_are_no_frames(tmp_path: Path) -> None:
     file = tmp_path / "video.mp4"
     write_video(file, numbered(10), shown_from=4)
     with av.open(str(file)) as container:
-        assert container.streams.video[0].frames == 10  # as the container tells, wrongly
+        assert container.streams.video[0].frames == 10  # as the container says, wrongly
     assert numbers(labelled(file), 10) == numbers(read_video(file), 10) == [4, 5, 6, 7, 8, 9]
     assert numbers(read_video(file, 5), 10) == [4, 6, 9]
 
@@ -109,7 +109,7 @@ def rgb(levels: np.ndarray[Any, Any], matrix: int, is_full: bool) -> np.ndarray[
 
 
 def write_levels(file: Path, levels: UInt8Array, pixels: str, matrix: int, full: int) -> None:
-    """A video of blocks of one colour each, levels uint8 [rows, columns, 3], without a loss."""
+    """Write a lossless video of coloured blocks. levels: uint8 [rows, columns, 3]"""
     with av.open(str(file), "w") as container:
         stream: Any = container.add_stream("libx264", rate=10, options={"qp": "0"})
         stream.height, stream.width, stream.pix_fmt = *(BLOCK_PX * n for n in levels.shape[:2]), pixels
@@ -131,7 +131,7 @@ def write_levels(file: Path, levels: UInt8Array, pixels: str, matrix: int, full:
 
 @pytest.mark.parametrize(("pixels", "matrix", "full"), COLOURS.values(), ids=COLOURS)
 def test_colours_are_those_of_the_video_s_matrix_and_range(tmp_path: Path, pixels: str, matrix: int, full: int) -> None:
-    """Whatever PyAV is installed: some take each video for one of BT.601, 6 to 29 levels off."""
+    """With any PyAV: some versions decode every video as BT.601, 6 to 29 levels off."""
     levels = np.random.default_rng(0).integers(60, 190, (6, 8, 3), np.uint8)
     write_levels(tmp_path / "video.mp4", levels, pixels, matrix, full)
     read = read_video(tmp_path / "video.mp4")[0]
@@ -203,7 +203,7 @@ def coded(codec: str = "libx264", **more: Any) -> Write:
 
 
 def recorded_live(file: Path, frames: UInt8Array) -> None:
-    """As into a pipe: nothing that is written is corrected afterwards."""
+    """A file that cannot seek, like a pipe."""
     codec, format = ("mpeg4", "avi") if file.suffix == ".avi" else ("libx264", "matroska")
     with file.open("wb") as opened:
         encode_here(SimpleNamespace(write=opened.write), frames, codec, format=format)

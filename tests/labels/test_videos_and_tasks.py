@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Folders of videos with a table of tasks, and the tasks that a caller gives for any dataset."""
+"""Folders of videos with a table of tasks, and tasks given by a caller."""
 
 from __future__ import annotations
 

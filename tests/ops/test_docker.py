@@ -77,7 +77,7 @@ class Image:
 
     @contextmanager
     def started(self, *words: object) -> Iterator[subprocess.Popen[bytes]]:
-        """A program that runs until it is told to stop, and then ends well."""
+        """A program that runs until a signal and then exits with 0."""
         log = self.root / f"{words[0]}.log"
         with log.open("ab") as lines:
             process = subprocess.Popen(self.program(words), env=self.environment, stdout=lines, stderr=lines)
@@ -336,7 +336,7 @@ def test_the_repository_that_the_guide_exports_is_served_unless_another_is_named
 
 
 def test_prometheus_has_the_secrets_that_its_configuration_names() -> None:
-    """Also in comments, which the reader is told to use."""
+    """Also in comments, which the file recommends."""
     text = (DOCKER / "prometheus" / "prometheus.yml").read_text()
     named = re.findall(r"/run/secrets/(\w+)", text)
     assert named == ["gateway_api_key"]

@@ -136,7 +136,7 @@ def test_every_manifest_fits_its_schema(folder: str, release: str) -> None:
 
 @pytest.mark.parametrize("workload", workloads(*SETS))
 def test_pods_are_restricted(workload: Object) -> None:
-    """As the pod security standard "restricted" has it, and with a root file system that cannot be written."""
+    """Pods meet the pod security standard "restricted" and have a read-only root file system."""
     pod, container = pod_of(workload), container_of(workload)
     context = {**pod.get("securityContext", {}), **container["securityContext"]}
     assert {name: context.pop(name) for name in SECURITY} == SECURITY

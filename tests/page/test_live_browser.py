@@ -86,7 +86,7 @@ class Page:
         poll(is_so)
 
     def has_pictures(self, run: str, *frames: UInt8Array) -> bool:
-        """Whether the page shows these frames of a run, as JPEG keeps them."""
+        """Return True if the page shows these frames of a run, up to JPEG's losses."""
         shown = self.browser.pixels(self.browser.run(PICTURES, run))
         off = [float(np.abs(one.astype(int) - other).mean()) for one, other in zip(shown, frames, strict=False)]
         return len(shown) == len(frames) and max(off) < 2

@@ -67,7 +67,7 @@ class Page:
         return json.loads(self.browser.saved("curves.json"))
 
     def beside_the_lines(self) -> list[float]:
-        """The numbers at the cursor: progress of each curve, then success of each."""
+        """Return the numbers at the cursor: progress by curve, then success by curve."""
         return [float(text) for signal in SIGNALS for text in self.browser.values("chart", signal).values()]
 
     def is_at(self, time_s: float, abs_s: float = 0.005) -> bool:

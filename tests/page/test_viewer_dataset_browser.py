@@ -110,7 +110,7 @@ class Page:
             time_s,
         )
         poll(lambda: self.is_at(time_s, 0.02))
-        self.browser.until(ARE_THERE)  # a video that still seeks tells where it is going, and shows where it was
+        self.browser.until(ARE_THERE)  # a seeking video reports the target and shows the old frame
 
     def is_at(self, time_s: float, abs_s: float) -> bool:
         return self.browser.times_s(PLAYERS) == pytest.approx([time_s] * 3, abs=abs_s)
@@ -503,7 +503,7 @@ def test_episodes_without_labels_can_be_watched_and_scored(page: Page) -> None:
 
 @pytest.fixture
 def running_episodes(url: str, demo_server: Endpoints) -> Iterator[None]:
-    """Episodes of four environments, of which one has ended and three still run."""
+    """Episodes of four environments; three still run."""
     kinds = ("success", "dropped", "rewound", "success")
     clips = [make_clip(kind, CLIP_TASK, CLIP_SEED + n).frames for n, kind in enumerate(kinds)]
     with RewardClient(demo_server.grpc_url) as client, LiveView(url, name="policy 7") as view:

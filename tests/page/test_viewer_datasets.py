@@ -51,7 +51,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @contextmanager
 def serving(*roots: Path, **settings: Any) -> Iterator[Get]:
-    """Gives the answers of a gateway that shows the datasets in these folders."""
+    """Run a gateway that shows the datasets in these folders. Yields a function that asks it."""
     with inside(dataset=tuple(map(str, roots)), **settings) as gateway:
         yield lambda path: gateway.get(f"/viewer/datasets{path}")
 

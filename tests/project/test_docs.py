@@ -168,7 +168,7 @@ def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: 
 
 
 def check_gateway(endpoints: Endpoints, command: str) -> None:
-    """It runs until it is told to stop."""
+    """Runs until a signal."""
     port = Endpoints.free().http_port
     words = [*shlex.split(command), "--triton", endpoints.grpc_url, "--metrics-url", endpoints.metrics_url]
     program = Path(sys.executable).parent / words[0]
@@ -246,7 +246,7 @@ def test_every_command_and_option_is_documented() -> None:
 
 
 def options(command: Command) -> Iterator[Parameter]:
-    """Return the options of a command and its subcommands, which all have a help text."""
+    """Return the options of a command and all subcommands. Check the help texts."""
     for parameter in command.params:
         if parameter.param_type_name == "option" and parameter.name not in COMPLETION:
             assert parameter.help, (command.name, parameter.name)  # type: ignore[attr-defined]

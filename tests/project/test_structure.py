@@ -118,7 +118,7 @@ def imports(file: Path) -> set[str]:
 
 
 def names_of_others(file: Path, package: str) -> Iterator[tuple[str, str]]:
-    """Module and name of everything of ours that a file imports from another package."""
+    """Yield module and name of each import from another package of ours."""
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in {*FOLDERS} - {package}:
             yield from ((node.module, name.name) for name in node.names)
@@ -127,7 +127,7 @@ def names_of_others(file: Path, package: str) -> Iterator[tuple[str, str]]:
 
 
 def is_part(name: str, packages: set[str]) -> bool:
-    """Whether the module is one of these packages or in one."""
+    """Return True if the module is, or lies in, one of these packages."""
     return any(name == package or name.startswith(f"{package}.") for package in packages)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Clients of a reference checkpoint: one that answers at once, and one whose answers come late."""
+"""Clients of a reference checkpoint, with prompt and with late answers."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rewards for one Gymnasium environment, with steps that wait for answers and steps that do not."""
+"""Rewards for a Gymnasium environment, with and without waiting for answers."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def not_blocking(late: LateClient, **options: Any) -> tuple[RewardModelWrapper, 
     return env, camera
 
 
-# After which step which answers come, and which of them is the newest in use at the next one.
+# Answers that arrive after each step, and the newest in use at the next.
 COMING: list[tuple[tuple[int, ...], int]] = [((), 0), ((), 0), ((2,), 2), ((1,), 2), ((3, 4), 4), ((), 4)]
 
 

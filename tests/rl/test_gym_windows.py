@@ -19,7 +19,7 @@ from coded_env import Code, CodedEnv, Recorder, frame_of
 from rfm_client import InvalidSampleError, ServerUnavailableError
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 
-LENGTHS = (3,), (4, 1, 2)  # steps of the episodes of each environment, in turn
+LENGTHS = (3,), (4, 1, 2)  # steps of the episodes by environment, in turn
 TASKS = ["task 0", "task 1"]
 ACTIONS = np.zeros(2, int)
 NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED

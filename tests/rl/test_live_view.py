@@ -47,7 +47,7 @@ def score(step: int, progress: float = 0.5, success: float = 0.25) -> StepScore:
 
 
 def episodes_of(taker: Taker) -> list[dict[str, Any]]:
-    """Return the reports of each episode in the order of their beginning."""
+    """Return the reports by episode, in the order of the first report."""
     found: dict[str, dict[str, Any]] = {}
     for body in taker.bodies:
         for told in body["episodes"]:

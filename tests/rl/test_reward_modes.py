@@ -51,7 +51,7 @@ def judge() -> Iterator[Judge]:
 
 
 def rewards(judge: Judge, **options: Any) -> list[float]:
-    """Of an episode."""
+    """The labels of an episode."""
     env = RewardModelWrapper(CodedEnv(0, (LAST,)), judge, TASK, RewardOptions(sampling="all", **options))
     env.reset()
     paid = []
@@ -137,7 +137,7 @@ def test_shaping_of_another_reward_leaves_its_best_policies_as_they_are(judge: J
 
 
 def paid_by(kind: str, make: Any, judge: Judge, options: RewardOptions, length: int) -> list[float]:
-    """Rewards of an episode's steps, by a wrapper of each kind."""
+    """Return an episode's rewards by wrapper."""
     if kind == "one":
         env: Any = RewardModelWrapper(make(), judge, TASK, options)
         env.reset()

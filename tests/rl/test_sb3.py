@@ -27,10 +27,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 
 from rfm_rl.sb3 import RenderedFrame, RewardModelVecEnv
 
-LENGTHS = (3,), (4, 1, 2)  # steps of the episodes of each environment, in turn
+LENGTHS = (3,), (4, 1, 2)  # steps of the episodes by environment, in turn
 TASKS = ["task 0", "task 1"]
 ACTIONS = np.zeros(2, int)
-# By environment: the episode and step that each call asks about, first the reset. Each end of an episode is a reset.
+# By environment: episode and step of each call, first the reset. The end of an episode is a reset.
 ASKED = (
     "0.0 0.1 0.2 0.3+1.0 1.1 1.2 1.3+2.0 2.1 2.2 2.3+3.0",
     "0.0 0.1 0.2 0.3 0.4+1.0 1.1+2.0 2.1 2.2+3.0 3.1 3.2",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Resets of episodes whose end the wrappers have not seen, so that a reward is never paid."""
+"""Early resets, after which the wrappers never pay a reward."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def owned_by(user: int, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_group_may_read_a_secret_of_root_s_alone(
     tmp_path: Path, user: int, mode: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As Kubernetes mounts it: links to a file of root's, which the pod's group reads."""
+    """Links to a file of root's that the pod's group reads, as Kubernetes mounts it."""
     (tmp_path / "data").write_text(f"{KEY}\n")
     (tmp_path / "data").chmod(mode)
     (tmp_path / "key").symlink_to("data")

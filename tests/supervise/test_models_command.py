@@ -141,7 +141,7 @@ def loading(running: Running, name: str, folder: Path) -> Iterator[None]:
 
 
 def test_callers_are_answered_while_another_model_loads(running: Running, tmp_path: Path) -> None:
-    """All of several connections for each thread that Triton has for HTTP. The load ends after they have been answered."""
+    """Use several connections per HTTP thread of Triton. The load ends after the answers."""
     trajectory = random_trajectory(1, 5, *rollout.WIDTHS)
     endpoints = running.served.endpoints
     urls = (endpoints.http_url, endpoints.grpc_url) * CONNECTIONS
@@ -194,7 +194,7 @@ def test_a_server_that_cannot_be_reached_is_told(url: str, words: tuple[str, ...
 def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(
     running: Running, other: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A rollout that fails after the ensemble's change, one that succeeds, and a rollback."""
+    """A rollout fails after the ensemble's change; another succeeds and is rolled back."""
     samples = rollout.questions()
     expected = {"1": rollout.answers(WITH_ENCODERS.checkpoint, samples), "2": rollout.answers(other, samples)}
     assert min(difference(*pair) for pair in zip(expected["1"], expected["2"], strict=True)) > rollout.CLEARLY

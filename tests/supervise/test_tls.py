@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""TLS and keys: of gRPC, of HTTP behind a proxy, and of the gateway."""
+"""TLS and keys for gRPC, HTTP behind a proxy, and the gateway."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def secure(repository: Path, papers: Papers, tmp_path_factory: pytest.TempPathFa
 
 @pytest.fixture(scope="module")
 def gateway_port() -> int:
-    """Of the gateway beside ``mutual``."""
+    """Port of the gateway beside ``mutual``."""
     return Endpoints.free().http_port
 
 
@@ -177,7 +177,7 @@ def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, key_f
 
 @pytest.fixture(scope="module")
 def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
-    """As behind nginx or an ingress, which asks for a certificate and a key."""
+    """An HTTPS proxy like nginx or an ingress that asks for a certificate and a key."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(papers.certificate, papers.key)
     context.verify_mode = ssl.CERT_REQUIRED
@@ -359,7 +359,7 @@ def test_half_a_certificate_of_the_gateway_is_refused(papers: Papers) -> None:
 
 
 def test_rfm_serve_heals_with_tls(mutual: Endpoints, papers: Papers, running: Serving, repository: Path) -> None:
-    """It is told of no certificate for itself."""
+    """The gateway has no server certificate."""
     kill_model(repository)
     with client(mutual.grpc_url, **papers.client) as asked:  # it asks again until the model is back
         scores_right(asked)

@@ -81,7 +81,7 @@ class Browser:
         poll(lambda: self[name].text == text)
 
     def cells(self, rows: str) -> list[list[str]]:
-        """The text of each cell of the table rows that a selector finds."""
+        """Return the cells' text of the table rows that match a selector."""
         script = "[...row.children].map((cell) => cell.textContent)"
         return list(self.run(f"return [...document.querySelectorAll('{rows}')].map((row) => {script})"))
 

@@ -106,7 +106,7 @@ def through_gateway(session: httpx.Client) -> Ask:
 
 @dataclass
 class Callers:
-    """A context with ``count`` threads that call, each with one call at a time, and the outcomes of their calls.
+    """A context with ``count`` threads that call without end, and the outcomes of the calls.
 
     pause_s: time between two calls of a thread
     latencies_s: of answered calls only

@@ -55,7 +55,7 @@ def run(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 def rows(output: str, row: str) -> list[list[str]]:
-    """The cells of each table row that begins so."""
+    """Return the cells of table rows with this beginning."""
     return [re.split(r"\s{2,}", line.strip()) for line in output.splitlines() if line.strip().startswith(row)]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An environment whose frames say which environment, episode and step they are of, and a client that reads that."""
+"""An environment whose frames encode environment, episode and step, and a client that reads the code."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class CodedEnv(gym.Env[Any, Any]):
 
     @property
     def has_ended(self) -> bool:
-        """Whether a step would be one after the episode's end."""
+        """True if the next step would follow the episode's end."""
         return self.t >= self.lengths[self.episode % len(self.lengths)]
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
@@ -74,7 +74,7 @@ class CodedEnv(gym.Env[Any, Any]):
 
 
 class Recorder(RewardClient):
-    """A client of a stand-in server, which keeps the frames' codes and the task of every question.
+    """A client of a stand-in server. Keeps the frames' codes and the task of every question.
 
     failing: number of the call that fails
     """

@@ -29,7 +29,7 @@ OWNER = re.compile(rf"{REGION_PREFIX}_(\d+)_")
 
 
 def is_alive(pid: int) -> bool:
-    """Whether there is a process of this id that has not ended."""
+    """Return True if the process has not ended."""
     return not has_ended(pid)
 
 
@@ -62,7 +62,7 @@ def running(words: str, most: int | None = None) -> set[int]:
 
 
 def tritons() -> set[int]:
-    """Process ids of every tritonserver that this run of the tests has started."""
+    """Return the ids of all tritonservers of this test run."""
     return {pid for pid in running("tritonserver", 1) if is_ours(pid)}
 
 
@@ -78,7 +78,7 @@ def is_ours(pid: int) -> bool:
 
 @contextmanager
 def nothing_left_behind() -> Iterator[None]:
-    """Within it, servers may start; behind it, none of this run is there, nor anything of it in shared memory."""
+    """Allow servers to start, and check that no process and no shared memory of this run is left."""
     regions_before, tritons_before = regions(), tritons()
     yield
     ends_s = time.monotonic() + EXIT_S

@@ -61,7 +61,7 @@ def two_cameras(observation: dict[str, Any]) -> dict[str, UInt8Array]:
 
 
 def scores(client: RewardClient, video: Video, step: int, max_frames: int | None = MAX_FRAMES) -> ProgressResult:
-    """Of the frames up to a step as upstream's RL loop sends them, cut or padded to ``max_frames``; None: all frames.
+    """Score the frames up to a step as upstream's RL loop does, cut or padded to ``max_frames``; None: all frames.
 
     Without the padded slots but the last, which is the newest frame's.
     """
@@ -105,7 +105,7 @@ def assert_close(left: Any, right: Any) -> None:
 
 
 class SlowConnection(Connection):
-    """To the real server; a question whose longest trajectory has a length that is held waits until it is let go."""
+    """A connection to the real server that holds questions by the length of the longest trajectory."""
 
     def __init__(self, url: str) -> None:
         super().__init__(url)

@@ -63,7 +63,7 @@ def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfo
 
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """The one browser of all tests of the page."""
+    """The shared browser."""
     from browsers import chromium
 
     with chromium(tmp_path_factory.mktemp("downloads")) as started:

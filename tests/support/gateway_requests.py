@@ -238,7 +238,7 @@ def post_body(
 
 @contextmanager
 def paused(triton: Triton) -> Iterator[None]:
-    """Within it nothing comes through to Triton, and nothing from it."""
+    """Stop all bytes to and from Triton."""
     with ExitStack() as held:
         for proxy in triton.proxies:
             held.enter_context(proxy.held())

@@ -56,7 +56,7 @@ class Gateway:
         return requests.get(f"{self.url}{path}", timeout=WITHIN_S, **options)
 
     def metric(self, name: str, **labels: str) -> float:
-        """Of the gateway's own."""
+        """Return the value of a metric of the gateway."""
         return metric_at(f"{self.url}/metrics", f"rfm_gateway_{name}", **labels)
 
 

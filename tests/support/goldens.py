@@ -107,7 +107,7 @@ class Config:
 
     @property
     def tolerances(self) -> tuple[float, float]:
-        """Of raw scores and of probabilities, in float32."""
+        """Tolerances of raw scores and probabilities in float32."""
         if not self.is_vlm:
             return REWIND_TOLERANCES
         return LORA_TOLERANCES if self.summary["lora"] else VLM_TOLERANCES
@@ -151,18 +151,18 @@ class Case:
 
     @property
     def tolerances(self) -> tuple[float, float]:
-        """Of raw scores and of probabilities, in float32; wide where the reference was computed in bfloat16 alone."""
+        """Tolerances of raw scores and probabilities; wide for references in bfloat16 alone."""
         rounded = self.config.is_bfloat16 and not self.has_float32
         return ROUNDED_TOLERANCES if rounded else self.config.tolerances
 
     @property
     def has_float32(self) -> bool:
-        """Whether a case of a checkpoint in bfloat16 was also computed in float32."""
+        """True if a case of a bfloat16 checkpoint also has float32 references."""
         return any(key.startswith("fp32.") for key in self.content["expected_arrays"])
 
     @property
     def is_refused(self) -> bool:
-        """Whether the request has to be refused."""
+        """True if the request has to be refused."""
         return "expectation" in self.content
 
     def samples(self) -> list[Sample]:
@@ -183,7 +183,7 @@ class Case:
     def expected(self, *, bfloat16: bool = False) -> list[Expected]:
         """Read the raw arrays, which the original's answer does not contain in full.
 
-        bfloat16: of a checkpoint in bfloat16 its scores in that type; else those in float32
+        bfloat16: True: scores in bfloat16 if the checkpoint has that type; False: in float32
         """
         arrays = self.arrays
         if not bfloat16 and self.has_float32:
@@ -247,7 +247,7 @@ def config(name: str) -> Config:
 
 
 # What the shared server serves: ReWiND, ReWiND with encoders, Qwen3-VL on images, Qwen2.5-VL on video. Each reference
-# case runs on the engine; through Triton one of each of these, and one that is refused.
+# case runs on the engine; through Triton one case of each model, and a refused one.
 SERVED = [config(name) for name in ("c1_t1_disc10", "enc_c1_t1_disc10", "q3_tok_disc10", "q25_video_avg_disc10")]
 SERVED_CASES = [next(case for case in each.cases() if case.file.stem.startswith("mixed")) for each in SERVED]
 REFUSED_CASE = next(case for each in SERVED for case in each.cases() if case.is_refused)
@@ -320,7 +320,7 @@ class _Reader:
     def expected(self, sample: Sample, row: int, prefix: str) -> Expected:
         kind = sample_type(sample)
         lengths = [trajectory.num_frames for trajectory in sample.trajectories]
-        if isinstance(sample, ProgressSample) and sample.frame_steps:  # one row a prefix, of which the last counts
+        if isinstance(sample, ProgressSample) and sample.frame_steps:  # one row per prefix; the last frame counts
             rows = range(row, row + lengths[0])
             progress, success = (
                 [np.stack([self._raw(f"{prefix}{kind}.{name}_logits_A", r)[-1] for r in rows])]
@@ -346,7 +346,7 @@ class _Reader:
         return [part[np.arange(length) // each] for part, length in zip(parts, lengths, strict=True)]
 
     def _raw(self, name: str, row: int) -> Array:
-        """[T] or [T, K]; of one frame the original may leave the axis of time out."""
+        """[T] or [T, K]; for a single frame the original may omit the time axis."""
         discrete = self.config.is_discrete and "progress" in name.rpartition(".")[2]
         return (
             self.arrays[name][row]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The commands ``rfm`` and ``rfm-client`` in this process, which saves the seconds of their imports."""
+"""The commands ``rfm`` and ``rfm-client`` in this process, which saves seconds of imports."""
 
 from __future__ import annotations
 

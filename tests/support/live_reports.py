@@ -21,7 +21,7 @@ Json = dict[str, Any]
 
 
 def picture(seed: int = 0, size: tuple[int, int] = (48, 64)) -> UInt8Array:
-    """A frame of one colour, which survives JPEG."""
+    """Return a frame with a single colour, which survives JPEG."""
     return np.full((*size, 3), np.random.default_rng(seed).integers(0, 256, 3), np.uint8)
 
 

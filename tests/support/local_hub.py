@@ -21,7 +21,7 @@ def commit_of(revision: str) -> str:
 
 @contextmanager
 def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") -> Iterator[str]:
-    """Serves repositories by id (``org/name``), each with the files of a folder at each revision. Gives the endpoint.
+    """Serve repositories by id (``org/name``) with a folder per revision. Yields the endpoint.
 
     kind: ``models`` or ``datasets``. All revisions but main are tags
     """
@@ -97,5 +97,5 @@ def _told(file: Path, folder: Path) -> dict[str, object]:
 
 
 def _commit(revisions: Mapping[str, Path], revision: str) -> str:
-    """The commit of a revision, which may be one."""
+    """Return the commit of a revision or commit."""
     return commit_of(revision) if revision in revisions else revision

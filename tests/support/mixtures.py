@@ -53,7 +53,7 @@ def plug() -> list[Sample]:
 
 
 def counts(served: Served, model: str) -> tuple[int, int]:
-    """Return the number of good answers and of pipeline executions so far. Triton counts its own calls."""
+    """Return the numbers of good answers and pipeline executions so far. Triton counts only calls."""
     time.sleep(TOLD_S)
     with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as client:
         stats = client.get_inference_statistics(model).model_stats[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A small repository whose model breaks when it is told to, and callers that notice."""
+"""A small repository with a model that breaks on demand, and callers that notice."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rfm_client import ProgressSample, RewardClient, Trajectory
 from servers import MODEL
 
 CALLERS = 16
-MARK = 7.0  # in the text embedding of a sample that a model of this test dies of
+MARK = 7.0  # in the text embedding of a deadly sample
 
 
 def answering(body: str) -> str:
@@ -44,7 +44,7 @@ DEADLY = answering(f"if {MARK} in marks: os._exit(1)")
 
 
 def answering_after(seconds: float, began: Path | None = None) -> str:
-    """Code for a model.py whose answers take so much longer. began: a file that is there once it works on one"""
+    """Return code for a model.py with slower answers. began: a file that each answer creates first"""
     note = "" if began is None else f"pathlib.Path({str(began)!r}).touch(); "
     return answering(f"{note}time.sleep({seconds})")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Two GPUs that are not there: tensors that say that they lie on ``cuda:0`` or ``cuda:1``, and are computed on the CPU.
+"""Two pretended GPUs: tensors claim to lie on ``cuda:0`` or ``cuda:1``, and the CPU computes them.
 
 As on GPUs, an operator that is given tensors of two places fails, and ``cuda`` is the thread's current device. What the
 host would wait for is counted: values that it asks for, and copies from memory that is not pinned. CUDA's own calls are
@@ -141,7 +141,7 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any], seen: Seen) -> Any:
     if not there and target.type != "cuda":
         return func(*args, **kwargs)
     if name == "_has_compatible_shallow_copy_type":
-        return False  # a parameter that lies here cannot become one that lies there: a new one is made
+        return False  # a parameter cannot move to another device, so a new one is made
     seen.num_operators += 1
     is_copy = (name in _COPIES and told is not None) or name == "copy_"
     if there and not is_copy:

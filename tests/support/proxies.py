@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A TCP proxy in front of a server: connections through it fall silent, or are held back for a while.
 
-A server is not stopped by a signal for that: where Triton 2.51's processes stop while one of them has a lock that
+No signal stops the server for that: if Triton 2.51's processes stop while one of them has a lock that
 another waits for, Triton ends as soon as they go on ("boost::interprocess::lock_exception"). It was seen in 1 of 48
 stops.
 """
@@ -102,7 +102,7 @@ class Proxy:
 
 
 class HttpProxy(Proxy):
-    """An HTTP proxy for CONNECT, behind which every host is the port. asked: the ``host:port`` of each CONNECT."""
+    """An HTTP proxy for CONNECT that maps every host to the port. asked: the ``host:port`` of each CONNECT."""
 
     def __init__(self, port: int) -> None:
         self.asked: list[str] = []

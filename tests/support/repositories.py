@@ -46,7 +46,7 @@ def configure(model: Path, *, instances: int = 1, batch_size: int = 64, **parame
 
 
 def bound_queue(model: Path, *, max_queue_size: int = 0, timeout_ms: int = 0) -> None:
-    """Changes an exported model's configuration: so many requests may wait in Triton, and so long; 0: any."""
+    """Bound the queue of an exported model in number and time of requests; 0: unbounded."""
     with changing(model) as config:
         policy = config.dynamic_batching.default_queue_policy
         policy.max_queue_size, policy.default_timeout_microseconds = max_queue_size, 1000 * timeout_ms
@@ -54,7 +54,7 @@ def bound_queue(model: Path, *, max_queue_size: int = 0, timeout_ms: int = 0) ->
 
 
 def kill_model(repository: Path, model: str = "rfm") -> None:
-    """Kills each process of a model that a server of ``repository`` runs."""
+    """Kill all processes of a model in ``repository``."""
     model_file = f"{repository}/{model}/1/model.py"
     killed = running(model_file)
     assert killed

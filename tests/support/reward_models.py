@@ -47,7 +47,7 @@ class Reference:
         return dict(np.load(self.file.with_suffix("").with_suffix(".expected.npz")))
 
     def samples(self, last: int | None = None) -> list[ProgressSample]:
-        """The request's samples. last: only as many frames, from the end"""
+        """Return the request's samples. last: keep only the last N frames"""
         inputs = self.file.parent / self.content["inputs"]
         arrays = np.load(inputs.with_suffix(".npz"))
         samples = []

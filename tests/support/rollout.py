@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Two versions of a checkpoint on one server, and callers who compare each answer with that of the version it names.
+"""Two versions of a checkpoint on a server, and callers who compare answers with the named version's.
 
 They send embeddings and raw frames, in turn, one request at a time and a few a second each, and retry nothing.
 """
@@ -41,7 +41,7 @@ NAME = "rfm"
 WITH_ENCODERS = goldens.config("enc_c1_t1_disc10")
 WIDTHS = (48, 32)
 FRAME_PX = 48
-CLEARLY = 1e-2  # versions differ by at least so much
+CLEARLY = 1e-2  # the least difference between versions
 CALLERS = 32
 PAUSE_S = 0.2  # a control loop's step; without it they would slow down the loading
 
@@ -50,7 +50,7 @@ PAUSE_S = 0.2  # a control loop's step; without it they would slow down the load
 class Tally:
     """Outcomes of requests.
 
-    unlike: answers that are neither version's, or not that of the version they name
+    unlike: answers of neither version, or of another version than the named one
     failed: requests without an answer; late: those past the deadline
     """
 
@@ -134,7 +134,7 @@ def callers(
     count: int = CALLERS,
     timeout_s: float = DEFAULT_TIMEOUT_S,
 ) -> Iterator[Tally]:
-    """So many ask on and on within it. expected: answers by version"""
+    """Run ``count`` callers. expected: answers by version"""
     tally, stop, begun = Tally(), threading.Event(), threading.Event()
 
     async def call(client: AsyncRewardClient, index: int) -> None:

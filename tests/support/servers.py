@@ -157,7 +157,7 @@ def children(pid: int, program: str = "") -> list[int]:
 
 
 def model_processes(triton: int, model: str = MODEL) -> list[int]:
-    """The processes of a model that live, of the tritonserver ``triton``; a zombie has no arguments."""
+    """Return the live processes of a model below the tritonserver ``triton``; a zombie has no arguments."""
     return sorted(running(f"/{model}/", 2) & set(children(triton, "triton_python")))
 
 
@@ -210,7 +210,7 @@ class Serving:
         return sum(self.metric("rfm_serve_restarts_total", what=name) for name in what)
 
     def api(self) -> RepositoryApi:
-        """Of one that is ``administered``."""
+        """Return the repository API of an ``administered`` server."""
         return RepositoryApi(self.endpoints.grpc_url, KEY)
 
     @property
@@ -250,7 +250,7 @@ def serving(repository: Path, *more: str, to: Path | None = None) -> Iterator[Se
 
 @contextmanager
 def administered(repository: Path, *more: str, **settings: int) -> Iterator[Serving]:
-    """Within it, the repository is served, with these settings and an admin key, and was ready."""
+    """Run ``rfm serve`` with these settings and an admin key until ready."""
     key_file, config = repository.parent / "key", repository.parent / "serve.yaml"
     key_file.touch(0o600)
     key_file.write_text(KEY)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Servers that stand in for real ones, whose checkpoint is replaced by another while callers ask."""
+"""Stand-in servers that replace the checkpoint while callers ask."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ V2 = Kept(0.9, "2", "weights-of-v2")
 
 @dataclass
 class Shelf:
-    """A server with a checkpoint, and another one as soon as it has answered so many requests about samples.
+    """A server that changes the checkpoint after ``after`` requests about samples.
 
-    parts: models that then are of the other one
+    parts: models that then belong to the other checkpoint
     """
 
     kept: Kept = V1

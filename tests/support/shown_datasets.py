@@ -45,7 +45,7 @@ def encoded_anew(video: Path, codec: str, options: dict[str, str], noise: np.ran
 
 
 def large(root: Path, num_episodes: int, seed: int = 0) -> Path:
-    """A LeRobot v3.0 dataset of so many episodes of two frames, without videos, and labels of it."""
+    """Write a LeRobot v3.0 dataset of N two-frame episodes without videos, and labels."""
     source, numbers = LEROBOT / "toy_v30_many", np.arange(num_episodes)
     (root / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
     (root / "data" / "chunk-000").mkdir(parents=True)

@@ -61,12 +61,12 @@ def text(name: str, content: str) -> Spoil:
 
 
 def text_settings(**changes: Any) -> Spoil:
-    """Of the language model in a vision-language one."""
+    """Names of the language model's layers in a vision-language model."""
     return in_json("config.json", lambda content: content["text_config"].update(changes))
 
 
 def conversion(load: Callable[[Path], object], folder: Path) -> str:
-    """Return the command that the refusal of ``load`` tells to type."""
+    """Return the command in the refusal of ``load``."""
     with pytest.raises(CheckpointError) as refusal:
         load(folder)
     (command,) = re.findall(r"python -c .*", str(refusal.value))

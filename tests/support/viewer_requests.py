@@ -44,7 +44,7 @@ def events(response: requests.Response) -> list[tuple[str, Json]]:
 
 
 def curve_of(told: Sequence[tuple[str, Json]]) -> Json:
-    """The curve that the events tell, of which none is missing and none comes twice."""
+    """Return the curve from the events, after a check for missing and repeated steps."""
     (first, video), *others, (last, _) = told
     assert (first, last) == ("video", "done"), told
     progress: list[Any] = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The requests of one batch, with a stand-in for the module that Triton gives to a model."""
+"""The requests of a batch, with a stand-in for Triton's Python module."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_requests_are_answered_together_and_each_gets_its_own(tmp_path: Path) ->
 
 
 def test_refused_and_failed_requests_fail_alone(tmp_path: Path) -> None:
-    """As one does whose tensors cannot be had, or read."""
+    """Fail like a request with missing or unreadable tensors."""
     model = Model(tmp_path)
     unreadable = Request(request(1).tensors | {"num_frames": np.zeros((1, 2), np.int32)})
     responses = model.respond(

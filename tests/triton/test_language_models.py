@@ -140,7 +140,7 @@ def test_unclear_answers_are_marked(asked: Served, protocol: str, is_old: bool) 
 
 
 class Newer(Connection):
-    """Tells of marks that the server's export does not have, as a description of before a rollback does."""
+    """Claims marks that the server's export lacks, like a description from before a rollback."""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         return replace(await super().model_info(model, timeout_s), marks_unclear=True)

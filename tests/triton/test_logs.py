@@ -158,7 +158,7 @@ def test_what_failed_is_logged_as_an_error_with_its_traceback(running: Running) 
 
 @pytest.mark.triton
 def test_the_requests_of_a_call_begin_alike(running: Running) -> None:
-    """One of three samples, which is refused, then each sample alone."""
+    """A refused batch of three, then each sample alone."""
     with running.client() as client:
         outcomes = client.evaluate([GOOD, TOO_LONG, GOOD], return_errors=True, request_id="call")
         assert isinstance(outcomes[1], InvalidSampleError)

@@ -151,7 +151,7 @@ def test_two_instances_count_apart_and_add_up(served_too: Served) -> None:
 
 
 def test_histograms_add_up_to_what_each_execution_took(served: Served) -> None:
-    """Sequential requests are separate executions, and results tell the times."""
+    """Sequential requests are separate executions with times in the results."""
     engine = load_engine(MODEL)
     requests = [mixed_samples(count) for count in (1, 2, 5, 9)]
     expected_padding = 0.0
@@ -193,7 +193,7 @@ def test_metrics_have_their_kinds_buckets_and_labels(served_too: Served) -> None
     of_one = [s.labels for s in scraped.family("samples").samples if s.labels["instance"] == f"{TWICE}_0_1"]
     assert {(labels["sample_type"], labels["outcome"]) for labels in of_one} == {
         (kind, outcome) for kind in (*TYPES, UNKNOWN_TYPE) for outcome in OUTCOMES
-    }  # before there is one of them, so that the first is an increase
+    }  # before the first, which must count as an increase
 
 
 def test_raw_frames_are_counted_where_they_are_encoded_and_where_they_are_scored(served: Served) -> None:

@@ -61,7 +61,7 @@ def video(seed: int, num_frames: int, height: int, width: int) -> Trajectory:
 
 
 def filmed_samples(count: int) -> list[Sample]:
-    """Pairs of both types, of one and of two sizes, and single videos; lengths and sizes differ from one to the next."""
+    """Return pairs of both types with equal and different sizes, and single videos, all with different lengths."""
     samples: list[Sample] = []
     for index in range(count):
         size = (48, 100) if index % 2 else (90, 61)
@@ -248,7 +248,7 @@ def test_what_cannot_be_scored_is_refused_with_what_was_expected(served: Served,
 
 @pytest.mark.parametrize("model", [MODEL, f"{FRAMES_MODEL}_encoder", f"{VLM}_frames"])
 def test_a_batch_of_no_samples_is_refused(served: Served, model: str) -> None:
-    """Triton lets it pass if the bytes are those of one sample. An ensemble answers it as that sample."""
+    """Triton lets the request pass if the bytes fit a single sample, which an ensemble then scores."""
     question = embedded() if model == MODEL else {**QUESTION, "task": np.array([[4, 0, 0, 0, *b"lift"]], np.uint8)}
     if model.endswith("_encoder"):
         question = {name: question[name] for name in ("num_frames", "frames", "task")}
@@ -354,7 +354,7 @@ def test_one_model_missing_is_named_and_does_not_cost_the_others(served: Served)
 
 @pytest.mark.slow
 def test_a_full_queue_refuses_at_once_and_patience_is_served(served: Served) -> None:
-    """By Triton's own policy; with one instance, Triton 2.51 notices a free one half a second late."""
+    """By Triton's policy. With a single instance, Triton 2.51 notices it free half a second late."""
     config, name = goldens.config(MODEL), "queued"
     rfm_export.export(config.checkpoint, served.repository, serve_config(config, name))
     file = served.repository / name / "1" / "model.py"
