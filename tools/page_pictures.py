@@ -85,7 +85,7 @@ def main() -> None:
         repository = Path(shutil.copytree(ROOT / "model_repository", folder / "model_repository"))
         endpoints = stack.enter_context(start_triton(repository)).endpoints
         client = stack.enter_context(RewardClient(endpoints.grpc_url))
-        client.wait_ready()
+        client.wait_ready(60)
         dataset = copied("toy_v30_many", folder)
         label(open_dataset(dataset), ClientScorer(client), LabelOptions())
         gateway = stack.enter_context(running(endpoints, folder, "rfm", "--dataset", str(dataset)))
