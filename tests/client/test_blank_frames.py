@@ -23,7 +23,7 @@ NOISE = np.random.default_rng(0).integers(0, 256, SIZE, np.uint8)
 
 
 def with_pixel(frame: UInt8Array, value: int) -> UInt8Array:
-    """The frame with a pixel of this value at a place that a coarse grid misses."""
+    """Return the frame with a pixel of this value between the points of a coarse grid."""
     marked = frame.copy()
     marked[13, 17] = value
     return marked

@@ -36,7 +36,7 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def shown(endpoints: Endpoints, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[str], list[str]]:
-    """The words and lines that a command about the demo's checkpoint shows, which fit the terminal."""
+    """Run a command about the demo's checkpoint. Return words and lines, which fit the terminal."""
     told, lines = on_terminal(*asked, "--url", endpoints.grpc_url)
     assert told == code, lines
     assert max(map(len, lines)) <= WIDTH

@@ -78,7 +78,7 @@ def test_a_server_that_hangs_costs_one_call_and_is_left_out(demo_server: Endpoin
     with socket.create_server(("127.0.0.1", 0)) as hung:
         urls = [f"{protocol}://127.0.0.1:{hung.getsockname()[1]}", url_of(demo_server, protocol)]
         with RewardClient(urls, timeout_s=2) as client:
-            client.wait_ready(30)  # the one that is ready is enough
+            client.wait_ready(30)  # a single ready server is enough
             outcomes: list[Result | Exception] = []
             for _ in range(6):
                 outcomes += client.evaluate([ProgressSample(trajectory(0))], return_errors=True)
@@ -112,7 +112,7 @@ def test_a_request_that_the_server_does_not_take_goes_over_a_new_connection_with
 
 
 def test_calls_that_share_a_connection_with_one_that_hits_its_deadline_go_on(demo_server: Endpoints) -> None:
-    """Over a connection that is alive and slow: a call that has more time keeps it."""
+    """A slow connection stays open for calls with more time."""
     with Proxy(demo_server.grpc_port) as proxy, RewardClient(f"grpc://127.0.0.1:{proxy.port}") as client:
         expected = client.progress(trajectory(0))
         with proxy.held():

@@ -20,7 +20,7 @@ from rfm_client.contract import triton
 from rfm_client.transport.shared_memory import FOLDER, MIN_REGION_BYTES, MIN_SHARED_BYTES, SharedMemory
 
 SMALL = np.ones(MIN_SHARED_BYTES, np.uint8)
-LARGE = np.ones(MIN_REGION_BYTES + 1, np.uint8)  # more than the region of a small one holds
+LARGE = np.ones(MIN_REGION_BYTES + 1, np.uint8)  # too large for a small array's region
 WITHIN_S = 30.0
 
 
@@ -71,7 +71,7 @@ def run(test: Test) -> None:
 
 
 async def lend(server: Triton, memory: SharedMemory, array: np.ndarray[Any, Any] = SMALL) -> str:
-    """Name of the region that the array was in."""
+    """Return the name of the array's region."""
     async with memory.lend(server, array) as region:
         assert region is not None
         return region.name

@@ -57,7 +57,7 @@ class Stand:
             raise DeadlineExceededError("no answer in time")
         is_end = self.num_ends > 0
         self.num_ends -= is_end
-        await asyncio.sleep(0.01)  # all come before one of them ends
+        await asyncio.sleep(0.01)  # all come before the first ends
         if is_end:
             self.go_down(self.down_s)
             raise lost()

@@ -52,7 +52,7 @@ def video(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array
 
 
 def offline(client: RewardClient, frames: UInt8Array, sampling: Sampling = FOUR, task: str = TASK) -> ProgressResult:
-    """Each frame's score from the prefix that ends with it, all pixels sent."""
+    """Return the scores of all prefixes, with all pixels sent."""
     results = client.evaluate(list(prefix_samples(Trajectory(frames=frames, task=task), sampling)))
     return of_prefixes([result for result in results if isinstance(result, ProgressResult)], sampling)
 
@@ -116,7 +116,7 @@ def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: S
     frames = video(100, 12, (56, 84))
 
     def encoded() -> dict[str, float]:
-        """Frames so far, by model. Each has told Triton of all by now."""
+        """Return the frames so far by model, after the models' reports."""
         time.sleep(TOLD_S)
         families = list(text_string_to_metric_families(httpx.get(served.endpoints.metrics_url).text))
         samples = [sample for family in families for sample in family.samples]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which errors a request may have caused, which requests are too large, and where a name leads."""
+"""Errors that a request may have caused, requests that are too large, and names with several addresses."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_which_errors_a_request_may_have_caused(message: str, may_have_ended: bo
 
 
 def test_requests_are_spread_over_the_addresses_of_a_name() -> None:
-    """A list of addresses stands for the name: none of several can be had without a DNS server."""
+    """A list of addresses stands for the name, which would need a DNS server."""
     counts = [0, 0]
 
     def serve(number: int) -> grpc.Server:

@@ -24,7 +24,7 @@ __all__ = ["references"]  # a fixture
 
 POISON = trajectory(99, mark=MARK)
 NUM_SERVERS = 3
-LONG_S = 4 * PATIENCE_S  # so that a machine that is slow to heal a model decides nothing
+LONG_S = 4 * PATIENCE_S  # generous, for slow machines
 
 
 @pytest.fixture

@@ -261,7 +261,7 @@ def test_frames_of_files_that_are_stored_as_bgr_become_rgb(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])
 def test_exif_data_turn_pictures(tmp_path: Path, suffix: str) -> None:
-    """Also those that a caller has opened, and those with EXIF data that do not turn them."""
+    """Also opened ones, and those with EXIF data but without a turn."""
     stored = np.repeat(np.repeat(FRAMES[0], 8, axis=0), 8, axis=1)
     for orientation, upright in ((1, stored), (6, np.rot90(stored, -1))):
         exif = Image.Exif()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A video of several LeRobot episodes is not one trajectory."""
+"""A video of several LeRobot episodes is not a trajectory."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ EXCEPTED = {
 def test_which_proxy_grpc_takes(
     proxy: HttpProxy, monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], expected: str | None
 ) -> None:
-    """gRPC itself is asked, too: of a proxy that it takes the host is asked."""
+    """Also ask gRPC itself, which asks its proxy for the host."""
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     assert grpc_proxy("server.lab:8001") == expected

@@ -22,7 +22,7 @@ from rfm_client.frames import frame_times_s
 from rfm_client.recording import Recording
 from servers import Endpoints
 
-JPEG_ERROR = 30  # of a pixel, by which the compressed picture may differ
+JPEG_ERROR = 30  # largest difference after compression
 NS_PER_S = 1e9
 
 
@@ -31,7 +31,7 @@ def entities(file: Path) -> set[str]:
 
 
 def logged(file: Path, timeline: str, entity: str, component: str) -> tuple[list[Any], list[Any]]:
-    """Times and values of a component, in the order of time."""
+    """Return a component's times and values in order."""
     view = rerun.dataframe.load_recording(file).view(index=timeline, contents=entity)
     table = view.select(timeline, f"{entity}:{component}").read_all()
     times, values = table.column(0).cast("int64").to_pylist(), table.column(1).to_pylist()

@@ -21,7 +21,7 @@ from servers import Served
 
 VECTORS = GOLDEN / "sampling-vectors.json"
 ELSEWHERE = goldens.ROOT.parent / VECTORS.name  # beside the further reference cases, where there are some
-READINGS = {"rewind_pad16": ("rewind_pad16_online", "rewind_pad16_offline")}  # the two of one function
+READINGS = {"rewind_pad16": ("rewind_pad16_online", "rewind_pad16_offline")}  # two arguments of the same function
 
 
 def cases(file: Path) -> Iterator[tuple[Sampling, int, list[int]]]:

@@ -72,7 +72,7 @@ def test_samples_of_all_kinds_and_lengths_arrive_as_they_were(make: Any) -> None
     for got, wanted in zip(wire.decode_samples(tensors), samples, strict=True):
         assert type(got) is type(wanted)
         assert getattr(got, "frame_steps", 0) == getattr(wanted, "frame_steps", 0)
-        text = wanted.trajectories[0]  # of a pair there is one
+        text = wanted.trajectories[0]  # a pair has one
         for one, other in zip(got.trajectories, wanted.trajectories, strict=True):
             np.testing.assert_array_equal(one.positions, other.positions)
             assert one.task == text.task

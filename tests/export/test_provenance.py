@@ -117,7 +117,7 @@ def test_the_scale_of_lora_says_its_file(vlm: Callable[[str], tuple[Path, Path]]
     assert decisions["lora"].value == {"r": 4, "lora_alpha": 8.0}
 
 
-# Of a checkpoint whose setting is read from it: the keys, and the value without them.
+# Settings from a checkpoint: the keys, and the value without them.
 KEYS: dict[str, tuple[str, list[str], object]] = {
     "dtype": (PLAIN, ["model.torch_dtype"], "bfloat16"),
     "per_frame_progress_token": (

@@ -40,7 +40,7 @@ def export(repository: Path, name: str = "rfm", config: goldens.Config = SMALL, 
 
 @contextmanager
 def as_any_user(folder: Path) -> Iterator[None]:
-    """A context in which this process, in ``folder``, has the rights of a user who may not do everything."""
+    """A context in which this process, in ``folder``, has an ordinary user's rights."""
     user = os.geteuid()
     try:
         if user == 0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Both families and the encoders on GPUs that PyTorch pretends to have: the CPU's numbers, and few waits of the host."""
+"""Both families and the encoders on pretended GPUs: the CPU's numbers, and few waits of the host."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def engine_there(name: str, feature_cache_mib: int = 0, device: torch.device = C
         return Engine.of(checkpoint, encoders=checkpoint.encoders(), **options)
 
 
-# How often the host waits in a batch like one that was scored before: for values, and for copies to the device.
+# Waits of the host in a batch like an earlier one: for values, and for copies to the device.
 # Vision-language models read all scores at once; for SmolVLM transformers looks for images of zeros.
 WAITS = {
     "c1_t1_disc10": (5, 11),  # progress, logits, success, questions twice; the parts of a batch
@@ -52,7 +52,7 @@ WAITS = {
 def test_a_device_gives_the_reference_answers_and_waits_no_more_often_than_it_must(
     seen: Seen, config: goldens.Config
 ) -> None:
-    """The device is the second, which is not the current one: no tensor may lie elsewhere."""
+    """The network is on the second device, not the current one; no tensor may lie elsewhere."""
     if config.name.startswith("smol") and TRANSFORMERS >= 5:
         pytest.skip("SmolVLM is refused with transformers 5")
     engine = engine_there(config.name, device=SECOND)

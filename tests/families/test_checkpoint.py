@@ -33,7 +33,7 @@ from spoilt import Spoil, conversion, convert, copied, in_json, settings, text, 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
 MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # the configs say l2 and 32 bins, the weights 5 bins
 IN_RUN_FOLDER = "c1_t1_disc10"  # config.yaml in the parent folder
-WITH_IMAGES = "q3_tok_disc10"  # a vision-language one: each frame an image, with a progress token
+WITH_IMAGES = "q3_tok_disc10"  # vision-language: every frame an image, with a progress token
 ADAPTER = "q25_peft_adapter_disc10"
 ENCODED = "enc_c1_t1_disc10"
 TAG = "best-p-rank-0.8500-step-123"
@@ -41,7 +41,7 @@ TAG = "best-p-rank-0.8500-step-123"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A copy of a reference checkpoint that a test may spoil."""
+    """A copy of a reference checkpoint for a test to spoil."""
     return copied(goldens.config(CONTINUOUS), tmp_path / "checkpoint")
 
 
@@ -153,7 +153,7 @@ def lost_shard(folder: Path) -> None:
 
 
 def in_two(weights: dict[str, Tensor], names: tuple[str, str]) -> tuple[dict[str, dict[str, Tensor]], str]:
-    """The weights of each shard, and the index."""
+    """Return the weights by shard, and the index."""
     keys = sorted(weights)
     shards = {
         name: {key: weights[key] for key in part} for name, part in zip(names, (keys[:20], keys[20:]), strict=True)
@@ -534,7 +534,7 @@ def test_what_is_neither_folder_nor_id_is_refused(source: str) -> None:
 
 
 def said(sources: Iterable[str]) -> dict[str, str]:
-    """The configuration in JSON, or the refusal, of each checkpoint."""
+    """Return each checkpoint's configuration as JSON, or the refusal."""
     outcomes = {}
     for source in sources:
         try:

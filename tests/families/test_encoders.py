@@ -289,7 +289,7 @@ def test_what_an_encoder_s_source_lacks_is_told_with_its_option(encoders: Encode
         checkpoint.encoders()
 
 
-# Of a picture of 4 x 4 pixels: the crop, and where the picture begins in it, or the crop in the picture where it is less.
+# For a 4 x 4 picture: the crop, and the offset of the picture in it, or of a smaller crop in the picture.
 CROPS = {
     "both smaller, evenly": ((6, 8), (1, 2)),
     "both smaller, by odd counts: more zeros behind": ((7, 5), (1, 0)),

@@ -108,7 +108,7 @@ class Fixed:
 
 
 def scores_of(**changed: float | None) -> FrameScores:
-    """Scores of one frame."""
+    """Return the scores of a frame."""
     values = {"progress": 0.5, "success": 0.5, **changed}
     return FrameScores(**{name: np.full(1, value, np.float32) for name, value in values.items() if value is not None})
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Families that the product does not know, and configurations that name none."""
+"""Foreign families, and configurations without a family."""
 
 from __future__ import annotations
 

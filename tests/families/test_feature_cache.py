@@ -36,7 +36,7 @@ def footage(frames: UInt8Array, task: str = TASK) -> EncoderSample:
 
 
 def named(frames: UInt8Array, sent: UInt8Array, task: str = TASK) -> EncoderSampleRefs:
-    """A question about frames of which only some are sent."""
+    """Return a question about frames with only some of them sent."""
     pixels = {frame_digest(frame): frame for frame in sent}
     return EncoderSampleRefs((TrajectoryRefs(tuple(map(frame_digest, frames)), pixels, task),))
 

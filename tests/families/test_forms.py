@@ -129,7 +129,7 @@ def test_lora_of_other_layers_is_refused(folder: Path, change: Callable[[dict[st
 
 
 def lost(pattern: str) -> Callable[[dict[str, Any]], None]:
-    """Takes the factors of the modules whose names match."""
+    """Remove the factors of modules with matching names."""
 
     def lose(tensors: dict[str, Any]) -> None:
         for name in [*tensors]:

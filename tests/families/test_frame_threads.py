@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frames are prepared in several threads for a GPU, each once, with the same pixels as in one thread."""
+"""Several threads prepare frames for a GPU: each once, with the same pixels as a single thread."""
 
 from __future__ import annotations
 

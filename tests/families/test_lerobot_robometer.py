@@ -22,7 +22,7 @@ from rfm_client import ProgressResult
 
 CASES = references("lerobot_robometer")
 CHECKPOINT = ROOT / "lerobot_robometer" / "tok_disc10" / "checkpoint"
-TOLERANCES = (1e-4, 2e-5)  # of logits and of answers, in float32; seen: 2e-6, 3e-7
+TOLERANCES = (1e-4, 2e-5)  # of logits and answers in float32; seen: 2e-6, 3e-7
 ROUNDED = 0.05  # of answers in bfloat16
 TOKENS = "model.lm_head.weight"
 

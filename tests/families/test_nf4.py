@@ -130,7 +130,7 @@ def test_other_types_of_bitsandbytes_are_refused_by_name(both: tuple[Path, Path]
 
 
 def test_config_json_may_say_nothing_of_nf4_but_nothing_wrong(both: tuple[Path, Path]) -> None:
-    """A trainer that saves weights alone leaves the configuration of the base model."""
+    """A trainer that saves weights alone keeps the base model's configuration."""
     few_bits, full = both
     shutil.copyfile(full / "config.json", few_bits / "config.json")
     assert "rounded_weights" in [each.name for each in load(PLAIN, few_bits).decisions()]

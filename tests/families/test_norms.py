@@ -65,7 +65,7 @@ def test_the_norms_of_gpus_give_the_bits_of_transformers_norms(name: str, dtype:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 300.0], ids=str)
 def test_a_norm_of_gpus_gives_the_bits_of_transformers_norm(scale: float, dtype: torch.dtype) -> None:
-    """Values as small as epsilon's root, and as large as those of some channels of trained networks."""
+    """Return values from epsilon's root to the largest channels of trained networks."""
     network = Engine.of(checkpoint(PLAIN), dtype=dtype).predictor.network  # type: ignore[attr-defined]  # of this family
     norm = network.model.language_model.norm
     torch.manual_seed(0)

@@ -44,7 +44,7 @@ def progress(engine: Engine, samples: list[Sample]) -> Float32Array:
 
 @pytest.fixture(scope="module")
 def cold() -> dict[str, list[float]]:
-    """Scores of the first pass of another process, by dtype."""
+    """Return the first pass's scores of another process by dtype."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(Path(__file__).parent), *sys.path]))}
     done = subprocess.run([sys.executable, "-c", COLD], env=environment, check=True, capture_output=True, text=True)
     return dict(json.loads(done.stdout))

@@ -54,7 +54,7 @@ def whole(frames: UInt8Array) -> ProgressSample:
 
 
 def named(frames: Sequence[UInt8Array], sent: Sequence[UInt8Array], frame_steps: int = 0) -> ProgressSampleRefs:
-    """A question about frames of which only some are sent."""
+    """Return a question about frames with only some of them sent."""
     pixels = {frame_digest(frame): frame for frame in sent}
     return ProgressSampleRefs(TrajectoryRefs(tuple(map(frame_digest, frames)), pixels, TASK), frame_steps)
 
@@ -150,7 +150,7 @@ def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> None:
-    """The last tokens of a video may stand behind all that is read."""
+    """The last tokens of a video may follow all positions that are read."""
     cache, frames = FeatureCache[Any](BYTES_PER_MIB), frames_of(12, 4)
     cached = engine(name, cache)
 
@@ -164,7 +164,7 @@ def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_a_frame_that_comes_many_times_is_brought_to_size_once(name: str) -> None:
-    """Or one large frame, named thousands of times, would take all memory."""
+    """Otherwise thousands of references to a large frame would take all memory."""
     cached, plain = of_both(name)
     frames = frames_of(13, 2)[[0, 1, 1, 0, 1, 1]]
     sample = named(frames, frames[:2])
@@ -227,7 +227,7 @@ def test_frames_that_were_evicted_are_kept_again_though_all_their_shots_are_kept
 
 
 def test_what_is_kept_holds_on_to_no_request() -> None:
-    """A frame of a large request would keep all of it."""
+    """A cached view would keep a whole large request in memory."""
     cache, frames = FeatureCache[Any](BYTES_PER_MIB), frames_of(10, 3)
     ask(engine(MODELS[0], cache), named(frames, frames))
     kept = cache.found([frame_digest(frame) for frame in frames])

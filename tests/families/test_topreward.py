@@ -90,7 +90,7 @@ def test_scores_are_those_of_the_original_code(case: Reference) -> None:
 
 
 def shortened(sample: ProgressSample, most: int) -> ProgressSample:
-    """The sample with the frames that Robometer's baseline picks of a longer video."""
+    """Return the sample with the frames that Robometer's baseline picks."""
     frames = sample.trajectory.positions
     if len(frames) > most:
         frames = frames[np.linspace(0, len(frames) - 1, most, dtype=int)]

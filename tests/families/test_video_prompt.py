@@ -208,7 +208,7 @@ def test_an_export_keeps_its_form(tmp_path: Path, name: str) -> None:
         (decision,) = (d for d in families.load(tmp_path / form).decisions() if d.name == "video_prompt")
         assert decision == Decision("video_prompt", form, "config.json")
     settings = json.loads((tmp_path / "bare" / "config.json").read_text())["rfm"]
-    assert "video_prompt" not in settings  # as in exports of before the setting, whose digests stay the same
+    assert "video_prompt" not in settings  # as in exports before the setting, which keep the digest
     with pytest.raises(CheckpointError, match="leave it out, or export the checkpoint again"):
         families.load(tmp_path / "bare", video_prompt="wrapped")
 

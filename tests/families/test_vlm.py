@@ -157,7 +157,7 @@ def test_a_mixture_equals_its_samples_alone(name: str, token_budget: int, step: 
 
 
 def test_an_ordinary_video_over_the_token_budget_is_scored() -> None:
-    """The budget decides which samples share a forward pass, not which are scored."""
+    """The budget decides how samples share forward passes, not whether they are scored."""
     samples = [ProgressSample(video(0, 12, 280, 420)), PreferenceSample(video(1, 6, 280, 420), video(2, 7, 280, 420))]
     samples.append(ProgressSample(video(3, 5, 84, 84), frame_steps=4))
     engine = Engine(load_engine(PLAIN).predictor, token_budget=100)
@@ -186,7 +186,7 @@ TWO_SIZES: dict[str, Callable[[], VlmPredictor]] = {
 
 
 def pooled(network: Any, states: torch.Tensor) -> torch.Tensor:
-    """[D] of the states [N, D] of a frame's tokens."""
+    """Return [D] from the states [N, D] of a frame's tokens."""
     if not network.config.pools_by_attention:
         return states.mean(dim=0)
     weights = (network.frame_pool_attn(states) / network.config.pooling_temperature).softmax(dim=0)

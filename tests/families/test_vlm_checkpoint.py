@@ -199,7 +199,7 @@ def drop_first(part: str) -> Callable[[dict[str, Any]], object]:
 
 
 def cut_first(part: str) -> Callable[[dict[str, Any]], object]:
-    """Takes the last column of the first tensor whose name has ``part``."""
+    """Remove the last column of the first tensor with ``part`` in the name."""
 
     def cut(weights: dict[str, Any]) -> None:
         name = next(name for name in weights if part in name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which hosts and which pages the gateway answers. No Triton is needed."""
+"""The gateway answers known hosts and pages alone. No Triton is needed."""
 
 from __future__ import annotations
 

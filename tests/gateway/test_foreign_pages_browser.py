@@ -78,7 +78,7 @@ def tried(browser: Browser, base: str) -> Json:
 
 
 def passed_on(gateway: Gateway) -> float:
-    """The number of requests that were not refused."""
+    """Return the number of accepted requests."""
     return gateway.metric("requests_total") - sum(
         gateway.metric("requests_total", code=code) for code in ("403", "421")
     )

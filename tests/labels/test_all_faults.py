@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One message names the faults of all episodes, and the options to go on with."""
+"""A message names the faults of all episodes and the options to continue."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def broken(folder: Path) -> Path:
 
 
 def without_tasks(folder: Path, *blank: str) -> Path:
-    """Each of these texts stands in for a task, from the first on."""
+    """Replace the tasks by these texts in order."""
     root = shutil.copytree(LEROBOT / "toy_v21", folder / "toy")
     file = root / "meta" / "tasks.jsonl"
     lines = [json.loads(line) for line in file.read_text().splitlines()]

@@ -45,7 +45,7 @@ def black(count: int = 12) -> np.ndarray[Any, Any]:
 
 
 def lines_of(source: Path, output: Path, **options: Any) -> list[str]:
-    """The lines of a run about pictures that show nothing."""
+    """Return a run's lines about blank pictures."""
     notes = Notes()
     dataset = open_dataset(source, task=TASK, override_task=True)
     label(dataset, BrightnessScorer(), LabelOptions(output=output, frames=2, **options), notes)

@@ -39,7 +39,7 @@ def tables_of(root: Path, below: str) -> list[Path]:
 
 
 def changed(below: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
-    """Changes the rows of episode 1 in the tables of a folder."""
+    """Change the rows of episode 1 in a folder's tables."""
 
     def apply(root: Path) -> None:
         for file in tables_of(root, below):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 files with links that lead nowhere, odd attributes and names, or damage: a line or an error names each fault."""
+"""HDF5 files with dead links, odd attributes and names, or damage: a line or an error names each fault."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which reward model suits a dataset: measures of label files, against slow formulas and known cases."""
+"""Measures of label files, against slow formulas and known cases."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_rank_correlations_are_those_of_slow_formulas(seed: int) -> None:
 
 
 def test_successes_are_told_from_failures(tmp_path: Path) -> None:
-    final = {0: 0.9, 1: 0.8, 2: 0.8, 3: 0.1}  # the last of each episode; a tie between a success and a failure
+    final = {0: 0.9, 1: 0.8, 2: 0.8, 3: 0.1}  # the last of each episode; a success ties with a failure
     success = {0: [0.0, 0.7], 1: [0.0, 0.4], 2: [0.9, 0.3], 3: [0.0, 0.1]}
     file = labels(tmp_path / "good_progress.parquet", {each: [0.0, value] for each, value in final.items()}, success)
     comparison = evaluate_labels([file], {0: True, 1: True, 2: False, 3: False})
@@ -74,7 +74,7 @@ def test_successes_are_told_from_failures(tmp_path: Path) -> None:
     assert found.name == "good"
     assert found.by_progress is not None
     assert found.by_success is not None
-    assert found.by_progress.auroc == pytest.approx((4 - 0.5) / 4)  # of four pairs one is a tie
+    assert found.by_progress.auroc == pytest.approx((4 - 0.5) / 4)  # one of four pairs is a tie
     assert (found.by_success.auroc, found.by_success.balanced_accuracy) == (1.0, 1.0)
     assert found.by_success.threshold == pytest.approx(0.4)
     assert (found.final_of_successes, found.final_of_failures) == (pytest.approx(0.85), pytest.approx(0.45))
@@ -111,7 +111,7 @@ def test_many_episodes_take_a_moment(tmp_path: Path) -> None:
 
 def test_the_cost_is_that_of_the_frames_that_the_run_scored(tmp_path: Path) -> None:
     dataset, output = open_dataset(copied("toy_v30_many", tmp_path)), tmp_path / "labels"
-    request_s = 0.05  # and each episode is one request
+    request_s = 0.05  # and an episode is a request
 
     def frames_per_s(scorer: BrightnessScorer, watch: Watch = QUIET, **options: Any) -> float | None:
         label(dataset, scorer, LabelOptions(output=output, workers=1, **{**FEW, **options}), watch)

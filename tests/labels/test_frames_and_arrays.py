@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Episodes as folders of frames and as arrays, and folders of HDF5 files."""
+"""Episodes as frame folders and arrays, and folders with HDF5 files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rfm_client.frames import Orient
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 TASK = "stack the cups"
-COUNT = 12  # frames of an episode, so that 10.png is there
+COUNT = 12  # frames of an episode; more than 10, so 10.png exists
 
 
 def write_frames(folder: Path, frames: Any, suffix: str = ".png") -> None:

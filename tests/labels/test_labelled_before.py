@@ -224,7 +224,7 @@ def test_labels_of_a_video_hold_until_its_time_changes_or_where_they_are_verifie
 
 
 def shifted_row(root: Path) -> None:
-    """Another time in a row of episode 3, whose video stays as it is."""
+    """Change a time in a row of episode 3 and keep the video."""
     file = root / "data" / "chunk-000" / "episode_000003.parquet"
     table = parquet.read_table(file, partitioning=None)
     times_s = table["timestamp"].to_numpy().copy()

@@ -120,7 +120,7 @@ def test_all_of_a_causal_network_in_one_pass_is_what_its_prefixes_give(client: R
     short = [episode.index for episode in dataset.episodes if episode.num_frames <= 32]
     options = LabelOptions(output=output, cameras=(FRONT,), sampling="all", episodes=short)
     told = progress_of(label(dataset, ClientScorer(client), options))
-    assert "progress." + FRONT not in told  # of one camera there is nothing to be fused
+    assert "progress." + FRONT not in told  # a single camera needs no fusion
     start = 0
     for episode, videos in iter_episodes(dataset, [FRONT]):
         if episode.index in short:

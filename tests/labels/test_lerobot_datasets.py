@@ -56,7 +56,7 @@ def videos(root: Path, camera: str) -> list[Path]:
 
 @pytest.mark.parametrize("root", DATASETS)
 def test_every_frame_is_that_of_the_video_in_order_and_every_episode_that_of_the_rows(root: Path) -> None:
-    """LeRobot writes episodes one behind the other: all videos of a camera, decoded whole, are all frames."""
+    """LeRobot writes episodes one after another, so a camera's whole videos hold all frames."""
     dataset = open_dataset(root)
     assert list(dataset.cameras) == [FRONT, WRIST]
     info = json.loads((root / "meta" / "info.json").read_text())
@@ -259,7 +259,7 @@ def cells(file: str, column: str, change: Callable[[list[Any]], list[Any]]) -> B
 
 
 def spans(change: Callable[[list[Any]], list[Any]]) -> Break:
-    """Other times at which episodes lie in the videos of the front camera."""
+    """Change the episodes' times in the front camera's videos."""
 
     def apply(root: Path) -> None:
         for name in ("from_timestamp", "to_timestamp"):
@@ -278,7 +278,7 @@ def told(**more: Any) -> Break:
 
 
 def video(change: Callable[[list[Any]], list[Any]], file: str = V21_VIDEO, fps: Fraction = Fraction(10)) -> Break:
-    """A video of other frames, or of another rate."""
+    """Write a video with other frames or another rate."""
     coded: dict[str, Any] = {"options": {"crf": "1"}, "pixels": "yuv444p", "rate": fps}
     return lambda root: encode_here(root / file, change(whole_video(root / file)), **coded)
 

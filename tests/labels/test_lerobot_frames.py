@@ -52,7 +52,7 @@ def regular(length: int) -> list[float]:
 
 
 def by_a_clock(length: int) -> list[float]:
-    """Some milliseconds late, other ones for each row."""
+    """Shift each row's time by some milliseconds."""
     return [t / FPS + t * 7 % 10 / 1000 for t in range(length)]
 
 
@@ -65,7 +65,7 @@ class Recording:
     """The parts of a v3.0 dataset. The frame of row t shows the row number.
 
     film: numbers that the video's frames show
-    starts, lasts: of each episode in the video, in frames
+    starts, lasts: frames of the episodes in the video
     """
 
     film: Sequence[int]
@@ -165,7 +165,7 @@ def test_a_row_that_is_further_from_its_frame_than_lerobot_allows_is_refused_wit
 
 
 def test_other_row_times_are_another_episode(tmp_path: Path, output: Path) -> None:
-    """They decide which frames are labelled, so labels of the rows before them do not count."""
+    """Rows decide the labelled frames, so labels of earlier rows do not count."""
     takes = RECORDINGS["the times of a clock and discarded takes"]
     root = written(tmp_path, takes)
     label(open_dataset(root, **CLOCK), BrightnessScorer(), options(output))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The tables of LeRobot's ``compute_rabc_weights``, which reward-aligned behaviour cloning reads, made by ``rfm label``."""
+"""``rfm label`` writes the tables of LeRobot's ``compute_rabc_weights`` for reward-aligned behaviour cloning."""
 
 from __future__ import annotations
 

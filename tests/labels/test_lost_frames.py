@@ -22,13 +22,13 @@ LOST = r"\(the decoder loses the others, .* ffmpeg -i IN OUT; or name a part: st
 
 
 def moving() -> UInt8Array:
-    """Frames that the encoder predicts from others: a noisy picture that moves."""
+    """Return a moving noisy picture, so that the encoder predicts frames from others."""
     picture = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
     return np.stack([np.roll(picture, 2 * t, axis=1) for t in range(NUM_FRAMES)])
 
 
 def remux(source: Path, target: Path, change: Callable[[list[Any]], list[Any]], **options: str) -> None:
-    """Write the packets that ``change`` makes of those in a file."""
+    """Write a file's packets after ``change``."""
     with av.open(str(source)) as whole, av.open(str(target), "w", options=options) as part:
         stream = part.add_stream_from_template(whole.streams.video[0])
         for packet in change([packet for packet in whole.demux(video=0) if packet.dts is not None]):
@@ -94,7 +94,7 @@ def test_an_hevc_video_without_its_first_key_frame_is_refused_whatever_the_decod
     assert_label_refuses(file)
 
 
-DROPPED = {  # the kind that is written over the kind of a coded picture, unknown to every decoder
+DROPPED = {  # overwrites the type of a coded picture; unknown to every decoder
     "H.264": (*STREAMS["x264"], 0x1E, r"expected frame 37 to be decoded \(.* ffmpeg -i IN OUT\), got Invalid data"),
     "HEVC": (*X265, 0x7E, f"expected 40 frames, one for each packet, got 37 {LOST}"),
 }

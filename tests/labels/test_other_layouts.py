@@ -13,7 +13,7 @@ import pytest
 from rfm_labels import DatasetError, open_dataset
 
 JPEGS = np.array([b"\xff\xd8\xff\xe0"] * 3, "S4")
-HDF5: dict[str, tuple[str, Any]] = {  # a dataset in a file of this layout, by a part of the file's name
+HDF5: dict[str, tuple[str, Any]] = {  # datasets by a part of the file name
     "aloha": ("observations/images/cam_high", np.zeros((3, 8, 8, 3), np.uint8)),
     "robomind": ("observations/rgb_images/camera_top", JPEGS),
     "robotwin": ("observation/head_camera/rgb", JPEGS),

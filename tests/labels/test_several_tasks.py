@@ -23,7 +23,7 @@ TASKS = (0, 4, 0)  # and numbers
 
 
 class SinceTheFirst(BrightnessScorer):
-    """Progress is by how much the newest frame is brighter than the first that is shown; keeps each sample's task."""
+    """Progress is the gain in brightness since the first visible frame. Keeps the samples' tasks."""
 
     def __init__(self, encodes: bool = False) -> None:
         super().__init__()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The table of tasks of LeRobot v3.0, whose columns depend on the program that wrote it."""
+"""LeRobot v3.0's table of tasks, whose columns depend on the writer."""
 
 from __future__ import annotations
 

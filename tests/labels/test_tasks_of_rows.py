@@ -40,7 +40,7 @@ def with_columns(folder: Path, source: Path = V30, **columns: Callable[[int, int
 
 
 def persistent(*subtasks: tuple[float, str | None], style: str = "subtask") -> list[dict[str, Any]]:
-    """The value of ``language_persistent`` in all rows of an episode, as LeRobot 0.6 writes it."""
+    """Return ``language_persistent`` in an episode's rows, as LeRobot 0.6 writes it."""
     rest = {"role": "assistant", "camera": None, "tool_calls": None}
     plan = {"content": "first this, then that", "style": "plan", "timestamp": 0.0, **rest}
     return [plan, *({"content": text, "style": style, "timestamp": time_s, **rest} for time_s, text in subtasks)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The toy dataset and the comparison of two checkpoints on it, with the commands of the guide."""
+"""The guide's comparison of two checkpoints on the toy dataset."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ BLOCK_PX = 16
 
 
 def rgb(levels: np.ndarray[Any, Any], matrix: int, is_full: bool) -> np.ndarray[Any, Any]:
-    """float64 [..., 3], 0..255, of levels Y, Cb, Cr in 8 bits (ITU-T H.273, equations of matrix coefficients)."""
+    """Convert 8-bit Y, Cb, Cr to float64 [..., 3] in 0..255 (ITU-T H.273, matrix coefficients)."""
     kr, kb = WEIGHTS.get(matrix, (0.299, 0.114))
     low, scale, chroma = (0, 255, 255) if is_full else (16, 219, 224)
     y, pb, pr = (levels[..., 0] - low) / scale, (levels[..., 1] - 128) / chroma, (levels[..., 2] - 128) / chroma
@@ -155,7 +155,7 @@ def test_videos_of_one_deep_channel_are_refused_as_depth_maps(tmp_path: Path, pi
 
 
 def write_streams(file: Path, *videos: tuple[UInt8Array, bool]) -> None:
-    """Several videos in one file, and whether each is an attached picture."""
+    """Write several videos into a file. attached: True: as an attached picture"""
     with av.open(str(file), "w") as container:
         streams: list[Any] = []
         for frames, attached in videos:
@@ -246,7 +246,7 @@ def test_a_whole_video_is_read_and_one_that_breaks_off_refused(tmp_path: Path, n
     with av.open(str(file)) as container:
         begins = sorted(packet.pos for packet in container.demux(video=0) if packet.size)
     whole = file.read_bytes()
-    is_live = write is recorded_live  # whose size is known up to the frame that breaks off
+    is_live = write is recorded_live  # with a known size up to the broken frame
     for num_bytes in [begins[24] + 100] if is_live else [begins[24] + 100, begins[24]]:
         file.write_bytes(whole[:num_bytes])
         size = r"\d+" if is_live else len(whole)
@@ -267,7 +267,7 @@ def test_a_frame_that_breaks_off_is_no_frame_where_the_file_s_size_is_unknown(
 
 
 def test_damage_counts_up_to_the_next_key_frame_and_only_in_frames_that_are_used(tmp_path: Path) -> None:
-    """Each 20th frame needs no other; the others are made from the one before. x264 notices damage in CAVLC."""
+    """Every 20th frame is a key frame; others need the frame before. x264 notices damage in CAVLC."""
     file = tmp_path / "video.mp4"
     options = {"preset": "ultrafast", "bf": "0", "g": "20", "sc_threshold": "0"}
     encode_here(file, noise(), "libx264", options)

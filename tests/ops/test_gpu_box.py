@@ -55,7 +55,7 @@ def section(heading: str) -> str:
 
 
 def commands(heading: str) -> str:
-    """The shell commands of a section, which are indented."""
+    """Return the indented shell commands of a section."""
     return "\n".join(re.findall(r"^ {4}(.*)$", section(heading), re.MULTILINE))
 
 
@@ -73,7 +73,7 @@ def said(script: str, box: Path) -> str:
 
 
 def here(script: str, heading: str) -> str:
-    """A section's commands with the name and the address of this machine in the place of the example's."""
+    """Return a section's commands with this machine's name and address instead of the example's."""
     assert script.count("gpu-box.lan") or script.count("192.0.2.10") or "$name" in script, heading
     return script.replace("gpu-box.lan", NAME).replace("192.0.2.10", IP)
 

@@ -422,7 +422,7 @@ def test_the_probes_tell_a_living_model_from_a_dead_one(tmp_path: Path, monkeypa
 
 
 def run_kserve_s_liveness_probe(status_port: int) -> None:
-    """Raises CalledProcessError if it does not pass. Knative sends an httpGet to no port but that of requests."""
+    """Raise CalledProcessError if the probe fails. Knative sends an httpGet only to the port of requests."""
     container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
     program, *words, script = container["livenessProbe"]["exec"]["command"]
     assert program == "python"

@@ -82,7 +82,7 @@ class Monitored:
         return answer["data"]
 
     def query(self, expression: str) -> list[Json]:
-        """Each series that has a number."""
+        """Return the series with finite values."""
         result = self.get("query", query=expression)["result"]
         return [entry for entry in result if math.isfinite(float(entry["value"][1]))]
 
@@ -137,7 +137,7 @@ def embedded(seed: int, num_frames: int) -> Trajectory:
 
 
 def load_triton(url: str, is_over: threading.Event) -> None:
-    """Samples of all kinds and both models, among them bad ones."""
+    """Send samples of all kinds to both models, also bad ones."""
     frames = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), np.uint8)
     seed = 0
     with RewardClient(url, retry=False) as client:
@@ -150,7 +150,7 @@ def load_triton(url: str, is_over: threading.Event) -> None:
                 client.progress(embedded(seed, TOO_MANY_FRAMES))
             except InvalidSampleError:
                 pass
-            except RewardError:  # of a model whose process was killed
+            except RewardError:  # the model process was killed
                 is_over.wait(0.1)
 
 
@@ -255,7 +255,7 @@ def test_every_query_of_the_dashboard_gives_data(monitored: Monitored, expressio
     for name, value in {"$model": ".*", "$version": ".*", "$__rate_interval": INTERVALS["1m"]}.items():
         expression = expression.replace(name, value)
     assert "$" not in expression
-    if expression.startswith("ALERTS"):  # of the process that the fixture has killed; it may be over by now
+    if expression.startswith("ALERTS"):  # about the killed process; may be over by now
         expression = f"last_over_time({expression}[10m])"
     if NEEDS_GPU in expression and not torch.cuda.is_available():
         assert monitored.query(expression) == []

@@ -92,7 +92,7 @@ class Page:
         return len(shown) == len(frames) and max(off) < 2
 
     def drawn(self, name: str) -> dict[str, list[float]]:
-        """The curve that the chart of an episode has drawn last."""
+        """Return the last curve in an episode's chart."""
         return dict(self.browser.run("return window.drawn[arguments[0]]", f"{name}, environment 0"))
 
 

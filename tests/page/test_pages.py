@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The files of the page and of the endpoints' documentation. No Triton is needed."""
+"""Files of the page and the endpoints' documentation. No Triton is needed."""
 
 from __future__ import annotations
 

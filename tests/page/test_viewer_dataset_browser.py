@@ -46,7 +46,7 @@ return [document.documentElement, ...document.querySelectorAll(".work")].map((ea
 """  # pixels by which the page and each tab overflow to the right
 PICTURES_ARE_THERE = """[...document.querySelectorAll("#live-episodes article")]
   .filter((card) => card.getBoundingClientRect().top < innerHeight)
-  .every((card) => card.querySelector("img").naturalWidth)"""  # the page fetches none that is out of sight
+  .every((card) => card.querySelector("img").naturalWidth)"""  # the page fetches only visible pictures
 ARE_THERE = f"[...document.querySelectorAll('{VIDEOS}')].every((video) => !video.seeking && video.readyState >= 2)"
 
 
@@ -68,7 +68,7 @@ class Page:
 
     @property
     def rows(self) -> list[list[str]]:
-        """The cells of the table of episodes."""
+        """Return the cells of the episodes' table."""
         return self.browser.cells("#episodes tr")
 
     @property
@@ -194,7 +194,7 @@ def test_the_table_has_the_numbers_of_the_labels(page: Page, number: int) -> Non
 
 
 def episodes_by(*keys: np.ndarray[Any, Any]) -> list[int]:
-    """The numbers of the episodes, the lowest of the first key first."""
+    """Return the episodes' numbers, sorted by the keys."""
     return np.lexsort([np.arange(len(keys[0])), *reversed(keys)]).tolist()  # type: ignore[no-any-return]
 
 
@@ -520,7 +520,7 @@ def running_episodes(url: str, demo_server: Endpoints) -> Iterator[None]:
 @pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
 @pytest.mark.usefixtures("running_episodes")
 def test_no_tab_is_wider_than_the_window(page: Page, size: tuple[int, int], theme: str) -> None:
-    """It leaves pictures of each tab among the downloads."""
+    """Leaves a picture of each tab among the downloads."""
 
     def fits(name: str) -> None:
         file = page.browser.downloads / f"{name}_{size[0]}x{size[1]}_{theme}.png"

@@ -32,7 +32,7 @@ from rfm_labels import LabelOptions, label, open_dataset
 from rfm_labels.datasets import LeRobotDataset
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew
 
-V21, V30 = range(2)  # numbers of the datasets with labels; one without follows
+V21, V30 = range(2)  # datasets with labels; one without follows
 VIDEO = "videos/observation.images.front/chunk-000/file-000.mp4"  # of the episodes below
 OF_VIDEO = range(4)
 NEEDS_LATER = {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "3", "b_strategy": "0"}

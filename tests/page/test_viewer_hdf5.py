@@ -27,7 +27,7 @@ NUMBERS, LENGTH, FPS = (3, 7), 12, 10
 
 @pytest.fixture
 def demos(tmp_path: Path) -> Path:
-    """Two demonstrations of smooth pictures, whose sides are odd."""
+    """Write two demonstrations with smooth pictures of odd size."""
     file = tmp_path / "shelf" / "demos.hdf5"
     file.parent.mkdir()
     rows, columns = np.mgrid[:63, :81]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The demo, the checkpoint that it shows, and how that is made."""
+"""The demo, the demo's checkpoint, and the training."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_a_policy_is_paid_by_the_served_checkpoint(tmp_path: Path) -> None:
-    """Two short rounds; ten whole ones, which take minutes, teach it the task."""
+    """Two short rounds; learning the task takes ten whole ones and minutes."""
     few = ("--rounds", 2, "--population", 6, "--scenes", 1, "--tests", 3, "--log", tmp_path / "triton.log")
     with nothing_left_behind():
         shown = example("train_policy.py", *few).splitlines()

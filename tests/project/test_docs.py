@@ -83,7 +83,7 @@ def found(pattern: re.Pattern[str], files: Iterable[Path] = RUN) -> list[Any]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The files that the documentation speaks of."""
+    """The files named in the documentation."""
     (tmp_path / "demo_output").mkdir()
     for name in (
         "video.mp4", "a.mp4", "b.mp4", "success.mp4", "failure.mp4", "demo_output/success.mp4", "demo_output/failure.mp4",

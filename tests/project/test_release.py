@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A release: one version everywhere, and wheels that serve without the source tree."""
+"""A release: the same version everywhere, and wheels that serve without the source tree."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ EXTRAS = {
 
 
 def imports(file: Path) -> set[str]:
-    """Dotted names of everything that a file imports, wherever in it."""
+    """Return the dotted names of all imports in a file."""
     found = set()
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):

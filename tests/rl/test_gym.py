@@ -244,7 +244,7 @@ def test_the_last_step_waits_so_that_late_rewards_add_up_unless_it_shall_not(
 def test_an_episode_ends_at_the_step_at_which_success_is_known_and_stays_a_success(
     client: RewardClient, late: LateClient
 ) -> None:
-    """The answer about that step, which is waited for, may say otherwise."""
+    """The awaited answer about that step may differ."""
     camera = Camera(cart_pole())
     play(RewardModelWrapper(camera, client, TASK))
     success = [float(scores(client, camera.videos[0], step, None).success[-1]) for step in range(6)]

@@ -131,7 +131,7 @@ def test_the_last_steps_are_reported_before_the_process_ends_and_a_fork_says_tha
 def test_without_a_gateway_a_warning_is_logged_once_and_steps_are_kept(
     taker: Taker, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """But not the frames of episodes that have ended."""
+    """Frames of ended episodes are dropped."""
     monkeypatch.setattr(live, "TRY_AGAIN_AFTER_S", 0.05)
     monkeypatch.setattr(live, "MOST_STEPS_KEPT", 100)
     taker.status = 503

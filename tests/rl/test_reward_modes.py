@@ -114,7 +114,7 @@ def test_an_episode_is_paid_by_its_mode(judge: Judge, options: dict[str, Any], e
 
 
 def test_a_policy_that_hovers_earns_nothing_by_shaping(judge: Judge) -> None:
-    """The discounted sum is that of the ends, whichever way the episode went, also where scores are old."""
+    """The discounted sum depends on both ends alone, also with old scores."""
     for every in (1, 2, 3):
         paid = rewards(judge, mode="shaping", gamma=GAMMA, every=every)
         discounted = sum(GAMMA**t * reward for t, reward in enumerate(paid))

@@ -180,7 +180,7 @@ class Batch(gym.Env[Any, Any]):
 
 
 class Unbatched(gym.Wrapper[Any, Any, Any, Any]):
-    """The only environment of a batch, as CPUGymWrapper of ManiSkill gives it."""
+    """A batch's only environment, as in ManiSkill's CPUGymWrapper."""
 
     def __init__(self, env: Batch) -> None:
         super().__init__(env)

@@ -29,7 +29,7 @@ group = ProcessGroup(["/bin/sh", "-c", "trap '' HUP; sleep 600 & sleep 601 & wai
 
 
 def of_group(group: int) -> list[int]:
-    """Processes of a group that live."""
+    """Return the live processes of a group."""
     found = []
     for pid in psutil.pids():
         with suppress(ProcessLookupError):  # it has ended

@@ -52,7 +52,7 @@ def test_a_triton_with_known_vulnerabilities_is_warned_about(caplog: pytest.LogC
 @pytest.mark.triton
 @pytest.mark.slow
 def test_an_older_triton_that_listens_elsewhere_is_stopped(repository: Path, tmp_path: Path) -> None:
-    """One whose version is known only when it answers: no wheel, as far as ``rfm serve`` can see."""
+    """A Triton that tells the version only when it runs, unlike the wheel's."""
     free = Endpoints.free()
 
     class Open(Endpoints):

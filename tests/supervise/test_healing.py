@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Faults that ``rfm serve`` survives, each by the same cure: Triton is started again."""
+"""Faults that ``rfm serve`` survives by a restart of Triton."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ DEADLY, FAILING, SLOW = MARK, MARK + 1, MARK + 2  # marks of samples
 
 
 def once(trigger: Path) -> str:
-    """Code that is true once the file is there, in one process."""
+    """Return an expression that is true once, in a single process, after the file appears."""
     return f"os.path.exists({str(trigger)!r}) and os.unlink({str(trigger)!r}) is None"
 
 
@@ -168,7 +168,7 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
 
         with pytest.raises(ServerUnavailableError, match="ended twice during this request") as ended:
             client.progress(trajectory(99, mark=DEADLY))
-        # A process that dies before the supervisor has seen its command line counts as Triton's.
+        # A process that dies before the supervisor reads the command line counts as Triton's.
         wait_for(lambda: served.restarts(MODEL, "triton") == 2)
         served.wait_ready()
         inside = re.findall(r" request=(\S+): \w+: these requests were inside", served.log.read_text())

@@ -63,7 +63,7 @@ class Running:
         return models(command, *words, *options, *([] if command == "list" else [f"--repository={self.repository}"]))
 
     def models(self, command: str, *words: str) -> str:
-        """Output of ``rfm models COMMAND``, which succeeds."""
+        """Return the output of ``rfm models COMMAND``."""
         done = self.ask(command, *words)
         assert done.exit_code == 0, done.output
         return done.stdout
@@ -240,7 +240,7 @@ def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(
 
 @pytest.mark.nightly  # a minute and a half
 def test_what_was_served_is_served_again_and_not_what_was_exported_since(running: Running, other: Path) -> None:
-    """Models that were loaded since, too; those that were unloaded are not."""
+    """Newly loaded models, too, but no unloaded ones."""
     served, samples = running.served, rollout.questions()
     running.export_plain("since")
     running.models("load", "since")
@@ -330,7 +330,7 @@ class GoingAway:
 
 @pytest.fixture(scope="module")
 def three_models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Encoder, scorer and ensemble, of which version 1 is served and version 2 was exported."""
+    """Encoder, scorer and ensemble with a served version 1 and an exported version 2."""
     repository = tmp_path_factory.mktemp("three") / "repository"
     rollout.export(WITH_ENCODERS.checkpoint, repository)
     rollout.export(WITH_ENCODERS.checkpoint, repository)

@@ -107,7 +107,7 @@ def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(monkey
     ids=["hang up", "kill", "demo"],
 )
 def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], number: signal.Signals) -> None:
-    """A stand-in never gets ready, so that the moment of the signal is known."""
+    """A stand-in never gets ready, so the moment of the signal is certain."""
     started = tmp_path / "started"
     program = executable(
         tmp_path / "tritonserver", f"#!/bin/sh\necho $$ > {tmp_path}/pid\nmv {tmp_path}/pid {started}\nexec sleep 600\n"
@@ -147,7 +147,7 @@ def test_a_signal_while_it_still_loads_ends_it() -> None:
 @pytest.mark.triton
 @pytest.mark.slow
 def test_models_that_cannot_be_loaded_are_named_with_a_remedy(tmp_path: Path) -> None:
-    """A checkpoint that cannot be read, and an export for GPUs that are not here."""
+    """An unreadable checkpoint, and an export for missing GPUs."""
     models = tmp_path / "models"
     shutil.copytree(REPOSITORY / "rfm", models / "rfm")
     settings = ExportConfig(name="gpu", num_gpus=torch.cuda.device_count() + 1)

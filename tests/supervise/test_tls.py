@@ -245,7 +245,7 @@ def test_a_proxy_denies_who_shows_no_key_or_certificate_and_is_not_trusted_by_st
 
 
 def test_a_closed_client_leaves_no_connection_to_a_server_that_hangs(papers: Papers) -> None:
-    """The server never says the goodbye of TLS, which the cancelled call's connection would wait for."""
+    """The server never closes TLS, for which the cancelled call's connection would wait."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(papers.certificate, papers.key)
     with socket.create_server(("127.0.0.1", 0)) as listener:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A model whose scores are plain to see, and requests that stand in for Triton's."""
+"""A model with plain scores, and stand-ins for Triton's requests."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ CONFIG = {
     "instance_group": [{"count": 1}],
 }
 FINAL = 1  # Triton's flag of the last response to a request
-REFUSED, BREAKS, FAILS = 2, 3, 4  # numbers of frames that the model below cannot bear
+REFUSED, BREAKS, FAILS = 2, 3, 4  # numbers of frames on which the model fails
 
 
 @dataclass

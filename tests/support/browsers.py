@@ -23,7 +23,7 @@ from rfm_client import UInt8Array
 AXE = Path(__file__).parents[1] / "page" / "vendored" / "axe-core" / "axe.min.js"
 WINDOW_PX = (1280, 1400)
 PICTURE_PX = (1440, 900)
-REBOUND = "rebound.example"  # a name of elsewhere that leads here, as with DNS rebinding
+REBOUND = "rebound.example"  # a foreign name that leads here, as with DNS rebinding
 QUIET = (  # nothing but the page asks for anything
     "--disable-background-networking", "--disable-component-update", "--disable-default-apps", "--disable-sync",
     "--no-first-run", "--no-default-browser-check", "--disable-features=OptimizationHints,MediaRouter",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Threads that send requests without end, check every answer, and count the outcomes of all calls."""
+"""Threads that send requests without end, check every answer, and count outcomes."""
 
 from __future__ import annotations
 

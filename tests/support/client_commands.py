@@ -60,7 +60,7 @@ def rows(output: str, row: str) -> list[list[str]]:
 
 
 def columns(output: str, row: str) -> list[str]:
-    """The cells of the table row that begins so."""
+    """Return the cells of the table row with this beginning."""
     (cells,) = rows(output, row)
     return cells
 

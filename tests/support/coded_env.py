@@ -29,7 +29,7 @@ class CodedEnv(gym.Env[Any, Any]):
 
     lengths: steps of the episodes, in turn
     reuse: all frames are drawn into the same array
-    bad: of this code a picture is rendered that is none
+    bad: a code for which rendering gives no picture
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm serve`` of the committed repository as a process, and the remains of such processes."""
+"""``rfm serve`` with the committed repository as a process, and its remains."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def in_shared_memory() -> set[str]:
 
 
 def regions() -> set[str]:
-    """Names in shared memory, but for those of servers that others run on this machine."""
+    """Return the names in shared memory, except those of other users' servers."""
     names = in_shared_memory()
     owners = {name: int(match[1]) for name in names if (match := OWNER.search(name))}
     return names - {name for name, pid in owners.items() if is_alive(pid) and not is_ours(pid)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Servers that stop, hang and come back, and calls that go on meanwhile."""
+"""Servers that stop, hang and come back during calls."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def heavy() -> Trajectory:
 
 
 def regions(endpoints: Endpoints) -> set[str]:
-    """Names of the regions that the server maps."""
+    """Return the names of the server's mapped regions."""
     with tritonclient.grpc.InferenceServerClient(endpoints.grpc_url.removeprefix("grpc://")) as client:
         return set(client.get_system_shared_memory_status().regions)
 

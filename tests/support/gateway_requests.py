@@ -216,7 +216,7 @@ NAMED = b'--b\r\nContent-Disposition: form-data; name="sample_0"\r\n\r\n'
 
 
 def begun(gateway: Gateway, headers: Mapping[str, str], *parts: bytes, path: str = "/evaluate_batch") -> Any:
-    """A connection on which the beginning of a request has been sent."""
+    """Open a connection and send the beginning of a request."""
     connection = gateway.connect()
     connection.putrequest("POST", path)
     for name, value in headers.items():

@@ -34,7 +34,7 @@ ROOT = Path(os.environ.get("RFM_GOLDENS") or GOLDEN)
 
 FRAME_STEPS = 4  # of the original's dense mode
 
-# Limits of differences from the original, of raw scores (logits, similarity) and of probabilities. The references come
+# Largest differences from the original for raw scores (logits, similarity) and probabilities. The references come
 # from another machine, so each limit is three times the largest difference with SSE4.1, AVX2 or AVX-512: small enough
 # to see an epsilon of 1e-6 in place of 1e-5 in a LayerNorm.
 REWIND_TOLERANCES = (2e-5, 5e-6)  # seen: 7.6e-6, 1.7e-6
@@ -258,7 +258,7 @@ def sample_type(sample: Sample) -> str:
 
 
 def differences(result: Result, expected: Expected) -> tuple[float, float]:
-    """Largest differences from the reference: of raw scores, and of probabilities."""
+    """Return the largest differences of raw scores and probabilities from the reference."""
     frames = frame_scores(result)
     raw, probabilities = [0.0], [0.0]
     for got, progress, success in zip(frames, expected.progress, expected.success, strict=True):
@@ -312,7 +312,7 @@ def _trajectory(trajectory: dict[str, Any], arrays: Any) -> Trajectory:
 
 @dataclass(frozen=True)
 class _Reader:
-    """The raw arrays of one case."""
+    """Return a case's raw arrays."""
 
     arrays: dict[str, Array]
     config: Config
@@ -338,7 +338,7 @@ class _Reader:
         return Expected([_mean_bin(part) for part in progress], progress, success, answer)
 
     def _of_trajectories(self, name: str, row: int, lengths: Sequence[int]) -> list[Array]:
-        """Values of each frame. The original splits a pair's half-way, whatever the lengths; here as they are."""
+        """Split the values by trajectory. The original splits pairs in the middle, whatever the lengths."""
         values = np.concatenate([self._raw(f"{name}_{side}", row) for side, _ in zip("AB", lengths, strict=False)])
         each = self.config.frames_per_value
         counts = [-(-length // each) for length in lengths]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Labelling without a server: a scorer of a few lines, and a process that labels with it and may be killed.
+"""Labelling without a server: a short scorer, and a process for tests to kill.
 
 python tests/support/labelling.py DATASET OUTPUT SECONDS_A_REQUEST
 """

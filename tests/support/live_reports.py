@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reports of running episodes as clients write them, and a place that takes reports and keeps them."""
+"""Reports of running episodes as clients write them, and a server that keeps reports."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Taker:
 
 @contextmanager
 def taking(context: ssl.SSLContext | None = None) -> Iterator[Taker]:
-    """A server that takes every report, or refuses them as the test wants. context: of HTTPS"""
+    """Run a server for reports that answers with ``status``. context: for HTTPS"""
     taker = Taker()
 
     class Handler(BaseHTTPRequestHandler):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An environment of Meta-World, which processes can make."""
+"""Make an environment of Meta-World, also in other processes."""
 
 from __future__ import annotations
 

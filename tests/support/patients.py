@@ -22,7 +22,7 @@ MARK = 7.0  # in the text embedding of a deadly sample
 
 
 def answering(body: str) -> str:
-    """Code for a model.py that does something before it answers. ``marks``: of the questions"""
+    """Return code for a model.py that runs ``body`` before it answers. ``marks``: by question"""
     return f"""
 
 _plain_answer = TritonPythonModel.answer

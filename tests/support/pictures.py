@@ -58,7 +58,7 @@ def numbered(count: int) -> UInt8Array:
 
 
 def numbers(frames: UInt8Array, count: int) -> list[int]:
-    """Which of ``numbered(count)`` the frames are."""
+    """Return the frames' numbers in ``numbered(count)``."""
     means = frames.mean(axis=(1, 2, 3))
     return np.abs(means[:, None] - numbered(count)[:, 0, 0, 0]).argmin(axis=1).tolist()
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Two pretended GPUs: tensors claim to lie on ``cuda:0`` or ``cuda:1``, and the CPU computes them.
 
-As on GPUs, an operator that is given tensors of two places fails, and ``cuda`` is the thread's current device. What the
+As on GPUs, an operator fails for tensors on two devices, and ``cuda`` is the thread's current device. What the
 host would wait for is counted: values that it asks for, and copies from memory that is not pinned. CUDA's own calls are
 recorded.
 """
@@ -62,7 +62,7 @@ class Seen:
         self._of_thread.device = device
 
     def placed(self, device: Any) -> torch.device:
-        """The device that is meant: ``cuda`` is the current one."""
+        """Return the device with an index; ``cuda`` is the current one."""
         device = self.current if device is None else torch.device("cuda", device) if type(device) is int else device
         device = torch.device(device)
         if device.type == "cuda" and device.index is None:

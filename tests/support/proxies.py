@@ -38,7 +38,7 @@ class Proxy:
         return len(self._pairs)
 
     def go_silent(self) -> None:
-        """All connections that there are; a new one is forwarded."""
+        """Silence all present connections, but not new ones."""
         for *_, is_silent in self._pairs:
             is_silent.set()
 

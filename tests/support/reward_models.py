@@ -65,7 +65,7 @@ def references(section: str) -> list[Reference]:
 
 
 def as_before_marks(file: Path) -> None:
-    """Take the output of marks out of a configuration, as exports before it have it."""
+    """Remove the output of marks from a configuration, as in older exports."""
     config = text_format.Parse(file.read_text(), ModelConfig())
     (index,) = (index for index, output in enumerate(config.output) if output.name == "unclear")
     del config.output[index]

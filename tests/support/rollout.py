@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Two versions of a checkpoint on a server, and callers who compare answers with the named version's.
 
-They send embeddings and raw frames, in turn, one request at a time and a few a second each, and retry nothing.
+They send embeddings and raw frames in turn, a few requests a second, without retries.
 """
 
 from __future__ import annotations

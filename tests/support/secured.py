@@ -41,7 +41,7 @@ class Papers:
 
     @property
     def client(self) -> dict[str, Path]:
-        """Options of a client that has everything."""
+        """Client options with all files."""
         return {"ca_file": self.ca, "client_certificate": self.client_certificate, "client_key": self.client_key}
 
 

@@ -33,7 +33,7 @@ from rfm.launch.repository_api import RepositoryApi
 from rfm.launch.triton_server import TritonServer
 from rfm_client import RewardClient
 
-CRASHES: list[Path] = []  # repositories whose Triton has ended with SIGABRT, by itself, or whose start was repeated
+CRASHES: list[Path] = []  # repositories whose Triton aborted, or started twice
 MODEL = "rfm"
 KEY = "a-key-that-only-tests-know"  # an admin key
 PATIENCE_S = 60.0
@@ -192,7 +192,7 @@ class Serving:
         return model_processes(self.triton, model)
 
     def reasons(self) -> dict[str, str]:
-        """Why models are not ready, of all that it knows; empty: they are."""
+        """Return the reasons by model; empty: the model is ready."""
         answer = self.ready()
         return {} if answer is None else {name: told["reason"] for name, told in answer.json()["models"].items()}
 

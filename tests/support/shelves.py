@@ -43,7 +43,7 @@ class Shelf:
     has_encoder: bool = True
     url: str = "grpc://shelf:1"
     count: int = 0
-    shapes: list[tuple[int, ...]] = field(default_factory=list)  # of the arrays that it was asked to score
+    shapes: list[tuple[int, ...]] = field(default_factory=list)  # of the arrays in requests
 
     def of(self, model: str) -> Kept:
         return self.other if self.count >= self.after and model in self.parts else self.kept
@@ -58,7 +58,7 @@ class Shelf:
             return Answer({name: array.astype(np.float32) for name, array in tensors.items()}, now.version)
         self.count += 1
         self.shapes.append(inputs["frames" if model == "rfm_frames" else "video_embeddings"].shape)
-        num_frames = inputs["num_frames"].sum(axis=1)  # of both trajectories, which may lie in two arrays
+        num_frames = inputs["num_frames"].sum(axis=1)  # of both trajectories, perhaps in two arrays
         scores = np.full((len(num_frames), num_frames.max()), now.score)
         return Answer(dict.fromkeys(outputs, scores.astype(np.float32)), now.version)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Copies of checkpoints that a test may spoil."""
+"""Copies of checkpoints for a test to spoil."""
 
 from __future__ import annotations
 
@@ -74,14 +74,14 @@ def conversion(load: Callable[[Path], object], folder: Path) -> str:
 
 
 def convert(load: Callable[[Path], object], folder: Path) -> None:
-    """Runs, in this process, the code that the refusal of ``load`` says to type."""
+    """Run the code from the refusal of ``load`` in this process."""
     _, _, code, *arguments = shlex.split(conversion(load, folder))
     with mock.patch.object(sys, "argv", ["-c", *arguments]):
         exec(code, {})
 
 
 def without(name: str, heads: Sequence[str], target: Path) -> Path:
-    """A copy of a reference checkpoint whose heads are cut off."""
+    """A copy of a reference checkpoint without heads."""
     copied(goldens.config(name), target)
     if not (target / "config.yaml").exists():
         shutil.copyfile(goldens.config(name).checkpoint.parent / "config.yaml", target / "config.yaml")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How far apart numbers may be that should be equal. goldens.py has the tolerances of reference scores."""
+"""Tolerances of equal numbers. goldens.py has those of reference scores."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ Json = dict[str, Any]
 
 
 def post(url: str, path: str, files: dict[str, Path | bytes], **fields: Any) -> requests.Response:
-    """The response to a form of the page, whose answer is read as it comes."""
+    """Post a form like the page. Return the response as a stream."""
     with ExitStack() as stack:
         parts = {
             name: (f"{name}.mp4", file)

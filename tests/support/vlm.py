@@ -57,7 +57,7 @@ def load(name: str, folder: Path | None = None, base: str | None = None) -> VlmC
 
 
 def upstream_inputs(predictor: VlmPredictor, rows: Sequence[VlmRow]) -> dict[str, torch.Tensor]:
-    """The arguments that upstream gives to the backbone: each shot as often, and in the order, as it is shown."""
+    """Return upstream's arguments for the backbone: every shot in order, with repetitions."""
     batch = predictor.collate(rows).to(torch.device("cpu"), torch.float32)
     if not isinstance(predictor.collator, QwenCollator):
         return batch.inputs

@@ -229,7 +229,7 @@ def test_what_an_execution_took_is_told(tmp_path: Path) -> None:
 def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Triton refuses a family whose name another kind of metric has."""
+    """Triton refuses the name of a metric of another kind."""
 
     def refused(*_: Any, **__: Any) -> None:
         raise ValueError("of another kind")
@@ -358,7 +358,7 @@ def test_what_is_loaded_is_computed_in_a_thread_that_ends() -> None:
     assert not thread.is_alive()
     assert num_threads == 3
     assert torch.get_num_threads() == 1  # the calling thread starts no team
-    with pytest.raises(RuntimeError, match="positive"):  # PyTorch's own words, not those of a pool of threads
+    with pytest.raises(RuntimeError, match="positive"):  # PyTorch's message, not a thread pool's
         Placement(torch.device("cpu"), num_threads=0).run(lambda: None)
 
 

@@ -63,12 +63,12 @@ class TritonPythonModel(TritonPythonModel):
 
 @dataclass(frozen=True)
 class Scraped:
-    """All of Triton's metrics at one moment."""
+    """Triton's metrics at a moment."""
 
     families: list[Metric]
 
     def value(self, name: str, **labels: str) -> float:
-        """The sum of a metric's series that have these labels."""
+        """Return the sum of a metric's series with these labels."""
         samples = (sample for family in self.families for sample in family.samples)
         return sum(s.value for s in samples if s.name == f"rfm_{name}" and labels.items() <= s.labels.items())
 

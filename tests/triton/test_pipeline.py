@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A model that works ahead: batches, the return of ``execute``, and faults."""
+"""A model with work ahead: batches, the return of ``execute``, and faults."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Ahead(Model):
         super().finalize()
 
     def begin(self) -> list[Request]:
-        """Has it score one or two requests, which are prepared, and are not answered before ``open``."""
+        """Start to score one or two prepared requests, which ``open`` lets answer."""
         first = [request(1), request(1)]
         self.take(*first)
         wait_for(lambda: self.batches and len(self.prepared) == 2)

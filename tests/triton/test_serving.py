@@ -40,7 +40,7 @@ from trajectories import random_trajectory
 pytestmark = pytest.mark.triton
 
 VLM = "q3_tok_disc10"
-LEAST_REGION_BYTES = 2**20  # of the Python backend, for one model process
+LEAST_REGION_BYTES = 2**20  # of the Python backend, per model process
 
 
 @pytest.mark.reference
@@ -92,7 +92,7 @@ def test_any_mixture_equals_its_samples_alone(served: Served, protocol: str, mod
         assert_same(result, wanted)
 
 
-BAD = 11  # the place of a sample that is refused
+BAD = 11  # index of the refused sample
 
 
 @pytest.mark.parametrize(("protocol", "model"), [("grpc", MODEL), ("http", MODEL), ("http", FRAMES_MODEL)])
@@ -125,7 +125,7 @@ def test_callers_share_batches_and_a_bad_sample_fails_alone(served: Served, prot
 
 
 def test_a_bad_sample_of_a_call_is_located_and_costs_no_other(served: Served) -> None:
-    """Be it too long, or of a width that Triton itself refuses."""
+    """Too long, or with a width that Triton itself refuses."""
     samples = mixed_samples(9)
     samples[4] = ProgressSample(random_trajectory(0, 17))
     samples[6] = ProgressSample(random_trajectory(1, 3, 768, 7))
