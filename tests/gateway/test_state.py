@@ -16,7 +16,6 @@ import pytest
 import requests
 import schemathesis
 import torch
-import yaml
 from hypothesis import HealthCheck, given, settings
 
 import goldens
@@ -110,7 +109,7 @@ def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: torch.nn.M
 
 
 def test_model_info_has_the_whole_configuration_of_the_training_run(encoders: Gateway) -> None:
-    run = yaml.safe_load((goldens.config("enc_c1_t1_disc10").checkpoint / "config.yaml").read_text())
+    run = goldens.training_run(goldens.config("enc_c1_t1_disc10").checkpoint / "config.yaml")
     assert requests.get(f"{encoders.url}/model_info").json()["experiment_config"] == json.loads(json.dumps(run))
 
 

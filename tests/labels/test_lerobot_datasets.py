@@ -132,7 +132,7 @@ def test_a_depth_camera_counts_only_where_it_is_named(tmp_path: Path, mark: dict
 
 
 def saved(convert: Callable[[Any], Any] = lambda image: image, form: str = "PNG") -> Callable[[Any], bytes]:
-    """Write a picture to a file. convert: mode in Pillow"""
+    """Return a function that encodes a picture. convert: applied before, to the Pillow image"""
 
     def save(image: Any) -> bytes:
         written = io.BytesIO()

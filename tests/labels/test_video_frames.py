@@ -155,7 +155,7 @@ def test_videos_of_one_deep_channel_are_refused_as_depth_maps(tmp_path: Path, pi
 
 
 def write_streams(file: Path, *videos: tuple[UInt8Array, bool]) -> None:
-    """Write several videos into a file. attached: True: as an attached picture"""
+    """Write several videos into a file. Each says whether it is an attached picture."""
     with av.open(str(file), "w") as container:
         streams: list[Any] = []
         for frames, attached in videos:
