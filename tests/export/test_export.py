@@ -17,7 +17,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 
 import goldens
 import rfm_export
-from engines import serve_config
+from engines import serve_config, training_run
 from in_process import rfm
 from paths import ROOT
 from repositories import forget_input
@@ -249,7 +249,7 @@ def test_an_export_says_what_the_run_did_not_train(
     tmp_path: Path, changes: dict[str, dict[str, object]], expected: list[str]
 ) -> None:
     checkpoint = shutil.copytree(EMBEDDINGS.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
-    run = goldens.training_run(EMBEDDINGS.checkpoint.parent / "config.yaml")
+    run = training_run(EMBEDDINGS.checkpoint.parent / "config.yaml")
     for section, values in changes.items():
         run[section] |= values
     (checkpoint / "config.yaml").write_text(yaml.safe_dump(run))
@@ -354,7 +354,7 @@ def test_the_configuration_of_the_training_run_is_kept_without_its_secrets(tmp_p
     config, checkpoint = goldens.config("legacy_keys_l2"), tmp_path / "checkpoint"
     shutil.copytree(config.checkpoint, checkpoint)
     file = checkpoint / "config.yaml"
-    run = json.loads(json.dumps(goldens.training_run(file)))
+    run = json.loads(json.dumps(training_run(file)))
     secrets = "{hub_token: hf_secret, WANDB_API_KEY: secret, max_token: 5, day: 2026-01-02}"
     file.write_text(f"{file.read_text()}\nreports: {secrets}\n")
     rfm_export.export(checkpoint, tmp_path / "model_repository", serve_config(config))

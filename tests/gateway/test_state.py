@@ -20,6 +20,7 @@ from hypothesis import HealthCheck, given, settings
 
 import goldens
 from commands import own_regions
+from engines import training_run
 from gateway_requests import (
     ENCODER_DIMS,
     ENCODERS,
@@ -109,7 +110,7 @@ def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: torch.nn.M
 
 
 def test_model_info_has_the_whole_configuration_of_the_training_run(encoders: Gateway) -> None:
-    run = goldens.training_run(goldens.config("enc_c1_t1_disc10").checkpoint / "config.yaml")
+    run = training_run(goldens.config("enc_c1_t1_disc10").checkpoint / "config.yaml")
     assert requests.get(f"{encoders.url}/model_info").json()["experiment_config"] == json.loads(json.dumps(run))
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import functools
 import importlib.metadata
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import goldens
 from rfm import families
+from rfm.checkpoint.content import read_run_config
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 
@@ -37,3 +39,8 @@ def load_engine(name: str) -> Engine:
     config = goldens.config(name)
     checkpoint = families.load(config.checkpoint, **config.sources)
     return Engine.of(checkpoint, encoders=checkpoint.encoders())
+
+
+def training_run(file: Path) -> dict[str, Any]:
+    """Return the configuration of a training run, whose file names Python classes."""
+    return read_run_config(file)

@@ -15,7 +15,6 @@ import numpy.typing as npt
 import torch
 
 from paths import GOLDEN
-from rfm.checkpoint.content import read_run_config
 from rfm_client import (
     FrameScores,
     PreferenceResult,
@@ -359,8 +358,3 @@ class _Reader:
 def _mean_bin(logits: Array) -> Array:
     weights = np.exp(logits.astype(np.float64) - logits.max(axis=-1, keepdims=True))
     return np.asarray(weights / weights.sum(axis=-1, keepdims=True) @ np.linspace(0, 1, logits.shape[-1]))
-
-
-def training_run(file: Path) -> dict[str, Any]:
-    """Return the configuration of a training run, whose file names Python classes."""
-    return read_run_config(file)
