@@ -21,6 +21,7 @@ import torch
 from load import Calls, Load, Measured, samples
 
 import rfm_export
+from rfm import families
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.launch.triton_server import Endpoints
@@ -152,7 +153,7 @@ class BareEngine:
     """``Engine.evaluate`` in this process, batch after batch: the upper bound for a server around it."""
 
     def __init__(self, measured: Checkpoint) -> None:
-        self._engine, self._widths = Engine.from_checkpoint(measured.folder), measured.widths
+        self._engine, self._widths = Engine.of(families.load(measured.folder)), measured.widths
 
     def measure(self, load: Load, batch_size: int) -> dict[str, float]:
         """Return rates and latencies for the load's samples. Two batches warm up."""

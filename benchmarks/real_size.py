@@ -22,6 +22,7 @@ import torch
 from load import Calls, Load, Measured, samples
 from random_checkpoints import BASE_MODEL, QWEN, QWEN3_VL_4B, ROBOMETER, TINY, Size
 
+from rfm import families
 from rfm.engine import Engine
 
 FRAMES = 8
@@ -94,13 +95,13 @@ def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
         ("roboreward", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
         ("roboreward-expected", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
     )
-    knows_graphs = "cuda_graphs" in inspect.signature(Engine.from_checkpoint).parameters
+    knows_graphs = "cuda_graphs" in inspect.signature(Engine.of).parameters
     for what, kind, sizes in plans:
         for graphs in (False, True) if knows_graphs and kind == ROBOMETER else (False,):
             sources: dict[str, Any] = {"base_model": str(BASE_MODEL)} if kind == ROBOMETER else {"reward_model": what}
-            if graphs:
-                sources["cuda_graphs"] = True
-            engine = Engine.from_checkpoint(folder / kind, device=scale.device, max_sample_tokens=MAX_TOKENS, **sources)
+            options: dict[str, Any] = {"cuda_graphs": True} if graphs else {}
+            checkpoint = families.load(folder / kind, **sources)
+            engine = Engine.of(checkpoint, device=scale.device, max_sample_tokens=MAX_TOKENS, **options)
             for size in sizes[:2] if graphs else sizes:
                 yield {"what": what, "way": "engine", "graphs": graphs, **measured(engine, scale, *size)}
             del engine

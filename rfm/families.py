@@ -44,12 +44,9 @@ def named(package: str) -> Family:
     return family
 
 
-def encoders_of(package: str | None) -> type[FrameEncoders]:
-    """Return the class of a family's encoders. Raises CheckpointError if the family has none.
-
-    package: None: ReWiND, which old exports do not name
-    """
-    encoders = named(package or FAMILIES[-1]).encoders
+def encoders_of(package: str) -> type[FrameEncoders]:
+    """Return the class of a family's encoders. Raises CheckpointError if the family has none."""
+    encoders = named(package).encoders
     if encoders is None:
         raise CheckpointError(f"family: expected one with encoders, got {package}, whose checkpoints score raw frames")
     return encoders
@@ -112,7 +109,7 @@ def notes(folder: Path, checkpoint: Checkpoint, answered: Collection[str] = HEAD
     lacks = checkpoint.description.lacks
     heads = [head for head in answered if head not in lacks]
     expected = set() if checkpoint.description.asks_in_words else {*answered} - {SIMILARITY}  # which most lack
-    missing = [head for head in answered if head in expected & lacks]
+    missing = [head for head in answered if head in expected and head in lacks]
     without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
     of_weights = constant_heads(checkpoint.parts[NETWORK], heads)
     of_run = training_notes(folder, heads)

@@ -13,8 +13,8 @@ from rfm.checkpoint.provenance import Decision
 from rfm.config import ExportConfig
 from rfm.config import VideoPrompt as VideoPrompt
 from rfm.config import Weights as Weights
-from rfm_client.contract import FrameSize, RewardError, Sample
-from rfm_client.contract.frame_refs import EncoderSampleRefs
+from rfm_client.contract import RewardError, Sample
+from rfm_client.contract.description import Description
 from rfm_client.contract.samples import EncoderSample, Float32Array
 
 if TYPE_CHECKING:
@@ -101,74 +101,12 @@ def _value(name: str, text: str, known: Mapping[str, type]) -> Any:
         raise CheckpointError(f"--as: {name}: expected a value of type {known[name].__name__}, got {text!r}") from None
 
 
-@dataclass(frozen=True)
-class Description:
-    """The inputs and outputs of a checkpoint.
-
-    widths: Dv and Dt, the widths of the frame and task embeddings that it scores; None: it scores raw frames
-    progress_bins: C; 1: continuous progress
-    max_frames: frames of the longest trajectory that the network can score; None: no limit
-    trained_frames: most frames of a trajectory in training; None: unknown
-    trained_padding: training padded shorter trajectories; None: unknown
-    frame_size: the size to which the checkpoint resizes each raw frame; None: it depends on the frame
-    frames_per_value: consecutive frames with one score
-    keeps_features: it can cache features of frames, and then takes samples with frame references
-    has_log_prob: progress comes with a log-probability of each frame
-    marks_unclear: progress comes with a mark of each frame whose written answer is unclear
-    needs_whole_episode: its scores are relative to the whole episode, so dense mode and online use are refused
-    may_not_answer: its answer may hold no score, also on blank frames; so it gets no warm-up, because Triton does not
-        load a model whose warm-up fails
-    kind: the reward model's name for people
-    asks_in_words: an ordinary language model, which has no heads, so that none is missing
-    uses_graphs: its predictor can score small batches with CUDA graphs (``use_graphs``)
-    is_large: exports are verified in the dtype that serves, on a GPU if it has room, since float32 on the CPU is slow
-    """
-
-    network_class: str
-    widths: tuple[int, int] | None
-    progress_bins: int
-    has_similarity: bool
-    max_frames: int | None = None
-    trained_frames: int | None = None
-    trained_padding: bool | None = None
-    frame_size: FrameSize | None = None
-    frames_per_value: int = 1
-    keeps_features: bool = False
-    uses_graphs: bool = False
-    is_large: bool = False
-    has_preference: bool = True
-    has_success: bool = True
-    has_log_prob: bool = False
-    marks_unclear: bool = False
-    needs_whole_episode: bool = False
-    may_not_answer: bool = False
-    kind: str = ""
-    asks_in_words: bool = False
-
-    @property
-    def lacks(self) -> frozenset[str]:
-        """Names of the heads that the network lacks."""
-        heads = {"preference": self.has_preference, "success": self.has_success, "similarity": self.has_similarity}
-        return frozenset(name for name, is_there in heads.items() if not is_there)
-
-
 def config_fields(config: Any) -> dict[str, Any]:
     """Return the fields of a network's configuration, as in files and digests.
 
     Newer fields are left out if they have the value of older exports, so that older files and digests stay valid.
     """
     return {name: value for name, value in asdict(config).items() if name not in _USUAL or value != _USUAL[name]}
-
-
-@dataclass(frozen=True)
-class EncodersDescription:
-    """The export's record of encoders.
-
-    frame_size: the size to which they resize each raw frame; None: it depends on the frame
-    """
-
-    network_class: str
-    frame_size: FrameSize | None = None
 
 
 class FrameEncoders(Protocol):
@@ -179,12 +117,12 @@ class FrameEncoders(Protocol):
         """Load the encoders that ``save`` wrote into ``folder``."""
 
     @classmethod
-    def describe(cls, folder: Path) -> EncodersDescription:
+    def describe(cls, folder: Path) -> Description:
         """Return the description of the encoders that ``save`` wrote into ``folder``, without loading them."""
 
     @property
-    def description(self) -> EncodersDescription:
-        """The export's record of these encoders."""
+    def description(self) -> Description:
+        """Network and frame size of these encoders."""
 
     def save(self, folder: Path) -> None:
         """Write the encoders into a folder, which may exist; ``load`` then needs no internet."""
@@ -194,14 +132,14 @@ class FrameEncoders(Protocol):
 
     def encode(
         self,
-        samples: Sequence[EncoderSample | EncoderSampleRefs],
+        samples: Sequence[EncoderSample],
         execution: Execution,
         cache: FeatureCache[Float32Array] | None,
     ) -> list[EncoderSample | RewardError]:
         """Return each sample with embeddings of its frames and task, or its error.
 
         execution: the costs are added to it
-        cache: of embeddings; None: no cache, and no samples with frame references
+        cache: of embeddings; None: no cache, and no samples with named frames
         """
 
 
@@ -214,7 +152,7 @@ class Checkpoint(Protocol):
 
     @property
     def description(self) -> Description:
-        """The checkpoint's inputs and outputs."""
+        """The checkpoint's inputs, outputs and limits. The export adds its origin, digests and configuration."""
 
     @property
     def parts(self) -> Mapping[str, Mapping[str, Tensor]]:

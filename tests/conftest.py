@@ -14,13 +14,15 @@ import goldens
 import rfm_export
 from commands import RUN
 from engines import load_engine, serve_config
+from environments import MODEL, LateClient
 from paths import ROOT
 from patients import references  # noqa: F401  a fixture
 from rfm.engine import Engine
 from rfm.launch import endpoints
+from rfm_client import RewardClient
 from servers import CRASHES, Endpoints, Served, start_triton
 
-pytest_plugins = ["gateway_fixtures"]
+pytest_plugins = ("gateway_fixtures",)
 SHARED = ("served", "triton")  # fixtures that start a server for the tests of many files
 LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the others run meanwhile
 
@@ -53,6 +55,18 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 def demo_server(served: Served) -> Endpoints:
     """Where the demo's checkpoint is asked under the name that clients expect."""
     return served.endpoints
+
+
+@pytest.fixture
+def client(served: Served) -> Iterator[RewardClient]:
+    with served.client("grpc", MODEL) as client:
+        yield client
+
+
+@pytest.fixture
+def late(served: Served) -> Iterator[LateClient]:
+    with LateClient(served.url("grpc")) as client:
+        yield client
 
 
 @pytest.fixture(autouse=True)

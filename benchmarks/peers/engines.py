@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from rfm import families
 from rfm.engine import Engine, Outcome
 from rfm.engine.predictor import RowScores
 from rfm_client import (
@@ -133,7 +134,7 @@ def _half(row: Any, num_bins: int) -> RowScores:
 
 def engine_of(checkpoint: str, device: str = "cpu") -> Engine:
     """Return the engine of a checkpoint. A file SIMULATION in the folder has arguments for ``simulate``."""
-    engine = Engine.from_checkpoint(checkpoint, device=device)
+    engine = Engine.of(families.load(checkpoint), device=device)
     simulation = Path(checkpoint, SIMULATION)
     if not simulation.exists():
         return engine

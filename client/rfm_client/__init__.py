@@ -37,11 +37,10 @@ from rfm_client.contract import (
     float_frames_to_uint8,
 )
 from rfm_client.contract.results import SUCCESS_THRESHOLD, unclear_answers
-from rfm_client.contract.samples import MAX_FRAME_STEPS, Float32Array, UInt8Array, as_array, checked_mask
+from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
 from rfm_client.frames.inputs import as_trajectory, load_trajectory
 
 __all__ = [
-    "MAX_FRAME_STEPS",
     "SUCCESS_THRESHOLD",
     "AccessDeniedError",
     "AsyncRewardClient",
@@ -72,7 +71,6 @@ __all__ = [
     "UInt8Array",
     "as_array",
     "as_trajectory",
-    "checked_mask",
     "float_frames_to_uint8",
     "load_trajectory",
     "unclear_answers",

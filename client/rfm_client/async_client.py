@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
+from rfm_client.client_options import ClientOptions
 from rfm_client.contract.errors import (
     ClientClosedError,
     DeadlineExceededError,
@@ -18,15 +19,18 @@ from rfm_client.contract.errors import (
     RewardError,
 )
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import DEFAULT_MODEL, Part, encoder_name, frames_name
+from rfm_client.contract.names import PROBE_PREFIX, Part, encoder_name, frames_name
+from rfm_client.contract.numbers import checked_count
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.contract.synthetic import blank_trajectory
 from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes
-from rfm_client.episodes.steps import EpisodeOptions, EpisodeSettings
-from rfm_client.episodes.windows import Window, WindowScorer
+from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
+from rfm_client.episodes.scorer import Asked, StepScorer
+from rfm_client.episodes.steps import Steps
 from rfm_client.scoring.call import Call, CallOptions
 from rfm_client.scoring.samples import SampleScorer
-from rfm_client.transport.calls import Transport, connect
+from rfm_client.transport.calls import connect
 from rfm_client.transport.concurrency import ConcurrencyLimiter
 from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.deadline import Deadline, check_timeout
@@ -36,54 +40,27 @@ from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-DEFAULT_TIMEOUT_S = 60.0
-DEFAULT_IN_FLIGHT = 128  # twice the usual batch: the next gathers while a batch is scored
 READY_POLL_S = 0.2
 
 
-class AsyncRewardClient(AsyncClosing, OneProcess):
+class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     """Client of one or several servers of the same checkpoint, for one event loop.
 
-    The arrays of a sample must not change while its call is awaited: they are read when it is the request's turn.
-
-    urls: one or several ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``. The server
-        with the fewest open requests gets the next; an episode stays on its server, which keeps features of its frames.
-        A server that fails is left out until it is ready again
-    model: name of the exported checkpoint; raw frames go to ``<model>_frames``
-    timeout_s: longest time of a call, retries included; at most 1e9
-    retry: True: until the time is up, retry requests that fail because a server is down, restarting or full
-    max_in_flight: most open requests; further requests wait
-    shared_memory: True: large inputs go through memory that client and server, on one host, both map
-    ca_file, client_certificate, client_key, headers, api_key: as in Credentials
-    transports: used in place of connections to ``urls``, for tests and unusual networks
+    ``help(AsyncRewardClient.__init__)`` describes the options. The arrays of a sample must not change while its call is
+    awaited: they are read when it is the request's turn.
     """
 
-    def __init__(
-        self,
-        urls: str | Iterable[str],
-        *,
-        model: str = DEFAULT_MODEL,
-        timeout_s: float = DEFAULT_TIMEOUT_S,
-        retry: bool = True,
-        max_in_flight: int = DEFAULT_IN_FLIGHT,
-        shared_memory: bool = False,
-        ca_file: str | Path | None = None,
-        client_certificate: str | Path | None = None,
-        client_key: str | Path | None = None,
-        headers: Mapping[str, str] | None = None,
-        api_key: str | None = None,
-        transports: Sequence[Transport] | None = None,
-    ) -> None:
-        check_timeout(timeout_s)
-        credentials = Credentials(ca_file, client_certificate, client_key, headers or {}, api_key)
+    def __post_init__(self) -> None:
+        check_timeout(self.timeout_s)
+        keys = self.ca_file, self.client_certificate, self.client_key
+        credentials = Credentials(*keys, self.headers or {}, self.api_key)
+        transports = self.transports
         if not transports:
-            urls = [urls] if isinstance(urls, str) else urls
-            transports = [connect(url, shared_memory=shared_memory, credentials=credentials) for url in urls]
-        self._model = model
-        self._timeout_s = timeout_s
-        self._servers = Servers(transports, retry=retry)
-        self._scorer = SampleScorer(model, self._servers, ConcurrencyLimiter(max_in_flight))
-        self._windows = WindowScorer(model, self._scorer, len(self._servers))
+            urls = [self.urls] if isinstance(self.urls, str) else self.urls
+            transports = [connect(url, shared_memory=self.shared_memory, credentials=credentials) for url in urls]
+        self._servers = Servers(transports, retry=self.retry)
+        self._scorer = SampleScorer(self.model, self._servers, ConcurrencyLimiter(self.max_in_flight))
+        self._steps = StepScorer(self.model, self._scorer, len(self._servers))
         self._is_closed = False
         self._loop: asyncio.AbstractEventLoop | None = None  # of the first call
 
@@ -148,39 +125,32 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
                 raise outcome
         return cast("list[Result]", outcomes)
 
-    def episode(self, task: str, *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]) -> AsyncEpisode:
+    def episode(self, task: str, *, env: int | None = None, **options: Unpack[StepKeywords]) -> AsyncEpisode:
         """Return an episode to score step by step. A step sends only its new frame, if the server keeps features.
 
-        timeout_s: longest time of a step; None: the client's
+        env: number of its environment, which errors name as ``envs[3]``; None: the only one
         options: fields of EpisodeOptions. Raises ValueError for contradictory options
         """
-        return AsyncEpisode(self, task, EpisodeOptions(**options), timeout_s)
+        where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
+        steps = Steps(task, EpisodeOptions(**options), env or 0, where)
+        return AsyncEpisode(AsyncEpisodes(self._steps, self._call, [steps]))
 
-    def episodes(
-        self, num: int, task: str | Sequence[str], *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]
-    ) -> AsyncEpisodes:
+    def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> AsyncEpisodes:
         """Return ``num`` parallel episodes, as in vectorised environments. A step takes as few requests as possible.
 
         task: a sentence for all episodes, or a sentence for each
-        timeout_s, options: as in ``episode``
+        options: as in ``episode``
         """
         tasks = [task] * num if isinstance(task, str) else list(task)
         if len(tasks) != num:
             raise ValueError(f"task: expected one for each of {num} episodes, got {len(tasks)}")
-        return AsyncEpisodes(self, tasks, EpisodeOptions(**options), timeout_s)
+        each, where = EpisodeOptions(**options), "episodes[{}]" if num > 1 else ""
+        steps = [Steps(sentence, each, env, where.format(env)) for env, sentence in enumerate(tasks)]
+        return AsyncEpisodes(self._steps, self._call, steps)
 
-    async def score_windows(
-        self, windows: Sequence[Window], *, timeout_s: float | None = None
-    ) -> list[Result | RewardError]:
-        """Return the progress result or error of each window. Only frames that the server lacks are sent."""
-        return await self._windows.outcomes(windows, self._call({"timeout_s": timeout_s}))
-
-    async def score_window(self, window: Window) -> ProgressResult:
-        """Return the result of a window. Raises RewardError."""
-        (outcome,) = await self.score_windows([window])
-        if isinstance(outcome, RewardError):
-            raise outcome
-        return cast(ProgressResult, outcome)
+    async def score_steps(self, asked: Sequence[Asked]) -> list[StepScore]:
+        """Return the score of each step of an episode, from as few requests as possible. Raises RewardError."""
+        return await self._steps.scores(asked, self._call({}), time.perf_counter())
 
     async def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
@@ -191,10 +161,14 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         """
         return await self._scorer.embeddings(trajectory, self._call({"timeout_s": timeout_s, "request_id": request_id}))
 
+    async def probe(self, model: ModelInfo, *, timeout_s: float | None = None) -> None:
+        """Score a blank sample, which the server's metrics leave out. Raises RewardError if that fails."""
+        await self.progress(blank_trajectory(model.widths), timeout_s=timeout_s, request_id=PROBE_PREFIX)
+
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
         """True if a server answers and has the model ready, for embeddings or for raw frames."""
         left_s = self._deadline(timeout_s).remaining_s()
-        return await self._servers.is_ready((self._model, frames_name(self._model)), left_s)
+        return await self._servers.is_ready((self.model, frames_name(self.model)), left_s)
 
     async def wait_ready(self, timeout_s: float) -> None:
         """Return as soon as ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
@@ -202,10 +176,16 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         await self._servers.check_ports()
         while not await self.is_ready(timeout_s=min(PROBE_TIMEOUT_S, deadline.remaining_s())):
             if deadline.ends_within(READY_POLL_S):
-                names = f"{self._model} and {frames_name(self._model)}"
+                names = f"{self.model} and {frames_name(self.model)}"
                 why = await self._why_unready()
                 raise DeadlineExceededError(f"{self._servers}: {names}: not ready within {timeout_s:g} s{why}")
             await asyncio.sleep(READY_POLL_S)
+
+    @property
+    def model_names(self) -> dict[Part, str]:
+        """Names of the checkpoint's models on the server, whether they are served or not."""
+        name = self.model
+        return {"embeddings": name, "encoder": encoder_name(name), "frames": frames_name(name)}
 
     async def model_info(
         self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None
@@ -216,7 +196,7 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
 
         Raises ModelNotFoundError if the model is not served.
         """
-        name = frames_name(self._model) if frames else self._model
+        name = frames_name(self.model) if frames else self.model
         return await self._scorer.model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
@@ -225,13 +205,8 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         Raises RewardError if no server answers.
         """
         deadline = self._deadline(timeout_s)
-        names: dict[Part, str] = {
-            "embeddings": self._model,
-            "encoder": encoder_name(self._model),
-            "frames": frames_name(self._model),
-        }
         told: dict[Part, list[ModelInfo]] = {}
-        for part, name in names.items():
+        for part, name in self.model_names.items():
             with suppress(ModelNotFoundError):
                 told[part] = await self._servers.model_infos(name, deadline)
         return told
@@ -247,7 +222,7 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
 
     async def _why_unready(self) -> str:
         try:
-            await self._servers.model_info(frames_name(self._model), Deadline(PROBE_TIMEOUT_S))
+            await self._servers.model_info(frames_name(self.model), Deadline(PROBE_TIMEOUT_S))
         except (ModelNotFoundError, InferenceFailedError) as error:
             return f": {error}"
         except RewardError:
@@ -268,4 +243,4 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         if self._loop is not loop:
             expected = "the event loop that it was first used in"
             raise RuntimeError(f"this AsyncRewardClient: expected {expected}, got another: make one in each loop")
-        return Deadline(self._timeout_s if timeout_s is None else timeout_s)
+        return Deadline(self.timeout_s if timeout_s is None else timeout_s)

@@ -4,23 +4,22 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future
-from pathlib import Path
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from rfm_client.async_client import DEFAULT_IN_FLIGHT, DEFAULT_TIMEOUT_S, AsyncRewardClient
+from rfm_client.async_client import AsyncRewardClient
+from rfm_client.client_options import ClientOptions
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import DEFAULT_MODEL, Part
+from rfm_client.contract.names import Part
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.episodes.episodes import Episode, Episodes
-from rfm_client.episodes.steps import EpisodeSettings
-from rfm_client.episodes.windows import Window
+from rfm_client.episodes.options import StepKeywords, StepScore
 from rfm_client.frames.fit_to_checkpoint import snapshot
 from rfm_client.scoring.call import CallOptions
-from rfm_client.transport.calls import Transport
 from rfm_client.transport.lifetime import Closing, OneProcess
 from rfm_client.transport.loop_thread import LoopThread
 
@@ -28,43 +27,15 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 
-class RewardClient(Closing, OneProcess):
+class RewardClient(ClientOptions, Closing, OneProcess):
     """Blocking, thread-safe client: an AsyncRewardClient whose event loop runs in a thread of its own.
 
-    Arguments and errors are AsyncRewardClient's. It closes as a context manager and at the interpreter's end.
-    It does not survive a fork: make a client in each process.
+    ``help(RewardClient.__init__)`` describes the options. Errors are AsyncRewardClient's. It closes as a context
+    manager and at the interpreter's end. It does not survive a fork: make a client in each process.
     """
 
-    def __init__(
-        self,
-        urls: str | Iterable[str],
-        *,
-        model: str = DEFAULT_MODEL,
-        timeout_s: float = DEFAULT_TIMEOUT_S,
-        retry: bool = True,
-        max_in_flight: int = DEFAULT_IN_FLIGHT,
-        shared_memory: bool = False,
-        ca_file: str | Path | None = None,
-        client_certificate: str | Path | None = None,
-        client_key: str | Path | None = None,
-        headers: Mapping[str, str] | None = None,
-        api_key: str | None = None,
-        transports: Sequence[Transport] | None = None,
-    ) -> None:
-        self._client = AsyncRewardClient(
-            urls,
-            model=model,
-            timeout_s=timeout_s,
-            retry=retry,
-            max_in_flight=max_in_flight,
-            shared_memory=shared_memory,
-            ca_file=ca_file,
-            client_certificate=client_certificate,
-            client_key=client_key,
-            headers=headers,
-            api_key=api_key,
-            transports=transports,
-        )
+    def __post_init__(self) -> None:
+        self._client = AsyncRewardClient(**{each.name: getattr(self, each.name) for each in fields(ClientOptions)})
         self._loop = LoopThread("rfm-client")
         self._finalizer = weakref.finalize(self, _close, self._client, self._loop)
 
@@ -122,31 +93,32 @@ class RewardClient(Closing, OneProcess):
         future.add_done_callback(lambda _done: self)  # keeps the client alive until then
         return future
 
-    def episode(self, task: str, *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]) -> Episode:
+    def episode(self, task: str, *, env: int | None = None, **options: Unpack[StepKeywords]) -> Episode:
         """Return an episode to score step by step. A step sends only its new frame, if the server keeps features.
 
-        timeout_s: longest time of a step; None: the client's
+        env: number of its environment, which errors name as ``envs[3]``; None: the only one
         options: fields of EpisodeOptions. Raises ValueError for contradictory options
         """
-        return Episode(self._client.episode(task, timeout_s=timeout_s, **options), self._loop, self)
+        return Episode(self._client.episode(task, env=env, **options), self._loop, self)
 
-    def episodes(
-        self, num: int, task: str | Sequence[str], *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]
-    ) -> Episodes:
+    def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> Episodes:
         """Return ``num`` parallel episodes, as in vectorised environments. A step takes as few requests as possible.
 
         task: a sentence for all episodes, or a sentence for each
-        timeout_s, options: as in ``episode``
+        options: as in ``episode``
         """
-        return Episodes(self._client.episodes(num, task, timeout_s=timeout_s, **options), self._loop, self)
+        return Episodes(self._client.episodes(num, task, **options), self._loop, self)
 
-    def score_windows(self, windows: Sequence[Window], *, timeout_s: float | None = None) -> list[Result | RewardError]:
-        """Return the progress result or error of each window. Only frames that the server lacks are sent."""
-        return self._loop.wait(self._client.score_windows(windows, timeout_s=timeout_s))
+    def score_episodes(self, episodes: Sequence[Episode]) -> list[StepScore]:
+        """Return the score of each episode at its newest frame, from as few requests as possible. Raises RewardError.
 
-    def submit_window(self, window: Window) -> Future[ProgressResult]:
-        """Send the window and return a future of its result, as ``submit`` does."""
-        future = self._loop.start(self._client.score_window(window))
+        It scores frames of ``Episode.keep``, which stay in the episodes if it fails.
+        """
+        return self._loop.wait(self._client.score_steps([each.asked for each in episodes]))
+
+    def submit_episodes(self, episodes: Sequence[Episode]) -> Future[list[StepScore]]:
+        """Return a future of the scores of ``score_episodes``, at once. Frames kept later do not change them."""
+        future = self._loop.start(self._client.score_steps([each.asked for each in episodes]))
         future.add_done_callback(lambda _done: self)
         return future
 

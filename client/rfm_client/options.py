@@ -2,7 +2,7 @@
 """Declare settings of a command or a configuration file, and check values. Applications build on it."""
 
 from rfm_client.contract.checks import first_names, require
-from rfm_client.contract.numbers import checked_count, checked_finite, checked_positive, checked_share
+from rfm_client.contract.numbers import checked_count, checked_finite
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting, settings_of
 from rfm_client.contract.tasks import is_blank
 
@@ -12,8 +12,6 @@ __all__ = [
     "Texts",
     "checked_count",
     "checked_finite",
-    "checked_positive",
-    "checked_share",
     "first_names",
     "is_blank",
     "require",

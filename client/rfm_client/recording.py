@@ -18,7 +18,7 @@ from rfm_client.contract.results import FrameScores
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.transport.lifetime import Closing
 
-__all__ = ["PROGRESS", "SUCCESS", "Recording", "load_rerun"]
+__all__ = ["Recording"]
 
 TIME = "video_time"  # timeline in seconds of the video
 FRAME = "frame"  # timeline in frames, where seconds are unknown
@@ -29,15 +29,6 @@ _APPLICATION = "rfm-client"
 _COLOURS = {PROGRESS: (31, 119, 180), SUCCESS: (44, 160, 44)}  # as in plots
 
 
-def load_rerun() -> Any:
-    """Return the package ``rerun``. Raises ImportError with the extra to install."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise ImportError('recordings need rerun-sdk: pip install "./client[rerun]"') from error
-    return rerun
-
-
 class Recording(Closing):
     """A recording file to which any thread can add trajectories. The first trajectory creates the file.
 
@@ -46,8 +37,12 @@ class Recording(Closing):
     """
 
     def __init__(self, file: Path) -> None:
-        """Raise ImportError if the package is missing."""
-        self._rerun = load_rerun()
+        """Raise ImportError, with the extra to install, if the package is missing."""
+        try:
+            import rerun
+        except ImportError as error:
+            raise ImportError('recordings need rerun-sdk: pip install "./client[rerun]"') from error
+        self._rerun: Any = rerun
         self._file = file
         self._stream: Any = None
         self._lock = threading.Lock()

@@ -26,7 +26,12 @@ from rfm_client.contract.listening import from_here
 from rfm_client.contract.process_log import write_log
 
 try:
-    from rfm_gateway import GatewayConfig, gateway, gateway_command  # before the modules below, which import it
+    from rfm_gateway import (
+        GatewayConfig,
+        check_gateway,
+        gateway,
+        gateway_command,
+    )  # before the modules below, which import it
 except ModuleNotFoundError:
     raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./apps/gateway .") from None
 from rfm_commands.command import AdminKeyFile, RfmCommand, TritonPath, fail, say
@@ -224,7 +229,7 @@ def _beside(server: TritonServer, config: Config) -> GatewayConfig:
         model=gateway.model or config.export.name,
     )
     try:
-        filled.check(os.environ)
+        check_gateway(filled, os.environ)
     except (OSError, ValueError) as error:
         fail(f"gateway: {error}")
     names = names_of(server.repository)

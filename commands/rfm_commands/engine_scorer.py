@@ -24,7 +24,7 @@ from rfm.engine.execution import Execution
 from rfm.family import Checkpoint, FrameEncoders, config_fields
 from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import EncoderSample, UInt8Array
-from rfm_export.verify import device_named
+from rfm_export.source import device_named
 from rfm_labels import CheckpointFacts
 
 
@@ -87,7 +87,6 @@ def _facts(
     told: Mapping[str, Any],
 ) -> CheckpointFacts:
     description = checkpoint.description
-    limits = [limit for limit in (description.trained_frames, description.max_frames) if limit is not None]
     name, _, tag = source.partition("@")
     is_local = Path(source).is_dir()
     return CheckpointFacts(
@@ -95,11 +94,11 @@ def _facts(
         revision=None if is_local else tag or None,
         weights_digest=weights_digest(folders),
         settings_digest=_settings_digest(checkpoint, encoders, folders, told),
-        max_frames=min(limits, default=None),
+        max_frames=description.max_frames,
         frame_size=description.frame_size if encoders is None else encoders.description.frame_size,
         encodes=encoders is not None,
         is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
-        trained_padding=description.trained_padding is not False,
+        trained_padding=description.trained_padding,
         has_log_prob=description.has_log_prob,
         needs_whole_episode=description.needs_whole_episode,
         weights=getattr(checkpoint.config, "weights", None),

@@ -13,7 +13,7 @@ from rfm.config import ExportConfig
 from rfm_client.cli.command import Given, OptionsOf, with_options
 from rfm_commands.command import ASKED_BY, CHECKPOINT_TITLE, OF_A_CHECKPOINT, say
 from rfm_labels import LabelOptions, RayOptions, Scorer
-from rfm_labels.commands.label import DatasetArgument, EpisodeTexts, LabelCommand, RunOptions
+from rfm_labels.commands import DatasetArgument, EpisodeTexts, LabelCommand, RunOptions
 
 _OPTIONS = (*OF_A_CHECKPOINT, *ASKED_BY, "dtype")
 

@@ -3,65 +3,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-import torch
 from google.protobuf.text_format import ParseError
 from safetensors import SafetensorError
 
 from rfm import families
-from rfm.checkpoint.hub import check_links
 from rfm.checkpoint.provenance import Decision, write
-from rfm.checkpoint.run_config import find_run_config
 from rfm.config import ExportConfig
-from rfm.engine import Engine
-from rfm.engine.computation import computation
-from rfm.family import Checkpoint, Description, Family, FrameEncoders, Options
+from rfm.family import Options
+from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import CHECKPOINT_FOLDER, FAMILY_PARAMETER
 from rfm_client.contract import wire
-from rfm_client.contract.model_info import COMPUTATION_PARAMETER, WEIGHTS_DIFFERENCE_PARAMETER
 from rfm_client.contract.names import encoder_name, frames_name
-from rfm_export.about import about, origin_in, origin_of, record_digests
-from rfm_export.batches import with_batch_size
 from rfm_export.errors import ExportError
-from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_name
+from rfm_export.layout import GeneratedModel, Version, description_in, generated_files, generated_models
 from rfm_export.publish import alone, next_version, publish, read_config, staging
-from rfm_export.verify import (
-    device_for,
-    device_named,
-    largest_difference,
-    needing_room,
-    probes,
-    verify,
-    verify_graphs,
+from rfm_export.source import (
+    Say,
+    Source,
+    described,
+    described_encoders,
+    num_gpus,
+    origin_in,
+    read_for_export,
+    read_source,
+    with_batch_size,
 )
-
-Say: TypeAlias = Callable[[str], object]  # takes a line for the user
+from rfm_export.verify import compare
 
 
 def _nobody(line: str) -> None:
     pass
-
-
-@dataclass(frozen=True)
-class _Source:
-    """The checked input of an export.
-
-    decisions: settings that the scores depend on
-    full: loads the checkpoint with full weights; None: the settings round nothing
-    """
-
-    family: Family
-    checkpoint: Checkpoint
-    encoders: FrameEncoders | None
-    origin: Mapping[str, str]
-    decisions: Sequence[Decision] = ()
-    full: Callable[[], Checkpoint] | None = None
 
 
 def export(
@@ -86,24 +63,17 @@ def export(
 
     Raises CheckpointError, ExportError.
     """
-    if not other_machine:
-        _check_gpus(settings.num_gpus)
-    named = None if device is None else device_named(device)
-    loaded = _load(source, settings, family, say)
-    _check_graphs(settings, loaded.checkpoint.description)
-    settings = with_batch_size(settings, loaded.checkpoint, say)
-    described = loaded.encoders.description if loaded.encoders is not None else None
+    read = read_for_export(source, settings, family, device, say, other_machine=other_machine)
     names = [settings.name, encoder_name(settings.name), frames_name(settings.name)]
     with alone(repository), staging(repository, names) as staged:
-        version = _version(loaded, settings, next_version(repository, names))
-        models = generated_models(loaded.checkpoint.description, described, version)
+        version = Version(next_version(repository, names), read.settings, read.num_gpus, read.family.name)
+        models = generated_models(read.description, read.of_encoders, version)
         _check_replaceable(repository, models, settings)
-        if (differs := _difference(loaded, version, named, say)) is not None:
-            version = replace(version, about={**version.about, WEIGHTS_DIFFERENCE_PARAMETER: differs})
-            models = generated_models(loaded.checkpoint.description, described, version)
         with _needing_disk(repository):
-            _stage(loaded, models, version, staged)
-        _verify(loaded, version, staged, named, say)
+            _save(read, version, staged)
+        if (difference := compare(read, version, staged, say)) is not None:
+            description = replace(read.description, weights_difference=difference)
+            models = generated_models(description, read.of_encoders, version)
         with _needing_disk(repository):
             publish(repository, staged, models)
     return version.number
@@ -120,51 +90,7 @@ def explain(
 
     Parameters as of ``export``. Raises CheckpointError.
     """
-    return _load(source, settings, family, say).decisions
-
-
-def _load(source: str | Path, settings: ExportConfig, family: str | None, say: Say) -> _Source:
-    """Load and check ``source``. Tell the user the file of the training run's settings, and possible faults."""
-    folder = families.find(source, say)
-    options = Options.of(settings)
-    kind = families.choose(folder, family, options)
-    checkpoint = families.load_from(folder, kind, options)
-    check_links(folder)
-    encoders = checkpoint.encoders()
-    if (run_config := find_run_config(folder)) is not None:
-        say(f"{run_config}: read as the settings of the training run")
-    for note in families.notes(folder, checkpoint):
-        say(note)
-    told = [] if settings.dtype is None else [Decision("served_dtype", settings.dtype, "--dtype")]
-    computed = computation(checkpoint, settings.torch_dtype, on_gpu=_num_gpus(settings) > 0)
-    told.append(Decision(COMPUTATION_PARAMETER, computed, "installed PyTorch"))
-    origin = {**origin_of(source, folder), COMPUTATION_PARAMETER: computed}
-    full = (
-        None if options.weights is None else partial(families.load_from, folder, kind, replace(options, weights=None))
-    )
-    return _Source(kind, checkpoint, encoders, origin, [*checkpoint.decisions(), *told], full)
-
-
-def _check_gpus(num_gpus: int | None) -> None:
-    """Raise ExportError for more GPUs than this machine has: Triton would refuse to load the models."""
-    there = torch.cuda.device_count()
-    if num_gpus is not None and num_gpus > there:
-        raise ExportError(
-            f"num_gpus: expected at most {there}, got {num_gpus}; --other-machine exports for a machine with more, "
-            "--num-gpus 0 for the CPU"
-        )
-
-
-def _check_graphs(settings: ExportConfig, description: Description) -> None:
-    """Raise ExportError if CUDA graphs are on but nothing would use them."""
-    if settings.cuda_graphs and not description.uses_graphs:
-        expected = "an RFM, Robometer or RoboReward checkpoint (its expected score) on a Qwen backbone"
-        raise ExportError(f"cuda_graphs: expected {expected}, got another; leave out --cuda-graphs")
-    if settings.cuda_graphs and not _num_gpus(settings):
-        raise ExportError(
-            "cuda_graphs: expected an export for GPUs, got one for the CPU; leave out --cuda-graphs, or name "
-            "--num-gpus with --other-machine"
-        )
+    return read_source(source, settings, family, say).decisions
 
 
 @contextmanager
@@ -177,72 +103,22 @@ def _needing_disk(repository: Path) -> Iterator[None]:
         raise ExportError(f"{repository}: expected room for the exported files, got: {error}; {kept}") from error
 
 
-def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, staged: Path) -> None:
-    folder = _checkpoint_folder(source.checkpoint.description, version, staged)
+def _save(source: Source, version: Version, staged: Path) -> None:
+    folder = version.checkpoint_folder(source.checkpoint.description, staged)
     source.checkpoint.save(folder)
     write(source.decisions, folder)
     if source.encoders is not None:
-        source.encoders.save(_encoders_folder(version, staged))
-    for path, content in _generated(models, staged).items():
-        (staged / path).parent.mkdir(parents=True, exist_ok=True)
-        (staged / path).write_bytes(content)
-
-
-def _difference(source: _Source, version: Version, named: torch.device | None, say: Say) -> str | None:
-    """Return the largest difference that rounding the weights makes to progress; None: nothing is rounded."""
-    full = None if source.full is None else source.full()
-    if full is None or full.config.weights is not None:
-        return None
-    settings, kind = version.settings, source.checkpoint.config.weights
-    device = named or device_for(full, settings.torch_dtype, may_use_gpu=settings.num_gpus != 0)
-    engine = partial(Engine.of, device=device, dtype=settings.torch_dtype)
-    samples = probes(full.description, with_encoders=False)
-    with needing_room(device):
-        largest = largest_difference(partial(engine, full), partial(engine, source.checkpoint), samples)
-    say(f"--weights {kind}: progress differs by at most {largest:.2g} from the full checkpoint's, on noise")
-    return f"{largest:.2g}"
-
-
-def _verify(source: _Source, version: Version, staged: Path, named: torch.device | None, say: Say) -> None:
-    """Raise ExportDiffersError unless the staged files give the checkpoint's scores."""
-    description, settings = source.checkpoint.description, version.settings
-    dtype = settings.torch_dtype if description.is_large else None
-    device = named or device_for(source.checkpoint, dtype, may_use_gpu=settings.num_gpus != 0)
-    engine = partial(Engine.of, device=device, dtype=dtype)
-    if description.is_large:
-        say(f"the export's scores are compared with the checkpoint's on {device} (--device names another one)")
-
-    def exported(*, cuda_graphs: bool = False) -> Engine:
-        checkpoint = families.named(source.family.name).load(
-            _checkpoint_folder(description, version, staged), Options()
-        )
-        if source.encoders is None:
-            return engine(checkpoint, cuda_graphs=cuda_graphs)
-        served_by = families.encoders_of(source.family.name)
-        return engine(checkpoint, encoders=served_by.load(_encoders_folder(version, staged)))
-
-    samples = probes(description, with_encoders=source.encoders is not None)
-    with needing_room(device):
-        original = partial(engine, source.checkpoint, encoders=source.encoders)
-        verify(original, exported, samples, may_not_answer=description.may_not_answer)
-        if settings.cuda_graphs and device.type == "cuda":
-            verify_graphs(partial(exported, cuda_graphs=True), description, say)
-        elif settings.cuda_graphs:
-            say(f"cuda_graphs: not compared with plain passes: {device} runs no CUDA graphs (--device names a GPU)")
-
-
-def _checkpoint_folder(description: Description, version: Version, repository: Path) -> Path:
-    return repository / scorer_name(description, version.settings.name) / str(version.number) / CHECKPOINT_FOLDER
-
-
-def _encoders_folder(version: Version, repository: Path) -> Path:
-    return repository / encoder_name(version.settings.name) / str(version.number)
+        source.encoders.save(version.encoders_folder(staged))
 
 
 def check(repository: Path, settings: ExportConfig) -> list[str]:
     """Return a line for each generated file that an export would now write differently. Raises ExportError."""
     scorer = settings.name if (repository / settings.name).exists() else frames_name(settings.name)
     config = _read_config(repository, scorer)
+    try:
+        origin = origin_in(description_in(config))
+    except ValueError as error:
+        raise ExportError(f"{repository / scorer / CONFIG_FILE}: {error}; export again") from error
     versions = config.version_policy.specific.versions
     if not versions:
         raise ExportError(f"{repository / scorer}: expected a configuration that names its versions, got none")
@@ -252,32 +128,17 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     checkpoint = family.load(folder, Options())
     settings = with_batch_size(settings, checkpoint, _nobody)
     encoders = repository / encoder_name(settings.name) / str(number)
-    described = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
-    version = _version(_Source(family, checkpoint, None, origin_in(config)), settings, number)
-    models = generated_models(checkpoint.description, described, version)
+    of_encoders = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
+    of_encoders = None if of_encoders is None else described_encoders(of_encoders, origin)
+    version = Version(number, settings, num_gpus(settings), family.name)
+    models = generated_models(described(checkpoint, origin), of_encoders, version)
     differences = []
-    for path, content in _generated(models, repository).items():
+    for path, content in generated_files(models, repository).items():
         if not (repository / path).is_file():
             differences.append(f"{repository / path}: is missing")
         elif (repository / path).read_bytes() != content:
             differences.append(f"{repository / path}: differs from what `rfm export` generates")
     return differences
-
-
-def _generated(models: Sequence[GeneratedModel], repository: Path) -> dict[str, bytes]:
-    """Contents of generated files by path, with digests of the weights in ``repository``."""
-    for model in models:
-        record_digests(model.config, model.version, repository)
-    return {path: content for model in models for path, content in model.files().items()}
-
-
-def _version(source: _Source, settings: ExportConfig, number: int) -> Version:
-    about_checkpoint = about(source.checkpoint, source.origin)
-    return Version(number, settings, _num_gpus(settings), source.family.name, about_checkpoint)
-
-
-def _num_gpus(settings: ExportConfig) -> int:
-    return torch.cuda.device_count() if settings.num_gpus is None else settings.num_gpus
 
 
 def _read_config(repository: Path, name: str) -> Any:

@@ -8,29 +8,27 @@ frames is the model ``<name>_frames`` alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
+from pathlib import Path
 
 from tritonclient.grpc import model_config_pb2 as pb
 
+from rfm.checkpoint.provenance import settings_digest, weights_digest
 from rfm.config import ExportConfig
-from rfm.family import Description, EncodersDescription
 from rfm.launch.repository_folder import CONFIG_FILE, MODEL_FILE
-from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER, GRAPHS_PARAMETER
-from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
-from rfm_client.contract.model_info import (
-    FRAME_SIZE_PARAMETER,
-    FRAMES_PER_VALUE_PARAMETER,
-    KIND_PARAMETER,
-    LACKS_PARAMETER,
-    MAX_FRAMES_PARAMETER,
-    TRAINED_PADDING_PARAMETER,
-    WHOLE_EPISODE_PARAMETER,
+from rfm.parameters import (
+    CHECKPOINT_FOLDER,
+    DTYPE_PARAMETER,
+    FAMILY_PARAMETER,
+    FEATURE_CACHE_PARAMETER,
+    GRAPHS_PARAMETER,
 )
+from rfm_client.contract import PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
+from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_client.contract.synthetic import blank_trajectory
-from rfm_export.about import about_encoders
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
 
 WARMUP_FOLDER = "warmup"
@@ -76,14 +74,27 @@ class Version:
 
     num_gpus: 0: the CPU
     family: package of the checkpoint's family
-    about: parameters that name the checkpoint
     """
 
     number: int
     settings: ExportConfig
     num_gpus: int
     family: str
-    about: Mapping[str, str]
+
+    def checkpoint_folder(self, description: Description, repository: Path) -> Path:
+        """Return the folder of the checkpoint's files."""
+        return repository / scorer_name(description, self.settings.name) / str(self.number) / CHECKPOINT_FOLDER
+
+    def encoders_folder(self, repository: Path) -> Path:
+        """Return the folder of the encoders' files."""
+        return repository / encoder_name(self.settings.name) / str(self.number)
+
+
+def generated_files(models: Sequence[GeneratedModel], repository: Path) -> dict[str, bytes]:
+    """Return contents of generated files by path, with digests of the weights in ``repository``."""
+    for model in models:
+        _record_digests(model.config, model.version, repository)
+    return {path: content for model in models for path, content in model.files().items()}
 
 
 def scorer_name(description: Description, name: str) -> str:
@@ -91,9 +102,7 @@ def scorer_name(description: Description, name: str) -> str:
     return frames_name(name) if description.widths is None else name
 
 
-def generated_models(
-    description: Description, encoders: EncodersDescription | None, version: Version
-) -> list[GeneratedModel]:
+def generated_models(description: Description, encoders: Description | None, version: Version) -> list[GeneratedModel]:
     """Return the models of a checkpoint and its encoders, parts before their ensemble."""
     name, widths, cache_mib = version.settings.name, description.widths, version.settings.feature_cache_mib
     # Two small networks keep a GPU busy: one scores while the other reads.
@@ -103,39 +112,25 @@ def generated_models(
     keeps = description.keeps_features and cache_mib > 0 and settings.instances == 1
     # A frame reference needs the cache that holds the frame, but Triton chooses the instance: so only one may exist.
     has_one_cache = cache_mib > 0 and version.num_gpus <= 1
-    bins = description.progress_bins if description.progress_bins > 1 else None
-    outputs = wire.score_outputs(bins, has_log_prob=description.has_log_prob, marks_unclear=description.marks_unclear)
+    outputs = wire.score_outputs(
+        description.progress_bins, has_log_prob=description.has_log_prob, marks_unclear=description.marks_unclear
+    )
     inputs = wire.frame_inputs(by_digest=keeps and has_one_cache) if widths is None else wire.embedding_inputs(*widths)
-    about = {**_limits(description, description.frame_size), **version.about}
-    scorer = Interface(scorer_name(description, name), inputs, outputs, about)
+    scorer = Interface(scorer_name(description, name), inputs, outputs, description)
     version = replace(version, settings=settings)
     models = [_python_model(scorer, "rfm", version, _warmups(description), keeps=keeps)]
     if settings.cuda_graphs:
         models[0].config.parameters[GRAPHS_PARAMETER].string_value = "true"
     if encoders is None or widths is None:
         return models
-    inputs, about = wire.encoder_inputs(by_digest=has_one_cache), about_encoders(encoders, version.about)
-    encoder = Interface(encoder_name(name), inputs, wire.encoder_outputs(*widths), about)
+    encodes = replace(encoders, video_dim=widths[0], text_dim=widths[1])
+    inputs = wire.encoder_inputs(by_digest=has_one_cache)
+    encoder = Interface(encoder_name(name), inputs, wire.encoder_outputs(*widths), encodes)
     of_encoder = replace(version, settings=replace(settings, instances=1)) if cache_mib else version
     models.append(_python_model(encoder, "rfm_encoder", of_encoder, [_encoder_warmup()], keeps=True))
-    about = {**_limits(description, encoders.frame_size), **version.about}
-    frames = Interface(frames_name(name), wire.frame_inputs(by_digest=has_one_cache), outputs, about)
+    of_frames = replace(description, video_dim=None, text_dim=None, frame_size=encoders.frame_size)
+    frames = Interface(frames_name(name), wire.frame_inputs(by_digest=has_one_cache), outputs, of_frames)
     return [*models, GeneratedModel(ensemble_config(frames, settings, version.number, encoder, scorer), version.number)]
-
-
-def _limits(description: Description, frame_size: FrameSize | None) -> dict[str, str]:
-    """Parameters that a client may need before it sends a trajectory; empty text: no limit."""
-    limits = [n for n in (description.trained_frames, description.max_frames) if n is not None]
-    padding = description.trained_padding
-    return {
-        MAX_FRAMES_PARAMETER: str(min(limits)) if limits else "",
-        FRAME_SIZE_PARAMETER: "" if frame_size is None else str(frame_size),
-        FRAMES_PER_VALUE_PARAMETER: str(description.frames_per_value),
-        KIND_PARAMETER: description.kind,
-        LACKS_PARAMETER: ",".join(sorted(description.lacks)),
-        **({WHOLE_EPISODE_PARAMETER: "true"} if description.needs_whole_episode else {}),
-        **({} if padding is None else {TRAINED_PADDING_PARAMETER: str(padding).lower()}),
-    }
 
 
 def _python_model(
@@ -166,3 +161,20 @@ def _warmups(description: Description) -> list[Warmup]:
 
 def _encoder_warmup() -> Warmup:
     return Warmup("frames", wire.encode_frames(blank_trajectory(None, task=WARMUP_TASK)))
+
+
+def description_in(config: pb.ModelConfig) -> Description:
+    """Return the description in an exported configuration. Raises ValueError."""
+    return Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value)
+
+
+def _record_digests(config: pb.ModelConfig, version: int, repository: Path) -> None:
+    """Set the digests of a version's weights and settings in ``repository``; an ensemble has those of its parts."""
+    parts = [step.model_name for step in config.ensemble_scheduling.step] or [config.name]
+    folders = [repository / part / str(version) for part in parts]
+    kinds = [pb.ModelInstanceGroup.Kind.Name(group.kind) for group in config.instance_group]
+    told = {"dtype": config.parameters[DTYPE_PARAMETER].string_value, "kinds": kinds} if kinds else {}
+    found = replace(
+        description_in(config), weights_digest=weights_digest(folders), settings_digest=settings_digest(folders, told)
+    )
+    config.parameters[DESCRIPTION_PARAMETER].string_value = found.to_json()

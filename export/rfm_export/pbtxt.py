@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from rfm.parameters import (
     THREADS_PARAMETER,
 )
 from rfm_client.contract import wire
+from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 from rfm_client.contract.wire import TensorSpec
 
 _US_PER_MS = 1000
@@ -31,12 +32,12 @@ HEADER = f"{EXPORT_HEADER}; `rfm export --check` compares it with what would be 
 
 @dataclass(frozen=True)
 class Interface:
-    """Name, inputs and outputs of a model, and the parameters that its clients read."""
+    """Name, inputs and outputs of a model, and the description that its clients read."""
 
     name: str
     inputs: tuple[TensorSpec, ...]
     outputs: tuple[TensorSpec, ...]
-    parameters: Mapping[str, str] = field(default_factory=dict)
+    description: Description
 
 
 @dataclass(frozen=True)
@@ -118,8 +119,7 @@ def _config(interface: Interface, settings: ExportConfig, version: int) -> pb.Mo
     for spec in interface.outputs:
         config.output.add(name=spec.name, data_type=_datatype(spec), dims=spec.dims)
     config.parameters[EXPORT_PARAMETER].string_value = EXPORT_VERSION
-    for name, value in interface.parameters.items():
-        config.parameters[name].string_value = value
+    config.parameters[DESCRIPTION_PARAMETER].string_value = interface.description.to_json()
     return config
 
 

@@ -29,7 +29,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.launch.repository_folder import CONFIG_FILE
 from rfm_export.errors import ExportError
-from rfm_export.layout import WARMUP_FOLDER, GeneratedModel
+from rfm_export.layout import WARMUP_FOLDER, GeneratedModel, generated_files
 from rfm_export.pbtxt import parse, render, serving_versions
 
 _SCRATCH = ".export-"
@@ -132,11 +132,14 @@ def replace_config(repository: Path, config: pb.ModelConfig, scratch: Path) -> N
 
 
 def publish(repository: Path, staged: Path, models: Sequence[GeneratedModel]) -> None:
-    """Move the staged models into the repository.
+    """Write the generated files beside the staged weights, and move the models into the repository.
 
     A new model appears whole. An existing model first serves its old and its new version, then the ensembles change to
     the new version, then the old version goes.
     """
+    for path, content in generated_files(models, staged).items():
+        (staged / path).parent.mkdir(parents=True, exist_ok=True)
+        (staged / path).write_bytes(content)
     replaced = [model for model in models if (repository / model.name).exists()]
     for model in models:
         (staged / model.name / str(model.version) / CONFIG_FILE).write_text(render(model.config))

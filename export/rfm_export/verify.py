@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""Compare the scores of an exported model with its checkpoint's, and choose the device that compares them."""
+"""Compare the scores of an exported model with its checkpoint's, on a device that has room."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from rfm import families
 from rfm.engine import Engine, Outcome
 from rfm.engine.graphs import PLAIN_CALLS
-from rfm.family import NETWORK, Checkpoint, Description
+from rfm.family import NETWORK, Checkpoint, Options
 from rfm_client.contract import (
     FrameScores,
     InvalidSampleError,
@@ -26,8 +29,11 @@ from rfm_client.contract import (
     SimilaritySample,
     Trajectory,
 )
+from rfm_client.contract.description import Description
 from rfm_client.contract.synthetic import Widths, random_trajectory
 from rfm_export.errors import ExportDiffersError, ExportError
+from rfm_export.layout import Version
+from rfm_export.source import Say, Source
 
 TOLERANCE = 1e-6  # same weights, machine and code: only rounding may differ
 GRAPHS_TOLERANCE = 1e-5  # the same kernels on the same shapes
@@ -35,6 +41,56 @@ PROBE_FRAMES = (1, 3, 8)
 PROBE_SIZE_PX = (48, 80)
 PROBE_FRAME_STEPS = 2
 WORKING_ROOM = 1.5  # times the weights' bytes, for weights and a pass over a few small samples
+
+
+def compare(source: Source, version: Version, staged: Path, say: Say) -> float | None:
+    """Raise ExportDiffersError unless the staged weights give the checkpoint's scores.
+
+    Return the largest difference that rounding the weights makes to progress; None: nothing is rounded.
+    """
+    difference = _difference(source, say)
+    _compare_staged(source, version, staged, say)
+    return difference
+
+
+def _difference(source: Source, say: Say) -> float | None:
+    """Return the largest difference that rounding the weights makes to progress; None: nothing is rounded."""
+    full = None if source.full is None else source.full()
+    if full is None or full.config.weights is not None:
+        return None
+    settings, kind = source.settings, source.checkpoint.config.weights
+    device = source.device or device_for(full, settings.torch_dtype, may_use_gpu=settings.num_gpus != 0)
+    engine = partial(Engine.of, device=device, dtype=settings.torch_dtype)
+    samples = probes(full.description, with_encoders=False)
+    with needing_room(device):
+        largest = largest_difference(partial(engine, full), partial(engine, source.checkpoint), samples)
+    say(f"--weights {kind}: progress differs by at most {largest:.2g} from the full checkpoint's, on noise")
+    return float(f"{largest:.2g}")
+
+
+def _compare_staged(source: Source, version: Version, staged: Path, say: Say) -> None:
+    description, settings = source.checkpoint.description, source.settings
+    dtype = settings.torch_dtype if description.is_large else None
+    device = source.device or device_for(source.checkpoint, dtype, may_use_gpu=settings.num_gpus != 0)
+    engine = partial(Engine.of, device=device, dtype=dtype)
+    if description.is_large:
+        say(f"the export's scores are compared with the checkpoint's on {device} (--device names another one)")
+
+    def exported(*, cuda_graphs: bool = False) -> Engine:
+        checkpoint = families.named(source.family.name).load(version.checkpoint_folder(description, staged), Options())
+        if source.encoders is None:
+            return engine(checkpoint, cuda_graphs=cuda_graphs)
+        served_by = families.encoders_of(source.family.name)
+        return engine(checkpoint, encoders=served_by.load(version.encoders_folder(staged)))
+
+    samples = probes(description, with_encoders=source.encoders is not None)
+    with needing_room(device):
+        original = partial(engine, source.checkpoint, encoders=source.encoders)
+        verify(original, exported, samples, may_not_answer=description.may_not_answer)
+        if settings.cuda_graphs and device.type == "cuda":
+            verify_graphs(partial(exported, cuda_graphs=True), description, say)
+        elif settings.cuda_graphs:
+            say(f"cuda_graphs: not compared with plain passes: {device} runs no CUDA graphs (--device names a GPU)")
 
 
 def device_for(checkpoint: Checkpoint, dtype: torch.dtype | None, *, may_use_gpu: bool) -> torch.device:
@@ -62,16 +118,6 @@ def _free_bytes(index: int) -> int:
         return 0
 
 
-def device_named(name: str) -> torch.device:
-    """Return the device of this name. Raises ExportError if this machine does not have it."""
-    there, why = ["cpu"], f": PyTorch {torch.__version__} finds no GPU; --device cpu"
-    if torch.cuda.is_available():
-        there, why = ["cpu", "cuda", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))], ""
-    if name not in there:
-        raise ExportError(f"device: expected one of {', '.join(there)}, got {name}{why}")
-    return torch.device(name)
-
-
 @contextmanager
 def needing_room(device: torch.device) -> Iterator[None]:
     """Raise ExportError for a network that does not fit on the device."""
@@ -97,7 +143,7 @@ def probes(description: Description, *, with_encoders: bool, seed: int = 0) -> l
     samples: list[Sample] = []
     for widths in (description.widths, None) if with_encoders else (description.widths,):
         for num_frames in PROBE_FRAMES:
-            length = min(num_frames, description.max_frames or num_frames)
+            length = min(num_frames, description.network_frames or num_frames)
             samples.append(ProgressSample(make(length, widths)))
             if not description.needs_whole_episode:
                 samples.append(ProgressSample(make(length, widths), frame_steps=PROBE_FRAME_STEPS))
@@ -142,7 +188,7 @@ def largest_difference(full: Callable[[], Engine], rounded: Callable[[], Engine]
     return max((float(np.abs(after.progress - before.progress).max()) for before, after in frames), default=0.0)
 
 
-def verify_graphs(make: Callable[[], Engine], description: Description, say: Callable[[str], object]) -> None:
+def verify_graphs(make: Callable[[], Engine], description: Description, say: Say) -> None:
     """Raise ExportDiffersError unless CUDA graphs give the scores of plain passes.
 
     Each sample, and another of the same shapes, is scored alone: first by plain passes, then by graphs.

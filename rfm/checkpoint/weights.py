@@ -58,7 +58,6 @@ _HEAD = "progress_head.4.weight"  # in every reward network
 # The model_type of config.json, by the name of a weight that such a network has and no other.
 _NETWORKS = {
     "rewind_transformer": re.compile(r"(^|\.)video_proj\.weight$"),
-    "smolvlm": re.compile(r"(^|\.)text_model\.layers\.\d+\.mlp\."),
     "qwen2_5_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.gate_proj\."),
     "qwen3_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.linear_fc1\."),
 }

@@ -12,8 +12,8 @@ import numpy as np
 
 from rfm.engine.threads import FrameThreads
 from rfm_client.contract import RewardError
-from rfm_client.contract.frame_refs import frame_digest
 from rfm_client.contract.samples import Float32Array, UInt8Array
+from rfm_client.contract.wire import frame_digest
 
 BYTES_PER_MIB = 2**20
 _ENTRY_BYTES = 256  # of a key, the array's header and the entry in the ordered dict

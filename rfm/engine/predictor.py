@@ -22,7 +22,6 @@ from rfm_client.contract import (
     Sample,
     SimilaritySample,
 )
-from rfm_client.contract.frame_refs import ProgressSampleRefs
 from rfm_client.contract.samples import Float32Array
 
 Row = TypeVar("Row")
@@ -43,10 +42,9 @@ class Predictor(Protocol[Row, Batch]):
     def works_ahead(self) -> bool:
         """True if ``work_ahead`` takes enough time to be worth a thread."""
 
-    def rows(self, sample: Sample | ProgressSampleRefs) -> list[Row]:
+    def rows(self, sample: Sample) -> list[Row]:
         """Return the sample's rows, without a forward pass: one, or one for each prefix that is scored.
 
-        sample: with frame references only if ``Description.keeps_features``
         Raises InvalidSampleError if this checkpoint cannot score the sample.
         """
 
@@ -71,7 +69,7 @@ class Predictor(Protocol[Row, Batch]):
         execution: a predictor of several passes calls its ``on_forward`` after each
         """
 
-    def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
+    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
         """Return the scores of a progress sample's frames, from those of all its rows."""
 
 
@@ -96,7 +94,7 @@ class RowScores:
     is_of_prefixes: bool = False
 
 
-def check_type(sample: Sample | ProgressSampleRefs, config: Any) -> None:
+def check_type(sample: Sample, config: Any) -> None:
     """Raise InvalidSampleError for a preference or similarity sample if the network lacks that head.
 
     config: the network's configuration
@@ -124,7 +122,7 @@ def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> Fram
     )
 
 
-def of_rows(sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
+def of_rows(sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
     """Return the scores of a progress sample: those of the only row; in dense mode, of each prefix's last frame."""
     return of_prefixes(rows) if getattr(sample, "frame_steps", 0) else rows[0].frames[0]
 

@@ -8,12 +8,10 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, TypeAlias, cast
 
 import torch
 
-from rfm import families
 from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
 from rfm.engine.device import memory_errors
 from rfm.engine.execution import Execution
@@ -22,7 +20,7 @@ from rfm.engine.finite import finite
 from rfm.engine.graphs import CudaCapture, Graphs
 from rfm.engine.layers import keep_float32
 from rfm.engine.predictor import GraphedPredictor, Predictor, RowScores, of_prefixes
-from rfm.family import Checkpoint, FrameEncoders, VideoPrompt, Weights
+from rfm.family import Checkpoint, FrameEncoders
 from rfm_client.contract import (
     BatchTiming,
     InvalidSampleError,
@@ -35,7 +33,6 @@ from rfm_client.contract import (
     Sample,
     SimilarityResult,
 )
-from rfm_client.contract.frame_refs import ProgressSampleRefs
 from rfm_client.contract.samples import EncoderSample, with_trajectories
 
 Outcome: TypeAlias = Result | RewardError
@@ -49,7 +46,7 @@ class Prepared:
     num_tokens: tokens in all rows
     """
 
-    sample: Sample | ProgressSampleRefs
+    sample: Sample
     rows: Sequence[Any] | RewardError
     num_tokens: int = 0
 
@@ -61,6 +58,7 @@ class Engine:
     encoders: on the same device, for samples of raw frames if the network scores embeddings
     token_budget: maximum tokens, with padding, of a forward pass of several rows; a larger row runs alone
     max_sample_tokens: maximum tokens of one sequence; a sample with a longer one is refused
+    cache: the predictor's, of frames and their features; None: it keeps none
     graphs: CUDA graphs for small batches, if the predictor can use them; None: all passes are plain
     """
 
@@ -71,58 +69,17 @@ class Engine:
         encoders: FrameEncoders | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
+        cache: FeatureCache[Any] | None = None,
         graphs: Graphs | None = None,
     ) -> None:
         self.predictor = predictor
         self.encoders = encoders
         self.token_budget = token_budget
         self.max_sample_tokens = max_sample_tokens
+        self.cache = cache
         self.graphs = graphs
         if graphs is not None:
             cast("GraphedPredictor[Any, Any]", predictor).use_graphs(graphs)
-
-    @classmethod
-    def from_checkpoint(
-        cls,
-        source: str | Path,
-        *,
-        family: str | None = None,
-        encoders: FrameEncoders | None = None,
-        base_model: str | None = None,
-        reward_model: str | None = None,
-        video_prompt: VideoPrompt | None = None,
-        strict_answers: bool = False,
-        weights: Weights | None = None,
-        device: str | torch.device = "cpu",
-        dtype: torch.dtype | None = None,
-        token_budget: int = DEFAULT_TOKEN_BUDGET,
-        max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
-        feature_cache_mib: int = 0,
-        cuda_graphs: bool = False,
-    ) -> Engine:
-        """Return the engine for a checkpoint's folder or Hugging Face id.
-
-        source, family, base_model to weights: as in ``rfm.families.load``; others: as in ``of`` and the class
-        Raises CheckpointError.
-        """
-        return cls.of(
-            families.load(
-                source,
-                family=family,
-                base_model=base_model,
-                reward_model=reward_model,
-                video_prompt=video_prompt,
-                strict_answers=strict_answers,
-                weights=weights,
-            ),
-            encoders=encoders,
-            device=device,
-            dtype=dtype,
-            token_budget=token_budget,
-            max_sample_tokens=max_sample_tokens,
-            feature_cache_mib=feature_cache_mib,
-            cuda_graphs=cuda_graphs,
-        )
 
     @classmethod
     def of(
@@ -156,6 +113,7 @@ class Engine:
             encoders=encoders,
             token_budget=token_budget,
             max_sample_tokens=max_sample_tokens,
+            cache=cache,
             graphs=Graphs(CudaCapture(on)) if is_graphed else None,
         )
 
@@ -174,7 +132,7 @@ class Engine:
             prepared = [self._prepared(sample, of) for sample, of in zip(samples, embedded_samples, strict=True)]
         return self._results(prepared, execution, before)
 
-    def prepare(self, sample: Sample | ProgressSampleRefs) -> Prepared:
+    def prepare(self, sample: Sample) -> Prepared:
         """Make the rows of a sample, without encoders or a forward pass; may run while another thread scores.
 
         sample: in the form that the network reads; the encoders are not used
@@ -198,7 +156,11 @@ class Engine:
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
         """Encode the raw frames of all samples together; an error replaces a sample that cannot be encoded."""
         outcomes: list[Sample | RewardError] = list(samples)
-        raw = {i: EncoderSample(s.trajectories) for i, s in enumerate(samples) if s.trajectories[0].frames is not None}
+        raw = {
+            i: EncoderSample(s.trajectories)
+            for i, s in enumerate(samples)
+            if s.trajectories[0].video_embeddings is None
+        }
         if self.encoders is None or not raw:
             return outcomes
         for index, outcome in zip(raw, self.encoders.encode(list(raw.values()), execution, None), strict=True):
@@ -208,9 +170,7 @@ class Engine:
                 outcomes[index] = outcome
         return outcomes
 
-    def _prepared(
-        self, sample: Sample | ProgressSampleRefs, embedded_sample: Sample | ProgressSampleRefs | RewardError
-    ) -> Prepared:
+    def _prepared(self, sample: Sample, embedded_sample: Sample | RewardError) -> Prepared:
         if isinstance(embedded_sample, RewardError):
             return Prepared(sample, embedded_sample)
         try:
@@ -305,14 +265,14 @@ class Engine:
 
     def _outcome(
         self,
-        sample: Sample | ProgressSampleRefs,
+        sample: Sample,
         scores: Sequence[RowScores | RewardError],
         timing: BatchTiming,
     ) -> Outcome:
         rows = [row for row in scores if isinstance(row, RowScores)]
         if len(rows) < len(scores):
             return next(row for row in scores if isinstance(row, RewardError))
-        if isinstance(sample, (ProgressSample, ProgressSampleRefs)):
+        if isinstance(sample, ProgressSample):
             frames = self.predictor.joined(sample, rows)
             return ProgressResult(**vars(frames), timing=timing)
         first, second = rows[0].frames

@@ -14,7 +14,7 @@ from pathlib import Path
 from rfm.config import DEFAULT_HOST, ServeConfig
 from rfm.launch.installation import ServerStartError
 from rfm_client.contract.addresses import check_authorities, check_certificate, is_loopback
-from rfm_client.contract.listening import check_free, in_url
+from rfm_client.contract.listening import ListenAddress, in_url
 
 PORTS = range(20_000, 32_000)  # below the ports that Linux gives to outgoing connections
 SECURITY_FLOOR = (
@@ -116,7 +116,7 @@ class Endpoints:
         )
         for name, host, port in listening:
             try:
-                check_free(host, port, name, port_option=f"--{name.lower()}-port")
+                ListenAddress(host, port).check_free(name, port_option=f"--{name.lower()}-port")
             except ValueError as error:
                 raise ServerStartError(str(error)) from None
 

@@ -12,6 +12,7 @@ from tritonclient.grpc.model_config_pb2 import ModelConfig
 from rfm.launch.installation import ServerStartError
 from rfm.launch.repository_folder import CONFIG_FILE, EXPORT_HEADER, MODEL_FILE
 from rfm.parameters import EXPORT_PARAMETER, EXPORT_VERSION, PYTHON_PARAMETERS
+from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 
 
 def check_models(repository: Path, models: Collection[str]) -> None:
@@ -52,11 +53,17 @@ def fault_in(repository: Path, model: str, config: ModelConfig | None = None) ->
 
 
 def _outdated(config: ModelConfig) -> str | None:
-    """Return what an exported configuration lacks."""
+    """Return what an exported configuration lacks; None: nothing."""
     stamp = config.parameters[EXPORT_PARAMETER].string_value
     if stamp != EXPORT_VERSION:
         is_newer = stamp.isdecimal() and int(stamp) > int(EXPORT_VERSION)
         return f"expected an export by this version of rfm, got one of {'a newer' if is_newer else 'an older'} version"
     needed = () if config.backend != "python" else PYTHON_PARAMETERS
     missing = [name for name in needed if name not in config.parameters]
-    return f"expected the parameter {missing[0]}, got none" if missing else None
+    if missing:
+        return f"expected the parameter {missing[0]}, got none"
+    try:
+        Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value)
+    except ValueError as error:
+        return str(error)
+    return None

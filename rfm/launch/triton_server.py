@@ -19,7 +19,7 @@ from urllib.parse import quote
 from google.protobuf import text_format
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
-from rfm.launch.admin_key import VARIABLE, http_headers, new_key, restrictions
+from rfm.launch.admin_key import http_headers, new_key, restrictions
 from rfm.launch.cleanup import NEEDS_ROOM, Claim
 from rfm.launch.ending import EXIT_TIMEOUT_S, ProcessGroup, how_it_ended
 from rfm.launch.endpoints import Endpoints, check_version
@@ -31,13 +31,12 @@ from rfm.launch.repository_check import check_models
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm.launch.triton_options import check_arguments, size_limits
 from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE, INSIDE_VARIABLE
-from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
 LOAD_S = 1800.0
 ANSWER_TIMEOUT_S = 10.0  # while the server starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # else a version's folder changes, and a `load` reloads all versions
-SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables withheld from Triton and the model processes
+SECRET = re.compile("RFM_.*_KEY")  # variables withheld from Triton and the model processes
 _REMEDIES = {  # by a pattern of the reason why a model is not loaded
     "unsupported gpu id|KIND_GPU|compiled with CUDA|no NVIDIA driver": (
         "the models were exported for GPUs that this machine lacks: rfm export again here (--num-gpus 0: for the CPU)"
@@ -294,7 +293,7 @@ class TritonServer:
         ]
 
     def _environment(self, claim: Claim) -> dict[str, str]:
-        own = {name: value for name, value in os.environ.items() if name not in SECRETS}
+        own = {name: value for name, value in os.environ.items() if not SECRET.fullmatch(name)}
         of_models = {HANG_VARIABLE: str(self._hang_s), INSIDE_VARIABLE: str(claim.requests)}
         return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE, **of_models}
 

@@ -40,12 +40,13 @@ from rfm.checkpoint.provenance import (
 from rfm.checkpoint.run_config import MAX_COUNT, check_progress, find_run_config, frame_count, trained_frames
 from rfm.checkpoint.weights import check_shapes, has_head, read_weights, take_prefix
 from rfm.engine.feature_cache import FeatureCache
-from rfm.family import NETWORK, Description, Options, config_fields
+from rfm.family import NETWORK, Options, config_fields
 from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
 from rfm.rewind.pretrained import IMAGE_ENCODER, TEXT_ENCODER, differences, image_facts, text_facts
 from rfm_client.contract import Sample
+from rfm_client.contract.description import Description
 
 MODEL_TYPE = "rewind_transformer"
 IMAGE_ENCODER_PREFIX = "image_encoder."
@@ -95,16 +96,17 @@ class RewindCheckpoint:
     def description(self) -> Description:
         """The checkpoint's inputs and outputs."""
         return Description(
-            network_class=RewindTransformer.__name__,
-            widths=(self.config.video_feature_dim, self.config.text_feature_dim),
-            progress_bins=self.config.progress_bins,
-            has_similarity=self.config.has_similarity,
-            max_frames=self.config.max_frames,
+            kind="ReWiND",
+            network={"class": RewindTransformer.__name__},
+            video_dim=self.config.video_feature_dim,
+            text_dim=self.config.text_feature_dim,
+            progress_bins=self.config.progress_bins if self.config.progress_bins > 1 else None,
             trained_frames=self.config.trained_frames,
-            trained_padding=self.config.trained_padding,
+            trained_padding=self.config.trained_padding is not False,
+            network_frames=self.config.max_frames,
             has_preference=self.config.has_preference,
             has_success=self.config.has_success,
-            kind="ReWiND",
+            has_similarity=self.config.has_similarity,
         )
 
     @property

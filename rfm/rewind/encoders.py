@@ -25,7 +25,6 @@ from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache, digests_of, get_or_make
 from rfm.engine.layers import as_tensor, speed_up
 from rfm.engine.threads import IN_TURN, FrameThreads
-from rfm.family import EncodersDescription
 from rfm.rewind.pretrained import (
     IMAGE_MODELS,
     TEXT_MODELS,
@@ -34,9 +33,9 @@ from rfm.rewind.pretrained import (
     load_preprocessor,
     load_tokenizer,
 )
-from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, wire
-from rfm_client.contract.frame_refs import EncoderSampleRefs, TrajectoryRefs
-from rfm_client.contract.samples import EncoderSample, Float32Array, UInt8Array
+from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
+from rfm_client.contract.description import Description
+from rfm_client.contract.samples import EncoderSample, Float32Array, NamedFrame, UInt8Array
 
 IMAGE_ENCODER_FOLDER = "image_encoder"  # in an exported version of a model with encoders
 TEXT_ENCODER_FOLDER = "text_encoder"
@@ -95,16 +94,16 @@ class Encoders:
         self.tokenizer.save_pretrained(text_folder)
 
     @classmethod
-    def describe(cls, folder: Path) -> EncodersDescription:
+    def describe(cls, folder: Path) -> Description:
         """Return the description of the encoders that ``save`` wrote into ``folder``, without loading them."""
         file = folder / IMAGE_ENCODER_FOLDER / PREPROCESSOR_CONFIG
         preprocessor = ImagePreprocessor.from_config(read_json(file), str(file))
-        return EncodersDescription(cls.__name__, preprocessor.frame_size)
+        return Description(network={"class": cls.__name__}, frame_size=preprocessor.frame_size)
 
     @property
-    def description(self) -> EncodersDescription:
+    def description(self) -> Description:
         """The export's record of these encoders."""
-        return EncodersDescription(type(self).__name__, self.preprocessor.frame_size)
+        return Description(network={"class": type(self).__name__}, frame_size=self.preprocessor.frame_size)
 
     def to(self, device: torch.device) -> Encoders:
         """Move both encoders to ``device``, and return them."""
@@ -125,14 +124,14 @@ class Encoders:
 
     def encode(
         self,
-        samples: Sequence[EncoderSample | EncoderSampleRefs],
+        samples: Sequence[EncoderSample],
         execution: Execution | None = None,
         cache: FeatureCache[Float32Array] | None = None,
     ) -> list[EncoderSample | RewardError]:
         """Return each sample with embeddings of its frames and task, or its error.
 
         execution: the costs are added to it; its tokens are those of images (without padding) and tasks
-        cache: of embeddings, which encodes equal frames and tasks once; None: no cache, and no frame references
+        cache: of embeddings, which encodes equal frames and tasks once; None: no cache, and no named frames
         """
         execution = execution or Execution()
         with execution.forwarding():
@@ -140,7 +139,7 @@ class Encoders:
 
     def _encoded(
         self,
-        samples: Sequence[EncoderSample | EncoderSampleRefs],
+        samples: Sequence[EncoderSample],
         execution: Execution,
         cache: FeatureCache[Float32Array] | None,
     ) -> list[EncoderSample | RewardError]:
@@ -164,45 +163,40 @@ class Encoders:
 
     def _all_of(
         self,
-        trajectories: Sequence[Trajectory | TrajectoryRefs],
+        trajectories: Sequence[Trajectory],
         tasks: Sequence[str],
         execution: Execution,
         cache: FeatureCache[Float32Array] | None,
     ) -> tuple[Sequence[Float32Array | RewardError], Sequence[Float32Array | RewardError]]:
         """Return the embeddings of each trajectory's frames [T, Dv] and of each task [Dt]."""
         if cache is None:
-            whole = [each.positions for each in trajectories if isinstance(each, Trajectory)]
-            assert len(whole) == len(trajectories)  # a model without a cache takes no frame references
+            whole = [each.positions for each in trajectories]
             execution.num_encoded += sum(map(len, whole))
             return self.encode_frames(whole, execution), self.encode_tasks(tasks, execution)
         with execution.collating():
-            named = self._named(trajectories)
-            pixels = dict(pair for each in named for pair in each.pixels.items())
-        wanted = (digest for each in named for digest in each.digests)
-        images, num_made = get_or_make(
+            videos = self._named(trajectories)
+        frames = [frame for video in videos for frame in video]
+        made, num_made = get_or_make(
             cache,
-            wanted,
-            pixels,
-            lambda frames: self._images(frames, execution),
+            (digest for digest, _ in frames),
+            {digest: pixels for digest, pixels in frames if pixels.dtype == np.uint8},
+            lambda missing: self._images(missing, execution),
             is_always_made=lambda frame: not frame.any(),  # the probe's frames: a cached result would prove nothing
         )
+        images = {**dict(frames), **made}  # an embedding that came with the request may be evicted by now
         execution.num_encoded += num_made
         execution.num_found += len(images) - num_made
         sources = {task_digest(task): task for task in tasks}
         texts, _ = get_or_make(cache, sources, sources, lambda missing: self.encode_tasks(missing, execution))
         execution.cache_bytes = cache.num_bytes
-        return [_of_named(each, images) for each in named], [texts[task_digest(task)] for task in tasks]
+        of_videos = [_of_video([images[digest] for digest, _ in video]) for video in videos]
+        return of_videos, [texts[task_digest(task)] for task in tasks]
 
-    def _named(self, trajectories: Sequence[Trajectory | TrajectoryRefs]) -> list[TrajectoryRefs]:
-        """Return each trajectory with the digests of its frames."""
-        whole = [each.positions for each in trajectories if isinstance(each, Trajectory)]
-        digests = iter(digests_of([frame for frames in whole for frame in frames], self.threads))
-        return [
-            each
-            if isinstance(each, TrajectoryRefs)
-            else TrajectoryRefs.of(each.positions, each.task, islice(digests, each.num_frames))
-            for each in trajectories
-        ]
+    def _named(self, trajectories: Sequence[Trajectory]) -> list[Sequence[NamedFrame]]:
+        """Return the frames of each trajectory with their digests."""
+        whole = [frame for each in trajectories if each.named is None for frame in each.positions]
+        named = zip(digests_of(whole, self.threads), whole, strict=True)
+        return [list(islice(named, each.num_frames)) if each.named is None else each.named for each in trajectories]
 
     def encode_frames(
         self, videos: Sequence[UInt8Array], execution: Execution | None = None
@@ -279,16 +273,6 @@ def task_digest(task: str) -> bytes:
     return b"task" + hashlib.sha256(task.encode()).digest()
 
 
-def _of_named(
-    trajectory: TrajectoryRefs, images: Mapping[bytes, Float32Array | RewardError]
-) -> Float32Array | RewardError:
-    """Return float32 [T, Dv] of a trajectory, or its error."""
-    unknown = sum(digest not in images for digest in trajectory.digests)
-    if unknown:
-        return InvalidSampleError.at(wire.FRAME_DIGESTS, wire.UNKNOWN_FRAMES, f"{unknown} others")
-    return _of_video([images[digest] for digest in trajectory.digests])
-
-
 def _of_video(images: Sequence[Float32Array | RewardError]) -> Float32Array | RewardError:
     """Stack the frames' embeddings to float32 [T, Dv]; the first error replaces them."""
     error = next((image for image in images if isinstance(image, RewardError)), None)
@@ -309,13 +293,10 @@ def _embedded(
     return EncoderSample(tuple(Trajectory(video_embeddings=video, text_embedding=of_text) for video in of_videos))
 
 
-def _check_shapes(trajectory: Trajectory | TrajectoryRefs) -> None:
+def _check_shapes(trajectory: Trajectory) -> None:
     """Raise InvalidSampleError for narrow frames: resizing the shorter side would make huge images of them."""
-    if isinstance(trajectory, TrajectoryRefs):  # all its pixels, since other trajectories may refer to them
-        sizes = {frame.shape[:2] for frame in trajectory.pixels.values()}
-    else:
-        sizes = {trajectory.positions.shape[1:3]}
-    for height, width in sizes:
+    frames = trajectory.positions[:1] if trajectory.named is None else [frame for _, frame in trajectory.named]
+    for height, width in {frame.shape[:2] for frame in frames if frame.dtype == np.uint8}:
         if min(height, width) < 1 or max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):
             expected = f"frames at most {MAX_ENCODER_ASPECT_RATIO} times as long as wide"
             raise InvalidSampleError.at("frames", expected, f"{height} x {width}")

@@ -98,7 +98,7 @@ FEED_FORWARD_RATIO = 4
 class RewindConfig:
     """The configuration of a network; the fields of upstream's config.json keep their names.
 
-    trained_frames: as in ``rfm.family.Description``
+    trained_frames: as in ``rfm_client.contract.description.Description``
     trained_padding: training padded shorter trajectories to ``trained_frames``, as upstream's does; None: unknown
     """
 

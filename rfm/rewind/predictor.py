@@ -33,7 +33,6 @@ from rfm_client.contract import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract.frame_refs import ProgressSampleRefs
 from rfm_client.contract.samples import Float32Array
 
 MAX_EMBEDDING = 1e6  # thousands of times an encoder's values
@@ -82,7 +81,7 @@ class RewindCollator:
         """Return the rows of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
         check_type(sample, self.config)
         frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
-        if sample.trajectories[0].frames is not None:
+        if sample.trajectories[0].video_embeddings is None:
             raise InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")
         text = self._text(sample.trajectories[0])
         videos = [self._video(trajectory, frame_steps) for trajectory in sample.trajectories]
@@ -168,10 +167,8 @@ class RewindPredictor:
         """True if the network predicts success."""
         return self.network.config.has_success
 
-    def rows(self, sample: Sample | ProgressSampleRefs) -> list[RewindRow]:
+    def rows(self, sample: Sample) -> list[RewindRow]:
         """Return the rows of a sample of embeddings. Raises InvalidSampleError."""
-        if isinstance(sample, ProgressSampleRefs):
-            raise InvalidSampleError.at("frames", "video_embeddings (this checkpoint reads embeddings)", "named frames")
         return self.collator.rows(sample)
 
     def num_tokens(self, row: RewindRow) -> int:
@@ -215,6 +212,6 @@ class RewindPredictor:
             start = end
         return list(scored)
 
-    def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
+    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
         """Return the scores of a progress sample's frames, from those of all its rows."""
         return of_rows(sample, rows)

@@ -14,13 +14,14 @@ from rfm.checkpoint.provenance import HUB_FOLDER, Decision
 from rfm.checkpoint.run_config import find_run_config
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.pixels import Normalisation
-from rfm.family import Description, Options
+from rfm.family import Options
 from rfm.roboreward.predictor import RoboRewardPredictor
 from rfm.roboreward.prompts import SCORES, RoboRewardCollator, RoboRewardConfig
 from rfm.vlm.collator import QWEN3
 from rfm.vlm.images import QwenImages
 from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork
 from rfm.vlm.language_folder import LanguageFolder, reward_model_of
+from rfm_client.contract.description import Description
 
 WRITTEN, EXPECTED = "roboreward", "roboreward-expected"  # of ``--as``
 REWARD_MODELS = (WRITTEN, EXPECTED)
@@ -41,19 +42,15 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
     def description(self) -> Description:
         """The model's inputs and outputs."""
         return Description(
-            network_class=LanguageNetwork.__name__,
-            widths=None,
+            kind="RoboReward, expected value of the score" if self.config.is_expected else "RoboReward",
+            network={"class": LanguageNetwork.__name__},
             progress_bins=len(SCORES),
-            has_similarity=False,
+            marks_unclear=not self.config.is_expected,
+            may_not_answer=not self.config.is_expected,
+            asks_in_words=True,
             keeps_features=True,
             uses_graphs=self.config.is_expected,  # a written answer keeps keys and values, whose number grows
             is_large=True,
-            asks_in_words=True,
-            has_preference=False,
-            has_success=False,
-            may_not_answer=not self.config.is_expected,
-            marks_unclear=not self.config.is_expected,
-            kind="RoboReward, expected value of the score" if self.config.is_expected else "RoboReward",
         )
 
     def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> RoboRewardCollator:

@@ -92,7 +92,7 @@ class RoboRewardPredictor(VlmPredictor):
         execution.on_forward()
         tokens = tokens[np.arange(len(rows)), num_right]
         lengths = np.array([row.num_tokens for row in rows]) + num_right
-        positions = np.array([row.position_ids[0, -1] for row in rows if row.position_ids is not None]) + 1 + num_right
+        positions = np.array([row.position_ids[0, -1] for row in rows]) + 1 + num_right
         while not all(answer.has_ended for answer in answers):
             with memory_errors():
                 fed = tokens.clip(min=0)  # instead of NOT_FINITE

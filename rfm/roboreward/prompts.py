@@ -103,7 +103,6 @@ class RoboRewardCollator(LanguageCollator):
         )
 
     def _drafted(self, row: VlmRow) -> VlmRow:
-        assert row.position_ids is not None
         at = row.position_ids[:, -1:] + 1 + np.arange(len(self.draft))
         return replace(
             row,

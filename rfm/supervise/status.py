@@ -16,7 +16,7 @@ from typing import Any
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 from rfm.launch.installation import ServerStartError
-from rfm_client.contract.listening import check_free
+from rfm_client.contract.listening import ListenAddress
 
 NO_REASON = ""  # of a ready model
 REQUEST_S = 5.0  # longest silence of a connection
@@ -87,7 +87,7 @@ class StatusServer(ThreadingHTTPServer):
 
     def __init__(self, host: str, port: int, status: Status) -> None:
         try:
-            check_free(host, port, "status", port_option="--status-port")
+            ListenAddress(host, port).check_free("status", port_option="--status-port")
         except ValueError as error:
             raise ServerStartError(str(error)) from None
         self.status = status

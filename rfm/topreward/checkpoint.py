@@ -15,7 +15,7 @@ from rfm.checkpoint.hub import find
 from rfm.checkpoint.provenance import Decision
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.pixels import Normalisation
-from rfm.family import Description, Options
+from rfm.family import Options
 from rfm.topreward.predictor import TopRewardPredictor
 from rfm.topreward.prompts import PROMPT_PREFIX, PROMPT_SUFFIX, TopRewardCollator, TopRewardConfig, TopRewardImages
 from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork, processor_name
@@ -27,6 +27,7 @@ from rfm.vlm.preprocessor import (
     check_settings,
     read_preprocessor,
 )
+from rfm_client.contract.description import Description
 
 LEROBOT, ROBOMETER = "topreward", "topreward-robometer"  # of ``--as``
 REWARD_MODELS = (LEROBOT, ROBOMETER)
@@ -58,19 +59,14 @@ class TopRewardCheckpoint(LanguageCheckpoint):
     def description(self) -> Description:
         """The model's inputs and outputs."""
         return Description(
-            network_class=LanguageNetwork.__name__,
-            widths=None,
-            progress_bins=1,
-            has_similarity=False,
-            max_frames=self.config.max_frames,
-            keeps_features=True,
-            is_large=True,
-            asks_in_words=True,
-            has_preference=False,
-            has_success=False,
+            kind=f"TOPReward, as {'LeRobot' if self.config.variant == 'lerobot' else 'Robometer'} computes it",
+            network={"class": LanguageNetwork.__name__},
+            network_frames=self.config.max_frames,
             has_log_prob=True,
             needs_whole_episode=True,
-            kind=f"TOPReward, as {'LeRobot' if self.config.variant == 'lerobot' else 'Robometer'} computes it",
+            asks_in_words=True,
+            keeps_features=True,
+            is_large=True,
         )
 
     def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> TopRewardCollator:

@@ -17,7 +17,6 @@ from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.row import VlmRow
 from rfm_client.contract import FrameScores, RewardError, Sample
-from rfm_client.contract.frame_refs import ProgressSampleRefs
 from rfm_client.contract.samples import Float32Array
 
 
@@ -38,7 +37,7 @@ class TopRewardPredictor(VlmPredictor):
         ends = np.cumsum([len(row.leaves) + 1 for row in rows])
         return [RowScores([_unjoined(of_row)]) for of_row in np.split(log_probs, ends[:-1])]
 
-    def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
+    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
         """Return the scores of an episode's frames: progress is 0 at the least likely prefix, 1 at the likeliest."""
         num_frames = sample.trajectories[0].num_frames
         prefixes = self._config.prefixes(num_frames)

@@ -29,7 +29,6 @@ from rfm.vlm.language import LanguageCollator, LanguageConfig
 from rfm.vlm.row import VlmRow
 from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import InvalidSampleError, Sample
-from rfm_client.contract.frame_refs import ProgressSampleRefs
 
 Variant: TypeAlias = Literal["lerobot", "robometer"]
 PROMPT_PREFIX = "The above video shows a robot manipulation trajectory that completes the following task: "
@@ -135,7 +134,7 @@ class TopRewardCollator(LanguageCollator):
     images: TopRewardImages
     config: TopRewardConfig  # type: ignore[assignment]  # no heads, so no VlmConfig
 
-    def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
+    def rows(self, sample: Sample) -> list[VlmRow]:
         """Return the conversations of a progress sample. Raises InvalidSampleError."""
         frame_steps = getattr(sample, "frame_steps", 0)
         if frame_steps:

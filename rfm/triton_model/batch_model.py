@@ -29,14 +29,7 @@ from rfm.triton_model.shared_memory import close_to_other_users
 from rfm.triton_model.watchdog import Watchdog
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
-from rfm_client.contract.frame_refs import EncoderSampleRefs
-from rfm_client.contract.model_info import (
-    COMPUTATION_PARAMETER,
-    DIGEST_PARAMETER,
-    NETWORK_PARAMETER,
-    REVISION_PARAMETER,
-    SOURCE_PARAMETER,
-)
+from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 from rfm_client.contract.process_log import write_log
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import Tensors
@@ -67,22 +60,25 @@ class BatchModel(Generic[Question, Answer]):
         write_log(f"{args['model_name']}/{args['model_version']}", os.environ)
         config = json.loads(args["model_config"])
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
+        description = Description.parse(settings.get(DESCRIPTION_PARAMETER, ""))
         placement = Placement.of(args, config, settings)
         version = Path(args["model_repository"], args["model_version"])
         self._pipeline: Pipeline | None = None
         self._is_executing = False
         self._batch_s = 0.0  # duration of the last batch
         self._watchdog = Watchdog(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), self._is_working)
-        check_digest(version, settings.get(DIGEST_PARAMETER, ""))
+        check_digest(version, description.weights_digest)
         placement.run(lambda: self.load(version, placement.device, settings))
         self._inside = RequestsInside(os.environ.get(INSIDE_VARIABLE, ""))
         model = {"model": args["model_name"], "version": args["model_version"]}
         labels = {**model, "device": str(placement.device), "instance": args["model_instance_name"]}
         sample_types = _sample_types([spec["name"] for spec in config["input"]])
-        self._metrics = InstanceMetrics(labels, _checkpoint(settings), sample_types, lambda: self._watchdog.num_steps)
+        self._metrics = InstanceMetrics(
+            labels, _checkpoint(description), sample_types, lambda: self._watchdog.num_steps
+        )
         self._blank_tensors = probe_request(config)
         self._num_warmups = sum(warmup.get("count") or 1 for warmup in config.get("model_warmup", []))
-        told = settings.get(COMPUTATION_PARAMETER)
+        told = description.computation
         if told and not is_by_this_torch(told):
             here = f"torch {torch.__version__}"
             differs = "labels will name the export's computation, %s, but this is %s: export with %s"
@@ -292,11 +288,10 @@ def _located(error: RewardError, index: int, count: int) -> RewardError:
 def _sample_types(input_names: Sequence[str]) -> list[str]:
     """Return the sample types that a model with these inputs scores."""
     of_samples = wire.SAMPLE_TYPE in input_names
-    kinds = {name: not issubclass(kind, (EncoderSample, EncoderSampleRefs)) for kind, name in SAMPLE_TYPES.items()}
-    return [name for name, is_sample in kinds.items() if is_sample == of_samples]
+    return [name for kind, name in SAMPLE_TYPES.items() if issubclass(kind, EncoderSample) != of_samples]
 
 
-def _checkpoint(settings: Mapping[str, str]) -> dict[str, str]:
+def _checkpoint(description: Description) -> dict[str, str]:
     """Return labels of the served checkpoint: source, revision, digest, and the class of its network."""
-    origin = {name: settings.get(name, "") for name in (SOURCE_PARAMETER, REVISION_PARAMETER, DIGEST_PARAMETER)}
-    return {**origin, "network": json.loads(settings.get(NETWORK_PARAMETER) or "{}").get("class", "")}
+    origin = {name: getattr(description, name) or "" for name in ("source", "revision", "weights_digest")}
+    return {**origin, "network": description.network.get("class", "")}

@@ -17,7 +17,6 @@ from rfm_client.contract import (
     SimilaritySample,
     wire,
 )
-from rfm_client.contract.frame_refs import EncoderSampleRefs, ProgressSampleRefs
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.samples import EncoderSample
 
@@ -27,11 +26,9 @@ OUTCOMES = SCORED, REFUSED, FAILED, CANCELLED = "scored", "refused", "failed", "
 
 SAMPLE_TYPES = {
     ProgressSample: "progress",
-    ProgressSampleRefs: "progress",
     PreferenceSample: "preference",
     SimilaritySample: "similarity",
     EncoderSample: "encode",
-    EncoderSampleRefs: "encode",
 }
 UNKNOWN_TYPE = "unknown"  # sample type of a request that could not be decoded
 

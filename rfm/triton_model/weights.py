@@ -10,13 +10,13 @@ from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.checkpoint.content import CheckpointError, is_there
 from rfm.checkpoint.provenance import weights_digest
-from rfm_client.contract.model_info import DIGEST_PARAMETER
+from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 
 
-def check_digest(version: Path, expected: str) -> None:
+def check_digest(version: Path, expected: str | None) -> None:
     """Raise CheckpointError if the weights in the folder ``version`` changed after the export.
 
-    expected: digest in the model's configuration; may be empty. The configuration in the version folder takes
+    expected: digest in the model's configuration; None: unknown. The configuration in the version folder takes
         precedence, since the model's may belong to a newer version
     """
     kept = version / "config.pbtxt"
@@ -28,10 +28,10 @@ def check_digest(version: Path, expected: str) -> None:
         )
 
 
-def _digest_in(file: Path) -> str:
-    """Return the digest of the weights in an exported configuration; may be empty."""
+def _digest_in(file: Path) -> str | None:
+    """Return the digest of the weights in an exported configuration; None: unknown."""
     try:
         config = text_format.Parse(file.read_text(), pb.ModelConfig())
+        return Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value).weights_digest
     except (OSError, ValueError, text_format.ParseError) as error:
-        raise CheckpointError(f"{file}: expected a configuration of the export, got {error}") from error
-    return str(config.parameters[DIGEST_PARAMETER].string_value)
+        raise CheckpointError(f"{file}: expected a configuration of the export, got {error}; export again") from error

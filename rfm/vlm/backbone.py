@@ -17,13 +17,12 @@ from torch import Tensor
 
 from rfm.checkpoint.content import CheckpointError, shown
 
-SMOL, QWEN_2_5 = "smolvlm", "qwen2_5_vl"
-BACKBONES = {QWEN_2_5: "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel", SMOL: "SmolVLMModel"}
+QWEN_2_5 = "qwen2_5_vl"
+BACKBONES = {QWEN_2_5: "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel"}
 VISION_THETA = 10_000.0  # a constant in the code of transformers 4.57, for each backbone
 
 # Required fields of text_config and vision_config: no weight's shape shows them, and transformers has defaults.
 _NEEDED = {
-    SMOL: (("num_attention_heads", "rms_norm_eps"), ("num_attention_heads", "image_size", "patch_size")),
     QWEN_2_5: (
         ("num_attention_heads", "rms_norm_eps"),
         ("num_heads", "patch_size", "window_size", "fullatt_block_indexes"),
@@ -72,10 +71,8 @@ def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]
         for name in needed:
             if config[part].get(name) is None:
                 raise CheckpointError(f"{where}: {part}.{name}: expected a value, got none; {_COPY}")
-    config["text_config"] = _text(config["text_config"], family, f"{where}: text_config")
+    config["text_config"] = _text(config["text_config"], f"{where}: text_config")
     config["vision_config"] = _vision(config["vision_config"], f"{where}: vision_config")
-    if family == SMOL:
-        _check_count(config.get("scale_factor"), f"{where}: scale_factor")
     return config
 
 
@@ -103,12 +100,12 @@ def _nested(content: Mapping[str, Any]) -> dict[str, Any]:
     return rest | {"text_config": text | {"model_type": f"{QWEN_2_5}_text"}}
 
 
-def _text(config: dict[str, Any], family: str, where: str) -> dict[str, Any]:
+def _text(config: dict[str, Any], where: str) -> dict[str, Any]:
     rope = _rope(config, where)
     theta = rope.pop("rope_theta", None)
     if type(theta) not in (int, float) or not 0 < theta < math.inf:
         raise CheckpointError(f"{where}.rope_theta: expected a number above 0, got {shown(theta)}; {_COPY}")
-    if family != SMOL and not isinstance(rope.get("mrope_section"), list):
+    if not isinstance(rope.get("mrope_section"), list):
         got = shown(rope.get("mrope_section"))
         raise CheckpointError(f"{where}.rope_scaling.mrope_section: expected a list of numbers, got {got}; {_COPY}")
     rest = {name: value for name, value in config.items() if name not in _ROPE}
@@ -151,7 +148,7 @@ def _vision(config: dict[str, Any], where: str) -> dict[str, Any]:
     if theta != VISION_THETA or kind not in ("axial", "default"):
         expected = "axial with a rope_theta of 10000"
         raise CheckpointError(f"{where}.rope_parameters: expected {expected}, got {shown(rope)}; {_COPY}")
-    for name in ("patch_size", "image_size", "spatial_merge_size", "temporal_patch_size"):
+    for name in ("patch_size", "spatial_merge_size", "temporal_patch_size"):
         _check_count(config.get(name, 1), f"{where}.{name}")
     return {name: value for name, value in config.items() if name != "rope_parameters"}
 
@@ -163,7 +160,6 @@ def _check_count(value: object, where: str) -> None:
 
 # Renames for a form of weights. The first pattern that matches a name is applied.
 Renames: TypeAlias = Sequence[tuple[str, str]]
-SMOL_NAMES: Renames = ((r"^model\.model\.", "model."),)
 LORA_INSIDE: Renames = ((r"^(model(\.\w+)?)\.base_model\.model\.", r"\1."),)
 ADAPTER_NAMES: Renames = ((r"^base_model\.model\.", "model."),)
 # For names of a Qwen backbone from transformers before 4.52, and in some cases since.

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rfm.engine.device import pinned
 from rfm.engine.layers import concatenated
-from rfm.vlm.images import QwenImages, SmolImages
+from rfm.vlm.images import QwenImages
 from rfm.vlm.leaves import Packs
 from rfm.vlm.qwen import VisionPlan
 from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo, shots_of
@@ -149,46 +149,6 @@ class QwenPixels:
         return {"pixel_values": concatenated(patches)}
 
 
-@dataclass(frozen=True)
-class SmolPixels:
-    """Pixels for SmolVLM: each conversation is padded to the largest number of squares.
-
-    squares: the square frames of all videos
-    rows, places, frames: int64 [N], conversation, place in it and frame of each of N shown squares
-    shape: number of conversations, and of squares in each
-    """
-
-    images: SmolImages
-    squares: FramesOfOneSize
-    rows: Tensor
-    places: Tensor
-    frames: Tensor
-    shape: tuple[int, int]
-
-    @property
-    def videos(self) -> list[Tensor]:
-        """The frames of each video, uint8 [T, side, side, 3]."""
-        return list(self.squares.videos)
-
-    @property
-    def num_shown(self) -> int:
-        """Number of squares of all videos."""
-        return self.squares.num_shown
-
-    def changed(self, change: Callable[[Tensor], Tensor]) -> SmolPixels:
-        """Return these pixels with ``change`` applied to the indices of the squares."""
-        return replace(self, rows=change(self.rows), places=change(self.places), frames=change(self.frames))
-
-    def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
-        """Return the backbone's inputs: squares and their mask. The backbone skips squares of zeros."""
-        squares = self.images.normalisation(self.squares.frames(device)).to(dtype)
-        pixels = squares.new_zeros(*self.shape, *squares.shape[1:])
-        mask = torch.zeros(*self.shape, *squares.shape[2:], dtype=torch.bool, device=device)
-        pixels[self.rows, self.places] = squares[self.frames]
-        mask[self.rows, self.places] = True
-        return {"pixel_values": pixels, "pixel_attention_mask": mask}
-
-
 class Layout:
     """The indices of each shot's merged tokens: first those from the vision tower, by size, then those from the cache.
 
@@ -220,8 +180,8 @@ class VlmBatch:
     query_rows, query_tokens: int64 [Q], row and token of each query
     num_tokens, num_span_tokens: tokens without padding; tokens in all spans
     pixels: source of the arguments for pixels; None: these are in ``inputs``, or all shots are cached
-    plan: of a Qwen backbone's vision tower; None: all shots are cached, or the backbone is SmolVLM
-    layout: of a Qwen backbone's shots; None: the backbone is SmolVLM
+    plan: of the vision tower; None: all shots are cached
+    layout: of the shots; None: not placed yet
     packs: of conversations that begin like others (``rfm.vlm.tree``). With packs, spans and queries have row 0 and
         index all tokens: the B * L of the conversations, then those of the packs
     """
@@ -232,7 +192,7 @@ class VlmBatch:
     query_tokens: Tensor
     num_tokens: int
     num_span_tokens: int
-    pixels: QwenPixels | SmolPixels | None = None
+    pixels: QwenPixels | None = None
     plan: VisionPlan | None = None
     layout: Layout | None = None
     packs: tuple[Packs, ...] = ()

@@ -6,7 +6,6 @@ A table of renames for each form turns the names of weights into those of VlmRew
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -32,19 +31,16 @@ from rfm.checkpoint.provenance import Decision
 from rfm.checkpoint.run_config import check_progress
 from rfm.checkpoint.weights import check_shapes, has_head, read_weights
 from rfm.engine.feature_cache import FeatureCache
-from rfm.family import NETWORK, Description, Options, config_fields
+from rfm.family import NETWORK, Options, config_fields
 from rfm.vlm.backbone import (
     BACKBONES,
     LORA_INSIDE,
     QWEN_2_5,
     QWEN_NAMES,
-    SMOL,
-    SMOL_NAMES,
     UNQUANTIZED,
     UNUSED,
     backbone_config,
     check_not_quantized,
-    is_at_least,
     renamed,
 )
 from rfm.vlm.collator import QWEN3, VlmCollator
@@ -53,7 +49,6 @@ from rfm.vlm.lerobot import LEROBOT_BACKBONE, check_bins, is_lerobot, lerobot_ru
 from rfm.vlm.lora import (
     Scaling,
     adapted,
-    base_of_adapter,
     changed_by,
     check_inside,
     has_adapter,
@@ -75,15 +70,15 @@ from rfm.vlm.processor import (
 from rfm.vlm.prompts import OF_AN_OLD_RUN
 from rfm.vlm.rounded import fit
 from rfm.vlm.rounding import FLAG, decision, kind_of, read_published, read_unrounded_config, round_layers
-from rfm.vlm.run_config import RunConfig, decisions_of
+from rfm.vlm.run_config import RunConfig, base_of_adapter, decisions_of
 from rfm.vlm.video_prompt import decided
 from rfm.vlm.work import flop
 from rfm_client.contract import Sample
+from rfm_client.contract.description import Description
 
 LORA = "lora"  # key in VlmCheckpoint.parts: the factors that change the network's weights
 SETTINGS = "rfm"  # key in an exported config.json: this project's fields
 
-_NAMES_OF = {SMOL: SMOL_NAMES}
 _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
 MAX_LAYERS = 1024
 
@@ -110,19 +105,18 @@ class VlmCheckpoint:
     def description(self) -> Description:
         """The checkpoint's inputs and outputs."""
         return Description(
-            network_class=VlmRewardModel.__name__,
-            widths=None,
-            progress_bins=self.config.progress_bins,
-            has_similarity=self.config.has_similarity,
+            kind="RFM or Robometer",
+            network={"class": VlmRewardModel.__name__},
+            progress_bins=self.config.progress_bins if self.config.progress_bins > 1 else None,
             trained_frames=self.config.trained_frames,
             frame_size=frame_size(self.config),
             frames_per_value=1 if self.config.multi_image else FRAMES_PER_GROUP,
-            keeps_features=self.config.family != SMOL,
-            uses_graphs=self.config.family != SMOL,
-            is_large=True,
             has_preference=self.config.has_preference,
             has_success=self.config.has_success,
-            kind="RFM or Robometer",
+            has_similarity=self.config.has_similarity,
+            keeps_features=True,
+            uses_graphs=True,
+            is_large=True,
         )
 
     @property
@@ -183,13 +177,12 @@ class VlmCheckpoint:
         """Return a predictor with the network on ``device``. Raises CheckpointError.
 
         dtype: of the network; None: float32 on the CPU, else the checkpoint's own
-        cache: for features of frames; SmolVLM does not use it; None: no cache
+        cache: for features of frames; None: no cache
         """
         if dtype is None and device.type == "cpu":
             dtype = torch.float32
         collator = self.collator  # first, so that a missing file is reported before the network is built
-        kept = cache if self.description.keeps_features else None
-        return VlmPredictor(self.build(dtype), collator, device, kept)
+        return VlmPredictor(self.build(dtype), collator, device, cache)
 
     def save(self, folder: Path) -> None:
         """Write weights and LoRA factors, a config.json with all settings, and the processor."""
@@ -208,10 +201,6 @@ class VlmCheckpoint:
         Raises CheckpointError.
         """
         wanted = dtype or self.config.torch_dtype
-        if self.config.family == SMOL and is_at_least(5):  # transformers 5 computes other image features
-            expected = "transformers < 5 for a SmolVLM checkpoint, whose scores would differ"
-            version = importlib.metadata.version("transformers")
-            raise CheckpointError(f"transformers: expected {expected}, got {version}")
         network = self._network(wanted)
         fit(network, self.weights, self.factors)
         # Parameters only: rotary frequencies stay float32, as upstream.
@@ -279,7 +268,7 @@ def _exported(folder: Path, content: Mapping[str, Any], base_model: str | None) 
     backbone = backbone_config(content, file)
     check_not_quantized(backbone, file, UNQUANTIZED)
     config = _saved_config(backbone)
-    weights, factors = _used(renamed(read_weights(folder), _NAMES_OF.get(config.family, QWEN_NAMES)))
+    weights, factors = _used(renamed(read_weights(folder), QWEN_NAMES))
     told = decisions_of(config, None, base_model)
     rounded = () if config.weights is None else (decision(config.weights, NETWORK_CONFIG),)
     return config, weights, factors, (*told, *rounded)
@@ -330,7 +319,6 @@ def _config(
     run: RunConfig,
     weights: Mapping[str, Tensor],
 ) -> VlmConfig:
-    family = str(backbone["model_type"])
     if "progress_head.4.weight" not in weights:
         raise CheckpointError(f"{folder}: expected reward heads, got no progress_head.4.weight")
     if "frame_pool_attn.weight" not in weights:
@@ -340,15 +328,14 @@ def _config(
         backbone=backbone,
         progress_bins=weights["progress_head.4.weight"].shape[0],
         has_similarity="similarity_head.0.weight" in weights,
-        size_px=run.size_px(family, network["multi_image"]),
+        size_px=run.size_px(network["multi_image"]),
         has_preference=has_head(weights, "preference"),
         has_success=has_head(weights, "success"),
         weights=kind_of(weights),
         **network,
     )
-    if (family == SMOL or config.per_frame_progress_token) and not config.multi_image:
-        why = "SmolVLM" if family == SMOL else "per-frame progress tokens"
-        raise CheckpointError(f"{run.file}: use_multi_image with {why}: expected true, got false")
+    if config.per_frame_progress_token and not config.multi_image:
+        raise CheckpointError(f"{run.file}: use_multi_image with per-frame progress tokens: expected true, got false")
     return config
 
 
@@ -361,7 +348,7 @@ def _whole(
         tensors, scaling = renamed(tensors, LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
         if is_there(folder / ADAPTER_CONFIG):
             scaling.check_equal(Scaling.of(folder / ADAPTER_CONFIG, read_json(folder / ADAPTER_CONFIG)))
-    return renamed(tensors, _NAMES_OF.get(backbone["model_type"], QWEN_NAMES)), scaling
+    return renamed(tensors, QWEN_NAMES), scaling
 
 
 def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

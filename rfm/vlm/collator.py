@@ -22,16 +22,15 @@ from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import check_type
 from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.vlm.batch import QwenPixels, Shots, VlmBatch
-from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages, SmolImages
+from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages
 from rfm.vlm.leaves import Leaf, PlacedPack, calls, padded, starts
 from rfm.vlm.network import VlmConfig
 from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, Chat, TrajectoryPart, Visual, question
 from rfm.vlm.qwen import Box, plan, positions
 from rfm.vlm.row import Spans, VlmRow
-from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo, named_frames
+from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo
 from rfm.vlm.video_prompt import WRAPPED
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
-from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs
 
 SECONDS_PER_GROUP = 1  # upstream's value for videos of Qwen2.5-VL
 TOKENS_PER_SECOND = 4  # transformers' default for Qwen2.5-VL
@@ -42,13 +41,15 @@ IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
 
 
 class VlmCollator:
-    """Turns samples into rows, and rows into batches, for a vision-language configuration.
+    """Turns samples into rows, and rows into batches, for Qwen2.5-VL and Qwen3-VL.
+
+    Images and videos are pad tokens between vision start and end.
 
     tokenizer: the base model's, with the checkpoint's special tokens and a chat template
     images: the backbone's preprocessing
     """
 
-    def __init__(self, config: VlmConfig, tokenizer: Any, images: QwenImages | SmolImages) -> None:
+    def __init__(self, config: VlmConfig, tokenizer: Any, images: QwenImages) -> None:
         self.config = config
         self.tokenizer = tokenizer
         self.images = images
@@ -60,13 +61,10 @@ class VlmCollator:
         """Number of frames in a temporal patch."""
         return 1 if self.config.multi_image else FRAMES_PER_GROUP
 
-    def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
-        """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it.
-
-        sample: with the pixels of all its frames
-        """
+    def rows(self, sample: Sample) -> list[VlmRow]:
+        """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
         check_type(sample, self.config)
-        frame_steps = sample.frame_steps if isinstance(sample, (ProgressSample, ProgressSampleRefs)) else 0
+        frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
         videos = tuple(video_of(trajectory, frame_steps) for trajectory in sample.trajectories)
         self._check_task(sample.trajectories[0].task)
         row = self._row(sample, videos)
@@ -75,14 +73,7 @@ class VlmCollator:
             return [replace(row, picked=picked) for picked in videos[0].conversations]
         return [row]
 
-    def to_size(
-        self, video: VlmVideo, cache: FeatureCache[Any] | None = None, threads: FrameThreads = IN_TURN
-    ) -> SizedFrames:
-        """Resize the frames of a video's shots for the backbone.
-
-        cache: frames of shots in it need no resizing; None: no cache
-        threads: prepare the frames
-        """
+    def _uncached_to_size(self, video: VlmVideo, threads: FrameThreads) -> SizedFrames:
         keys = {shot: (id(video), shot) for shot in video.shots(are_images=self.config.multi_image)}
         needed = sorted({frame for shot in keys for frame in shot})
         places = np.full(len(video.frames), -1)
@@ -93,14 +84,6 @@ class VlmCollator:
         parts = threads.parts(partial(self._to_size, video), needed)
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
-    def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
-        """Resize some of a video's frames to uint8 [N, H', W', 3], each independent of the others. Thread-safe."""
-        raise NotImplementedError
-
-    def num_patches(self, video: VlmVideo) -> int:
-        """Return the number of patches that the vision tower reads of a video's frames."""
-        raise NotImplementedError
-
     def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> VlmBatch:
         """Return the batch of conversations of any kinds and lengths, whose frames have been resized.
 
@@ -109,21 +92,18 @@ class VlmCollator:
         length = length or max(row.num_tokens for row in rows)
         pad = self.tokenizer.pad_token_id
         ids = torch.full((len(rows), length), pad, dtype=torch.int64)
-        mask = torch.zeros_like(ids)
-        shifts = [length - row.num_tokens if self.config.pads_left else 0 for row in rows]
-        for index, (row, shift) in enumerate(zip(rows, shifts, strict=True)):
-            ids[index, shift : shift + row.num_tokens] = torch.from_numpy(row.input_ids)
-            mask[index, shift : shift + row.num_tokens] = 1
+        for index, row in enumerate(rows):
+            ids[index, : row.num_tokens] = torch.from_numpy(row.input_ids)
         spans = [
-            (index, start + shifts[index], stop + shifts[index])
+            (index, start, stop)
             for index, row in enumerate(rows)
             for of_trajectory in row.spans
             for start, stop in of_trajectory
         ]
-        queries = [(index, row.query + shifts[index]) for index, row in enumerate(rows) if row.query is not None]
+        queries = [(index, row.query) for index, row in enumerate(rows) if row.query is not None]
         query_rows, query_tokens = torch.tensor(queries, dtype=torch.int64).reshape(-1, 2).T.contiguous()
         batch = VlmBatch(
-            inputs={"input_ids": ids, "attention_mask": mask},
+            inputs={"input_ids": ids},
             spans=torch.tensor(spans, dtype=torch.int64),
             query_rows=query_rows,
             query_tokens=query_tokens,
@@ -132,7 +112,7 @@ class VlmCollator:
         )
         return self._with_pixels(batch, rows)
 
-    def _row(self, sample: Sample | ProgressSampleRefs, videos: tuple[VlmVideo, ...]) -> VlmRow:
+    def _row(self, sample: Sample, videos: tuple[VlmVideo, ...]) -> VlmRow:
         parts: list[str | Visual] = []
         for part in question(sample, progress_in_preference=self.config.progress_in_preference):
             parts += self._frame_parts(videos[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
@@ -156,22 +136,6 @@ class VlmCollator:
             each.append(PROGRESS_TOKEN)
         return each * num_frames
 
-    def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
-        """Return the text with a pad token for each image, video or temporal patch, this token, and its repetitions."""
-        raise NotImplementedError
-
-    def _spans(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> tuple[Spans, ...]:
-        """Return the tokens at which each frame's state is read."""
-        raise NotImplementedError
-
-    def _position_ids(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> Indices | None:
-        """Return position ids, int64 [3, L], if the backbone needs them."""
-        return None
-
-    def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Return the batch with the backbone's inputs besides tokens."""
-        raise NotImplementedError
-
     def _image_spans(self, ids: Indices, videos: tuple[VlmVideo, ...], ends: Spans) -> tuple[Spans, ...]:
         """Return the spans of frames that are separate images; ``ends``: the tokens around each image."""
         if self.config.per_frame_progress_token:
@@ -194,18 +158,16 @@ class VlmCollator:
             if token in task:
                 raise InvalidSampleError.at("task", "text without the model's special tokens", repr(token))
 
-
-class QwenCollator(VlmCollator):
-    """The collator for Qwen2.5-VL and Qwen3-VL: images and videos are pad tokens between vision start and end."""
-
-    images: QwenImages
-
     def to_size(
         self, video: VlmVideo, cache: FeatureCache[Any] | None = None, threads: FrameThreads = IN_TURN
     ) -> SizedFrames:
-        """Resize the frames of the shots that are not in the cache."""
+        """Resize the frames of a video's shots for the backbone.
+
+        cache: frames of shots in it need no resizing; None: no cache
+        threads: prepare the frames
+        """
         if cache is None:
-            return super().to_size(video, threads=threads)
+            return self._uncached_to_size(video, threads)
         video.compute_digests(threads)
         keys = self.shot_keys(video)
         found = cache.found(keys.values())
@@ -223,6 +185,7 @@ class QwenCollator(VlmCollator):
         return {shot: (grid.rows, grid.columns, *(digests[frame] for frame in shot)) for shot in shots}
 
     def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
+        """Resize some of a video's frames to uint8 [N, H', W', 3], each independent of the others. Thread-safe."""
         frames = video.stack(needed)
         if self.config.multi_image:
             return self.images.images_to_size(frames)
@@ -249,6 +212,7 @@ class QwenCollator(VlmCollator):
         return grid.groups * grid.rows * grid.columns
 
     def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
+        """Return the text with a pad token for each image, video or temporal patch, this token, and its repetitions."""
         grids = [self.grid(video) for video in videos]
         of_shots = [grid.tokens_per_group for grid in grids for _ in range(grid.groups)]
         if self.config.multi_image:
@@ -263,6 +227,7 @@ class QwenCollator(VlmCollator):
         return (VISION_START, *texts, VISION_END) if self.config.video_prompt == WRAPPED else texts
 
     def _spans(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> tuple[Spans, ...]:
+        """Return the tokens at which each frame's state is read."""
         starts = self._positions(ids, VISION_START)
         if self.config.multi_image:
             ends = list(zip(starts.tolist(), self._positions(ids, VISION_END).tolist(), strict=True))
@@ -291,6 +256,7 @@ class QwenCollator(VlmCollator):
         return positions(len(ids), boxes)
 
     def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
+        """Return the batch with the backbone's inputs besides tokens."""
         shots = Shots(are_images=self.config.multi_image)
         read = [shots.add(video, shown) for row in rows for video, shown in row.shown]
         read_by = {leaf: shots.add(row.videos[0], leaf.shown) for row in rows for leaf in row.leaves}
@@ -299,7 +265,6 @@ class QwenCollator(VlmCollator):
         ids = batch.inputs["input_ids"]
         position_ids = torch.zeros(3, *ids.shape, dtype=torch.int64)
         for index, row in enumerate(rows):
-            assert row.position_ids is not None
             position_ids[:, index, : row.num_tokens] = torch.from_numpy(row.position_ids)
         inputs = {
             "input_ids": ids,
@@ -344,10 +309,11 @@ class QwenCollator(VlmCollator):
         )
 
 
-def video_of(trajectory: Trajectory | TrajectoryRefs, frame_steps: int) -> VlmVideo:
+def video_of(trajectory: Trajectory, frame_steps: int) -> VlmVideo:
     """Return the video of a trajectory's frames. Raises InvalidSampleError for embeddings."""
-    if isinstance(trajectory, TrajectoryRefs):
-        return VlmVideo.of(named_frames(trajectory), frame_steps, trajectory.digests)
+    if trajectory.named is not None:
+        digests, frames = zip(*trajectory.named, strict=True)
+        return VlmVideo.of(frames, frame_steps, digests)
     if trajectory.frames is None:
         raise InvalidSampleError.at("video_embeddings", "frames (this checkpoint reads raw frames)", "embeddings")
     return VlmVideo.of(trajectory.frames, frame_steps)

@@ -5,7 +5,7 @@ T frames, H x W pixels (H' x W' after resizing), C = 3 channels, P pixels a side
 MERGE x MERGE patches.
 The CPU resizes each frame once, as uint8 (``..._to_size``). The device does the rest in float.
 Sources: the resizing rules of ``qwen-vl-utils`` 0.0.14, the patch order of ``transformers``' Qwen2-VL image
-processor, and its SmolVLM image processor. Neither torchvision nor these processors are needed.
+processor. Neither torchvision nor this processor is needed.
 """
 
 from __future__ import annotations
@@ -160,38 +160,6 @@ class QwenImages:
         return Grid(groups, height // self.patch_px, width // self.patch_px)
 
 
-@dataclass(frozen=True)
-class SmolImages:
-    """Image preprocessing for SmolVLM: the longer side is resized to ``size_px``, then both sides.
-
-    resample: Pillow's filter
-    tokens: image tokens of a frame
-    """
-
-    size_px: int
-    resample: int
-    tokens: int
-    normalisation: Normalisation
-
-    def to_config(self) -> dict[str, Any]:
-        """Return the corresponding fields of preprocessor_config.json."""
-        return {"resample": self.resample, **self.normalisation.to_config()}
-
-    def images_to_size(self, frames: UInt8Array) -> Tensor:
-        """Resize frames to squares: uint8 [T, H, W, 3] -> [T, size_px, size_px, 3]."""
-        scaled = _scaled_to_longest(frames.shape[1], frames.shape[2], self.size_px)
-        return _to_sizes(frames, [scaled, (self.size_px, self.size_px)], self.resample)
-
-
-def _scaled_to_longest(height: int, width: int, longest: int) -> tuple[int, int]:
-    """Return height and width with the longer side ``longest``, the other in proportion and even."""
-    if width >= height:
-        scaled = int(longest / (width / height))
-        return max(scaled + scaled % 2, 1), longest
-    scaled = int(longest * (width / height))
-    return longest, max(scaled + scaled % 2, 1)
-
-
 def scaled_video(video: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize a video to height and width as torchvision does: uint8 [T, H, W, 3] -> [T, *size, 3]."""
     if video.shape[1:3] == size:
@@ -204,13 +172,13 @@ def scaled_video(video: Tensor, size: tuple[int, int]) -> Tensor:
     return scaled
 
 
-def _to_sizes(frames: UInt8Array, sizes: Sequence[tuple[int, int]], resample: int = PIL_BICUBIC) -> Tensor:
+def _to_sizes(frames: UInt8Array, sizes: Sequence[tuple[int, int]]) -> Tensor:
     """Resize frames to each of ``sizes`` in turn: uint8 [T, H, W, 3] -> [T, *sizes[-1], 3]."""
     if frames.flags.writeable and all(size == frames.shape[1:3] for size in sizes):
         return torch.from_numpy(frames)
     sized = np.empty((len(frames), *sizes[-1], frames.shape[-1]), np.uint8)
     for index, frame in enumerate(frames):
         for size in sizes:
-            frame = resized(frame, *size, resample)
+            frame = resized(frame, *size)
         sized[index] = frame
     return torch.from_numpy(sized)

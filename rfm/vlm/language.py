@@ -31,7 +31,7 @@ from rfm.vlm.collator import (
     VIDEO_PAD,
     VISION_END,
     VISION_START,
-    QwenCollator,
+    VlmCollator,
     expanded,
     timed_groups,
     video_of,
@@ -48,7 +48,6 @@ from rfm.vlm.row import VlmRow
 from rfm.vlm.video import Indices, VlmVideo
 from rfm.vlm.work import flop
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample
-from rfm_client.contract.frame_refs import ProgressSampleRefs
 
 SETTINGS, REWARD_MODEL = "rfm", "reward_model"  # keys in an exported config.json
 VIDEO = VISION_START + VIDEO_PAD + VISION_END  # a video, or a temporal patch, in the text of a prompt
@@ -100,7 +99,7 @@ class LanguageNetwork(nn.Module):
         return LanguageOutput(self.lm_head(hidden[batch.query_rows, batch.query_tokens]), made)
 
 
-class LanguageCollator(QwenCollator):
+class LanguageCollator(VlmCollator):
     """The collator of prompts with one video, each temporal patch behind its time."""
 
     def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
@@ -117,10 +116,10 @@ class LanguageCollator(QwenCollator):
         """Return the prompt of an example task, with VIDEO in the place of the video."""
         raise NotImplementedError
 
-    def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
+    def rows(self, sample: Sample) -> list[VlmRow]:
         """Return the conversations of a progress sample. Raises InvalidSampleError."""
         check_type(sample, self.config)
-        assert isinstance(sample, (ProgressSample, ProgressSampleRefs))  # by check_type
+        assert isinstance(sample, ProgressSample)  # by check_type
         (trajectory,) = sample.trajectories
         self._check_task(trajectory.task)
         try:

@@ -44,7 +44,6 @@ from rfm.vlm.backbone import (
 )
 from rfm.vlm.lora_targets import TEXT, WHOLE, check_factors, check_none_lost, check_replaced
 from rfm.vlm.rounded import is_rounded, shape_of
-from rfm.vlm.run_config import RunConfig, model_name
 
 LORA_NAME = re.compile(r"(?P<module>.+)\.lora_(?P<side>[AB])(\.default)?\.weight")
 _BASE_LAYER = ".base_layer."
@@ -201,10 +200,9 @@ _NO_EMBEDDING = (
     "lost with the run; save the whole model where it was trained (save_model() of the trainer), or the adapter with "
     "save_pretrained(..., save_embedding_layers=True)"
 )
-# In names of SmolVLM's weights, of LoRA factors of embeddings, and of an embedding that PEFT saves in two ways at once.
-_OTHER = re.compile(r"\.(text_model|lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
+# In names of LoRA factors of embeddings, and of an embedding that PEFT saves in two ways at once.
+_OTHER = re.compile(r"\.(lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
 _PARTS = ("model.language_model.", "model.visual.")  # in names of an adapter around all of them
-_FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # Unsloth's names of base models rounded to fewer bits, for training
 
 
 def has_adapter(folder: Path) -> bool:
@@ -222,34 +220,6 @@ def has_adapter(folder: Path) -> bool:
             "that is not meant"
         )
     return bool(adapter)
-
-
-def base_of_adapter(folder: Path, run: RunConfig) -> str:
-    """Return the base model that the run names.
-
-    Raises CheckpointError if the adapter names another, or if the run began with a checkpoint, whose weights the
-    adapter may change.
-    """
-    base = run.get("model.base_model_id", "")
-    if not base:
-        raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
-    named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
-    if isinstance(named, str) and _FEW_BITS.search(named):
-        expected = f"base_model_name_or_path: expected weights in full precision, got {shown(named)}"
-        raise CheckpointError(f"{folder / ADAPTER_CONFIG}: {expected}; {DEQUANTIZED.format(base=named)}")
-    if named and model_name(str(named)) != model_name(base):
-        raise CheckpointError(
-            f"{folder / ADAPTER_CONFIG}: base_model_name_or_path: expected {cut(base)}, the model.base_model_id of "
-            f"{run.file}, got {shown(named)}; name the one that the adapter was trained on with --base-model"
-        )
-    began_with = run.get("training.load_from_checkpoint", "")
-    if began_with:
-        raise CheckpointError(
-            f"{run.file}: training.load_from_checkpoint: expected none beside an adapter, got {shown(began_with)}: the "
-            f"adapter may change its weights in place of those of {cut(base)}; {MERGE}; if it does change those of "
-            f"{cut(base)}, name them with --base-model"
-        )
-    return base
 
 
 def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor], Scaling]:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from rfm.engine.graphs import Graphs
 from rfm.engine.layers import PredictionHead, concatenated
 from rfm.family import VideoPrompt, Weights
-from rfm.vlm.backbone import BACKBONES, SMOL
+from rfm.vlm.backbone import BACKBONES
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.graphed import graphed_features, graphed_hidden_state
 from rfm.vlm.qwen import KeyValues, check_attention, features, last_hidden_state
@@ -48,11 +48,6 @@ class BackboneConfig:
         return str(self.backbone["model_type"])
 
     @property
-    def pads_left(self) -> bool:
-        """True if padding stands before the tokens, as in SmolVLM's training."""
-        return self.family == SMOL
-
-    @property
     def hidden_dim(self) -> int:
         """D, the width of the language model."""
         return int(self.backbone["text_config"]["hidden_size"])
@@ -74,7 +69,7 @@ class VlmConfig(BackboneConfig):
     average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
     progress_in_preference: prompts for preference also ask for progress
     size_px: height and width to which every frame is resized first; None: resizing starts from each frame's size
-    trained_frames: as in ``rfm.family.Description``
+    trained_frames: as in ``rfm_client.contract.description.Description``
     """
 
     multi_image: bool
@@ -106,8 +101,7 @@ class VlmConfig(BackboneConfig):
 class VlmOutput:
     """Logits: progress [F, K], success [F], preference and similarity [Q]; None without that head.
 
-    made: features from the vision tower, [merged tokens, levels, D]; None: all shots are cached, or the backbone is
-        SmolVLM
+    made: features from the vision tower, [merged tokens, levels, D]; None: all shots are cached
     """
 
     progress: Tensor
@@ -138,10 +132,7 @@ class VlmRewardModel(nn.Module):
 
     def forward(self, batch: VlmBatch) -> VlmOutput:
         """Return the logits of every frame and query in the batch, which is on the network's device."""
-        if self.config.family == SMOL:
-            hidden, made = self.model(**batch.inputs, use_cache=False).last_hidden_state, None
-        else:
-            hidden, made = qwen_states(self.model, batch, graphs=self.graphs)
+        hidden, made = qwen_states(self.model, batch, graphs=self.graphs)
         frames = self._frame_states(hidden, batch.spans, batch.num_span_tokens)
         queries = hidden[batch.query_rows, batch.query_tokens]
         return VlmOutput(
@@ -216,8 +207,7 @@ def build_backbone(config: BackboneConfig, dtype: torch.dtype) -> nn.Module:
     settings = network.config_class.from_dict(config.backbone)
     with _no_init_weights():
         backbone: nn.Module = network._from_config(settings, dtype=dtype, attn_implementation="sdpa")
-    if config.family != SMOL:
-        check_attention(backbone)
+    check_attention(backbone)
     return backbone
 
 

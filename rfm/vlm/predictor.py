@@ -19,19 +19,18 @@ from rfm.engine.layers import progress_from_logits, speed_up
 from rfm.engine.predictor import RowScores, no_success, of_rows, part_of
 from rfm.engine.threads import FrameThreads
 from rfm.vlm.batch import Layout, VlmBatch
-from rfm.vlm.collator import QwenCollator, VlmCollator
+from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.network import VlmOutput
 from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees
 from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
-from rfm_client.contract.frame_refs import ProgressSampleRefs
 
 
 class VlmPredictor:
     """A vision-language reward model on a device.
 
-    cache: holds frames, for frame references, and features of temporal patches; None: no cache
+    cache: holds frames, which requests may name, and features of temporal patches; None: no cache
     threads: prepare the frames of all samples
     """
 
@@ -60,15 +59,15 @@ class VlmPredictor:
         """Score small batches with CUDA graphs from now on."""
         self.network.graphs = graphs
 
-    def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
-        """Return the conversations of a sample. Raises InvalidSampleError, also for unknown frame references."""
-        rows = self.collator.rows(self._completed(sample) if isinstance(sample, ProgressSampleRefs) else sample)
+    def rows(self, sample: Sample) -> list[VlmRow]:
+        """Return the conversations of a sample. Raises InvalidSampleError."""
+        rows = self.collator.rows(sample)
         # Beyond this limit the backbone has learned no positions, so scores would mean nothing.
         longest = max(row.num_tokens for row in rows)
         if longest > self._max_tokens:
             expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"
             raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
-        if not (self.makes_trees and isinstance(self.collator, QwenCollator)):
+        if not self.makes_trees:
             return rows
         return trees(rows, self.collator.visual_pad, are_images=self.collator.config.multi_image)
 
@@ -128,7 +127,7 @@ class VlmPredictor:
             self._keep(rows, batch.layout, output.made)
         return list(of_rows)
 
-    def joined(self, sample: Sample | ProgressSampleRefs, rows: Sequence[RowScores]) -> FrameScores:
+    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
         """Return the scores of a progress sample's frames, from those of all its rows."""
         return of_rows(sample, rows)
 
@@ -144,17 +143,10 @@ class VlmPredictor:
                 self.network.graphs.clear()
             raise
 
-    def _completed(self, sample: ProgressSampleRefs) -> ProgressSampleRefs:
-        named = sample.trajectory
-        kept = {} if self.cache is None else self.cache.found(named.digests)
-        found = {digest: named.pixels.get(digest, kept.get(digest)) for digest in named.digests}
-        pixels = {digest: frame for digest, frame in found.items() if frame is not None}
-        return replace(sample, trajectory=replace(named, pixels=pixels))
-
     def _keep(self, rows: Sequence[VlmRow], layout: Layout | None, made: torch.Tensor | None) -> None:
         """Cache each video's frames and its new features; skip a video that is larger than the cache.
 
-        layout: of a Qwen backbone's shots; None: nothing can be cached
+        layout: of the shots; None: nothing can be cached
         """
         if self.cache is None or layout is None:
             return

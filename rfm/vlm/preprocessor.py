@@ -42,7 +42,6 @@ _RESIZING: Settings = {
 # Values that leave pixels as they are computed here, by the code that trained or that asks the model.
 SIZED_BEFORE: Settings = _OF_QWEN  # RFM and Robometer resize frames themselves, and turn the processor's resizing off
 SIZED_BY_PROCESSOR: Settings = {**_OF_QWEN, **_RESIZING}
-SMOL_NEUTRAL: Settings = {**_ALL, "do_resize": True, "do_pad": True}
 # Settings that are read, and those without effect on pixels of RGB frames.
 _APPLIED = {"image_mean", "image_std", "patch_size", "resample", "size"}
 _IDLE = {
@@ -53,7 +52,6 @@ _IDLE = {
     "video_processor_type", "video_sampling",
 }  # fmt: skip
 _CHANNELS = 3
-_FILTERS = range(6)  # of Pillow
 
 
 def read_preprocessor(processor: str | Path, file: str, key: str) -> dict[str, Any]:
@@ -86,7 +84,7 @@ def _optional(file: Path) -> dict[str, Any]:
 def check_settings(settings: Settings, neutral: Settings, where: object) -> None:
     """Raise CheckpointError for a setting that is not applied and has another value than its neutral one.
 
-    neutral: SIZED_BEFORE, SIZED_BY_PROCESSOR or SMOL_NEUTRAL
+    neutral: SIZED_BEFORE or SIZED_BY_PROCESSOR
     """
     idle = (_IDLE | _APPLIED | _RESIZING.keys()) - neutral.keys()
     for name, value in settings.items():
@@ -129,14 +127,6 @@ def patch_px(settings: Settings, vision: Settings, where: object) -> int:
     if type(stated) is not int or stated != expected:
         got = "none" if stated is None else shown(stated)
         raise CheckpointError(f"{where}: patch_size: expected {expected}, as vision_config of config.json, got {got}")
-    return stated
-
-
-def resample_of(settings: Settings, where: object) -> int:
-    """Return the number of Pillow's filter. Raises CheckpointError."""
-    stated = settings.get("resample")
-    if type(stated) is not int or stated not in _FILTERS:
-        raise CheckpointError(f"{where}: resample: expected one of {list(_FILTERS)}, got {shown(stated)}")
     return stated
 
 

@@ -12,29 +12,25 @@ from typing import Any
 from rfm.checkpoint.content import PREPROCESSOR_CONFIG, CheckpointError, is_there, read_json
 from rfm.checkpoint.hub import local_copy
 from rfm.checkpoint.provenance import Decision, source_name
-from rfm.vlm.backbone import QWEN_2_5, SMOL, is_at_least
+from rfm.vlm.backbone import QWEN_2_5, is_at_least
 from rfm.vlm.collator import (
     IMAGE_PAD,
     QWEN3,
     VIDEO_PAD,
     VISION_START,
-    QwenCollator,
     VlmCollator,
 )
-from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, QwenImages, SmolImages, fitted_size
+from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, QwenImages, fitted_size
 from rfm.vlm.network import BackboneConfig, VlmConfig
 from rfm.vlm.preprocessor import (
     OF_IMAGES,
     OF_VIDEOS,
     SIZED_BEFORE,
-    SMOL_NEUTRAL,
     normalisation_of,
     patch_px,
     read_preprocessor,
-    resample_of,
 )
 from rfm.vlm.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS, Chat, Visual
-from rfm.vlm.smol_collator import SMOL_IMAGE, SmolCollator
 from rfm_client.contract import FrameSize
 
 PROCESSOR_FOLDER = "processor"  # in an exported checkpoint
@@ -45,15 +41,11 @@ _KEPT = (
     "unk_token",
 )  # fmt: skip
 # Fields of a backbone's config.json with token ids.
-_OF_QWEN = {"image_token_id": IMAGE_PAD, "video_token_id": VIDEO_PAD, "vision_start_token_id": VISION_START}
-_STATED_TOKENS = {QWEN_2_5: _OF_QWEN, QWEN3: _OF_QWEN, SMOL: {"image_token_id": SMOL_IMAGE}}
-SMOL_SIZE_PX = 512  # upstream sets it for every base model, so that no image is split
+_STATED_TOKENS = {"image_token_id": IMAGE_PAD, "video_token_id": VIDEO_PAD, "vision_start_token_id": VISION_START}
 
 
 def frame_size(config: VlmConfig) -> FrameSize | None:
     """Return the size to which a checkpoint first resizes each frame; None: it depends on the frame."""
-    if config.family == SMOL:
-        return FrameSize("longest", (SMOL_SIZE_PX,))
     if config.size_px is None:
         return None
     factor = config.backbone["vision_config"]["patch_size"] * MERGE * (1 if config.multi_image else FRAMES_PER_GROUP)
@@ -107,7 +99,7 @@ def check_tokens(
     config: BackboneConfig, tokenizer: Any, processor: str | Path, expected: Mapping[str, int] | None = None
 ) -> None:
     """Raise CheckpointError unless the tokenizer has the ids in the backbone's config.json and ``expected``."""
-    stated = {token: config.backbone.get(name) for name, token in _STATED_TOKENS[config.family].items()}
+    stated = {token: config.backbone.get(name) for name, token in _STATED_TOKENS.items()}
     expected = {**(expected or {}), **{token: number for token, number in stated.items() if type(number) is int}}
     for token, number in expected.items():
         got = tokenizer.convert_tokens_to_ids(token)
@@ -159,14 +151,9 @@ def save_processor(collator: VlmCollator, folder: Path) -> None:
 def _collator(config: VlmConfig, tokenizer: Any, preprocessor: dict[str, Any], processor: str | Path) -> VlmCollator:
     where = f"base model {processor}: preprocessing of {'images' if config.multi_image else 'videos'}"
     vision = config.backbone["vision_config"]
-    if config.family != SMOL:
-        normalisation = normalisation_of(preprocessor, SIZED_BEFORE, where)
-        images = QwenImages(patch_px(preprocessor, vision, where), normalisation, config.size_px)
-        return QwenCollator(config, tokenizer, images)
-    normalisation = normalisation_of(preprocessor, SMOL_NEUTRAL, where)
-    tokens = (vision["image_size"] // vision["patch_size"] // config.backbone["scale_factor"]) ** 2
-    resample = resample_of(preprocessor, where)
-    return SmolCollator(config, tokenizer, SmolImages(SMOL_SIZE_PX, resample, tokens, normalisation))
+    normalisation = normalisation_of(preprocessor, SIZED_BEFORE, where)
+    images = QwenImages(patch_px(preprocessor, vision, where), normalisation, config.size_px)
+    return VlmCollator(config, tokenizer, images)
 
 
 _EXAMPLE = "TASK"
@@ -174,7 +161,6 @@ _QWEN_PROMPT = "<|im_start|>user\nTASK{visual} 1: <|vision_start|><|{pad}_pad|><
 _NAMES = {
     QWEN_2_5: r"Qwen/Qwen2\.5-VL-\w+-Instruct",
     QWEN3: r"Qwen/Qwen3-VL-\w+-Instruct",
-    SMOL: r"HuggingFaceTB/SmolVLM2-[\w.-]+-Instruct",
 }
 _FACTS: dict[str, dict[str, Any]] = {
     QWEN_2_5: {
@@ -184,12 +170,6 @@ _FACTS: dict[str, dict[str, Any]] = {
         "image_std": [0.26862954, 0.26130258, 0.27577711],
     },
     QWEN3: {"prompt": _QWEN_PROMPT, "patch_size": 16, "image_mean": [0.5] * 3, "image_std": [0.5] * 3},
-    SMOL: {
-        "prompt": "<|im_start|>User: TASK<image><end_of_utterance>\n",
-        "resample": 1,
-        "image_mean": [0.5] * 3,
-        "image_std": [0.5] * 3,
-    },
 }
 
 

@@ -17,7 +17,6 @@ import numpy as np
 
 from rfm.vlm.video import Indices
 from rfm_client.contract import PreferenceSample, ProgressSample, Sample
-from rfm_client.contract.frame_refs import ProgressSampleRefs
 
 SPLIT_TOKEN = "<|split_token|>"
 REWARD_TOKEN = "<|reward_token|>"
@@ -61,13 +60,13 @@ class TrajectoryPart:
 Part: TypeAlias = str | TrajectoryPart
 
 
-def question(sample: Sample | ProgressSampleRefs, *, progress_in_preference: bool) -> list[Part]:
+def question(sample: Sample, *, progress_in_preference: bool) -> list[Part]:
     """Return the parts of the prompt for a sample.
 
     progress_in_preference: the checkpoint was trained with preference prompts that also ask for progress
     """
     task = sample.trajectories[0].task
-    if isinstance(sample, (ProgressSample, ProgressSampleRefs)):
+    if isinstance(sample, ProgressSample):
         return [PROGRESS_PROMPT.replace("{task}", task), TrajectoryPart(0)]
     if isinstance(sample, PreferenceSample):
         also = PREFERENCE_PROGRESS_PROMPT if progress_in_preference else ""

@@ -7,7 +7,7 @@ L tokens.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -28,7 +28,7 @@ class VlmRow:
     spans: for each trajectory, the tokens (first, behind the last) whose states are read for each frame
     query: index of the token whose state gives preference or similarity; None: a single trajectory
     picked: in dense mode int64 [frame_steps], the frames in the conversation; None: all
-    position_ids: int64 [3, L] for a Qwen backbone; None: for SmolVLM
+    position_ids: int64 [3, L]
     packs: conversations about the same video that begin like this one, the trunk, and precede it (``rfm.vlm.tree``)
     alone: all conversations of a row with packs, as rows
     """
@@ -39,7 +39,7 @@ class VlmRow:
     query: int | None
     is_similarity: bool
     picked: Indices | None = None
-    position_ids: Indices | None = None
+    position_ids: Indices = field(kw_only=True)
     packs: tuple[tuple[Leaf, ...], ...] = ()
     alone: tuple[VlmRow, ...] = ()
 

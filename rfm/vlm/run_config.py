@@ -10,16 +10,23 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
-from rfm.checkpoint.content import ADAPTER_CONFIG, NETWORK_CONFIG, RUN_CONFIG, CheckpointError, read_run_config, shown
+from rfm.checkpoint.content import (
+    ADAPTER_CONFIG,
+    NETWORK_CONFIG,
+    RUN_CONFIG,
+    CheckpointError,
+    cut,
+    read_json,
+    read_run_config,
+    shown,
+)
 from rfm.checkpoint.provenance import OF_UPSTREAM, OF_WEIGHTS, TRAINED_WITH_PADDING, Decision, file_name, source_name
 from rfm.checkpoint.run_config import find_run_config, frame_count
-from rfm.vlm.backbone import QWEN_2_5, SMOL
+from rfm.vlm.backbone import DEQUANTIZED, QWEN_2_5
+from rfm.vlm.lora import MERGE, Scaling
 from rfm.vlm.network import VlmConfig
-
-if TYPE_CHECKING:
-    from rfm.vlm.lora import Scaling
 
 HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, generated text
 DTYPES = ("float32", "bfloat16", "float16")
@@ -40,6 +47,7 @@ SETTINGS = {
 _OF_WEIGHTS = ("progress_bins", "has_similarity", "has_preference", "has_success")
 _BASE_MODEL = "--base-model"
 _VARIANT = re.compile(r"-unsloth$")  # Unsloth's name for its copy of a base model
+_FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # Unsloth's names of base models rounded to fewer bits, for training
 _DROPPED = ("pairwise_progress", "use_progress_token")  # settings of prompts that upstream has dropped
 
 Value = TypeVar("Value", bool, str, float)
@@ -121,13 +129,13 @@ class RunConfig:
             ),
         }
 
-    def size_px(self, family: str, multi_image: bool) -> tuple[int, int] | None:
+    def size_px(self, multi_image: bool) -> tuple[int, int] | None:
         """Return height and width to which every frame is resized first; None: resizing starts from each frame's size.
 
         None for images, for which all upstream versions with a frame_pool_attn ignore the keys.
         Raises CheckpointError.
         """
-        if family == SMOL or multi_image:
+        if multi_image:
             return None
         keys = ("resized_height", "resized_width")
         for key in keys:
@@ -188,6 +196,34 @@ class RunConfig:
         return any(values.values())
 
 
+def base_of_adapter(folder: Path, run: RunConfig) -> str:
+    """Return the base model that the run names.
+
+    Raises CheckpointError if the adapter names another, or if the run began with a checkpoint, whose weights the
+    adapter may change.
+    """
+    base = run.get("model.base_model_id", "")
+    if not base:
+        raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
+    named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
+    if isinstance(named, str) and _FEW_BITS.search(named):
+        expected = f"base_model_name_or_path: expected weights in full precision, got {shown(named)}"
+        raise CheckpointError(f"{folder / ADAPTER_CONFIG}: {expected}; {DEQUANTIZED.format(base=named)}")
+    if named and _model_name(str(named)) != _model_name(base):
+        raise CheckpointError(
+            f"{folder / ADAPTER_CONFIG}: base_model_name_or_path: expected {cut(base)}, the model.base_model_id of "
+            f"{run.file}, got {shown(named)}; name the one that the adapter was trained on with --base-model"
+        )
+    began_with = run.get("training.load_from_checkpoint", "")
+    if began_with:
+        raise CheckpointError(
+            f"{run.file}: training.load_from_checkpoint: expected none beside an adapter, got {shown(began_with)}: the "
+            f"adapter may change its weights in place of those of {cut(base)}; {MERGE}; if it does change those of "
+            f"{cut(base)}, name them with --base-model"
+        )
+    return base
+
+
 def decisions_of(
     config: VlmConfig,
     run: RunConfig | None,
@@ -236,12 +272,12 @@ def _base_model(named: str, run: RunConfig | None, given: str | None) -> Decisio
     if given is None:
         file = NETWORK_CONFIG if run is None else f"{run.name}: {run.shown('model.base_model_id')}"
         return Decision("base_model", source_name(named), file)
-    if run is None or not named or model_name(named) in given.lower():
+    if run is None or not named or _model_name(named) in given.lower():
         return Decision("base_model", source_name(given), _BASE_MODEL)
     source = f"{_BASE_MODEL}, for {named} of {run.name}"
     return Decision("base_model", source_name(given), source, is_assumed=True)
 
 
-def model_name(base: str) -> str:
+def _model_name(base: str) -> str:
     """Return the name by which ids and paths of the same base model are compared."""
     return _VARIANT.sub("", base.rstrip("/").rpartition("/")[2].lower())

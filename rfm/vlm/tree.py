@@ -50,8 +50,6 @@ class Conversation:
     def shared(self, other: Conversation) -> int:
         """Return the number of first tokens that equal those of ``other``, also in position and features."""
         row, before = self.row, other.row
-        assert row.position_ids is not None
-        assert before.position_ids is not None
         most = min(row.num_tokens, before.num_tokens, self.reads[0])
         pairs = enumerate(zip(self.shots, other.shots, strict=False))
         differing = next((number for number, (shot, another) in pairs if shot != another), None)
@@ -65,7 +63,6 @@ class Conversation:
         """Return the tokens behind those from the trunk and from leaves."""
         start = from_trunk + sum(count for _, count in from_leaves)
         assert self.row.picked is not None
-        assert self.row.position_ids is not None
         first, behind = self.reads
         ids, positions = self.row.input_ids[start:].copy(), self.row.position_ids[:, start:].copy()
         return Leaf(from_trunk, from_leaves, ids, positions, self.row.picked, (first - start, behind - start))

@@ -19,8 +19,6 @@ from rfm.engine.feature_cache import digests_of
 from rfm.engine.predictor import prefix_indices
 from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.vlm.images import FRAMES_PER_GROUP
-from rfm_client.contract import InvalidSampleError, wire
-from rfm_client.contract.frame_refs import TrajectoryRefs
 from rfm_client.contract.samples import UInt8Array
 
 Indices: TypeAlias = npt.NDArray[np.int64]
@@ -50,7 +48,7 @@ class VlmVideo:
     frames: T frames, uint8 [H, W, 3], of equal size
     num_shown: frames in a conversation
     conversations: indices of the frames in each, int64 [num_shown]
-    named: digests of the frames in a sample with frame references, computed by the server; None: no references
+    named: digests of the frames of a sample with named frames, computed by the server; None: no named frames
     sized: the resized frames; None: not yet resized
     """
 
@@ -98,7 +96,7 @@ class VlmVideo:
         return np.array([first.setdefault(digest, index) for index, digest in enumerate(self.digests)])
 
     def is_blank(self, shot: Shot) -> bool:
-        """True if a shot's frames, not from frame references, are black, as a probe's are.
+        """True if a shot's frames, which are not named, are black, as a probe's are.
 
         The network must compute these: cached features would not show that it works.
         """
@@ -115,18 +113,6 @@ class VlmVideo:
         """Return the different shots of all conversations."""
         shown = (shot for frames in self.conversations for shot in shots_of(frames, are_images=are_images))
         return list(dict.fromkeys(shown))
-
-
-def named_frames(trajectory: TrajectoryRefs) -> list[UInt8Array]:
-    """Return each frame, uint8 [H, W, 3]. Raises InvalidSampleError for unknown frames or unequal sizes."""
-    unknown = sum(digest not in trajectory.pixels for digest in trajectory.digests)
-    if unknown:
-        raise InvalidSampleError.at(wire.FRAME_DIGESTS, wire.UNKNOWN_FRAMES, f"{unknown} others")
-    frames = [trajectory.pixels[digest] for digest in trajectory.digests]
-    sizes = sorted({frame.shape[:2] for frame in frames})
-    if len(sizes) > 1:
-        raise InvalidSampleError.at(wire.FRAME_DIGESTS, "digests of frames of one size", f"sizes {sizes}")
-    return frames
 
 
 def shots_of(shown: Indices, *, are_images: bool) -> Iterable[Shot]:

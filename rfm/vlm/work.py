@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import torch
 
-from rfm.vlm.collator import QwenCollator, VlmCollator
+from rfm.vlm.collator import VlmCollator
 from rfm.vlm.network import BackboneConfig, build_backbone
 from rfm.vlm.tree import trees
 from rfm_client.contract import Sample
 
-_VISION = ("visual.", "vision_model.")  # beginnings of parameters that patches pass
+_VISION = "visual."  # beginning of parameters that patches pass
 _EMBEDDING = "embed_tokens."  # looked up, not multiplied
 
 
@@ -27,7 +27,6 @@ def flop(config: BackboneConfig, collator: VlmCollator, sample: Sample) -> float
     counts = {name: weights.numel() for name, weights in backbone.named_parameters() if _EMBEDDING not in name}
     of_vision = sum(count for name, count in counts.items() if name.startswith(_VISION))
     num_patches = sum(collator.num_patches(video) for video in videos)
-    if isinstance(collator, QwenCollator):
-        rows = trees(rows, collator.visual_pad, are_images=collator.config.multi_image)
+    rows = trees(rows, collator.visual_pad, are_images=collator.config.multi_image)
     num_tokens = sum(row.cost for row in rows)
     return 2.0 * (of_vision * num_patches + (sum(counts.values()) - of_vision) * num_tokens)

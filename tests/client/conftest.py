@@ -1,19 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Videos, clients and a repository for the tests of the client."""
+"""A video and a repository for the tests of the client."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import clip
-from environments import MODEL
 from paths import ROOT
-from rfm_client import RewardClient
-from servers import Served
 
 
 @pytest.fixture(scope="session")
@@ -28,12 +24,6 @@ def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("TERMINAL_WIDTH", "200")
     monkeypatch.delenv("RFM_URL", raising=False)
-
-
-@pytest.fixture
-def client(served: Served) -> Iterator[RewardClient]:
-    with served.client("grpc", MODEL) as client:
-        yield client
 
 
 @pytest.fixture

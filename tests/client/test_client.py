@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
+import re
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from dataclasses import replace
@@ -45,6 +47,15 @@ KINDS: dict[type, str] = {
     SimilaritySample: "similarity",
 }
 WIDTHS = (48, 32)  # of the embeddings of FRAMES_MODEL
+
+
+@pytest.mark.parametrize("kind", [RewardClient, AsyncRewardClient])
+def test_help_of_a_client_tells_of_each_option(kind: type[Any]) -> None:
+    parameters = inspect.signature(kind).parameters
+    assert [name for name, each in parameters.items() if each.kind is not each.KEYWORD_ONLY] == ["urls"]
+    assert len(parameters) == 12
+    for name in parameters:
+        assert re.search(rf"^    [\w, ]*\b{name}\b[\w, ]*: ", kind.__init__.__doc__ or "", re.MULTILINE), name
 
 
 def test_every_style_of_call_gives_the_engine_s_answers(served: Served, protocol: str) -> None:
@@ -344,7 +355,7 @@ def test_a_model_without_a_description_is_scored() -> None:
 
 
 @pytest.mark.parametrize(
-    "more", [{"max_frames": None}, {"needs_whole_episode": True}], ids=["unknown", "whole episodes"]
+    "more", [{"trained_frames": None}, {"needs_whole_episode": True}], ids=["unknown", "whole episodes"]
 )
 def test_a_checkpoint_without_a_limit_of_training_gets_no_line(
     caplog: pytest.LogCaptureFixture, more: dict[str, Any]

@@ -72,7 +72,7 @@ class Stand:
         self.asked["model_info"] += 1
         if self.error is not None:
             raise self.error
-        return ModelInfo(model, (str(self.version),), self.max_batch_size, None, None, None, None, None)
+        return ModelInfo(name=model, versions=(str(self.version),), max_batch_size=self.max_batch_size)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         return self.error is None and not self.is_down

@@ -8,8 +8,8 @@ import asyncio
 import pytest
 
 from rfm_client import DeadlineExceededError
-from rfm_client.serving import Deadline
 from rfm_client.transport.concurrency import MAX_BYTES, ConcurrencyLimiter
+from rfm_client.transport.deadline import Deadline
 
 
 def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import httpx
 import numpy as np
@@ -36,7 +36,7 @@ from rfm_client import (
     UInt8Array,
 )
 from rfm_client.episodes import Episode
-from rfm_client.frames import RULES, Rule, Sampling, of_prefixes, prefix_samples
+from rfm_client.frames import Rule, Sampling
 from servers import Served, Serving, serving
 from tolerances import BATCHED_VLM_TOLERANCE, TOLERANCE
 from transports import Answer, Tensors
@@ -53,8 +53,8 @@ def video(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array
 
 def offline(client: RewardClient, frames: UInt8Array, sampling: Sampling = FOUR, task: str = TASK) -> ProgressResult:
     """Return the scores of all prefixes, with all pixels sent."""
-    results = client.evaluate(list(prefix_samples(Trajectory(frames=frames, task=task), sampling)))
-    return of_prefixes([result for result in results if isinstance(result, ProgressResult)], sampling)
+    results = client.evaluate(list(sampling.samples(Trajectory(frames=frames, task=task))))
+    return sampling.joined([result for result in results if isinstance(result, ProgressResult)])
 
 
 def online(episode: Episode, frames: UInt8Array) -> tuple[list[float], list[float]]:
@@ -94,7 +94,7 @@ def client(transport: Recording) -> Iterator[RewardClient]:
 
 
 STEPPED = [
-    *((MODEL, rule, "grpc") for rule in RULES),
+    *((MODEL, rule, "grpc") for rule in get_args(Rule)),
     *((model, rule, "http") for model in (IMAGES, VIDEO) for rule in ("rint_pad", "linspace_trunc")),
     (IMAGES, "rint_pad", "grpc"),
 ]
@@ -103,7 +103,7 @@ STEPPED = [
 @pytest.mark.parametrize(("model", "rule", "protocol"), STEPPED)
 def test_steps_have_the_scores_of_the_whole(served: Served, model: str, rule: Rule, protocol: str) -> None:
     number = None if rule == "all" or rule.startswith("rewind") else 7 if model == MODEL else 4
-    frames = video(RULES.index(rule), 16 if rule == "all" else 40, (40, 56) if model == MODEL else (56, 84))
+    frames = video(get_args(Rule).index(rule), 16 if rule == "all" else 40, (40, 56) if model == MODEL else (56, 84))
     with served.client(protocol, model) as client, client.episode(TASK, sampling=rule, frames=number) as episode:
         assert client.model_info(frames=True).by_digest
         tolerance = TOLERANCE if model == MODEL else BATCHED_VLM_TOLERANCE
@@ -348,6 +348,47 @@ def test_an_episode_keeps_its_client(served: Served) -> None:
     assert [episode.add(frame).step for frame in video(115, 2)] == [0, 1]
 
 
+def test_kept_frames_are_scored_when_asked_and_several_episodes_in_one_request(
+    transport: Recording, client: RewardClient
+) -> None:
+    videos = video(120, 6), video(121, 4)
+    episodes = [client.episode(TASK, env=env, frames=4) for env in (2, 5)]
+    for episode, frames in zip(episodes, videos, strict=True):
+        for frame in frames:
+            buffer = frame.copy()
+            episode.keep(buffer)
+            buffer[:] = 0
+    assert transport.requests == []
+    scores = client.score_episodes(episodes)
+    assert len(transport.requests) == 1
+    assert [score.step for score in scores] == [episode.step for episode in episodes] == [5, 3]
+    for score, frames in zip(scores, videos, strict=True):
+        assert score.progress == pytest.approx(offline(client, frames).progress[-1], abs=TOLERANCE)
+    answer = client.submit_episodes(episodes[:1])
+    episodes[0].keep(videos[0][0])  # which the open question does not see
+    (score,) = answer.result()
+    assert score.step == 5
+    assert score.progress == pytest.approx(scores[0].progress, abs=TOLERANCE)
+
+
+def test_kept_frames_stay_when_a_request_fails(served: Served) -> None:
+    server, frames = Failing(served.url("grpc")), video(122, 3)
+    with RewardClient([], transports=[server], model=MODEL, retry=False) as client:
+        episode = client.episode(TASK, env=3, frames=4)
+        for frame in frames:
+            episode.keep(frame)
+        server.is_down = True
+        with pytest.raises(ServerUnavailableError):
+            client.score_episodes([episode])
+        server.is_down = False
+        (score,) = client.score_episodes([episode])
+        assert score.progress == pytest.approx(offline(client, frames).progress[-1], abs=TOLERANCE)
+        with pytest.raises(InvalidSampleError, match=r"^envs\[3\]\.frame: expected uint8 \[H, W, 3\]"):
+            episode.keep(np.zeros((2, 2, 3)))
+        assert episode.step == 2
+    episode.close()  # after the client
+
+
 def test_large_frames_go_in_several_requests(transport: Recording, client: RewardClient) -> None:
     large = video(116, 5, (700, 700))  # 1.5 MB each
     episodes = client.episodes(5, TASK, frames=2)
@@ -392,6 +433,30 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         r"^channels: expected some of the cameras \['front'\], got 'wrist'$",
     ),
 }
+
+
+KEPT: dict[str, tuple[dict[str, Any], Any, str]] = {
+    "no frame": ({}, None, r"^envs\[3\]\.frame: expected one to score, got none yet$"),
+    "no task": ({"task": " "}, video(0, 1)[0], r"^envs\[3\]\.task: expected a task sentence"),
+    "no camera": ({"cameras": ["a"]}, video(0, 1)[0], r"^envs\[3\]\.frame: .* the cameras \['a'\], got ndarray$"),
+    "another camera": (
+        {"cameras": ["a"]},
+        {"b": video(0, 1)[0]},
+        r"^envs\[3\]\.frame: expected frames of the cameras \['a'\], got frames of \['b'\]$",
+    ),
+    "env": ({"env": "3"}, video(0, 1)[0], "^env: expected a whole number, got '3'$"),
+}
+
+
+@pytest.mark.parametrize(("given", "frame", "message"), KEPT.values(), ids=KEPT)
+def test_a_frame_that_cannot_be_kept_or_scored_is_refused_with_its_environment(
+    client: RewardClient, given: dict[str, Any], frame: Any, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        episode = client.episode(**{"task": TASK, "env": 3, "frames": 4, **given})
+        if frame is not None:
+            episode.keep(frame)
+        client.score_episodes([episode])
 
 
 @pytest.mark.parametrize(("given", "message"), REFUSED.values(), ids=REFUSED)

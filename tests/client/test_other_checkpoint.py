@@ -50,3 +50,18 @@ def test_frames_are_resized_as_the_checkpoint_reads_them_by_now() -> None:
         episode.add(FRAME)
     assert shelf.shapes[-1] == (1, 8, 16, 16, 3)
     assert {shape[2:4] for shape in shelf.shapes[:-1]} == {(8, 8)}
+
+
+def test_kept_frames_have_the_size_that_the_checkpoint_read_at_the_first() -> None:
+    small, large = (
+        replace(SHORT, frame_size=FrameSize("exact", (8, 8))),
+        replace(LONG, frame_size=FrameSize("exact", (16, 16))),
+    )
+    shelf = Shelf(small, large, after=1, has_encoder=False)
+    with RewardClient("", transports=[shelf]) as client:
+        for _ in range(2):
+            episode = client.episode(TASK, resize=True)
+            for _ in range(3):
+                episode.keep(FRAME)
+                client.score_episodes([episode])
+    assert [shape[2:4] for shape in shelf.shapes] == [(8, 8)] * 3 + [(16, 16)] * 3

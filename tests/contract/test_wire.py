@@ -25,7 +25,6 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
-from rfm_client.contract.frame_refs import EncoderSampleRefs, ProgressSampleRefs, TrajectoryRefs, frame_digest
 from rfm_client.contract.samples import EncoderSample
 
 OUTPUTS = [spec.name for spec in wire.score_outputs(4)]
@@ -207,19 +206,23 @@ def test_embeddings_of_another_shape_are_an_error(video: tuple[int, ...], text: 
 )
 def test_named_frames_arrive_with_those_that_are_sent(num_sent: int, shape: tuple[int, ...]) -> None:
     videos = filmed(0, 2), filmed(1, 3)
-    named = [TrajectoryRefs.of(video.positions, video.task) for video in videos]
-    sent = [*videos[0].positions, *videos[1].positions][:num_sent]
-    tensors = wire.encode_refs(named, sent)
+    digests = [[wire.frame_digest(frame) for frame in video.positions] for video in videos]
+    frames = [*videos[0].positions, *videos[1].positions]
+    kept = {wire.frame_digest(frame): frame for frame in frames[num_sent:]}
+    tensors = wire.encode_refs(digests, [video.task for video in videos], frames[:num_sent])
     assert tensors[wire.FRAMES].shape == shape
     assert wire.num_positions(tensors) == 3
-    samples, footage = wire.decode_samples(tensors), wire.decode_trajectories(tensors)
-    for sample, video, wanted in zip(samples, footage, named, strict=True):
-        assert isinstance(sample, ProgressSampleRefs)
-        assert isinstance(video, EncoderSampleRefs)
-        for trajectory in (*sample.trajectories, *video.trajectories):
-            assert (trajectory.digests, trajectory.task) == (wanted.digests, wanted.task)
-            for frame in sent:
-                np.testing.assert_array_equal(trajectory.pixels[frame_digest(frame)], frame)
+    samples = wire.decode_samples(tensors, lambda asked: {each: kept[each] for each in asked if each in kept})
+    footage = wire.decode_trajectories(tensors, lambda asked: {each: np.ones(2, np.float32) for each in asked})
+    for sample, encoded, video, wanted in zip(samples, footage, videos, digests, strict=True):
+        assert isinstance(sample, ProgressSample)
+        for trajectory in (*sample.trajectories, *encoded.trajectories):
+            assert trajectory.named is not None
+            assert [digest for digest, _ in trajectory.named] == wanted
+            assert (trajectory.task, trajectory.num_frames) == (video.task, len(wanted))
+            for (digest, known), frame in zip(trajectory.named, video.positions, strict=True):
+                expected = np.ones(2) if trajectory in encoded.trajectories and digest in kept else frame
+                np.testing.assert_array_equal(known, expected)
 
 
 def request(lengths: tuple[int, int], kind: int, steps: int = 0, stray: int = 0) -> wire.Tensors:

@@ -23,7 +23,8 @@ from rfm.engine import Engine
 from rfm.engine.graphs import Captured, Function, Graphs
 from rfm.family import NETWORK
 from rfm_export import ExportDiffersError
-from rfm_export.verify import WORKING_ROOM, device_for, device_named, needing_room, verify_graphs
+from rfm_export.source import device_named
+from rfm_export.verify import WORKING_ROOM, device_for, needing_room, verify_graphs
 
 SMALL = goldens.config("c1_t1_disc10")
 LARGE = next(iter(goldens.VLM))

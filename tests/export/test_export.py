@@ -20,11 +20,12 @@ import rfm_export
 from engines import serve_config, training_run
 from in_process import rfm
 from paths import ROOT
-from repositories import forget_input
+from repositories import changing, description_of, forget_input
 from rfm.families import CheckpointError
 from rfm.rewind.checkpoint import RewindCheckpoint
+from rfm_client.contract.description import DESCRIPTION_PARAMETER, Origin
 from rfm_export import ExportDiffersError, ExportError
-from rfm_export.about import origin_of
+from rfm_export.source import origin_of
 
 EMBEDDINGS = goldens.config("c1_t1_disc10")
 FRAMES = goldens.config("enc_c1_t1_disc10")
@@ -297,10 +298,6 @@ def test_upstream_s_file_exports_whatever_its_batch_size_unless_it_names_gpus_th
     assert config.max_batch_size == 64
 
 
-def parameter(repository: Path, model: str, name: str) -> str:
-    return str(read(repository, model).parameters[name].string_value)
-
-
 def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
     """An ensemble's digest covers the files of all parts in order."""
 
@@ -311,7 +308,7 @@ def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
     expected = {"rfm": digest("rfm"), "video": digest("video"), "video_encoder": digest("video_encoder")}
     expected["video_frames"] = digest("video_encoder", "video")
     assert len(set(expected.values())) == len(expected)
-    assert {name: parameter(exported, name, "weights_digest") for name in expected} == expected
+    assert {name: description_of(exported / name).weights_digest for name in expected} == expected
 
 
 @pytest.mark.parametrize("file", ["text_encoder/model.safetensors", "image_encoder/preprocessor_config.json"])
@@ -328,26 +325,37 @@ def test_check_names_what_differs_also_by_other_weights_and_settings(exported: P
     ]
 
 
+def test_check_names_a_broken_description(exported: Path, tmp_path: Path) -> None:
+    repository = shutil.copytree(exported, tmp_path / "repository")
+    with changing(repository / "video") as config:
+        config.parameters[DESCRIPTION_PARAMETER].string_value = "{"
+    expected = r"/video/config\.pbtxt: parameter description: expected the JSON object .*; export again"
+    with pytest.raises(ExportError, match=expected):
+        rfm_export.check(repository, serve_config(FRAMES, "video"))
+
+
 def test_the_digest_of_settings_is_of_the_dtype_too(exported: Path, tmp_path: Path) -> None:
     export(FRAMES, tmp_path, name="video", dtype="bfloat16")
-    repositories = (exported, tmp_path)
-    assert len({parameter(repository, "video", "weights_digest") for repository in repositories}) == 1
-    assert len({parameter(repository, "video", "settings_digest") for repository in repositories}) == 2
+    told = [description_of(repository / "video") for repository in (exported, tmp_path)]
+    assert len({each.weights_digest for each in told}) == 1
+    assert len({each.settings_digest for each in told}) == 2
 
 
 def test_clients_learn_number_type_pytorch_and_attention(exported: Path, tmp_path: Path) -> None:
     export(FRAMES, tmp_path, name="video", dtype="bfloat16")
     for repository, dtype in ((exported, "float32"), (tmp_path, "bfloat16")):
         expected = f"{dtype}, torch {torch.__version__}, scaled_dot_product_attention"
-        assert parameter(repository, "video", "computation") == parameter(repository, "video_frames", "computation")
-        assert parameter(repository, "video", "computation") == expected
+        assert description_of(repository / "video").computation == expected
+        assert description_of(repository / "video_frames").computation == expected
 
 
 def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:
     snapshot = tmp_path / "models--org--name" / "snapshots" / "0123abcd"
-    assert origin_of("org/name@best", snapshot) == {"source": "org/name@best", "revision": "0123abcd"}
+    assert origin_of("org/name@best", snapshot, "") == Origin(
+        source="org/name@best", revision="0123abcd", computation=""
+    )
     snapshot.mkdir(parents=True)
-    assert origin_of(snapshot, snapshot) == {"source": "org/name@0123abcd", "revision": ""}
+    assert origin_of(snapshot, snapshot, "") == Origin(source="org/name@0123abcd", computation="")
 
 
 def test_the_configuration_of_the_training_run_is_kept_without_its_secrets(tmp_path: Path) -> None:
@@ -358,6 +366,6 @@ def test_the_configuration_of_the_training_run_is_kept_without_its_secrets(tmp_p
     secrets = "{hub_token: hf_secret, WANDB_API_KEY: secret, max_token: 5, day: 2026-01-02}"
     file.write_text(f"{file.read_text()}\nreports: {secrets}\n")
     rfm_export.export(checkpoint, tmp_path / "model_repository", serve_config(config))
-    kept = json.loads(read(tmp_path / "model_repository", "rfm").parameters["run_config"].string_value)
+    kept = description_of(tmp_path / "model_repository" / "rfm").run_config
     assert kept == {**run, "reports": {"max_token": 5, "day": "2026-01-02"}}
     assert rfm_export.check(tmp_path / "model_repository", serve_config(config)) == []

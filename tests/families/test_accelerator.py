@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import goldens
-from engines import TRANSFORMERS, load_engine
+from engines import load_engine
 from pretended import CUDA, SECOND, Seen, pretended
 from reward_models import ROOT, references
 from rfm import families
@@ -37,12 +37,12 @@ def engine_there(name: str, feature_cache_mib: int = 0, device: torch.device = C
 
 
 # Waits of the host in a batch like an earlier one: for values, and for copies to the device.
-# Vision-language models read all scores at once; for SmolVLM transformers looks for images of zeros.
+# Vision-language models read all scores at once.
 WAITS = {
     "c1_t1_disc10": (5, 11),  # progress, logits, success, questions twice; the parts of a batch
     "legacy_keys_l2": (4, 11),
     "enc_c1_t1_disc10": (8, 15),
-    **{config.name: (40 if config.name.startswith("smol") else 1, 0) for config in goldens.VLM},
+    **{config.name: (1, 0) for config in goldens.VLM},
 }
 
 
@@ -53,8 +53,6 @@ def test_a_device_gives_the_reference_answers_and_waits_no_more_often_than_it_mu
     seen: Seen, config: goldens.Config
 ) -> None:
     """The network is on the second device, not the current one; no tensor may lie elsewhere."""
-    if config.name.startswith("smol") and TRANSFORMERS >= 5:
-        pytest.skip("SmolVLM is refused with transformers 5")
     engine = engine_there(config.name, device=SECOND)
     cases = [case for case in config.cases() if not case.is_refused]
     for case in [*cases[:1], *(case for case in cases if "mixed" in case.file.stem)]:
@@ -132,7 +130,7 @@ MIXED: list[Sample] = [
 ]
 
 
-@pytest.mark.parametrize("name", [PLAIN, "q25_video_avg_disc10", "smol_mean_disc10"])
+@pytest.mark.parametrize("name", [PLAIN, "q25_video_avg_disc10"])
 @pytest.mark.slow
 def test_batches_that_are_collated_while_others_are_scored_have_the_cpu_s_scores(seen: Seen, name: str) -> None:
     engine = engine_there(name, feature_cache_mib=1)
@@ -140,9 +138,8 @@ def test_batches_that_are_collated_while_others_are_scored_have_the_cpu_s_scores
     for _ in range(2):  # the second time, frame features are on the device
         for result, expected in zip(engine.evaluate(MIXED), load_engine(name).evaluate(MIXED), strict=True):
             assert_close(result, expected, 1e-5)
-    if not name.startswith("smol"):
-        assert seen.calls.count("Stream") == 1
-        assert {"pin_memory", "stream", "wait_stream", "record_stream"} <= {*seen.calls}
+    assert seen.calls.count("Stream") == 1
+    assert {"pin_memory", "stream", "wait_stream", "record_stream"} <= {*seen.calls}
 
 
 def test_a_lack_of_memory_frees_what_pytorch_keeps(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:

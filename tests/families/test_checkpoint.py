@@ -437,8 +437,6 @@ def with_config_of(name: str) -> Spoil:
 OTHER_NETWORKS: dict[str, tuple[str, Spoil, str, str]] = {
     "Qwen3-VL, of Qwen2.5-VL": (WITH_IMAGES, with_config_of("q25_mean_l2"), "qwen3_vl", "'qwen2_5_vl'"),
     "Qwen2.5-VL, of Qwen3-VL": ("q25_mean_l2", with_config_of(WITH_IMAGES), "qwen2_5_vl", "'qwen3_vl'"),
-    "SmolVLM, of Qwen3-VL": ("smol_mean_disc10", with_config_of(WITH_IMAGES), "smolvlm", "'qwen3_vl'"),
-    "Qwen3-VL, of SmolVLM": (WITH_IMAGES, with_config_of("smol_mean_disc10"), "qwen3_vl", "'smolvlm'"),
     "Qwen3-VL, of ReWiND": (WITH_IMAGES, with_config_of(CONTINUOUS), "qwen3_vl", "'rewind_transformer'"),
     "Qwen3-VL, of a part of it": (WITH_IMAGES, settings("config.json", model_type="qwen3_vl_text"), "qwen3_vl", "'qwen3_vl_text'"),
     "Qwen3-VL, without one": (WITH_IMAGES, lambda folder: (folder / "config.json").unlink(), "qwen3_vl", "none"),

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sysconfig
@@ -21,12 +20,12 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 import rfm_export
 import toy_family
 from paths import ROOT
+from repositories import description_of
 from rfm import families
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.families import CheckpointError
-from rfm.launch.installation import Installation, find_installation
-from rfm.parameters import FAMILY_PARAMETER
+from rfm.launch.installation import Installation
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -37,9 +36,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
-from rfm_export.layout import CONFIG_FILE
-from rfm_export.pbtxt import parse, render
-from servers import start_triton
+from servers import find_installation, start_triton
 
 TESTS = ROOT / "tests" / "support"
 DEMO = ROOT / "model_repository"
@@ -89,11 +86,6 @@ def with_family(installation: Installation, folder: Path) -> Installation:
 def running(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     folder = tmp_path_factory.mktemp("served")
     repository = shutil.copytree(DEMO, folder / "model_repository")
-    for name in ("rfm", "rfm_encoder"):
-        file = repository / name / CONFIG_FILE
-        config = parse(file.read_text())
-        del config.parameters[FAMILY_PARAMETER]
-        file.write_text(render(config))
     rfm_export.export(checkpoint, repository, TOY, family=toy_family.__name__)
     installation = with_family(find_installation(), folder / "environment")
     with start_triton(repository, installation) as server:
@@ -118,17 +110,19 @@ def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> No
         with pytest.raises(InvalidSampleError, match="sample_type: expected progress or preference, got similarity"):
             client.evaluate([SimilaritySample(video(first), video(second))])
     assert rfm_export.check(running.repository, TOY) == []
-    config = parse((running.repository / "toy" / CONFIG_FILE).read_text())
-    network = json.loads(config.parameters["network"].string_value)
-    assert network == {"class": "Redness", "config": {"num_colours": 3}, "parameters": {"line": 4}}
+    assert description_of(running.repository / "toy").network == {
+        "class": "Redness",
+        "config": {"num_colours": 3},
+        "parameters": {"line": 4},
+    }
 
 
 @pytest.mark.triton
-def test_a_configuration_that_names_no_family_serves_what_its_folder_holds(running: Running) -> None:
+def test_a_family_from_elsewhere_is_served_beside_one_of_this_package(running: Running) -> None:
     demo = running.repository / "rfm" / "1" / "checkpoint"
-    encoders = families.encoders_of(None).load(running.repository / "rfm_encoder" / "1")
+    encoders = families.encoders_of("rfm.rewind").load(running.repository / "rfm_encoder" / "1")
     sample = ProgressSample(video([0.1, 0.5, 0.9]))
-    (expected,) = Engine.from_checkpoint(demo, encoders=encoders).evaluate([sample])
+    (expected,) = Engine.of(families.load(demo), encoders=encoders).evaluate([sample])
     with RewardClient(running.url) as client:
         (result,) = client.evaluate([sample])
     np.testing.assert_allclose(result.progress, expected.progress, atol=1e-5)

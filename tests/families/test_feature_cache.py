@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from rfm.engine import Execution
 from rfm.engine.feature_cache import FeatureCache, get_or_make
 from rfm.family import FrameEncoders
 from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, UInt8Array
-from rfm_client.contract.frame_refs import EncoderSampleRefs, TrajectoryRefs, frame_digest
+from rfm_client.contract import wire
 from rfm_client.contract.samples import EncoderSample
+from rfm_client.contract.wire import frame_digest
 from vlm import video
 
 TASK = "stack the cups"
@@ -35,10 +37,10 @@ def footage(frames: UInt8Array, task: str = TASK) -> EncoderSample:
     return EncoderSample((Trajectory(frames=frames, task=task),))
 
 
-def named(frames: UInt8Array, sent: UInt8Array, task: str = TASK) -> EncoderSampleRefs:
-    """Return a question about frames with only some of them sent."""
-    pixels = {frame_digest(frame): frame for frame in sent}
-    return EncoderSampleRefs((TrajectoryRefs(tuple(map(frame_digest, frames)), pixels, task),))
+def named(frames: UInt8Array, sent: UInt8Array, cache: FeatureCache[Any]) -> EncoderSample:
+    """Return a request about frames with only some of them sent, as a model with this cache decodes it."""
+    (sample,) = wire.decode_trajectories(wire.encode_refs([[*map(frame_digest, frames)]], [TASK], [*sent]), cache.found)
+    return sample
 
 
 def embeddings(outcome: EncoderSample | RewardError) -> tuple[np.ndarray, np.ndarray]:
@@ -57,7 +59,7 @@ def test_episodes_that_grow_by_a_frame_are_embedded_as_without_a_cache(
     for stop in range(1, 13):
         (expected,) = encoders.encode([footage(frames[:stop])], Execution(), None)
         sent = frames[stop - 1 : stop] if limit_bytes else frames[:stop]
-        (outcome,) = encoders.encode([named(frames[:stop], sent)], execution, cache)
+        (outcome,) = encoders.encode([named(frames[:stop], sent, cache)], execution, cache)
         for got, wanted in zip(embeddings(outcome), embeddings(expected), strict=True):
             np.testing.assert_allclose(got, wanted, atol=1e-5)
     assert execution.num_encoded == (12 if limit_bytes else 78)
@@ -65,34 +67,39 @@ def test_episodes_that_grow_by_a_frame_are_embedded_as_without_a_cache(
 
 
 def test_equal_frames_of_one_batch_are_encoded_once(encoders: FrameEncoders) -> None:
-    frames, execution = frames_of(1, 5), Execution()
-    batch = [footage(frames), footage(frames[[0, 0, 4, 4]], "another task"), named(frames[:3], frames[:0])]
-    outcomes = encoders.encode(batch, execution, FeatureCache(2**20))
+    frames, execution, cache = frames_of(1, 5), Execution(), FeatureCache(2**20)
+    batch = [footage(frames), footage(frames[[0, 0, 4, 4]], "another task"), named(frames[:3], frames[:3], cache)]
+    outcomes = encoders.encode(batch, execution, cache)
     assert execution.num_encoded == 5
     whole, others, first = (embeddings(outcome)[0] for outcome in outcomes)
     np.testing.assert_array_equal(others, whole[[0, 0, 4, 4]])
     np.testing.assert_array_equal(first, whole[:3])
 
 
-def test_a_digest_that_is_not_known_fails_its_sample_alone(encoders: FrameEncoders) -> None:
+def test_a_digest_that_is_not_known_is_refused_until_all_frames_are_sent(encoders: FrameEncoders) -> None:
     frames, cache = frames_of(2, 4), FeatureCache(2**20)
-    failed, scored = encoders.encode([named(frames, frames[2:3]), footage(frames_of(3, 2))], Execution(), cache)
-    assert isinstance(failed, InvalidSampleError)
-    assert str(failed) == (
-        "frame_digests: expected digests of frames that this model knows or has been sent, got 3 others"
-    )
-    assert isinstance(scored, EncoderSample)
-    (healed,) = encoders.encode([named(frames, frames)], Execution(), cache)
+    expected = "frame_digests: expected digests of frames that this model knows or has been sent, got 3 others"
+    with pytest.raises(InvalidSampleError, match=f"^{expected}$"):
+        named(frames, frames[2:3], cache)
+    (healed,) = encoders.encode([named(frames, frames, cache)], Execution(), cache)
     assert isinstance(healed, EncoderSample)
+
+
+def test_a_frame_that_is_evicted_after_its_request_came_is_not_missing(encoders: FrameEncoders) -> None:
+    frames, cache = frames_of(6, 3), FeatureCache(2**20)
+    (expected,) = encoders.encode([footage(frames)], Execution(), cache)
+    sample, execution = named(frames, frames[:0], cache), Execution()
+    cache.clear()
+    (outcome,) = encoders.encode([sample], execution, cache)
+    np.testing.assert_array_equal(embeddings(outcome)[0], embeddings(expected)[0])
+    assert (execution.num_encoded, execution.num_found) == (0, 3)
 
 
 def test_nobody_can_say_what_a_digest_shows(encoders: FrameEncoders) -> None:
     """Pixels are named by who reads them: a digest that a caller gives them counts for nothing."""
     frames, cache = frames_of(4, 2), FeatureCache(2**20)
-    honest = frame_digest(frames[0])
-    question = TrajectoryRefs((honest,), {frame_digest(frames[1]): frames[1]}, TASK)
-    (outcome,) = encoders.encode([EncoderSampleRefs((question,))], Execution(), cache)
-    assert isinstance(outcome, InvalidSampleError)
+    with pytest.raises(InvalidSampleError, match="got 1 others"):
+        named(frames[:1], frames[1:], cache)
     (expected,) = encoders.encode([footage(frames[:1])], Execution(), None)
     (outcome,) = encoders.encode([footage(frames[:1])], Execution(), cache)
     np.testing.assert_allclose(embeddings(outcome)[0], embeddings(expected)[0], atol=1e-5)
@@ -139,17 +146,16 @@ def test_a_black_frame_with_pixels_is_always_encoded(encoders: FrameEncoders) ->
     """A server probes itself with such: it is to see whether the encoder works."""
     black, cache, execution = np.zeros((2, 40, 56, 3), np.uint8), FeatureCache(2**20), Execution()
     expected = [embeddings(encoders.encode([footage(black)], execution, cache)[0])[0] for _ in range(2)]
-    (outcome,) = encoders.encode([named(black, black[:0])], execution, cache)
+    (outcome,) = encoders.encode([named(black, black[:0], cache)], execution, cache)
     np.testing.assert_allclose(embeddings(outcome)[0], expected[0], atol=1e-5)
     assert execution.num_encoded == 2
 
 
-def test_a_sliver_is_refused_though_only_another_request_names_it(encoders: FrameEncoders) -> None:
-    """The second request of a batch needs the features of the first."""
-    sliver, cache, frames = np.zeros((1, 3000, 3), np.uint8), FeatureCache(2**20), frames_of(5, 1)
+def test_a_sliver_is_refused_and_fails_no_neighbour(encoders: FrameEncoders) -> None:
+    sliver, cache, frames = np.zeros((1, 1, 3000, 3), np.uint8), FeatureCache(2**20), frames_of(5, 1)
     encoders.encode([footage(frames)], Execution(), cache)
-    sends = TrajectoryRefs((frame_digest(frames[0]),), {frame_digest(sliver): sliver}, TASK)
-    names = TrajectoryRefs((frame_digest(sliver),), {}, TASK)
-    refused, unknown = encoders.encode([EncoderSampleRefs((sends,)), EncoderSampleRefs((names,))], Execution(), cache)
-    assert str(refused) == "frames: expected frames at most 50 times as long as wide, got 1 x 3000"
-    assert "frame_digests: expected digests of frames that this model knows" in str(unknown)
+    batch = [named(sliver, sliver, cache), footage(sliver), named(frames, frames[:0], cache)]
+    *refused, scored = encoders.encode(batch, Execution(), cache)
+    for outcome in refused:
+        assert str(outcome) == "frames: expected frames at most 50 times as long as wide, got 1 x 3000"
+    assert isinstance(scored, EncoderSample)

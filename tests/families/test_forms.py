@@ -86,11 +86,6 @@ def test_other_adapters_of_peft_are_refused(folder: Path, name: str, message: st
 EMBEDDING = "base_model.model.language_model.embed_tokens"
 
 
-def of_smolvlm(tensors: dict[str, Any]) -> None:
-    for name in [*tensors]:
-        tensors[name.replace("model.language_model", "model.model.text_model")] = tensors.pop(name)
-
-
 def on_a_convolution(tensors: dict[str, Any]) -> None:
     shapes = {"A": (4, 3, 2, 14, 14), "B": (32, 4, 1, 1, 1)}
     tensors.update(
@@ -111,7 +106,6 @@ def with_the_embedding_twice(tensors: dict[str, Any]) -> None:
 
 LINEAR = r"adapter_model\.safetensors: expected LoRA factors of linear layers of a Qwen backbone, got "
 OTHER_LAYERS: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
-    "SmolVLM": (of_smolvlm, rf"{LINEAR}'model\.model\.text_model\."),
     "an embedding": (on_the_embedding, rf"{LINEAR}'model\.language_model\.embed_tokens\.lora_embedding_A'"),
     "an embedding saved in two ways": (with_the_embedding_twice, rf"{LINEAR}'model\.language_model\.embed_tokens\."),
     "a convolution": (

@@ -25,7 +25,6 @@ from rfm.engine.graphs import IDLE_CALLS, MAX_GRAPHS, STEP_TOKENS, Captured, Fun
 from rfm_client import PreferenceSample, ProgressSample, Sample
 from vlm import BFLOAT16, PLAIN, assert_close, video
 
-QWEN = [config for config in goldens.VLM if not config.name.startswith("smol")]
 ROBOREWARD = references("roboreward")[0].config / "checkpoint"
 CPU = torch.device("cpu")
 
@@ -37,7 +36,7 @@ def engine_with(graphs: Graphs, config: goldens.Config, feature_cache_mib: int =
     return Engine(checkpoint.predictor(CPU, None, cache), graphs=graphs)
 
 
-@pytest.mark.parametrize("config", QWEN, ids=lambda config: config.name)
+@pytest.mark.parametrize("config", goldens.VLM, ids=lambda config: config.name)
 @pytest.mark.parametrize("feature_cache_mib", [0, 4])
 def test_replays_give_the_reference_answers(config: goldens.Config, feature_cache_mib: int) -> None:
     cases = [case for case in config.cases() if not case.is_refused][:3]

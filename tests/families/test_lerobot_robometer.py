@@ -41,10 +41,10 @@ def check(results: list[Any], decoded: dict[str, Any], frames_per_value: int, to
 def test_scores_are_those_of_lerobot(case: Reference) -> None:
     content, frames_per_value = case.content, 1 if case.summary["use_multi_image"] else 2
     last, is_rounded = content.get("cropped_to_last"), case.summary["torch_dtype"] == "bfloat16"
-    engine = Engine.from_checkpoint(str(case.config / "checkpoint"), base_model=str(BASE))
+    engine = Engine.of(families.load(str(case.config / "checkpoint"), base_model=str(BASE)))
     results = engine.evaluate(case.samples(last))
     if is_rounded:
-        rounded = Engine.from_checkpoint(str(case.config / "checkpoint"), base_model=str(BASE), dtype=torch.bfloat16)
+        rounded = Engine.of(families.load(str(case.config / "checkpoint"), base_model=str(BASE)), dtype=torch.bfloat16)
         check(rounded.evaluate(case.samples(last)), content["decoded"], frames_per_value, ROUNDED)
         if "fp32_decoded" in content:
             check(results, content["fp32_decoded"], frames_per_value, TOLERANCES[1])
@@ -64,7 +64,7 @@ def test_an_export_scores_the_same_and_every_setting_has_a_source(tmp_path: Path
     case = next(case for case in CASES if case.config == CHECKPOINT.parent)
     checkpoint = families.load(CHECKPOINT, base_model=str(BASE))
     checkpoint.save(tmp_path / "saved")
-    saved = Engine.from_checkpoint(str(tmp_path / "saved")).evaluate(case.samples())
+    saved = Engine.of(families.load(str(tmp_path / "saved"))).evaluate(case.samples())
     for result, expected in zip(saved, Engine.of(checkpoint).evaluate(case.samples()), strict=True):
         assert isinstance(result, ProgressResult)
         assert isinstance(expected, ProgressResult)
@@ -158,5 +158,5 @@ def test_of_untied_weights_the_embedding_is_read(tmp_path: Path) -> None:
         config["vlm_config"]["tie_word_embeddings"] = False
 
     case = next(case for case in CASES if case.config == CHECKPOINT.parent)
-    engine = Engine.from_checkpoint(str(changed(tmp_path, untie)), base_model=str(BASE))
+    engine = Engine.of(families.load(str(changed(tmp_path, untie)), base_model=str(BASE)))
     check(engine.evaluate(case.samples(case.content.get("cropped_to_last"))), case.content["decoded"], 1, TOLERANCES[1])

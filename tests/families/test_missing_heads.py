@@ -19,6 +19,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 import goldens
 import rfm_export
 from engines import serve_config
+from repositories import description_of
 from rfm import families
 from rfm.engine import Engine
 from rfm.families import CheckpointError, Decision
@@ -32,8 +33,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client import SimilaritySample as Similarity
-from rfm_client.contract.synthetic import random_trajectory
-from rfm_client.serving import blank_trajectory
+from rfm_client.contract.synthetic import blank_trajectory, random_trajectory
 from rfm_commands.engine_scorer import EngineScorer
 from spoilt import convert, weights, without
 from vlm import assert_close
@@ -96,7 +96,7 @@ def test_what_is_exported_has_the_same_heads(tmp_path: Path, name: str) -> None:
     model = tmp_path / "repository" / ("rfm_frames" if name == VLM else "rfm")
     config = text_format.Parse((model / "config.pbtxt").read_text(), pb.ModelConfig())
     assert [warmup.name for warmup in config.model_warmup] == ["progress", *(["similarity"] if name == REWIND else [])]
-    told = json.loads(config.parameters["network"].string_value)["config"]
+    told = description_of(model).network["config"]
     assert (told["has_preference"], told["has_success"]) == (False, False)
     exported = load(name, model / str(number) / "checkpoint")
     assert exported.config == load(name, folder).config
@@ -160,8 +160,8 @@ def run(first_code: tuple[Path, FirstCode], tmp_path: Path) -> Path:
 def test_a_checkpoint_of_the_first_rewind_code_has_its_scores(first_code: tuple[Path, FirstCode]) -> None:
     folder, network = first_code
     checkpoint = families.load(folder)
-    assert (checkpoint.description.trained_frames, checkpoint.description.max_frames) == (16, None)
-    assert checkpoint.description.lacks == {"preference", "success", "similarity"}
+    assert (checkpoint.description.trained_frames, checkpoint.description.network_frames) == (16, None)
+    assert checkpoint.description.lacks == ("preference", "similarity", "success")
     lacking, line = families.notes(folder, checkpoint)
     assert lacking == "model.safetensors: there is no head of preference and success: served without"
     source = "(default of the first ReWiND code)"

@@ -16,6 +16,7 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from few_bits import TOLERANCES, as_bytes, case, change_config, in_both_forms
+from rfm import families
 from rfm.engine import Engine
 from rfm.families import CheckpointError
 from rfm.vlm import nf4
@@ -113,7 +114,11 @@ def test_an_export_scores_as_the_values_of_its_weights(tmp_path: Path, name: str
     assert "quantization_config" not in json.loads((exported / "config.json").read_text())
 
     base_model = str(goldens.config(name).base_model)
-    engines = [Engine.from_checkpoint(exported), Engine.from_checkpoint(full, base_model=base_model), load_engine(name)]
+    engines = [
+        Engine.of(families.load(exported)),
+        Engine.of(families.load(full, base_model=base_model)),
+        load_engine(name),
+    ]
     (result,), (expected,), (unrounded,) = (
         engine.evaluate([ProgressSample(video(0, 3, 60, 84))]) for engine in engines
     )

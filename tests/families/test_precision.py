@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import goldens
+from rfm import families
 from rfm.engine import Engine
 from rfm.engine.layers import MKL_FUNCTIONS
 
@@ -25,6 +26,6 @@ def test_the_first_calls_of_all_functions_of_mkl_are_made_by_one_thread() -> Non
 def test_an_engine_multiplies_float32_as_float32(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
     monkeypatch.setattr(torch.backends.cuda.matmul, "allow_tf32", True)
-    Engine.from_checkpoint(goldens.REWIND[0].checkpoint)
+    Engine.of(families.load(goldens.REWIND[0].checkpoint))
     assert not torch.backends.cudnn.allow_tf32
     assert not torch.backends.cuda.matmul.allow_tf32

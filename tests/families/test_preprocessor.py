@@ -19,7 +19,7 @@ from spoilt import Spoil, copied, in_json, settings
 from vlm import PLAIN, load
 
 IMAGES, VIDEOS, BOTH = "preprocessor_config.json", "video_preprocessor_config.json", "processor_config.json"
-VIDEO, SMOL = "q25_video_avg_disc10", "smol_mean_disc10"
+VIDEO = "q25_video_avg_disc10"
 
 
 def loaded(name: str, spoil: Spoil, tmp_path: Path) -> Any:
@@ -64,9 +64,6 @@ REFUSED: dict[str, tuple[str, Spoil, str]] = {
     "no deviation": (PLAIN, without(IMAGES, "image_std"), f"{OF_IMAGES}image_std: expected 3 numbers, got None"),
     "a deviation of 0": (PLAIN, settings(IMAGES, image_std=[0.5, 0, 0.5]), f"{OF_IMAGES}image_std: expected numbers above 0, got [0.5, 0, 0.5]"),
     "videos without normalisation": (VIDEO, settings(VIDEOS, do_normalize=False), f"{OF_VIDEOS}do_normalize: expected true, got false"),
-    "images of SmolVLM in their own size": (SMOL, settings(IMAGES, do_resize=False), f"{OF_IMAGES}do_resize: expected true, got false"),
-    "images of SmolVLM without a filter": (SMOL, without(IMAGES, "resample"), f"{OF_IMAGES}resample: expected one of [0, 1, 2, 3, 4, 5], got None"),
-    "images of SmolVLM with an unknown filter": (SMOL, settings(IMAGES, resample=9), f"{OF_IMAGES}resample: expected one of [0, 1, 2, 3, 4, 5], got 9"),
     "two files that disagree": (
         PLAIN,
         nested(image_mean=[0.4] * 3),
@@ -99,10 +96,6 @@ FORMS = {
 TAKEN: dict[str, tuple[str, Spoil]] = {
     "sizes, which Robometer's code decides": (PLAIN, settings(IMAGES, **SIZES)),
     "times of videos, which RFM's code decides": (VIDEO, settings(VIDEOS, **SIZES, **OF_TIMES)),
-    "sizes of SmolVLM, which RFM's code decides": (
-        SMOL,
-        settings(IMAGES, size={"longest_edge": 2048}, max_image_size={"longest_edge": 384}, do_image_splitting=False),
-    ),
     "keys without effect": (PLAIN, settings(IMAGES, **FORMS)),
     "an unknown setting that is off": (PLAIN, settings(IMAGES, sharpen=False, blur=None)),
     "the same in two files": (PLAIN, nested()),
@@ -157,16 +150,16 @@ def test_frames_that_the_processor_does_not_pick_are_refused_where_it_must(tmp_p
 VISION = {
     "no patches": (PLAIN, "vision_config", {"patch_size": None}, "vision_config.patch_size: expected a value, got none"),
     "patches in words": (PLAIN, "vision_config", {"patch_size": "16"}, "vision_config.patch_size: expected a whole number"),
-    "no pixels": (SMOL, "vision_config", {"image_size": 0}, "vision_config.image_size: expected a whole number of at least 1, got 0"),
-    "half a token": (SMOL, None, {"scale_factor": 0.5}, "scale_factor: expected a whole number of at least 1, got 0.5"),
+    "no merged tokens": (PLAIN, "vision_config", {"spatial_merge_size": 0}, "vision_config.spatial_merge_size: expected a whole number of at least 1, got 0"),
+    "half a patch": (PLAIN, "vision_config", {"temporal_patch_size": 0.5}, "vision_config.temporal_patch_size: expected a whole number of at least 1, got 0.5"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "part", "changes", "message"), VISION.values(), ids=VISION)
 def test_a_vision_tower_without_sizes_is_refused(
-    tmp_path: Path, name: str, part: str | None, changes: dict[str, Any], message: str
+    tmp_path: Path, name: str, part: str, changes: dict[str, Any], message: str
 ) -> None:
     folder = copied(goldens.config(name), tmp_path / "checkpoint")
-    in_json("config.json", lambda content: (content[part] if part else content).update(changes))(folder)
+    in_json("config.json", lambda content: content[part].update(changes))(folder)
     with pytest.raises(CheckpointError, match=re.escape(message)):
         load(name, folder)

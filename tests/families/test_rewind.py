@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 import goldens
+from rfm import families
 from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
 from rfm.engine.layers import progress_from_logits
@@ -303,7 +304,7 @@ def test_the_gpu_gives_the_numbers_of_the_cpu(config: RewindConfig) -> None:
 def test_half_precision_scores_are_near_those_of_float32() -> None:
     """ReWiND in bfloat16, on request."""
     checkpoint = goldens.config("c1_t1_disc10").checkpoint
-    in_float32, in_bfloat16 = (Engine.from_checkpoint(checkpoint, dtype=dtype) for dtype in (None, torch.bfloat16))
+    in_float32, in_bfloat16 = (Engine.of(families.load(checkpoint), dtype=dtype) for dtype in (None, torch.bfloat16))
     samples = [ProgressSample(random_trajectory(seed, 1 + seed)) for seed in range(8)]
     for exact, near in zip(in_float32.evaluate(samples), in_bfloat16.evaluate(samples), strict=True):
         assert isinstance(exact, ProgressResult) and isinstance(near, ProgressResult)

@@ -55,7 +55,7 @@ def samples_of(case: Reference) -> list[ProgressSample]:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_answers_are_those_of_the_original_code(case: Reference, dtype: torch.dtype) -> None:
-    engine = Engine.from_checkpoint(str(case.config / "checkpoint"), reward_model="roboreward", dtype=dtype)
+    engine = Engine.of(families.load(str(case.config / "checkpoint"), reward_model="roboreward"), dtype=dtype)
     samples = samples_of(case)
     for sample, result, told in zip(samples, engine.evaluate(samples), case.content["generations"], strict=True):
         if told["parsed_score"] is None:
@@ -74,7 +74,7 @@ def test_answers_are_those_of_the_original_code(case: Reference, dtype: torch.dt
 @pytest.mark.reference
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_expected_value_is_that_of_the_digits_behind_answer(case: Reference) -> None:
-    engine = Engine.from_checkpoint(str(case.config / "checkpoint"), reward_model="roboreward-expected")
+    engine = Engine.of(families.load(str(case.config / "checkpoint"), reward_model="roboreward-expected"))
     for result, told in zip(engine.evaluate(samples_of(case)), case.content["generations"], strict=True):
         assert isinstance(result, ProgressResult), result
         assert result.progress_logits is not None
@@ -166,7 +166,7 @@ def test_strict_answers_refuse_an_unclear_answer(tmp_path: Path, is_exported: bo
         families.load(CHECKPOINT, **options).save(tmp_path / "saved")  # type: ignore[arg-type]
         folder, options = tmp_path / "saved", {}
     execution = Execution()
-    strict = Engine.from_checkpoint(folder, **options)  # type: ignore[arg-type]
+    strict = Engine.of(families.load(folder, **options))  # type: ignore[arg-type]
     samples = [*samples_named("fallback_digits_T2"), *samples_named("score5_T4")]
     refused, clear = strict.evaluate(samples, execution)
     assert isinstance(refused, InvalidSampleError)
@@ -177,7 +177,7 @@ def test_strict_answers_refuse_an_unclear_answer(tmp_path: Path, is_exported: bo
 
 
 def test_an_expected_score_has_no_marks() -> None:
-    engine = Engine.from_checkpoint(str(CHECKPOINT), reward_model="roboreward-expected")
+    engine = Engine.of(families.load(str(CHECKPOINT), reward_model="roboreward-expected"))
     (result,) = engine.evaluate(samples_named("fallback_digits_T2"))
     assert isinstance(result, ProgressResult)
     assert result.unclear is None
@@ -185,7 +185,7 @@ def test_an_expected_score_has_no_marks() -> None:
 
 @pytest.fixture(scope="module")
 def engine() -> Engine:
-    return Engine.from_checkpoint(str(CHECKPOINT), reward_model="roboreward", feature_cache_mib=16)
+    return Engine.of(families.load(str(CHECKPOINT), reward_model="roboreward"), feature_cache_mib=16)
 
 
 def test_a_mixed_batch_gives_the_answers_of_single_samples(engine: Engine) -> None:
@@ -382,7 +382,7 @@ def test_without_settings_of_generation_it_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.gpu
 def test_a_gpu_writes_the_answers_of_the_original_in_bfloat16() -> None:
-    engine = Engine.from_checkpoint(str(CHECKPOINT), reward_model="roboreward", device="cuda")
+    engine = Engine.of(families.load(str(CHECKPOINT), reward_model="roboreward"), device="cuda")
     cases = [case for case in CASES if case.config == CONFIGS[0]]
     told = [each for case in cases for each in case.content["generations"]]
     results = engine.evaluate([sample for case in cases for sample in samples_of(case)])

@@ -17,7 +17,7 @@ from torch import nn
 
 import goldens
 import rfm_export
-from engines import TRANSFORMERS, load_engine, serve_config
+from engines import load_engine, serve_config
 from few_bits import LORA_INSIDE, TOLERANCES, in_both_forms
 from few_bits import rounded as in_nf4
 from pretended import CUDA, pretended
@@ -62,26 +62,22 @@ def layers_of(engine: Engine) -> dict[str, RoundedLinear]:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", [PLAIN, "q25_mean_l2", "smol_mean_disc10", "roboreward-expected", "topreward"])
+@pytest.mark.parametrize("name", [PLAIN, "q25_mean_l2", "roboreward-expected", "topreward"])
 def test_a_rounded_network_scores_a_sample_alone_as_in_a_batch(name: str, kind: str, dtype: torch.dtype) -> None:
-    if name.startswith("smol") and TRANSFORMERS >= 5:
-        pytest.skip("SmolVLM is refused with transformers 5")
-    if name.startswith("smol") and dtype is torch.bfloat16:
-        pytest.skip("in bfloat16 padding changes SmolVLM's scores, with full weights, too")
-    engine = Engine.from_checkpoint(**sources(name), weights=kind, dtype=dtype)
+    engine = Engine.of(families.load(**sources(name), weights=kind), dtype=dtype)
     assert {type(layer) for layer in layers_of(engine).values()} == {KINDS[kind]}
     together = engine.evaluate(SAMPLES)
     for sample, expected in zip(SAMPLES, together, strict=True):
         (alone,) = engine.evaluate([sample])
         assert_close(alone, expected, 1e-5 if dtype is torch.float32 else 5e-3)
-    full = Engine.from_checkpoint(**sources(name), dtype=dtype).evaluate(SAMPLES)
+    full = Engine.of(families.load(**sources(name)), dtype=dtype).evaluate(SAMPLES)
     with pytest.raises(AssertionError):
         assert_close(full[0], together[0], 1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_layers_of_the_language_model_and_the_vision_tower_are_rounded_and_nothing_else(kind: str) -> None:
-    engine, full = Engine.from_checkpoint(**sources(PLAIN), weights=kind), load_engine(PLAIN)
+    engine, full = Engine.of(families.load(**sources(PLAIN), weights=kind)), load_engine(PLAIN)
     linear = {name for name, each in network_of(full).named_modules() if isinstance(each, nn.Linear)}
     inside = {name for name in linear if ".layers." in name or ".blocks." in name}
     assert layers_of(engine).keys() == inside
@@ -136,7 +132,10 @@ def test_an_export_holds_the_rounded_weights_and_says_how_far_scores_are(tmp_pat
     settings = ExportConfig(**{**vars(serve_config(config)), "weights": kind})
     rfm_export.export(config.checkpoint, tmp_path, settings, say=said.append)
     folder = tmp_path / "rfm_frames"
-    exported, memory = Engine.from_checkpoint(folder / "1" / "checkpoint"), families.load(**sources(name), weights=kind)
+    exported, memory = (
+        Engine.of(families.load(folder / "1" / "checkpoint")),
+        families.load(**sources(name), weights=kind),
+    )
     in_memory = Engine.of(memory).evaluate(SAMPLES)
     for result, expected in zip(exported.evaluate(SAMPLES), in_memory, strict=True):
         assert_close(result, expected, 1e-6)
@@ -186,7 +185,7 @@ def test_a_checkpoint_in_nf4_keeps_its_codes_and_is_labelled(tmp_path: Path, nam
     for path, layer in layers_of(engine).items():
         kept = [key for key in weights if key.endswith(".weight") and _is_of(key, path)]
         assert torch.equal(layer.weight.flatten(), weights[kept[0]].flatten())
-    dense = Engine.from_checkpoint(full, **options)
+    dense = Engine.of(families.load(full, **options))
     for result, expected in zip(engine.evaluate(SAMPLES), dense.evaluate(SAMPLES), strict=True):
         assert_close(result, expected, TOLERANCES[name])
 
@@ -245,7 +244,7 @@ def test_a_missing_bitsandbytes_is_named_with_its_remedy(monkeypatch: pytest.Mon
     expected = r'^weights: expected bitsandbytes, which decodes .* got none; pip install "\.\[quantized\]"$'
     with pytest.raises(CheckpointError, match=expected):
         families.load(**sources(PLAIN), weights="nf4")
-    Engine.from_checkpoint(**sources(PLAIN), weights="int8")  # which PyTorch decodes
+    Engine.of(families.load(**sources(PLAIN), weights="int8"))  # which PyTorch decodes
 
 
 @pytest.mark.parametrize("part", ["weight", "scale"])
@@ -271,9 +270,9 @@ def test_labels_tell_rounded_weights(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_device_decodes_without_a_wait(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    expected = Engine.from_checkpoint(**sources(PLAIN), weights=kind).evaluate(SAMPLES)
+    expected = Engine.of(families.load(**sources(PLAIN), weights=kind)).evaluate(SAMPLES)
     with pretended(monkeypatch) as seen, torch.inference_mode():
-        engine = Engine.from_checkpoint(**sources(PLAIN), weights=kind, device=CUDA, dtype=torch.float32)
+        engine = Engine.of(families.load(**sources(PLAIN), weights=kind), device=CUDA, dtype=torch.float32)
         results = engine.evaluate(SAMPLES)
         asked = seen.asked.total()
         engine.evaluate(SAMPLES)
@@ -304,7 +303,8 @@ def test_a_gpu_needs_room_for_the_rounded_bytes(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_gpu_decodes_as_the_cpu(kind: str) -> None:
     engines = [
-        Engine.from_checkpoint(**sources(PLAIN), weights=kind, device=on, dtype=torch.float32) for on in ("cpu", "cuda")
+        Engine.of(families.load(**sources(PLAIN), weights=kind), device=on, dtype=torch.float32)
+        for on in ("cpu", "cuda")
     ]
     layers = [layers_of(engine) for engine in engines]
     for name, layer in layers[0].items():

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -14,9 +15,10 @@ import torch
 from rfm.engine import Engine, Execution
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.vlm.predictor import VlmPredictor
-from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory, UInt8Array
-from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs, frame_digest
-from rfm_client.frames import RULES, Rule, Sampling
+from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, Trajectory, UInt8Array
+from rfm_client.contract import wire
+from rfm_client.contract.wire import frame_digest
+from rfm_client.frames import Rule, Sampling
 from tolerances import TOLERANCE
 from vlm import assert_close, load, video
 
@@ -32,7 +34,7 @@ def engine(name: str, cache: FeatureCache[Any] | None = None) -> Engine:
     if name.endswith(AS_VIDEO):
         config = replace(checkpoint.config, multi_image=False, per_frame_progress_token=False)
         checkpoint = replace(checkpoint, config=config)
-    return Engine(checkpoint.predictor(torch.device("cpu"), None, cache))
+    return Engine(checkpoint.predictor(torch.device("cpu"), None, cache), cache=cache)
 
 
 def of_both(name: str, cache: FeatureCache[Any] | None = None) -> tuple[Engine, Engine]:
@@ -53,14 +55,26 @@ def whole(frames: UInt8Array) -> ProgressSample:
     return ProgressSample(Trajectory(frames=frames, task=TASK))
 
 
-def named(frames: Sequence[UInt8Array], sent: Sequence[UInt8Array], frame_steps: int = 0) -> ProgressSampleRefs:
-    """Return a question about frames with only some of them sent."""
-    pixels = {frame_digest(frame): frame for frame in sent}
-    return ProgressSampleRefs(TrajectoryRefs(tuple(map(frame_digest, frames)), pixels, TASK), frame_steps)
+def named(
+    served: Engine, frames: Sequence[UInt8Array], sent: Sequence[UInt8Array], frame_steps: int = 0
+) -> ProgressSample:
+    """Return a request about frames with only some of them sent, as a model with this engine decodes it."""
+    tensors = wire.encode_refs([[*map(frame_digest, frames)]], [TASK], [*sent])
+    tensors[wire.FRAME_STEPS][:] = frame_steps
+    assert served.cache is not None
+    (sample,) = wire.decode_samples(tensors, served.cache.found)
+    assert isinstance(sample, ProgressSample)
+    return sample
 
 
-def ask(served: Engine, sample: ProgressSampleRefs, execution: Execution | None = None) -> Any:
-    (outcome,) = served.score([served.prepare(sample)], execution or Execution())
+def ask(
+    served: Engine,
+    frames: Sequence[UInt8Array],
+    sent: Sequence[UInt8Array],
+    frame_steps: int = 0,
+    execution: Execution | None = None,
+) -> Any:
+    (outcome,) = served.score([served.prepare(named(served, frames, sent, frame_steps))], execution or Execution())
     return outcome
 
 
@@ -71,7 +85,7 @@ def assert_scored(outcome: Any, plain: Engine, frames: UInt8Array, frame_steps: 
 
 
 @pytest.mark.parametrize(
-    ("name", "rule"), [*((MODELS[0], rule) for rule in RULES), *((name, "rint_pad") for name in MODELS[1:])]
+    ("name", "rule"), [*((MODELS[0], rule) for rule in get_args(Rule)), *((name, "rint_pad") for name in MODELS[1:])]
 )
 def test_an_episode_has_the_scores_of_the_whole_and_each_shot_is_encoded_once(name: str, rule: Rule) -> None:
     cached, plain = of_both(name)
@@ -80,7 +94,7 @@ def test_an_episode_has_the_scores_of_the_whole_and_each_shot_is_encoded_once(na
     per_shot, shown, num_shown = predictor_of(cached).collator.frames_per_shot, set(), 0
     for step in range(len(frames)):
         window = frames[sampling.prefix(step).indices]
-        assert_scored(ask(cached, named(window, frames[step : step + 1]), execution), plain, window)
+        assert_scored(ask(cached, window, frames[step : step + 1], 0, execution), plain, window)
         digests = [*map(frame_digest, window)]
         digests += digests[-1:] * (-len(digests) % per_shot)
         shots = {tuple(digests[i : i + per_shot]) for i in range(0, len(digests), per_shot)}
@@ -94,14 +108,19 @@ def test_a_cache_that_holds_nothing_changes_no_score(name: str) -> None:
     cache, frames = FeatureCache[Any](1), frames_of(1, 4)
     cached, plain = of_both(name, cache)
     for stop in range(1, 5):
-        assert_scored(ask(cached, named(frames[:stop], frames[:stop])), plain, frames[:stop])
+        assert_scored(ask(cached, frames[:stop], frames[:stop]), plain, frames[:stop])
         assert len(cache) == 0
-    assert str(ask(cached, named(frames[:2], frames[1:]))) == (
-        "frame_digests: expected digests of frames that this model knows or has been sent, got 1 others"
-    )
-    frames_of_two_sizes = [*frames_of(8, 1), *frames_of(9, 1, (84, 56))]
+    expected = "frame_digests: expected digests of frames that this model knows or has been sent, got 1 others"
+    with pytest.raises(InvalidSampleError, match=f"^{expected}$"):
+        named(cached, frames[:2], frames[1:])
+
+
+def test_a_video_has_frames_of_one_size() -> None:
+    cached, kept, sent = engine(MODELS[0], FeatureCache(BYTES_PER_MIB)), frames_of(8, 1), frames_of(9, 1, (84, 56))
+    ask(cached, kept, kept)
     expected = "frame_digests: expected digests of frames of one size, got sizes [(56, 84), (84, 56)]"
-    assert str(ask(cached, named(frames_of_two_sizes, frames_of_two_sizes))) == expected
+    with pytest.raises(InvalidSampleError, match=f"^{re.escape(expected)}$"):
+        named(cached, [*kept, *sent], sent)
 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
@@ -111,10 +130,11 @@ def test_a_cache_that_evicts_at_every_step_changes_no_score(name: str) -> None:
     cached, plain = of_both(name, cache)
     for stop in range(4, 9):
         window = frames[stop - 4 : stop]
-        outcome = ask(cached, named(window, window[-1:]))
-        if isinstance(outcome, RewardError):
+        try:
+            outcome = ask(cached, window, window[-1:])
+        except InvalidSampleError:
             unknown += 1
-            outcome = ask(cached, named(window, window))
+            outcome = ask(cached, window, window)
         assert_scored(outcome, plain, window)
         assert cache.num_bytes <= cache.limit_bytes
     assert unknown
@@ -132,8 +152,8 @@ def test_whole_videos_of_other_callers_fill_the_cache(name: str) -> None:
             assert_close(outcome, other, TOLERANCE)
         assert (execution.num_encoded, execution.num_found) == counts
         assert execution.cache_bytes
-    assert_scored(ask(cached, named(first.positions, ())), plain, first.positions)
-    assert_scored(ask(cached, named(first.positions, (), 3)), plain, first.positions, 3)
+    assert_scored(ask(cached, first.positions, ()), plain, first.positions)
+    assert_scored(ask(cached, first.positions, (), 3), plain, first.positions, 3)
 
 
 def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,7 +162,7 @@ def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch
     frames = frames_of(6, 4, (448, 336))
     monkeypatch.setattr("rfm.vlm.images.VIDEO_TOTAL_TOKENS", 300.0)
     for stop in (2, 4):
-        assert_scored(ask(cached, named(frames[:stop], frames[:stop])), plain, frames[:stop])
+        assert_scored(ask(cached, frames[:stop], frames[:stop]), plain, frames[:stop])
     rows = [predictor_of(cached).rows(whole(frames[:stop]))[0] for stop in (2, 4)]
     grid = predictor_of(cached).collator.grid  # type: ignore[attr-defined]  # of the Qwen backbones
     assert grid(rows[0].videos[0]).tokens_per_group != grid(rows[1].videos[0]).tokens_per_group
@@ -158,7 +178,7 @@ def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> 
         return torch.cat([output[:-1], output[-1:] * torch.nan])
 
     predictor_of(cached).network.model.visual.merger.register_forward_hook(spoil)
-    ask(cached, named(frames, frames))
+    ask(cached, frames, frames)
     assert len(cache) == 0
 
 
@@ -167,12 +187,14 @@ def test_a_frame_that_comes_many_times_is_brought_to_size_once(name: str) -> Non
     """Otherwise thousands of references to a large frame would take all memory."""
     cached, plain = of_both(name)
     frames = frames_of(13, 2)[[0, 1, 1, 0, 1, 1]]
-    sample = named(frames, frames[:2])
+    sample = named(cached, frames, frames[:2])
+    assert sample.trajectory.named is not None
+    assert len({id(pixels) for _, pixels in sample.trajectory.named}) == 2
     prepared = cached.prepare(sample)
     cached.work_ahead(prepared)
     (row,) = prepared.rows
     assert len(row.videos[0].ready.pixels) == 2
-    assert_scored(ask(cached, sample), plain, frames)
+    assert_scored(ask(cached, frames, frames[:2]), plain, frames)
 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
@@ -185,7 +207,7 @@ def test_black_frames_with_pixels_are_always_encoded(name: str) -> None:
     )
     for _ in range(2):
         (expected,) = cached.evaluate([whole(black)], execution)
-    assert_close(ask(cached, named(black, ()), execution), expected, TOLERANCE)
+    assert_close(ask(cached, black, (), 0, execution), expected, TOLERANCE)
     assert execution.num_encoded == 2 * predictor_of(cached).collator.frames_per_shot
 
 
@@ -220,16 +242,16 @@ def test_frames_that_were_evicted_are_kept_again_though_all_their_shots_are_kept
     shots = cache.found(predictor_of(cached).collator.shot_keys(row.videos[0]).values())  # type: ignore[attr-defined]
     cache.clear()
     cache.keep(shots)
-    for sample in (whole(frames), named(frames, ())):
-        (outcome,) = cached.score([cached.prepare(sample)], execution)
-        assert_scored(outcome, plain, frames)
+    (outcome,) = cached.evaluate([whole(frames)], execution)
+    for scored in (outcome, ask(cached, frames, (), 0, execution)):
+        assert_scored(scored, plain, frames)
     assert execution.num_encoded == 0
 
 
 def test_what_is_kept_holds_on_to_no_request() -> None:
     """A cached view would keep a whole large request in memory."""
     cache, frames = FeatureCache[Any](BYTES_PER_MIB), frames_of(10, 3)
-    ask(engine(MODELS[0], cache), named(frames, frames))
+    ask(engine(MODELS[0], cache), frames, frames)
     kept = cache.found([frame_digest(frame) for frame in frames])
     assert len(kept) == 3
     assert all(frame.base is None for frame in kept.values())

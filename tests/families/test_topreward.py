@@ -51,7 +51,9 @@ def engine_of(case: Reference, num_prefixes: int | None) -> Engine:
     settings |= {} if num_prefixes is None else {"num_prefixes": num_prefixes}
     said = ",".join([name, *(f"{key}={value}" for key, value in settings.items())])
     dtype = torch.bfloat16 if summary["vlm_dtype"] == "torch.bfloat16" else None
-    return Engine.from_checkpoint(str((case.config / summary["checkpoint"]).resolve()), reward_model=said, dtype=dtype)
+    return Engine.of(
+        families.load(str((case.config / summary["checkpoint"]).resolve()), reward_model=said), dtype=dtype
+    )
 
 
 def check(result: Any, expected: dict[str, Any], curve: list[float], *, is_rounded: bool) -> None:
@@ -107,12 +109,12 @@ def progress(frames: UInt8Array, task: str = TASK) -> ProgressSample:
 
 @pytest.fixture(scope="module")
 def lerobot() -> Engine:
-    return Engine.from_checkpoint(str(CHECKPOINT), reward_model="topreward", feature_cache_mib=16)
+    return Engine.of(families.load(str(CHECKPOINT), reward_model="topreward"), feature_cache_mib=16)
 
 
 @pytest.fixture(scope="module")
 def robometer() -> Engine:
-    return Engine.from_checkpoint(str(CHECKPOINT), reward_model="topreward-robometer")
+    return Engine.of(families.load(str(CHECKPOINT), reward_model="topreward-robometer"))
 
 
 def test_a_mixed_batch_gives_the_answers_of_single_samples(lerobot: Engine) -> None:
@@ -150,11 +152,11 @@ def test_progress_of_equal_frames_is_noise_between_0_and_1(robometer: Engine) ->
 
 def test_the_settings_of_lerobot_s_config_json_are_used(tmp_path: Path, lerobot: Engine) -> None:
     (expected,) = lerobot.evaluate([progress(noise(5))])
-    by_file = Engine.from_checkpoint(str(OF_LEROBOT), base_model=str(CHECKPOINT))
+    by_file = Engine.of(families.load(str(OF_LEROBOT), base_model=str(CHECKPOINT)))
     changed = shutil.copytree(OF_LEROBOT, tmp_path / "changed")
     content = json.loads((changed / "config.json").read_text()) | {"fps": 4.0}
     (changed / "config.json").write_text(json.dumps(content))
-    at_4_fps = Engine.from_checkpoint(str(changed), base_model=str(CHECKPOINT))
+    at_4_fps = Engine.of(families.load(str(changed), base_model=str(CHECKPOINT)))
     assert isinstance(expected, ProgressResult)
     for engine, is_equal in ((by_file, True), (at_4_fps, False)):
         (result,) = engine.evaluate([progress(noise(5))])
@@ -165,7 +167,7 @@ def test_the_settings_of_lerobot_s_config_json_are_used(tmp_path: Path, lerobot:
 def test_a_saved_model_scores_the_same(tmp_path: Path, robometer: Engine) -> None:
     checkpoint = families.load(CHECKPOINT, reward_model="topreward-robometer")
     checkpoint.save(tmp_path / "saved")
-    saved = Engine.from_checkpoint(str(tmp_path / "saved"))
+    saved = Engine.of(families.load(str(tmp_path / "saved")))
     (result,), (expected,) = (engine.evaluate([progress(noise(5))]) for engine in (saved, robometer))
     assert isinstance(result, ProgressResult)
     assert isinstance(expected, ProgressResult)
@@ -243,7 +245,7 @@ def test_a_template_without_the_video_is_refused(tmp_path: Path) -> None:
     template = json.loads(file.read_text())["chat_template"]
     file.write_text(json.dumps({"chat_template": "<|im_start|>system\nHelp.<|im_end|>\n" + template}))
     with pytest.raises(CheckpointError, match="chat template: expected one video in a prompt, got 0"):
-        Engine.from_checkpoint(str(changed), reward_model="topreward")
+        Engine.of(families.load(str(changed), reward_model="topreward"))
 
 
 def test_a_robometer_needs_no_as() -> None:
@@ -278,7 +280,7 @@ def test_a_missing_language_head_is_refused(tmp_path: Path) -> None:
 def test_a_gpu_gives_the_cpu_s_numbers(reward_model: str) -> None:
     samples = [progress(noise(n, h, w, n)) for n, h, w in ((1, 64, 96), (5, 48, 80), (8, 100, 200))]
     engines = (
-        Engine.from_checkpoint(str(CHECKPOINT), reward_model=reward_model, device=device, dtype=torch.float32)
+        Engine.of(families.load(str(CHECKPOINT), reward_model=reward_model), device=device, dtype=torch.float32)
         for device in ("cpu", "cuda")
     )
     for expected, result in zip(*(engine.evaluate(samples) for engine in engines), strict=True):

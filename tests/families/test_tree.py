@@ -19,7 +19,7 @@ from rfm.vlm import leaves, tree
 from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
-from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs, frame_digest
+from rfm_client.contract import wire
 from tolerances import TOLERANCE
 from vlm import load
 
@@ -34,7 +34,7 @@ def sample(num_frames: int, height: int = 64, width: int = 64, frame_steps: int 
 
 
 def topreward(settings: str = "", **options: Any) -> Engine:
-    return Engine.from_checkpoint(str(CHECKPOINT), reward_model=f"topreward{settings}", **options)
+    return Engine.of(families.load(str(CHECKPOINT), reward_model=f"topreward{settings}"), **options)
 
 
 def robometer(name: str = "q3_tok_disc10", **options: Any) -> Engine:
@@ -157,8 +157,11 @@ def test_cached_features_and_frame_references_change_no_score(
     expected, again = values(cached.evaluate([asked])), Execution()
     frames = asked.trajectory.frames
     assert frames is not None
-    longer = ProgressSampleRefs(TrajectoryRefs(tuple(map(frame_digest, frames)), {}, TASK), frame_steps)
-    found = values(cached.score([cached.prepare(longer)], again))
+    tensors = wire.encode_refs([[*map(wire.frame_digest, frames)]], [TASK], [])
+    tensors[wire.FRAME_STEPS][:] = frame_steps
+    assert cached.cache is not None
+    (named,) = wire.decode_samples(tensors, cached.cache.found)
+    found = values(cached.score([cached.prepare(named)], again))
     np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=TOLERANCE)
     assert (again.num_encoded, again.num_found > 0) == (0, True)
 

@@ -64,7 +64,7 @@ class Case:
     sample: Any = PROGRESS
 
     def engine(self, form: Any = None) -> Engine:
-        return Engine.from_checkpoint(self.source, **self.options, video_prompt=form)
+        return Engine.of(families.load(self.source, **self.options, video_prompt=form))
 
     def ids(self, form: Any) -> list[int]:
         return list(map(int, self.engine(form).predictor.rows(self.sample)[-1].input_ids))
@@ -203,7 +203,7 @@ def test_an_export_keeps_its_form(tmp_path: Path, name: str) -> None:
     case = CASES[name]
     for form in ("bare", "wrapped"):
         families.load(case.source, **case.options, video_prompt=form).save(tmp_path / form)
-        saved = Engine.from_checkpoint(tmp_path / form)
+        saved = Engine.of(families.load(tmp_path / form))
         assert list(saved.predictor.rows(case.sample)[-1].input_ids) == case.ids(form)
         (decision,) = (d for d in families.load(tmp_path / form).decisions() if d.name == "video_prompt")
         assert decision == Decision("video_prompt", form, "config.json")

@@ -15,10 +15,10 @@ import torch
 
 import goldens
 from engines import TRANSFORMERS, load_engine
+from rfm import families
 from rfm.engine import Engine, Execution
 from rfm.engine.layers import progress_from_logits
 from rfm.vlm.backbone import QWEN_2_5
-from rfm.vlm.collator import QwenCollator
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.qwen import embedded
 from rfm_client import (
@@ -38,7 +38,7 @@ from vlm import BFLOAT16, PLAIN, assert_close, load, predictor_of, upstream_inpu
 PIXEL_TOLERANCE = 1e-6  # relative, of a sum over all pixels
 
 
-SMOL, ON_VIDEOS = "smol_mean_disc10", f"{PLAIN} on videos"
+ON_VIDEOS = f"{PLAIN} on videos"
 MIXED_TOLERANCE = 5e-6  # seen: 1e-6
 
 
@@ -81,7 +81,7 @@ BFLOAT16_CASES = goldens.config(BFLOAT16).cases()
 
 def engine_in_bfloat16() -> tuple[Engine, VlmPredictor]:
     config = goldens.config(BFLOAT16)
-    engine = Engine.from_checkpoint(config.checkpoint, **config.sources, dtype=torch.bfloat16)
+    engine = Engine.of(families.load(config.checkpoint, **config.sources), dtype=torch.bfloat16)
     assert isinstance(engine.predictor, VlmPredictor)
     return engine, engine.predictor
 
@@ -143,7 +143,6 @@ def mixture(step: int = 1) -> list[Sample]:
         ("q25_peft_adapter_disc10", 65_536, 2),
         ("q25_attention_disc10", 65_536, 2),
         ("q25_video_last_l2", 65_536, 2),
-        (SMOL, 4096, 9),  # squares take long on a CPU
     ],
 )
 def test_a_mixture_equals_its_samples_alone(name: str, token_budget: int, step: int) -> None:
@@ -202,9 +201,8 @@ def test_a_pair_of_two_frame_sizes_is_scored_as_transformers_reads_it(
     Our matrix product embeds the patches, because the convolution sums in another order.
     """
     predictor = make()
-    if isinstance(predictor.collator, QwenCollator):
-        embed = predictor.network.model.visual.patch_embed
-        monkeypatch.setattr(embed, "forward", partial(embedded, embed.proj))
+    embed = predictor.network.model.visual.patch_embed
+    monkeypatch.setattr(embed, "forward", partial(embedded, embed.proj))
     network, sample = predictor.network, PreferenceSample(video(0, 3, 56, 140), video(1, 4, 130, 84))
     if TRANSFORMERS >= 5 and network.config.family == QWEN_2_5 and not network.config.multi_image:
         pytest.skip("text behind a video stands elsewhere since transformers 5")
@@ -268,7 +266,7 @@ def test_the_task_is_not_a_template() -> None:
     assert "'put {task} there'" in tokens.tokenizer.decode(row.input_ids)
 
 
-ASKED_AGAIN = {name: TWO_SIZES[name] for name in (PLAIN, "q25_video_last_l2", SMOL, ON_VIDEOS)}
+ASKED_AGAIN = {name: TWO_SIZES[name] for name in (PLAIN, "q25_video_last_l2", ON_VIDEOS)}
 
 
 @pytest.mark.parametrize("make", ASKED_AGAIN.values(), ids=ASKED_AGAIN)
@@ -290,7 +288,7 @@ def test_a_question_is_read_as_if_no_other_had_been_asked_before(make: Callable[
         fresh = type(many)(many.config, many.tokenizer, many.images)  # has kept nothing
         (alone, *_), (among, *_) = fresh.rows(question), many.rows(question)
         np.testing.assert_array_equal(among.input_ids, alone.input_ids)
-        np.testing.assert_array_equal(among.position_ids, alone.position_ids)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(among.position_ids, alone.position_ids)
         assert (among.spans, among.query) == (alone.spans, alone.query)
 
 

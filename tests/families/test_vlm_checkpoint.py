@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import re
 import shutil
@@ -14,14 +13,13 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from google.protobuf import text_format
 from safetensors.torch import load_file, save_file
-from tritonclient.grpc import model_config_pb2 as pb
 
 import goldens
 import rfm_export
 import spoilt
 from engines import load_engine, serve_config
+from repositories import description_of
 from rfm import families
 from rfm.engine import Engine
 from rfm.families import CheckpointError
@@ -65,7 +63,7 @@ def run(section: str, **changes: Any) -> Spoil:
 
 
 def scores(folder: Path, name: str, **sources: str) -> Result:
-    (result,) = Engine.from_checkpoint(folder, **goldens.config(name).sources | sources).evaluate([SAMPLE])
+    (result,) = Engine.of(families.load(folder, **goldens.config(name).sources | sources)).evaluate([SAMPLE])
     assert not isinstance(result, RewardError), result
     return result
 
@@ -115,9 +113,8 @@ def as_transformers_5_writes(backbone: dict[str, Any]) -> None:
     text["rope_parameters"] = {"rope_type": "default"} | (text.pop("rope_scaling") or {})
     text["rope_parameters"]["rope_theta"] = text.pop("rope_theta")
     text["pad_token_id"] = None
-    if backbone["model_type"] != "smolvlm":
-        backbone["vision_config"]["rope_parameters"] = {"rope_theta": 10000.0, "rope_type": "axial"}
-        backbone["vision_config"]["model_type"] += "_vision"
+    backbone["vision_config"]["rope_parameters"] = {"rope_theta": 10000.0, "rope_type": "axial"}
+    backbone["vision_config"]["model_type"] += "_vision"
 
 
 def as_before_text_config(backbone: dict[str, Any]) -> None:
@@ -155,7 +152,6 @@ def beside_its_adapter(folder: Path) -> None:
 FORMS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "Qwen2.5-VL of transformers 5": ("q25_mean_l2", in_json("config.json", as_transformers_5_writes)),
     "Qwen3-VL of transformers 5": (PLAIN, in_json("config.json", as_transformers_5_writes)),
-    "SmolVLM of transformers 5": ("smol_mean_disc10", in_json("config.json", as_transformers_5_writes)),
     "Qwen2.5-VL without text_config": ("q25_mean_l2", in_json("config.json", as_before_text_config)),
     "layers right under the model": (
         "q25_mean_l2",
@@ -243,7 +239,7 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
         r"text_config\.layer_types: expected full_attention alone, got \['full_attention', 'sliding_attention'\]",
     ),
     "rotary positions without a base": (
-        "smol_mean_disc10",
+        PLAIN,
         in_json("config.json", lambda backbone: backbone["text_config"].pop("rope_theta")),
         r"config\.json: text_config\.rope_theta: expected a number above 0, got None; copy it from config\.json of the base",
     ),
@@ -262,7 +258,7 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
             ("q25_mean_l2", "text_config", "num_attention_heads"),
             ("q25_mean_l2", "vision_config", "fullatt_block_indexes"),
             (PLAIN, "vision_config", "deepstack_visual_indexes"),
-            ("smol_mean_disc10", "vision_config", "num_attention_heads"),
+            (PLAIN, "vision_config", "num_heads"),
         ]
     },
     "a vision tower with other rotary positions": (
@@ -353,13 +349,6 @@ def test_a_spoiled_checkpoint_is_refused(
         load(name, folder).build()
 
 
-def test_smolvlm_is_refused_where_its_scores_would_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint = load("smol_mean_disc10")
-    monkeypatch.setattr(importlib.metadata, "version", lambda _name: "5.0.0")
-    with pytest.raises(CheckpointError, match=r"transformers: expected transformers < 5 for a SmolVLM checkpoint"):
-        checkpoint.build()
-
-
 @pytest.mark.parametrize(
     ("name", "version", "is_told"),
     [
@@ -381,7 +370,7 @@ def test_a_video_run_of_transformers_5_is_told_about_its_positions(
 def test_a_processor_of_another_model_is_refused() -> None:
     other = str(goldens.config(ADAPTER).base_model)
     with pytest.raises(CheckpointError, match=r"expected a tokenizer of 451 tokens .*, got 447"):
-        Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=other)
+        Engine.of(families.load(goldens.config(PLAIN).checkpoint, base_model=other))
 
 
 def test_eight_special_tokens_tell_an_old_run(copied: Callable[[str], Path]) -> None:
@@ -417,7 +406,7 @@ def as_transformers_5_saves(base: Path) -> None:
             file.unlink()
 
 
-@pytest.mark.parametrize("name", ["q25_mean_l2", PLAIN, "smol_mean_disc10"])
+@pytest.mark.parametrize("name", ["q25_mean_l2", PLAIN])
 def test_a_processor_of_transformers_5_reads_the_same(tmp_path: Path, name: str) -> None:
     config, base = goldens.config(name), tmp_path / "base"
     shutil.copytree(config.sources["base_model"], base, copy_function=shutil.copyfile)
@@ -482,8 +471,7 @@ def test_clients_are_told_no_size_that_is_ignored(copied: Callable[[str], Path],
     folder = copied(PLAIN)
     IGNORED["a size for images"][1](folder)
     rfm_export.export(folder, tmp_path / "repository", serve_config(goldens.config(PLAIN)))
-    text = (tmp_path / "repository" / "rfm_frames" / "config.pbtxt").read_text()
-    assert text_format.Parse(text, pb.ModelConfig()).parameters["frame_size"].string_value == ""
+    assert description_of(tmp_path / "repository" / "rfm_frames").frame_size is None
 
 
 DECIDED = {

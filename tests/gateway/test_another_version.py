@@ -10,7 +10,10 @@ import numpy as np
 
 from gateway_requests import filmed, progress
 from rfm_client import AsyncRewardClient, ModelInfo
+from rfm_gateway import GatewayConfig
 from rfm_gateway.body import Batch
+from rfm_gateway.config import MIB
+from rfm_gateway.mounting import BodyLimits
 from rfm_gateway.schema import SAMPLES
 from rfm_gateway.scoring import Evaluator
 from rfm_gateway.state import TritonState
@@ -30,9 +33,10 @@ class Rollout(Shelf):
 def test_values_are_those_of_the_version_that_answers() -> None:
     async def ask() -> None:
         async with AsyncRewardClient("", transports=[Rollout(after=1)], retry=False) as client:
-            state = TritonState(client, "grpc://127.0.0.1:1", "http://127.0.0.1:1/metrics", "rfm")
+            config = GatewayConfig(triton="grpc://127.0.0.1:1", metrics_url="http://127.0.0.1:1/metrics")
+            state = TritonState(client, config)
             batch = Batch(SAMPLES.validate_python([progress(filmed(1, NUM_FRAMES, size_px=8))], context={}), False)
-            evaluator = Evaluator(client, 60.0)
+            evaluator = Evaluator(client, BodyLimits(MIB, 60.0))
             first, second = [await evaluator.evaluate(batch, "request") for _ in range(2)]
             assert first.outputs_progress is not None and second.outputs_progress is not None
             np.testing.assert_allclose(first.outputs_progress.progress_pred, [[0.1] * NUM_FRAMES], rtol=1e-6)

@@ -36,6 +36,7 @@ from rfm.config import ExportConfig
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 from rfm_client import AsyncRewardClient, ServerUnavailableError
+from rfm_gateway import GatewayConfig
 from rfm_gateway.state import STALL_S, TritonState
 from servers import start_triton
 
@@ -143,8 +144,8 @@ def test_while_a_model_works_health_is_told_and_callers_who_hang_up_cost_no_forw
 
     async def ask_health() -> None:
         async with AsyncRewardClient(endpoints.grpc_url) as client:
-            urls = endpoints.grpc_url, endpoints.metrics_url
-            state = TritonState(client, *urls, TINY, clock_s=lambda: now_s[0])
+            config = GatewayConfig(triton=endpoints.grpc_url, metrics_url=endpoints.metrics_url)
+            state = TritonState(client, config, clock_s=lambda: now_s[0])
             assert (await state.health()).status == "healthy"
             now_s[0] += STALL_S
             await state.health()

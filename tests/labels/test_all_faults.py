@@ -18,13 +18,7 @@ from labelling import FEW, LEROBOT, WRIST, BrightnessScorer, Notes, command
 from pictures import numbered, write_video
 from rfm_client import RewardError
 from rfm_client.command_line import ExitCode
-from rfm_labels import (
-    DatasetError,
-    LabelOptions,
-    label,
-    open_dataset,
-    parse_episodes,
-)
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset, parse_episodes
 
 TASK = "stack the cups"
 

@@ -12,7 +12,7 @@ from pyarrow import parquet
 
 from labelling import FEW, LEROBOT
 from rfm_client import InferenceFailedError, InvalidSampleError, ProgressResult, RewardClient
-from rfm_client.frames import Sampling, of_prefixes
+from rfm_client.frames import Sampling
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
 from shelves import V1, V2, Kept, Shelf
 
@@ -80,4 +80,4 @@ def test_a_curve_of_several_versions_is_none() -> None:
     score = np.ones(1, np.float32)
     results = [ProgressResult(progress=score, success=score, model_version=version) for version in ("1", "2")]
     with pytest.raises(InferenceFailedError, match="model_version: expected one for all frames, got 1, 2"):
-        of_prefixes(results, Sampling("all", None))
+        Sampling("all", None).joined(results)

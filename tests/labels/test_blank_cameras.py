@@ -22,8 +22,7 @@ from in_process import rfm
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
-from rfm_labels.datasets import chosen_cameras
-from rfm_labels.label import plan_labels
+from rfm_labels.plan import plan_labels
 from rfm_labels.ray_engine import EpisodeActor, RayJob
 
 TASK = "stack the cups"
@@ -189,13 +188,13 @@ def test_a_camera_that_is_named_like_a_depth_map_or_a_mask_is_scored_only_if_nam
     assert report.plan.recipe.cameras == ("front",)
     (told,) = [line for line in notes.lines if line.startswith(f"left out: {camera}: ")]
     assert told.endswith("by name or mark, without colours; --cameras includes it")
-    assert chosen_cameras(dataset, [camera]) == (camera,)
+    assert dataset.chosen_cameras([camera]) == (camera,)
 
 
 @pytest.mark.parametrize("camera", COLOURS)
 def test_other_words_are_names_of_cameras(tmp_path: Path, camera: str) -> None:
     file = hdf5(tmp_path / "demos.hdf5", [{"front": noise(), camera: noise()}])
-    assert sorted(chosen_cameras(open_dataset(file, task=TASK), ())) == sorted(("front", camera))
+    assert sorted(open_dataset(file, task=TASK).chosen_cameras()) == sorted(("front", camera))
 
 
 def renamed(folder: Path, *cameras: tuple[str, str, str]) -> Path:
@@ -214,15 +213,15 @@ def test_words_in_names_count_for_videos_and_pictures_of_lerobot(tmp_path: Path,
     root = renamed(tmp_path, (WRIST, "observation.images.wrist_depth", dtype))
     dataset = open_dataset(root)
     assert sorted(dataset.cameras) == [FRONT, "observation.images.wrist_depth"]
-    assert chosen_cameras(dataset, ()) == (FRONT,)
-    assert chosen_cameras(dataset, ["wrist_depth"]) == ("observation.images.wrist_depth",)
+    assert dataset.chosen_cameras() == (FRONT,)
+    assert dataset.chosen_cameras(["wrist_depth"]) == ("observation.images.wrist_depth",)
 
 
 def test_a_dataset_of_such_cameras_alone_needs_a_name(tmp_path: Path) -> None:
     seg, depth = "observation.images.seg", "observation.images.depth"
     root = renamed(tmp_path, (FRONT, seg, "video"), (WRIST, depth, "video"))
     with pytest.raises(DatasetError) as caught:
-        chosen_cameras(open_dataset(root), ())
+        open_dataset(root).chosen_cameras()
     expected = f"cameras: expected some of {seg}, {depth} named: all are seg and depth cameras, got none"
     assert str(caught.value) == expected
 

@@ -19,18 +19,10 @@ from pyarrow import parquet
 
 from in_process import rfm_client
 from labelling import FEW, BrightnessScorer
-from rfm_labels import (
-    DatasetError,
-    LabelOptions,
-    Watch,
-    evaluate_labels,
-    label,
-    open_dataset,
-    read_outcomes,
-)
-from rfm_labels.cost import Cost
+from rfm_labels import DatasetError, LabelOptions, Watch, evaluate_labels, label, open_dataset, read_outcomes
 from rfm_labels.evaluation import kendall, spearman
 from rfm_labels.label_files import read_cost
+from rfm_labels.metadata import Cost
 from shown_datasets import copied
 
 Curves = Mapping[int, Sequence[float]]
@@ -78,6 +70,14 @@ def test_successes_are_told_from_failures(tmp_path: Path) -> None:
     assert (found.by_success.auroc, found.by_success.balanced_accuracy) == (1.0, 1.0)
     assert found.by_success.threshold == pytest.approx(0.4)
     assert (found.final_of_successes, found.final_of_failures) == (pytest.approx(0.85), pytest.approx(0.45))
+
+
+def test_of_two_thresholds_that_are_equally_good_the_lower_counts(tmp_path: Path) -> None:
+    file = labels(tmp_path / "a.parquet", {episode: [0.0, episode / 10] for episode in range(8)})
+    (found,) = evaluate_labels([file], {episode: episode in (2, 6) for episode in range(8)}).evaluations
+    assert found.by_progress is not None
+    assert found.by_progress.threshold == pytest.approx(0.2)  # at 0.6, 1/2 and 5/6 are right, whose mean is 2/3, too
+    assert found.by_progress.balanced_accuracy == pytest.approx((1 + 1 / 3) / 2)
 
 
 def test_the_order_is_that_of_successes_and_a_constant_curve_has_none(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ import pytest
 
 from labelling import BrightnessScorer, PickyScorer
 from rfm_client import UInt8Array
-from rfm_labels import Dataset, DatasetEpisode, LabelOptions, Report, episode_scores, label, run
-from rfm_labels.episode_scores import FrameMemory
+from rfm_labels import Dataset, DatasetEpisode, LabelOptions, Report, label, scoring
+from rfm_labels.scoring import FrameMemory
 
 NUM_FRAMES, SIDE = 1000, 48
 VIDEO_BYTES = NUM_FRAMES * SIDE * SIDE * 3
@@ -25,7 +25,7 @@ WORKERS = 4
 @pytest.fixture(autouse=True)
 def small_requests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make requests small beside a video, as in reality."""
-    monkeypatch.setattr(episode_scores, "MAX_BYTES", VIDEO_BYTES // 50)
+    monkeypatch.setattr(scoring, "MAX_BYTES", VIDEO_BYTES // 50)
 
 
 class LongVideos(Dataset):
@@ -88,7 +88,7 @@ BOUNDS = {
 def test_all_workers_together_hold_no_more_than_fits_or_one_video(
     output: Path, max_bytes: int, scorer: BrightnessScorer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run, "FrameMemory", functools.partial(FrameMemory, max_bytes))
+    monkeypatch.setattr(scoring, "FrameMemory", functools.partial(FrameMemory, max_bytes))
     options = LabelOptions(output=output, workers=WORKERS, frames=2)
     peak, report = peak_videos(LongVideos(output, WORKERS), options, scorer)
     assert len(report.failures) == (WORKERS if isinstance(scorer, PickyScorer) else 0)

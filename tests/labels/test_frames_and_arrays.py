@@ -19,7 +19,6 @@ from pyarrow import parquet
 from labelling import BrightnessScorer, brightness, command
 from pictures import numbered, numbers
 from rfm_client.command_line import ExitCode
-from rfm_client.frames import Orient
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 TASK = "stack the cups"
@@ -132,7 +131,7 @@ def test_arrays_are_episodes_with_their_own_tasks_or_the_callers(tmp_path: Path)
     frames = numbered(COUNT)
     np.save(tmp_path / "10.npy", frames[:4])
     np.savez(tmp_path / "9.npz", frames=frames.astype(np.float32) / 255, task="open the box")
-    dataset = open_dataset(tmp_path, task=TASK, orient=Orient.parse(["flip-vertical"]))
+    dataset = open_dataset(tmp_path, task=TASK, orient="flip-vertical")
     assert (dataset.kind, dataset.decoder("frames")) == ("arrays", None)
     told = [(e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
     assert told == [("9.npz", "open the box", COUNT, 0), ("10.npy", TASK, 4, COUNT)]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import av
 import numpy as np
@@ -18,7 +18,7 @@ import goldens
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
 from rfm_client import ProgressSample, RewardClient, Trajectory
-from rfm_client.frames import RULES, Sampling
+from rfm_client.frames import Rule, Sampling
 from rfm_labels import (
     ClientScorer,
     DatasetError,
@@ -136,7 +136,7 @@ def test_all_of_a_causal_network_in_one_pass_is_what_its_prefixes_give(client: R
             start += len(frames)
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", get_args(Rule))
 def test_any_rule_labels_each_frame_with_the_slot_that_it_reads(rule: Any, output: Path) -> None:
     """The scorer returns each slot's brightness: rules read frame t, except for K = 1."""
     dataset = open_dataset(LEROBOT / "toy_v21")

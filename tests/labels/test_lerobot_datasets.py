@@ -30,7 +30,6 @@ from encoding import encode, encode_here
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, digest_of
 from pictures import write_video
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
-from rfm_labels.datasets import chosen_cameras
 
 HUB_ID = "org/name"
 ELSEWHERE = goldens.ROOT.parent / "lerobot"  # beside the further reference cases, where there are some
@@ -121,14 +120,14 @@ def test_a_depth_camera_counts_only_where_it_is_named(tmp_path: Path, mark: dict
     root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "toy")
     change_info(root, lambda info: info["features"][WRIST].update(mark))
     dataset = open_dataset(root)
-    assert chosen_cameras(dataset, ()) == (FRONT,)
+    assert dataset.chosen_cameras() == (FRONT,)
     assert (list(dataset.cameras), list(dataset.depth_cameras)) == ([FRONT, WRIST], [WRIST])
-    assert chosen_cameras(dataset, ["front", "wrist"]) == (FRONT, WRIST)
+    assert dataset.chosen_cameras(["front", "wrist"]) == (FRONT, WRIST)
     report = label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path, limit=1, frames=2, formats=("progress",)))
     assert "progress.wrist" not in parquet.read_schema(report.files[0]).names
     change_info(root, lambda info: info["features"][FRONT].update(mark))
     with pytest.raises(DatasetError, match=r"^cameras: expected .* named: all are depth cameras, got none$"):
-        chosen_cameras(open_dataset(root), ())
+        open_dataset(root).chosen_cameras()
 
 
 def saved(convert: Callable[[Any], Any] = lambda image: image, form: str = "PNG") -> Callable[[Any], bytes]:

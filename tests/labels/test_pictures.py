@@ -20,10 +20,9 @@ from pyarrow import parquet
 from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, redness
 from pictures import numbered, numbers
 from rfm_client import UInt8Array
-from rfm_labels import Channels, DatasetError, LabelOptions, Orient, label, open_dataset
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 from rfm_labels.datasets.frame_names import in_order_of_numbers
-from rfm_labels.datasets.protocol import digest_of
-from rfm_labels.datasets.video_frames import video_identity
+from rfm_labels.datasets.stored_files import digest_of, file_identity
 
 TASK = "stack the cups"
 ORIENTATION, RESOLUTION_UNIT = 0x0112, 0x0128  # EXIF's tags
@@ -169,7 +168,7 @@ def test_exif_data_turn_the_frames_of_a_folder_and_change_their_identity(tmp_pat
     np.testing.assert_array_equal(frame, shown(picture))
     assert np.array_equal(frame, np.asarray(Image.open(file).convert("RGB"))) != is_turned
     for verify in (False, True):  # labels of other pictures stay
-        before = digest_of([f"{file.name} {video_identity(file, verify=verify)}".encode()])
+        before = digest_of([f"{file.name} {file_identity(file, verify=verify)}".encode()])
         assert (dataset.identity(episode, "frames", verify=verify) != before) == is_turned
 
 
@@ -214,7 +213,7 @@ def bgr_folder(root: Path) -> Path:
 
 def test_labels_of_pictures_stored_as_bgr_are_those_of_rgb_and_say_so(tmp_path: Path) -> None:
     root, notes = bgr_folder(tmp_path / "pictures"), Notes()
-    swapped = open_dataset(root, task=TASK, channels=Channels("bgr"), orient=Orient("rotate90"))
+    swapped = open_dataset(root, task=TASK, channels="bgr", orient="rotate90")
     report = label(swapped, BrightnessScorer(), LabelOptions(), notes)
     table = parquet.read_table(report.files[0])
     expected = redness(np.stack([np.roll(BRIGHT, t, axis=1) for t in range(4)]))
@@ -234,7 +233,7 @@ def test_labels_made_with_other_channels_are_not_kept(tmp_path: Path) -> None:
     root = bgr_folder(tmp_path / "pictures")
     (file, *_) = label(open_dataset(root, task=TASK), BrightnessScorer(), LabelOptions()).files
     assert "channels" not in provenance(file)  # as in labels made before there was a choice
-    swapped = open_dataset(root, task=TASK, channels=Channels.parse(["frames=bgr"]))
+    swapped = open_dataset(root, task=TASK, channels={"frames": "bgr"})
     with pytest.raises(DatasetError, match=r"got channels\.frames: none there, bgr now: choose another --name"):
         label(swapped, BrightnessScorer(), LabelOptions())
     scorer = BrightnessScorer()
@@ -246,12 +245,12 @@ def test_labels_made_with_other_channels_are_not_kept(tmp_path: Path) -> None:
 
 def test_channels_of_one_camera_of_a_lerobot_dataset_are_swapped() -> None:
     root = LEROBOT / "toy_v21"
-    stored, swapped = open_dataset(root), open_dataset(root, channels=Channels.parse(["wrist=bgr"]))
+    stored, swapped = open_dataset(root), open_dataset(root, channels={"wrist": "bgr"})
     episode = stored.episodes[0]
     for camera in stored.cameras:
         frames, others = (np.stack(list(each.frames(episode, camera))) for each in (stored, swapped))
         np.testing.assert_array_equal(others, frames[..., ::-1] if camera == WRIST else frames)
     with pytest.raises(DatasetError, match=r"channels: expected one of the cameras .*, got 'top'"):
-        open_dataset(root, channels=Channels.parse(["top=bgr"]))
+        open_dataset(root, channels={"top": "bgr"})
     with pytest.raises(ValueError, match=r"^channels: expected one of rgb, bgr, got 'brg'$"):
-        Channels.parse(["brg"])
+        open_dataset(root, channels={"wrist": "brg"})

@@ -13,9 +13,8 @@ import pytest
 
 from labelling import FEW, LEROBOT, BrightnessScorer, picky, slow, without_cost
 from rfm_client import ProgressResult, RewardError
-from rfm_client.frames import Channels, Orient
 from rfm_labels import LabelOptions, RayOptions, Scorer, Watch, label, label_with_ray, open_dataset
-from rfm_labels.label import plan_labels
+from rfm_labels.plan import plan_labels
 from rfm_labels.ray_engine import EpisodeActor, RayJob
 
 pytestmark = pytest.mark.filterwarnings(
@@ -42,7 +41,7 @@ class OpenScorer(BrightnessScorer):
 
 def test_an_actor_opens_the_dataset_as_it_is_told_and_its_scorer_for_as_long_as_it_lives(output: Path) -> None:
     scorer, told = OpenScorer(), {"task": "juggle", "override_task": True}
-    told |= {"orient": Orient("rotate90"), "channels": Channels("bgr")}
+    told |= {"orient": "rotate90", "channels": "bgr"}
 
     @contextmanager
     def connect() -> Iterator[Scorer]:

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from rfm_labels.datasets.lerobot_v30 import read_tasks
+from rfm_labels.datasets.lerobot_rows import read_sentences
 
 TABLES: dict[str, tuple[dict[str, list[Any]], list[str]]] = {
     "an index without a name": ({"task_index": [0, 1], "__index_level_0__": ["a b", "c d"]}, ["a b", "c d"]),
@@ -26,4 +26,4 @@ def test_a_table_of_tasks_is_read_as_its_writers_name_its_columns(
 ) -> None:
     (tmp_path / "meta").mkdir()
     parquet.write_table(pa.table(columns), tmp_path / "meta" / "tasks.parquet")
-    assert list(read_tasks(tmp_path).values()) == expected
+    assert list(read_sentences(tmp_path / "meta" / "tasks.parquet").values()) == expected

@@ -18,13 +18,7 @@ from gateway_requests import failure
 from gateways import TestClient, inside, running
 from live_reports import Json, episode, identity, jpeg, picture, report, step
 from rfm_client.episodes import StepScore
-from rfm_page.live import (
-    FORGOTTEN_AFTER_S,
-    MOST_BODY_BYTES,
-    MOST_EPISODES,
-    LiveEpisodes,
-    LiveReport,
-)
+from rfm_page.live import FORGOTTEN_AFTER_S, MOST_BODY_BYTES, MOST_EPISODES, LiveEpisodes, LiveReport
 from rfm_rl import LiveView, live
 from servers import Endpoints
 

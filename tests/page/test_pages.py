@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -67,6 +68,26 @@ def test_no_viewer_turns_the_page_off() -> None:
         for path in ("/viewer/score", "/live/reports"):
             assert gateway.post(path).status_code == 404
         assert gateway.get("/docs").status_code == 200
+
+
+WITHOUT_LABELS = """
+import sys
+sys.modules["rfm_labels"] = None
+from gateways import GatewayConfig, create_app, inside
+with inside() as gateway:
+    assert gateway.get("/viewer/datasets").json() == {"datasets": []}
+try:
+    create_app(GatewayConfig(triton="grpc://127.0.0.1:1", dataset=("demonstrations",)))
+except ValueError as error:
+    print(error)
+"""
+
+
+def test_without_the_package_of_datasets_the_page_shows_none_and_says_what_to_install() -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests" / "support")}
+    told = subprocess.check_output([sys.executable, "-c", WITHOUT_LABELS], env=environment, text=True)
+    assert told.startswith("dataset: expected the package rfm_labels")
+    assert told.endswith(", which reads it, got none: pip install ./apps/labels\n")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ import clip
 from browsers import Browser
 from gateways import Gateway, poll, running
 from paths import VIDEOS
-from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, ChannelOrder, Correction, Orientation
+from rfm_client.frames import ChannelOrder, Correction, Orientation
 from servers import Endpoints
 from tolerances import SHOWN, TOLERANCE
 from toy_world import Task, make_clip
@@ -141,7 +141,7 @@ def picture(page: Page) -> Image.Image:
 
 @pytest.mark.parametrize(
     ("orientation", "channels"),
-    [*((orientation, "rgb") for orientation in ORIENTATIONS), ("none", "bgr"), ("rotate90", "bgr")],
+    [*((orientation, "rgb") for orientation in get_args(Orientation)), ("none", "bgr"), ("rotate90", "bgr")],
 )
 def test_a_person_sees_what_the_model_sees(page: Page, orientation: Orientation, channels: ChannelOrder) -> None:
     frames = make_clip("success", Task("red", "bowl"), 2_000_000).frames[:, :40]
@@ -162,7 +162,7 @@ def test_a_person_sees_what_the_model_sees(page: Page, orientation: Orientation,
         expected = Image.fromarray(correction.applied(frames[0]))
         return float(np.abs(np.float32(seen.resize(expected.size)) - np.float32(expected)).mean())
 
-    corrections = [Correction(*both) for both in itertools.product(ORIENTATIONS, CHANNEL_ORDERS)]
+    corrections = [Correction(*both) for both in itertools.product(get_args(Orientation), get_args(ChannelOrder))]
     assert min(corrections, key=distance) == Correction(orientation, channels)
 
 

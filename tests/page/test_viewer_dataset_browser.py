@@ -22,7 +22,6 @@ from browsers import Browser
 from gateways import poll, running
 from labelling import BrightnessScorer
 from rfm_client import RewardClient
-from rfm_client.frames import Channels, Orient
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset, summarise
 from rfm_labels.datasets import LeRobotDataset
 from rfm_rl import LiveView
@@ -132,7 +131,7 @@ def folders(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) ->
     with RewardClient(demo_server.grpc_url) as client:
         label(open_dataset(demo), ClientScorer(client), LabelOptions())
     label(open_dataset(demo), BrightnessScorer(), LabelOptions(name=OTHER))
-    corrected = open_dataset(bright, orient=Orient.parse(["wrist=rotate180"]), channels=Channels.parse(["wrist=bgr"]))
+    corrected = open_dataset(bright, orient={"wrist": "rotate180"}, channels={"wrist": "bgr"})
     label(corrected, BrightnessScorer(), LabelOptions())
     coded = []
     for coding, (codec, options) in CODINGS.items():

@@ -22,12 +22,11 @@ import pytest
 from pyarrow import parquet
 
 from gateway_requests import failure
-from gateways import inside
+from gateways import free_port, inside
 from labelling import LEROBOT, BrightnessScorer
 from pictures import TURNS, turn
-from rfm_client.frames import Channels, Orient
 from rfm_client.options import ConfigError
-from rfm_gateway import GatewayConfig
+from rfm_gateway import GatewayConfig, check_gateway
 from rfm_labels import LabelOptions, label, open_dataset
 from rfm_labels.datasets import LeRobotDataset
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew
@@ -90,7 +89,7 @@ def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: 
 @pytest.mark.parametrize("form", ["progress", "signals"])
 def test_the_table_tells_how_pictures_became_upright_rgb_for_the_labels(tmp_path: Path, form: Any) -> None:
     root = copied("toy_v21", tmp_path)
-    corrected = open_dataset(root, orient=Orient.parse(["wrist=rotate180"]), channels=Channels("bgr"))
+    corrected = open_dataset(root, orient={"wrist": "rotate180"}, channels="bgr")
     label(corrected, BrightnessScorer(), LabelOptions(formats=(form,)))
     with serving(root) as get:
         front, wrist = get("/0").json()["corrections"]
@@ -371,7 +370,8 @@ def test_a_folder_that_is_no_dataset_is_refused_at_start(tmp_path: Path, name: s
 
 
 def test_a_missing_package_names_the_mend(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    message = r"dataset: expected pyarrow, which reads datasets, got none: pip install \./client \./apps/labels"
+    monkeypatch.setitem(sys.modules, "rfm_labels.datasets", None)
+    message = "dataset: expected the package rfm_labels.datasets, which reads it, got none: pip install ./apps/labels"
+    config = GatewayConfig(free_port(), triton="grpc://robot:8001", dataset=(str(LEROBOT / "toy_v21"),))
     with pytest.raises(ConfigError, match=message):
-        GatewayConfig(triton="grpc://robot:8001", dataset=(str(LEROBOT / "toy_v21"),)).check({})
+        check_gateway(config, {})

@@ -232,12 +232,6 @@ def test_what_cannot_be_used_is_refused(url: str, options: Any, message: str) ->
         LiveView(url, **options)
 
 
-def test_without_pillow_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(ImportError, match=r"client\[resize\]"):
-        LiveView("http://127.0.0.1:1")
-
-
 def test_the_scores_that_add_returns_are_reported(served: Served, taker: Taker) -> None:
     video = [picture(seed) for seed in range(9)]
     rule = SuccessRule(threshold=0.0)
@@ -293,7 +287,7 @@ def test_episodes_of_a_vector_environment_are_reported_and_end_with_their_last_s
             env.step(np.array([0, 1]))
         if mode is not AutoresetMode.SAME_STEP:  # which has reset them
             env.reset()
-        client.failing = len(client.calls) + 2
+        client.server.failing = len(client.calls) + 2
         for _ in range(2):
             env.step(np.array([0, 1]))
         with pytest.raises(ServerUnavailableError):

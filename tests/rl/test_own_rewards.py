@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,11 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from gymnasium.wrappers import RecordEpisodeStatistics
 from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
 
-from coded_env import CodedEnv, Recorder
+from coded_env import Code, CodedEnv, CodeReader, Recorder
 from environments import TASK
 from goal_env import LENGTH, Reach
-from rfm_client import ProgressResult, RewardClient
+from rfm_client import RewardClient
+from rfm_client.contract import wire
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 
 pytest.importorskip("stable_baselines3", reason="the extra sb3 is not installed")
@@ -140,16 +141,15 @@ def test_a_normalization_inside_is_refused(recorder: Recorder) -> None:
         vector(recorder, VecMonitor(VecNormalize(rendered())))
 
 
-class Pleased(Recorder):
+class Pleased(CodeReader):
     """Sees a success in each frame."""
 
-    def score_windows(self, windows: Sequence[Any], **options: Any) -> Any:
-        ones = [np.ones(len(window.frames), np.float32) for window in windows]
-        return [ProgressResult(progress=each, success=each) for each in ones]
+    def scores(self, codes: list[Code]) -> dict[str, Any]:
+        return {wire.PROGRESS: 1.0, wire.SUCCESS: 1.0}
 
 
 def test_a_monitor_outside_counts_episodes_that_end_by_success() -> None:
-    with Pleased() as client:
+    with Recorder(server=Pleased()) as client:
         env = single(client, Reach(), terminate_on_success=SuccessRule())
         model = PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, device="cpu").learn(4)
         assert [(episode["r"], episode["l"]) for episode in model.ep_info_buffer] == [(1, 1)] * 4

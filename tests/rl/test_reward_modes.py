@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from coded_env import CodedEnv, Recorder
-from rfm_client import ProgressResult
+from coded_env import Code, CodedEnv, CodeReader, Recorder
+from rfm_client.contract import wire
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 
 PROGRESS = (0.1, 0.4, 0.3, 0.3, 0.8)  # of an episode's frames
@@ -23,20 +23,24 @@ GAMMA = 0.9
 TASK = "task 0"
 
 
-class Judge(Recorder):
+class Judging(CodeReader):
     """Scores each frame by the step."""
 
+    predicts_success = True
+
+    def scores(self, codes: list[Code]) -> dict[str, Any]:
+        steps = [step for *_, step in codes]
+        success = np.array(SUCCESS)[steps] if self.predicts_success else np.nan
+        return {wire.PROGRESS: np.array(PROGRESS)[steps], wire.SUCCESS: success}
+
+
+class Judge(Recorder):
+    """A client of such a server."""
+
     def __init__(self, predicts_success: bool = True) -> None:
-        super().__init__()
-        self.predicts_success = predicts_success
-
-    def score_windows(self, windows: Sequence[Any], **options: Any) -> Any:
-        super().score_windows(windows, **options)
-        return [self._scored([int(frame.pixels[0, 0, 2]) for frame in window.frames]) for window in windows]
-
-    def _scored(self, steps: list[int]) -> ProgressResult:
-        success = np.array(SUCCESS)[steps] if self.predicts_success else np.full(len(steps), np.nan)
-        return ProgressResult(progress=np.float32(np.array(PROGRESS)[steps]), success=np.float32(success))
+        server = Judging()
+        server.predicts_success = predicts_success
+        super().__init__(server=server)
 
     @property
     def steps(self) -> list[int]:

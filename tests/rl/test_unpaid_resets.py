@@ -149,7 +149,7 @@ def test_final_allows_a_reset_after_each_error(recorder: Recorder) -> None:
     env = RewardModelWrapper(CodedEnv(), recorder, TASK, replace(FINAL, success_bonus=1.0))
     for _ in range(3):
         env.reset()
-        recorder.failing = len(recorder.calls)
+        recorder.server.failing = len(recorder.calls)
         with pytest.raises(ServerUnavailableError):
             env.step(0)
 

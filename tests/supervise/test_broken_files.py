@@ -13,11 +13,12 @@ import pytest
 from commands import REPOSITORY, nothing_left_behind
 from in_process import rfm
 from repositories import changing
-from rfm.launch.installation import ServerStartError, find_installation
+from rfm.launch.installation import ServerStartError
 from rfm.launch.repository_check import fault_in
 from rfm.launch.triton_server import TritonServer
 from rfm.parameters import EXPORT_PARAMETER, PYTHON_PARAMETERS
-from servers import Endpoints
+from rfm_client.contract.description import DESCRIPTION_PARAMETER
+from servers import Endpoints, find_installation
 
 FOREIGN = 'name: "foreign"\nbackend: "python"\nmax_batch_size: 1\na_field_of_a_newer_triton: 1\n'
 
@@ -42,6 +43,15 @@ def forget(parameter: str) -> Callable[[Path], None]:
     return change
 
 
+def describe(text: str) -> Callable[[Path], None]:
+    def change(model: Path) -> None:
+        with changing(model) as config:
+            config.parameters[DESCRIPTION_PARAMETER].string_value = text
+
+    return change
+
+
+DESCRIBED = "/rfm/config.pbtxt: parameter description: "
 DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "garbage": (
         "rfm",
@@ -55,6 +65,22 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "no program": ("rfm", lambda model: (model / "1/model.py").unlink(), "/rfm/1/model.py: expected the model's pro"),
     "no version": ("rfm", lambda model: shutil.rmtree(model / "1"), "/rfm/1: expected the folder of a version, got no"),
     "no version of an ensemble": ("rfm_frames", lambda model: shutil.rmtree(model / "1"), "/rfm_frames/1: expected "),
+    "no description": (
+        "rfm",
+        forget(DESCRIPTION_PARAMETER),
+        f"{DESCRIBED}expected the JSON object of an export, got none; ",
+    ),
+    "a broken description": ("rfm", describe('{"kind"'), f"{DESCRIBED}expected .* got '{{\"kind\"': Expecting ':'"),
+    "a wrong description": (
+        "rfm",
+        describe('{"text_dim": "32"}'),
+        f"{DESCRIBED}text_dim: expected int or null, got '32'; ",
+    ),
+    "no description of an ensemble": (
+        "rfm_frames",
+        forget(DESCRIPTION_PARAMETER),
+        "/rfm_frames/config.pbtxt: parameter descr",
+    ),
     **{
         name: ("rfm", forget(name), f"/rfm/config.pbtxt: .* parameter {name}, got none; ") for name in PYTHON_PARAMETERS
     },

@@ -29,6 +29,7 @@ from rfm_client import (
     Sample,
 )
 from rfm_client.contract import wire
+from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 from rfm_client.contract.process_log import LEVEL_VARIABLE, LogLines
 from servers import wait_for
 from trajectories import random_trajectory
@@ -45,6 +46,7 @@ CONFIG = {
     "max_batch_size": 8,
     "instance_group": [{"count": 1}],
 }
+BARE = Description()
 FINAL = 1  # Triton's flag of the last response to a request
 REFUSED, BREAKS, FAILS = 2, 3, 4  # numbers of frames on which the model fails
 
@@ -104,10 +106,17 @@ MODELS: list[Model] = []  # of the test that runs
 class Model(BatchModel[Sample, Result]):
     """Scores each frame with how many there are."""
 
-    def __init__(self, folder: Path, warmups: int = 0, settings: Mapping[str, str] = MappingProxyType({})) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        warmups: int = 0,
+        settings: Mapping[str, str] = MappingProxyType({}),
+        description: Description = BARE,
+    ) -> None:
         MODELS.append(self)
         self.batches: list[int] = []
-        parameters = {name: {"string_value": value} for name, value in {"torch_threads": "1", **settings}.items()}
+        settings = {"torch_threads": "1", DESCRIPTION_PARAMETER: description.to_json(), **settings}
+        parameters = {name: {"string_value": value} for name, value in settings.items()}
         config = CONFIG | {"parameters": parameters, "model_warmup": [{"count": 0}] * warmups}
         instance = {"model_instance_name": "rfm_0_0", "model_instance_kind": "CPU", "model_instance_device_id": "0"}
         model = {"model_repository": str(folder), "model_version": "1", "model_name": "rfm"}

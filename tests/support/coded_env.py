@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""An environment whose frames encode environment, episode and step, and a client that reads the code."""
+"""An environment whose frames encode environment, episode and step, and a server that reads the code."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, ClassVar, TypeAlias
 
 import gymnasium as gym
 import numpy as np
 
 from rfm_client import RewardClient, ServerUnavailableError, UInt8Array
+from rfm_client.contract import wire
+from rfm_client.transport.calls import Answer
 from shelves import Shelf
 
 SIZE_PX = 32
@@ -73,22 +75,52 @@ class CodedEnv(gym.Env[Any, Any]):
         return self.canvas
 
 
-class Recorder(RewardClient):
-    """A client of a stand-in server. Keeps the frames' codes and the task of every question.
+class CodeReader(Shelf):
+    """A stand-in server. Keeps the frames' codes and the task of every question, by request.
 
-    failing: number of the call that fails
+    failing: number of the request that fails
     """
 
     def __init__(self, failing: int | None = None) -> None:
-        super().__init__("", transports=[Shelf(has_encoder=False)], retry=False)
+        super().__init__(has_encoder=False)
         self.calls: list[list[tuple[list[Code], str]]] = []
         self.pixels: list[list[UInt8Array]] = []  # of each window
         self.failing = failing
 
-    def score_windows(self, windows: Sequence[Any], **options: Any) -> Any:
-        self.pixels += [[frame.pixels for frame in window.frames] for window in windows]
-        codes = [[tuple(frame.pixels[0, 0].tolist()) for frame in window.frames] for window in windows]
-        self.calls.append([(of_window, window.task) for of_window, window in zip(codes, windows, strict=True)])
+    async def infer(
+        self, model: str, inputs: wire.Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+    ) -> Answer:
+        counts = inputs[wire.NUM_FRAMES][:, 0]
+        windows = [list(frames[:count]) for frames, count in zip(inputs[wire.FRAMES], counts, strict=True)]
+        self.pixels += windows
+        codes: list[list[Code]] = [[tuple(frame[0, 0].tolist()) for frame in window] for window in windows]
+        tasks = [task.decode() for task in inputs[wire.TASK][:, 0]]
+        self.calls.append(sorted(zip(codes, tasks, strict=True)))
         if len(self.calls) - 1 == self.failing:
-            return [ServerUnavailableError("the server is restarting")] * len(windows)
-        return super().score_windows(windows, **options)
+            raise ServerUnavailableError("the server is restarting")
+        answer = await super().infer(model, inputs, outputs, timeout_s)
+        tensors = {name: array.copy() for name, array in answer.tensors.items()}  # which are one array
+        for row, of_window in enumerate(codes):
+            for name, scores in self.scores(of_window).items():
+                tensors[name][row, : len(of_window)] = scores
+        return Answer(tensors, answer.model_version)
+
+    def scores(self, codes: list[Code]) -> dict[str, Any]:
+        """Outputs of a window in place of the shelf's."""
+        return {}
+
+
+class Recorder(RewardClient):
+    """A client of such a server."""
+
+    def __init__(self, failing: int | None = None, server: CodeReader | None = None) -> None:
+        self.server = server or CodeReader(failing)
+        super().__init__("", transports=[self.server], retry=False)
+
+    @property
+    def calls(self) -> list[list[tuple[list[Code], str]]]:
+        return self.server.calls
+
+    @property
+    def pixels(self) -> list[list[UInt8Array]]:
+        return self.server.pixels

@@ -8,8 +8,6 @@ import importlib.metadata
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 import goldens
 from rfm import families
 from rfm.checkpoint.content import read_run_config
@@ -34,8 +32,6 @@ def scorer(checkpoint: str, **options: str) -> Any:
 @functools.cache
 def load_engine(name: str) -> Engine:
     """Return the engine of a reference checkpoint, with encoders if there are any."""
-    if name.startswith("smol") and TRANSFORMERS >= 5:
-        pytest.skip("SmolVLM is refused with transformers 5")
     config = goldens.config(name)
     checkpoint = families.load(config.checkpoint, **config.sources)
     return Engine.of(checkpoint, encoders=checkpoint.encoders())

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.wrappers import AddRenderObservation
 
 from rfm_client import ProgressResult, RewardClient, Trajectory, UInt8Array
+from rfm_client.episodes import Episode, StepScore
 from tolerances import TOLERANCE
 from transports import Answer, Connection, Tensors
 
@@ -124,16 +125,16 @@ class LateClient(RewardClient):
     def __init__(self, url: str) -> None:
         self.connection = SlowConnection(url)
         super().__init__(url, transports=[self.connection], model=MODEL, retry=False)
-        self.submitted: list[Future[ProgressResult]] = []
-        self.answers: dict[int, Future[ProgressResult]] = {}  # by step
+        self.submitted: list[Future[list[StepScore]]] = []
+        self.answers: dict[int, Future[list[StepScore]]] = {}  # by step
 
     def hold(self, *steps: int) -> None:
         self.connection.held |= {step + 1: Future() for step in steps}
 
-    def submit_window(self, window: Any) -> Future[ProgressResult]:
-        answer = super().submit_window(window)
+    def submit_episodes(self, episodes: Sequence[Episode]) -> Future[list[StepScore]]:
+        answer = super().submit_episodes(episodes)
         self.submitted.append(answer)
-        self.answers[len(window.frames) - 1] = answer
+        self.answers |= {episode.step: answer for episode in episodes}
         return answer
 
     def let_come(self, *steps: int) -> None:

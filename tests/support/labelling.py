@@ -21,7 +21,7 @@ from pyarrow import parquet
 
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory, UInt8Array
 from rfm_labels import CheckpointFacts, DatasetEpisode, LabelOptions, RayOptions, Scorer, Watch, label, open_dataset
-from rfm_labels.datasets.protocol import digest_of as digest_of
+from rfm_labels.datasets.stored_files import digest_of as digest_of
 
 LEROBOT = Path(__file__).parents[1] / "lerobot"
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"

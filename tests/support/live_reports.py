@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import ssl
 from collections.abc import Iterator
@@ -12,9 +13,9 @@ from http.server import BaseHTTPRequestHandler
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from rfm_client import UInt8Array
-from rfm_client.frames import as_jpeg
 from servers import web_server
 
 Json = dict[str, Any]
@@ -43,7 +44,9 @@ def report(*episodes: Json, **frames: str) -> Json:
 
 
 def jpeg(frame: UInt8Array) -> str:
-    return base64.b64encode(as_jpeg(frame, max(frame.shape))).decode()
+    file = io.BytesIO()
+    Image.fromarray(frame).save(file, "JPEG", quality=85, subsampling=0)
+    return base64.b64encode(file.getvalue()).decode()
 
 
 class Taker:

@@ -12,7 +12,8 @@ from pathlib import Path
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
 from commands import running
-from rfm_export.layout import CONFIG_FILE
+from rfm_client.contract.description import Description
+from rfm_export.layout import CONFIG_FILE, description_in
 from rfm_export.pbtxt import parse, render
 
 
@@ -23,6 +24,11 @@ def changing(model: Path) -> Iterator[ModelConfig]:
     config = parse(file.read_text())
     yield config
     file.write_text(render(config))
+
+
+def description_of(model: Path) -> Description:
+    """The description in an exported model's configuration."""
+    return description_in(parse((model / CONFIG_FILE).read_text()))
 
 
 def forget_input(repository: Path, model: str, name: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ from tritonclient.grpc.model_config_pb2 import ModelConfig
 
 from paths import GOLDEN
 from rfm_client import ProgressSample, Trajectory
+from rfm_client.contract.description import DESCRIPTION_PARAMETER
+from rfm_export.layout import description_in
 
 ROOT = Path(os.environ.get("RFM_REWARD_MODELS") or GOLDEN / "reward_models")
 BASE = ROOT / "bases" / "q3"
@@ -65,8 +67,10 @@ def references(section: str) -> list[Reference]:
 
 
 def as_before_marks(file: Path) -> None:
-    """Remove the output of marks from a configuration, as in older exports."""
+    """Remove the marks from a configuration, as in an export without them."""
     config = text_format.Parse(file.read_text(), ModelConfig())
     (index,) = (index for index, output in enumerate(config.output) if output.name == "unclear")
     del config.output[index]
+    described = replace(description_in(config), marks_unclear=False)
+    config.parameters[DESCRIPTION_PARAMETER].string_value = described.to_json()
     file.write_text(text_format.MessageToString(config))

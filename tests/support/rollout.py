@@ -33,7 +33,7 @@ from rfm_client import (
     Sample,
     Trajectory,
 )
-from rfm_client.async_client import DEFAULT_TIMEOUT_S
+from rfm_client.client_options import DEFAULT_TIMEOUT_S
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
 

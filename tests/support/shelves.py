@@ -65,15 +65,15 @@ class Shelf:
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         if model != "rfm_frames" and not self.has_encoder:
             raise ModelNotFoundError(model)
-        now, widths = self.of(model), (None, None) if model == "rfm_frames" else (4, 2)
+        now, (video_dim, text_dim) = self.of(model), (None, None) if model == "rfm_frames" else (4, 2)
         return ModelInfo(
-            model,
-            (now.version,),
-            64,
-            now.max_frames,
-            now.frame_size,
-            *widths,
-            None,
+            name=model,
+            versions=(now.version,),
+            max_batch_size=64,
+            video_dim=video_dim,
+            text_dim=text_dim,
+            trained_frames=now.max_frames,
+            frame_size=now.frame_size,
             weights_digest=now.weights,
             settings_digest=now.settings,
         )

@@ -18,11 +18,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS
-from rfm.checkpoint.provenance import Decision
 from rfm.engine import Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import RowScores, frame_scores, of_rows, prefix_indices
-from rfm.family import NETWORK, Description, EncodersDescription, Family, Options
+from rfm.families import Decision
+from rfm.family import NETWORK, Family, Options
 from rfm_client import (
     FrameScores,
     InvalidSampleError,
@@ -32,7 +32,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract.frame_refs import EncoderSampleRefs, TrajectoryRefs
+from rfm_client.contract.description import Description
 from rfm_client.contract.samples import EncoderSample
 
 MODEL_TYPE = "redness"
@@ -68,12 +68,12 @@ class Palette:
         return cls(load_file(folder / PALETTE)["scale"])
 
     @classmethod
-    def describe(cls, folder: Path) -> EncodersDescription:
-        return EncodersDescription(cls.__name__)
+    def describe(cls, folder: Path) -> Description:
+        return Description(network={"class": cls.__name__})
 
     @property
-    def description(self) -> EncodersDescription:
-        return EncodersDescription(type(self).__name__)
+    def description(self) -> Description:
+        return Description(network={"class": type(self).__name__})
 
     def save(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -84,23 +84,17 @@ class Palette:
 
     def encode(
         self,
-        samples: Sequence[EncoderSample | EncoderSampleRefs],
+        samples: Sequence[EncoderSample],
         execution: Execution,
         cache: FeatureCache | None = None,
     ) -> list[EncoderSample | RewardError]:
         return [self._encoded(sample) for sample in samples]
 
-    def _encoded(self, sample: EncoderSample | EncoderSampleRefs) -> EncoderSample:
+    def _encoded(self, sample: EncoderSample) -> EncoderSample:
         letters = np.full(1, len(sample.trajectories[0].task), np.float32)
-        colours = [_frames(each).mean(axis=(1, 2)).astype(np.float32) for each in sample.trajectories]
+        colours = [each.positions.mean(axis=(1, 2)).astype(np.float32) for each in sample.trajectories]
         videos = [self.scale.cpu().numpy() * colour for colour in colours]
         return EncoderSample(tuple(Trajectory(video_embeddings=video, text_embedding=letters) for video in videos))
-
-
-def _frames(trajectory: Trajectory | TrajectoryRefs) -> np.ndarray:
-    if isinstance(trajectory, TrajectoryRefs):
-        return np.stack([trajectory.pixels[digest] for digest in trajectory.digests])
-    return trajectory.positions
 
 
 @dataclass(frozen=True)
@@ -157,7 +151,14 @@ class ToyCheckpoint:
 
     @property
     def description(self) -> Description:
-        return Description(Redness.__name__, (self.config.num_colours, 1), progress_bins=1, has_similarity=False)
+        return Description(
+            kind="redness",
+            network={"class": Redness.__name__},
+            video_dim=self.config.num_colours,
+            text_dim=1,
+            has_preference=True,
+            has_success=True,
+        )
 
     @property
     def parts(self) -> dict[str, dict[str, Tensor]]:

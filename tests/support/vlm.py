@@ -13,13 +13,10 @@ import goldens
 from engines import load_engine
 from rfm import families
 from rfm.vlm.checkpoint import VlmCheckpoint
-from rfm.vlm.collator import QwenCollator
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.qwen import UNIT
 from rfm.vlm.row import VlmRow
-from rfm_client import (
-    Trajectory,
-)
+from rfm_client import Trajectory
 
 BFLOAT16 = "q3_tok_disc10_bf16"
 
@@ -59,8 +56,6 @@ def load(name: str, folder: Path | None = None, base: str | None = None) -> VlmC
 def upstream_inputs(predictor: VlmPredictor, rows: Sequence[VlmRow]) -> dict[str, torch.Tensor]:
     """Return upstream's arguments for the backbone: every shot in order, with repetitions."""
     batch = predictor.collate(rows).to(torch.device("cpu"), torch.float32)
-    if not isinstance(predictor.collator, QwenCollator):
-        return batch.inputs
     mask = torch.zeros_like(batch.inputs["input_ids"])
     for index, row in enumerate(rows):
         mask[index, : row.num_tokens] = 1

@@ -34,7 +34,8 @@ from rfm_client import (
     Sample,
 )
 from rfm_client.contract import wire
-from rfm_client.serving import PROBE_PREFIX
+from rfm_client.contract.description import Description
+from rfm_client.contract.names import PROBE_PREFIX
 from servers import PATIENCE_S
 from trajectories import random_trajectory
 
@@ -243,7 +244,7 @@ def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(
 
 
 def test_metrics_know_the_checkpoint_and_what_can_be_asked(tmp_path: Path) -> None:
-    Model(tmp_path, settings={"source": "org/name", "network": '{"class": "Rewind"}'})
+    Model(tmp_path, description=Description(source="org/name", network={"class": "Rewind"}))
     (told,) = (metric for metric in METRICS if metric.name == "rfm_checkpoint_info")
     assert told.value == 1
     assert told.labels == {
@@ -321,7 +322,7 @@ def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_watchdog_k
 @pytest.mark.parametrize("told", ["", f"float32, torch {torch.__version__}, sdpa", "float32, torch 1.0, sdpa"])
 def test_an_instance_notes_that_labels_name_another_pytorch(tmp_path: Path, told: str) -> None:
     """Clients read the PyTorch of the export, and write it into label files."""
-    Model(tmp_path, settings={"computation": told})
+    Model(tmp_path, description=Description(computation=told))
     noted = [line for line in LOGGED if "labels will name" in line]
     assert len(noted) == ("torch 1.0" in told)
     assert all(f"export with torch {torch.__version__}" in note for note in noted)

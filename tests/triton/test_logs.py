@@ -33,7 +33,7 @@ from rfm_client import (
     RewardError,
     ServerUnavailableError,
 )
-from rfm_client.serving import PROBE_PREFIX
+from rfm_client.contract.names import PROBE_PREFIX
 from servers import Endpoints, Serving, children, serving, wait_for, web_server
 from tensors import encode_samples
 from trajectories import random_trajectory

@@ -5,7 +5,7 @@
 the answer in the evaluation server's shape, ``app`` joins the endpoints. The gateway holds no model and no queue.
 """
 
-from rfm_gateway.command import gateway, gateway_command
+from rfm_gateway.command import check_gateway, gateway, gateway_command
 from rfm_gateway.config import GatewayConfig
 
-__all__ = ["GatewayConfig", "gateway", "gateway_command"]
+__all__ = ["GatewayConfig", "check_gateway", "gateway", "gateway_command"]

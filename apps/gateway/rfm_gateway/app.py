@@ -7,7 +7,6 @@ import logging
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
@@ -20,21 +19,18 @@ from starlette.requests import ClientDisconnect
 
 from rfm_client import (
     AccessDeniedError,
-    AsyncRewardClient,
     DeadlineExceededError,
     InferenceFailedError,
     ModelNotFoundError,
     RewardError,
     ServerUnavailableError,
 )
-from rfm_client.serving import DEFAULT_MODEL
 from rfm_gateway import pages, schema
 from rfm_gateway.admission import RETRY_AFTER
 from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
 from rfm_gateway.config import MIB, GatewayConfig
 from rfm_gateway.foreign_pages import ForeignPageMiddleware
-from rfm_gateway.installed_page import page_of
-from rfm_gateway.mounting import Surroundings
+from rfm_gateway.mounting import PageHost, page_of
 from rfm_gateway.observe import (
     CALLER_LEFT,
     REQUEST_ID_HEADER,
@@ -45,8 +41,6 @@ from rfm_gateway.observe import (
 )
 from rfm_gateway.scoring import Evaluator
 from rfm_gateway.state import TritonState
-
-DECODED_PER_BODY = 2  # limit of decoded files, as a multiple of the body's limit
 
 _KEY_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # at module level, where FastAPI resolves annotations
 _KEY_BEARER = HTTPBearer(auto_error=False)
@@ -72,16 +66,9 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
     Raises OSError for a missing folder, ValueError for a malformed URL or an unusable file.
     """
     folder = None if config.allow_folder is None else config.allow_folder.resolve(strict=True)
-    model, credentials, metrics = config.model or DEFAULT_MODEL, config.credentials, GatewayMetrics()
-    new_client = partial(
-        AsyncRewardClient,
-        config.triton_url,
-        timeout_s=config.timeout_s,
-        retry=False,  # the caller gets the error at once, and may retry
-        max_in_flight=config.max_in_flight,
-        **credentials.options,
-    )
-    client = new_client(model=model)
+    client, metrics = config.client(), GatewayMetrics()
+    limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
+    state = TritonState(client, config)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -102,16 +89,10 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
             allow_headers=["*"],
             expose_headers=[REQUEST_ID_HEADER],
         )
-    limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
-    max_decoded_bytes = DECODED_PER_BODY * limits.max_bytes
-    state = TritonState(client, config.triton_url, config.metrics_url, model, credentials)
     guards = [] if api_key is None else [Depends(_key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
-    _add_evaluations(guarded, limits, Evaluator(client, config.timeout_s, folder, max_decoded_bytes), metrics)
+    _add_evaluations(guarded, limits, Evaluator(client, limits, folder), metrics)
     _add_reports(guarded, state, metrics)
-    page = page_of(config)
-    if page is not None:
-        guarded.include_router(page.routes(Surroundings(config, new_client, limits, max_decoded_bytes, metrics)))
     app.include_router(guarded)
 
     @app.get("/health", responses=_failures(502, 503, 504))
@@ -120,8 +101,9 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
         return await state.health()
 
     pages.add_docs(app)
-    if page is not None:
-        page.add_files(app)
+    add_page = page_of(config)
+    if add_page is not None:
+        add_page(PageHost(app, guards, config, limits, metrics))
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
     return app
 

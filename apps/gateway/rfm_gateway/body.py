@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
+from collections import Counter
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
+from tokenize import TokenError
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,11 +22,11 @@ from python_multipart.multipart import parse_options_header
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
-from rfm_client.frames import BROKEN_NPY
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
 from rfm_gateway.admission import Turn, arriving
 
+DECODED_PER_BODY = 2  # limit of decoded files, as a multiple of the body's limit
 MAX_PARTS = 2000  # of one multipart request: each takes memory, also if it is empty
 IN_MEMORY_BYTES = 32 * 2**20  # of a file; larger files lie on disk
 MAX_SAMPLES = 10_000  # of one request
@@ -32,6 +34,7 @@ MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files
 MAX_ERRORS = 1000  # listed in an answer
 
 _format: Any = np.lib.format  # numpy declares no types for it
+_BROKEN_NPY = (ValueError, TypeError, LookupError, SyntaxError, TokenError, MemoryError, RecursionError)  # its errors
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _STEPS_FIELD = "use_frame_steps"
@@ -48,11 +51,9 @@ _EXPECTED = {  # the expected value, by pydantic's kind of error
     "union_tag_invalid": "progress, preference or similarity",
     "union_tag_not_found": "progress, preference or similarity",
 }
-_AROUND_EXPECTED = re.compile(
-    "^.*?should (be|have|match) | after validation.*|, unable to .*"
-)  # in pydantic's messages
+_AROUND_EXPECTED = re.compile("^.*?should (be|have|match) | after validation.*|, unable to .*")  # in its messages
 
-Parts: TypeAlias = tuple[dict[str, str], dict[str, UploadFile]]  # fields and files of a form, by name
+Take: TypeAlias = Callable[[int], object]  # takes bytes from a budget, or raises
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,29 @@ class BodyLimits:
         """Return the whole body."""
         return b"".join([chunk async for chunk in self._chunks(request, min(self.max_bytes, max_bytes))])
 
+    @contextmanager
+    def decoding(self) -> Iterator[Take]:
+        """Yield a function that takes bytes from one request's budget for decoded files, before they are decoded.
+
+        It raises HTTPException 413 if too few are left, and always after the context, so that threads stop decoding.
+        """
+        most_bytes = DECODED_PER_BODY * self.max_bytes
+        left_bytes: float = most_bytes
+
+        def take(num_bytes: int) -> None:
+            nonlocal left_bytes
+            left_bytes -= num_bytes
+            if left_bytes < 0:
+                limit = f"files of at most {most_bytes} bytes in one request, when they are decoded"
+                raise HTTPException(413, f"body: expected {limit}, got more")
+
+        try:
+            yield take
+        finally:
+            left_bytes = float("-inf")
+
     @asynccontextmanager
-    async def form(self, request: Request) -> AsyncIterator[Parts]:
+    async def form(self, request: Request) -> AsyncIterator[tuple[dict[str, str], dict[str, UploadFile]]]:
         """Yield fields and files of a multipart request by name. The files exist until the context ends.
 
         Raises RequestValidationError for two parts of the same name, HTTPException 415 for another content type and 400
@@ -111,13 +133,8 @@ class BodyLimits:
         charset = options.get(b"charset", b"utf-8").decode("latin-1")
         if charset.lower() not in _CHARSETS:  # some of Python's codecs fail, others change the text
             raise HTTPException(415, f"content-type: expected the charset utf-8, got {reprlib.repr(charset)}")
-        parser = _Form(
-            request.headers,
-            self._chunks(request, self.max_bytes),
-            max_files=MAX_PARTS,
-            max_fields=MAX_PARTS,
-            max_part_size=MAX_JSON_BYTES,
-        )
+        most: Any = {"max_files": MAX_PARTS, "max_fields": MAX_PARTS, "max_part_size": MAX_JSON_BYTES}
+        parser = _Form(request.headers, self._chunks(request, self.max_bytes), **most)
         try:
             form = await parser.parse()
         except (MultiPartException, ValueError) as error:  # ValueError: of python_multipart
@@ -125,16 +142,11 @@ class BodyLimits:
         try:
             if not parser.has_ended:
                 raise HTTPException(400, "body: expected its last boundary at its end, got none")
-            fields: dict[str, str] = {}
-            uploads: dict[str, UploadFile] = {}
-            for name, value in form.multi_items():
-                if name in fields or name in uploads:
+            for name, count in Counter(name for name, _ in form.multi_items()).items():
+                if count > 1:
                     raise invalid((name,), "expected one part of this name, got several")
-                if isinstance(value, UploadFile):
-                    uploads[name] = value
-                else:
-                    fields[name] = value
-            yield fields, uploads
+            uploads = {name: value for name, value in form.items() if isinstance(value, UploadFile)}
+            yield {name: value for name, value in form.items() if isinstance(value, str)}, uploads
         finally:
             await form.close()
 
@@ -154,31 +166,12 @@ class _Form(MultiPartParser):
     def on_part_begin(self) -> None:
         self.num_parts += 1
         if self.num_parts > MAX_PARTS:
-            limit = f"{MAX_PARTS} parts, fields and files together"
-            raise HTTPException(413, f"body: expected at most {limit}, got more; send the samples in several requests")
+            expected = f"body: expected at most {MAX_PARTS} parts, fields and files together"
+            raise HTTPException(413, f"{expected}, got more; send the samples in several requests")
         super().on_part_begin()
 
     def on_end(self) -> None:
         self.has_ended = True
-
-
-class Decoded:
-    """A budget of ``max_bytes`` for the decoded files of one request, taken before they are decoded."""
-
-    def __init__(self, max_bytes: int) -> None:
-        self._max_bytes = max_bytes
-        self._left_bytes: float = max_bytes
-
-    def take(self, num_bytes: int) -> None:
-        """Take ``num_bytes``. Raises HTTPException 413 if less is left."""
-        self._left_bytes -= num_bytes
-        if self._left_bytes < 0:
-            limit = f"files of at most {self._max_bytes} bytes in one request, when they are decoded"
-            raise HTTPException(413, f"body: expected {limit}, got more")
-
-    def end(self) -> None:
-        """Make every later ``take`` fail, so that threads stop decoding for a caller who has left."""
-        self._left_bytes = float("-inf")
 
 
 async def read_json(limits: BodyLimits, request: Request) -> Batch:
@@ -219,7 +212,7 @@ def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
     upload.file.seek(0)
     try:
         array: np.ndarray[Any, Any] = _format.read_array(upload.file, allow_pickle=False)
-    except BROKEN_NPY as error:
+    except _BROKEN_NPY as error:
         raise ValueError(f"expected a .npy file, got: {error}") from None
     if array.dtype.kind not in "biuf":
         raise ValueError(f"expected a .npy file of numbers, got {array.dtype}")
@@ -259,19 +252,18 @@ def _unwrapped(document: Any) -> tuple[list[Any], bool]:
             document = others[0]
         else:
             document = others
-    if not isinstance(document, list):
-        raise invalid(("samples",), f"expected a list of samples, got {type(document).__name__}", "list_type")
-    return document, use_frame_steps
+    if isinstance(document, list):
+        return document, use_frame_steps
+    raise invalid(("samples",), f"expected a list of samples, got {type(document).__name__}", "list_type")
 
 
 def _sample_fields(fields: Mapping[str, str]) -> list[str]:
     """Return the names ``sample_0``, ``sample_1`` and so on. Raises for a gap, which would shift later answers."""
-    numbers = []
-    for name in filter(_ANY_SAMPLE_FIELD.fullmatch, fields):
+    names = [name for name in fields if _ANY_SAMPLE_FIELD.fullmatch(name)]
+    for name in names:
         if not _SAMPLE_FIELD.fullmatch(name):
             raise invalid((name,), "expected sample_0, sample_1 and so on, got another spelling")
-        numbers.append(int(name.partition("_")[2]))
-    numbers.sort()
+    numbers = sorted(int(name.partition("_")[2]) for name in names)
     for expected, number in enumerate(numbers):
         if number != expected:
             raise invalid((f"sample_{expected}",), f"expected a sample, got none, but sample_{number}", "missing")

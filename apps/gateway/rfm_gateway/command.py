@@ -6,18 +6,16 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Mapping
 from typing import Annotated
 
 import typer
 
 from rfm_client.command_line import OptionsOf, with_options
 from rfm_client.options import ConfigError, settings_of
-from rfm_client.serving import DEFAULT_MODEL, check_free, from_here, in_url, is_loopback, raise_limit, write_log
-from rfm_gateway.config import GatewayConfig
-from rfm_gateway.installed_page import page_of
+from rfm_client.serving import DEFAULT_MODEL, raise_limit, write_log
+from rfm_gateway.config import DEFAULT_HOST, DEFAULT_PORT, GatewayConfig
 
-DEFAULT_HOST = "127.0.0.1"
-DEFAULT_PORT = 8000
 KEEP_ALIVE_S = 30
 STOP_WITHIN_S = 30
 OPTIONS = OptionsOf(
@@ -49,26 +47,30 @@ def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
 
         from rfm_gateway.app import create_app
         from rfm_gateway.connections import Connection, most_connections
+        from rfm_gateway.mounting import INSTALL, page_of
     except ModuleNotFoundError as error:
         raise typer.BadParameter(f"the gateway needs {error.name}: pip install ./client ./apps/gateway") from None
     write_log("rfm-gateway", os.environ)
-    host, port = config.host or DEFAULT_HOST, config.port or DEFAULT_PORT
+    address = config.address
     try:
         api_key, tls = config.api_key(os.environ), config.tls
         app = create_app(config, api_key)
-        check_free(host, port, "gateway", port_option="--port")
+        address.check_free("gateway", port_option="--port")
     except ConfigError:  # with_options names its option
         raise
     except (ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from None
-    if api_key is None and not is_loopback(host):
-        logger.warning("%s is no loopback address, and no key is required: every host that reaches it can use it", host)
+    if api_key is None and not address.is_loopback:
+        open_to_all = "%s is no loopback address, and no key is required: every host that reaches it can use it"
+        logger.warning(open_to_all, address.host)
     if page_of(config) is not None:
         logger.info("look at rewards in the browser: %s", page_link(config))
+    elif config.viewer:
+        logger.info("no page in the browser, since the package rfm-page is not installed: %s", INSTALL)
     uvicorn.run(
         app,
-        host=host,
-        port=port,
+        host=address.host,
+        port=address.port,
         access_log=False,
         log_config=None,
         http=Connection,
@@ -77,6 +79,15 @@ def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
         timeout_graceful_shutdown=STOP_WITHIN_S,
         **tls,
     )
+
+
+def check_gateway(config: GatewayConfig, environment: Mapping[str, str]) -> None:
+    """Raise ValueError or OSError for settings with which a gateway beside ``rfm serve`` would not start."""
+    from rfm_gateway.app import create_app
+
+    config.address.check_free("port", port_option="--gateway-port", host_option="--gateway-host")
+    _ = config.tls
+    create_app(config, config.api_key(environment))
 
 
 def gateway_command(config: GatewayConfig) -> list[str]:
@@ -94,6 +105,4 @@ def gateway_command(config: GatewayConfig) -> list[str]:
 
 def page_link(config: GatewayConfig) -> str:
     """Return the page's URL for browsers that can reach the address."""
-    host = config.host or DEFAULT_HOST
-    scheme = "http" if config.certificate is None else "https"
-    return f"{scheme}://{in_url(from_here(host))}:{config.port or DEFAULT_PORT}/"
+    return f"{config.address.url('http' if config.certificate is None else 'https')}/"

@@ -3,17 +3,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from rfm_client import AsyncRewardClient
 from rfm_client.options import ConfigError, Settings, Texts, setting
-from rfm_client.serving import GATEWAY_KEY_VARIABLE, MAX_PORT, Credentials, check_certificate, check_free, split_url
-from rfm_gateway.installed_page import page_of
+from rfm_client.serving import (
+    DEFAULT_MODEL,
+    Credentials,
+    ListenAddress,
+    ServerStatus,
+    check_certificate,
+    read_status,
+)
 
+DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
 MIB = 2**20
+KEY_VARIABLE = "RFM_GATEWAY_API_KEY"
+_MAX_PORT = 65535
 _HOST_NAME = re.compile(r"[\w.-]+", re.ASCII)
 _ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/A-Z]+")  # as browsers send it
 _SHORTEST_S, _LONGEST_S = 0.001, 86_400.0  # a day
@@ -28,16 +39,14 @@ class GatewayConfig(Settings):
 
     TITLE: ClassVar[str] = "Gateway (section gateway of the file)"
 
-    port: int | None = setting(None, "Port to listen on; else there is no gateway.", least=1, most=MAX_PORT)
+    port: int | None = setting(None, "Port to listen on; else there is no gateway.", least=1, most=_MAX_PORT)
     host: str | None = setting(None, "Address to listen on; else that of Triton.")
     triton: str | None = setting(
         None, "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://; else the one beside it."
     )
     metrics_url: str | None = setting(None, "Triton's metrics; else those of the Triton beside it.")
     model: str | None = setting(None, "Name under which the checkpoint was exported; else rfm, or export.name.")
-    api_key_file: Path | None = setting(
-        None, f"File with the key that requests must show; else {GATEWAY_KEY_VARIABLE}."
-    )
+    api_key_file: Path | None = setting(None, f"File with the key that requests must show; else {KEY_VARIABLE}.")
     certificate: Path | None = setting(None, "Serve HTTPS with this certificate (PEM), and its key.")
     key: Path | None = setting(None, "The certificate's key (PEM).")
     triton_ca_file: Path | None = setting(None, "Authorities (PEM) that Triton is trusted by; else the system's.")
@@ -79,9 +88,41 @@ class GatewayConfig(Settings):
         return self.triton
 
     @property
-    def credentials(self) -> Credentials:
-        """Credentials for Triton. Raises ValueError for unusable files."""
-        return Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key)
+    def address(self) -> ListenAddress:
+        """Address that the gateway listens on."""
+        return ListenAddress(self.host or DEFAULT_HOST, self.port or DEFAULT_PORT)
+
+    @property
+    def checkpoint(self) -> str:
+        """Name under which the checkpoint was exported."""
+        return self.model or DEFAULT_MODEL
+
+    def client(self, checkpoint: str | None = None) -> AsyncRewardClient:
+        """Return a client of Triton. Raises ValueError for a malformed URL or unusable files.
+
+        checkpoint: name of another export; None: the gateway's
+        """
+        return AsyncRewardClient(
+            self.triton_url,
+            model=checkpoint or self.checkpoint,
+            timeout_s=self.timeout_s,
+            retry=False,  # the caller gets the error at once, and may retry
+            max_in_flight=self.max_in_flight,
+            ca_file=self.triton_ca_file,
+            client_certificate=self.triton_certificate,
+            client_key=self.triton_key,
+        )
+
+    async def status(self, timeout_s: float) -> ServerStatus:
+        """Read the state of Triton and of its devices. Raises ServerError."""
+        credentials = Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key)
+        return await asyncio.to_thread(
+            read_status,
+            self.triton_url,
+            metrics_url=self.metrics_url,
+            timeout_s=timeout_s,
+            credentials=credentials,
+        )
 
     @property
     def tls(self) -> dict[str, Any]:
@@ -94,22 +135,9 @@ class GatewayConfig(Settings):
     def api_key(self, environment: Mapping[str, str]) -> str | None:
         """Return the key that requests must show, or None. Raises ConfigError."""
         try:
-            key = environment.get(GATEWAY_KEY_VARIABLE) if self.api_key_file is None else self.api_key_file.read_text()
+            key = environment.get(KEY_VARIABLE) if self.api_key_file is None else self.api_key_file.read_text()
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError("api_key_file", f"expected a text file, got {error}") from None
         if key is not None and not key.strip():
-            raise ConfigError("api_key_file", f"expected a key, here or in {GATEWAY_KEY_VARIABLE}, got no character")
+            raise ConfigError("api_key_file", f"expected a key, here or in {KEY_VARIABLE}, got no character")
         return None if key is None else key.strip()
-
-    def check(self, environment: Mapping[str, str]) -> None:
-        """Raise ValueError or OSError for settings with which a gateway would not start."""
-        split_url(self.triton_url)
-        if self.host is not None and self.port is not None:
-            options = {"port_option": "--gateway-port", "host_option": "--gateway-host"}
-            check_free(self.host, self.port, "port", **options)
-        if self.allow_folder is not None:
-            self.allow_folder.resolve(strict=True)
-        _ = self.credentials, self.tls, self.api_key(environment)
-        page = page_of(self)
-        if page is not None:
-            page.check(self)

@@ -12,9 +12,9 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from rfm_client import InvalidSampleError, Trajectory, UInt8Array
-from rfm_client.frames import ARRAY_SUFFIXES, load_trajectory, upright_picture
-from rfm_gateway.body import Decoded
+from rfm_client import InvalidSampleError, Trajectory, UInt8Array, load_trajectory
+from rfm_client.frames import ARRAY_SUFFIXES, Picture
+from rfm_gateway.body import Take
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -22,28 +22,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RequestFiles:
-    """The files of one request. Their decoded size is taken from ``decoded`` before they are read.
+    """The files of one request.
 
     folder: the allowed folder, with links resolved; None: no file is read
+    take: called with the decoded size of files before they are read
 
-    Its methods raise InvalidSampleError, and HTTPException if ``decoded`` is used up.
+    Its methods raise InvalidSampleError, and what ``take`` raises.
     """
 
     folder: Path | None
-    decoded: Decoded
+    take: Take
 
     def frames(self, names: Sequence[str]) -> UInt8Array:
         """Return the T named images as uint8 [T, H, W, 3], RGB, upright as their EXIF data say."""
         with self._image(names[0], "frames.0") as first:
             num_pixels = first.height * first.width
-        self.decoded.take(len(names) * num_pixels * 3)
+        self.take(len(names) * num_pixels * 3)
         others = InvalidSampleError.at("frames", "images of one size", "different ones")
         frames = np.empty(0, np.uint8)
         for index, name in enumerate(names):
             with self._image(name, f"frames.{index}") as image:
                 if image.height * image.width != num_pixels:  # known before it is decoded
                     raise others
-                pixels = np.asarray(upright_picture(image).convert("RGB"))
+                pixels = Picture(image).pixels()
             if index == 0:
                 frames = np.empty((len(names), *pixels.shape), np.uint8)
             if pixels.shape != frames.shape[1:]:
@@ -57,7 +58,7 @@ class RequestFiles:
         if file.suffix.lower() not in ARRAY_SUFFIXES:
             raise InvalidSampleError.at("embeddings_path", " or ".join(ARRAY_SUFFIXES), name)
         try:
-            self.decoded.take(_unpacked_bytes(file))
+            self.take(_unpacked_bytes(file))
             trajectory = load_trajectory(file)
         except (OSError, ValueError, BadZipFile):  # also InvalidSampleError, whose message has the whole path
             raise InvalidSampleError.at("embeddings_path", "a file of embeddings [T, D]", name) from None

@@ -16,7 +16,6 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rfm_client.serving import is_loopback
 from rfm_gateway.config import GatewayConfig
 
 EMBEDDED_HERE_ALONE = {"Cross-Origin-Resource-Policy": "same-origin"}  # without TLS, browsers do not say who asks
@@ -35,7 +34,7 @@ class ForeignPageMiddleware:
         self._app = app
         self._origins = config.cors_origin
         self._has_key = has_key
-        self._is_local = config.host is None or is_loopback(config.host)
+        self._is_local = config.address.is_loopback
         own = () if self._is_local else (config.host or "", socket.gethostname())
         self._names = {name.lower().removesuffix(".") for name in (*config.allow_host, *own)}
 

@@ -1,40 +1,66 @@
 # SPDX-License-Identifier: MIT
-"""What a page in the browser needs of the gateway that serves it."""
+"""The page in the browser, which another package brings: how the gateway finds it, and what it offers to it.
+
+The package's entry point in the group ``rfm_gateway.page`` names an ``AddPage``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TypeAlias
 
-from rfm_client import AsyncRewardClient
-from rfm_gateway.body import BodyLimits, Decoded, field_errors, invalid
+from fastapi import APIRouter, FastAPI
+from fastapi.params import Depends
+
+from rfm_client.options import ConfigError
+from rfm_gateway.body import BodyLimits, field_errors, invalid
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.observe import GatewayMetrics, while_connected
 from rfm_gateway.pages import add_page
 
-__all__ = [
-    "BodyLimits",
-    "Decoded",
-    "GatewayConfig",
-    "GatewayMetrics",
-    "Surroundings",
-    "add_page",
-    "field_errors",
-    "invalid",
-    "while_connected",
-]
+__all__ = ["BodyLimits", "GatewayConfig", "PageHost", "field_errors", "invalid", "while_connected"]
+
+INSTALL = "pip install ./client ./apps/gateway ./apps/page"
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """The gateway around a page.
+class PageHost:
+    """The gateway that serves a page.
 
-    new_client: returns a client for a model's name
-    max_decoded_bytes: limit of the decoded files of one request
+    guards: refuse requests without the gateway's key
     """
 
+    app: FastAPI
+    guards: Sequence[Depends]
     config: GatewayConfig
-    new_client: Callable[..., AsyncRewardClient]
     limits: BodyLimits
-    max_decoded_bytes: int
     metrics: GatewayMetrics
+
+    def add_endpoints(self, router: APIRouter) -> None:
+        """Serve endpoints to callers with the gateway's key."""
+        self.app.include_router(router, dependencies=self.guards)
+
+    def add_files(self, folder: Path, **folders: Path) -> None:
+        """Serve ``index.html`` at ``/`` and the files of ``folder`` at ``/viewer``, after its endpoints, without a key.
+
+        folders: more files, by the name below ``/viewer``
+        """
+        add_page(self.app, "/", "/viewer", folder, **folders)
+
+
+AddPage: TypeAlias = Callable[[PageHost], None]  # adds a page; raises ConfigError for settings that it cannot serve
+
+
+def page_of(config: GatewayConfig) -> AddPage | None:
+    """Return what adds the page; None: the gateway serves none.
+
+    Raises ConfigError if it should show a dataset, but no page is installed.
+    """
+    found = list(entry_points(group="rfm_gateway.page")) if config.viewer else []
+    if config.viewer and config.dataset and not found:
+        raise ConfigError("dataset", f"expected the package rfm-page, which shows it, got none: {INSTALL}")
+    page: AddPage | None = found[0].load() if found else None
+    return page

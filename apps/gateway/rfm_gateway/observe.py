@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Count requests for Prometheus, and cancel the work of callers who hang up."""
+"""Count requests for Prometheus, and cancel work that is late, or whose caller has hung up."""
 
 from __future__ import annotations
 
 import asyncio
-import secrets
 import time
 from collections.abc import Coroutine
 from typing import Any, TypeVar
@@ -14,7 +13,8 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rfm_client.serving import PROBE_PREFIX, REQUEST_ID, log_requests
+from rfm_client import DeadlineExceededError
+from rfm_client.serving import begin_request
 from rfm_gateway.admission import Room, Turn
 from rfm_gateway.config import GatewayConfig
 
@@ -37,7 +37,6 @@ REJECTIONS = {
 }
 
 REQUEST_ID_HEADER = "X-Request-ID"
-_ID_BYTES = 8  # random, for a request without an id
 
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
 
@@ -93,9 +92,8 @@ class RequestMiddleware:
             await self._app(scope, receive, send)
             return
         started_s = time.perf_counter()
-        request_id = _request_id(scope)
+        request_id = begin_request(Headers(scope=scope).get(REQUEST_ID_HEADER, ""))
         scope.setdefault("state", {})["request_id"] = request_id
-        log_requests([request_id])
         code = 500  # unless an answer begins
 
         async def send_counted(message: Message) -> None:
@@ -113,17 +111,6 @@ class RequestMiddleware:
             if turn is not None:
                 turn.end()
             self._metrics.count(scope["path"], code, time.perf_counter() - started_s)
-
-
-def _request_id(scope: Scope) -> str:
-    """Return the caller's request id, or a random id.
-
-    A random id replaces an id that breaks log lines, or that would make metrics take the request for a probe.
-    """
-    given = Headers(scope=scope).get(REQUEST_ID_HEADER, "")
-    if REQUEST_ID.fullmatch(given) and not given.startswith(PROBE_PREFIX):
-        return given
-    return secrets.token_hex(_ID_BYTES)
 
 
 class CallerLeftError(Exception):
@@ -146,6 +133,14 @@ async def while_connected(request: Request, work: Coroutine[Any, Any, Returned])
         for task in (working, leaving):
             task.cancel()
         await asyncio.gather(working, leaving, return_exceptions=True)
+
+
+async def within(timeout_s: float, work: Coroutine[Any, Any, Returned]) -> Returned:
+    """Return the result of ``work``, calls of Triton. Cancels it and raises DeadlineExceededError if it is late."""
+    try:
+        return await asyncio.wait_for(work, timeout_s)
+    except (asyncio.TimeoutError, DeadlineExceededError) as error:
+        raise DeadlineExceededError(f"Triton: no answer within {timeout_s:g} s") from error
 
 
 async def _disconnected(request: Request) -> None:

@@ -24,8 +24,11 @@ from pydantic import (
     WithJsonSchema,
 )
 
+from rfm_client import InvalidSampleError, UInt8Array, float_frames_to_uint8
+
 UPLOAD_KEY = "__numpy_file__"
 MAX_AXES = 4  # of frames, [T, H, W, 3]
+RGB_CHANNELS, RGBA_CHANNELS = 3, 4
 
 _UPLOADED = {
     "type": "object",
@@ -120,6 +123,29 @@ class TrajectoryInput(BaseModel):
     )
     data_source: Any = None
     metadata: Any = None
+
+    @property
+    def has_embeddings(self) -> bool:
+        """True with embeddings, or with a file of embeddings and no frames."""
+        return self.video_embeddings is not None or (self.embeddings_path is not None and self.frames is None)
+
+    @property
+    def uint8_frames(self) -> UInt8Array:
+        """The frames of an array as uint8 [T, H, W, C], converted as the evaluation server does.
+
+        Floats are clipped and truncated. A single frame becomes a video of one frame. RGBA loses its alpha channel.
+        Raises InvalidSampleError for integers outside 0..255. ``Trajectory`` refuses all other types and shapes.
+        """
+        array: np.ndarray[Any, Any] = self.frames if self.frames.ndim != 3 else self.frames[np.newaxis]
+        if array.ndim == 4 and array.shape[-1] == RGBA_CHANNELS:
+            array = array[..., :RGB_CHANNELS]
+        if array.dtype.kind == "f":
+            return float_frames_to_uint8(array)
+        if array.dtype != np.uint8 and array.dtype.kind in "iu" and array.size:
+            if array.min() < 0 or array.max() > 255:
+                raise InvalidSampleError.at("frames", "values in 0..255", f"{array.min()}..{array.max()}")
+            return array.astype(np.uint8)
+        return array
 
 
 class _Sample(BaseModel):

@@ -6,16 +6,17 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from fastapi.exceptions import RequestValidationError
 
 from rfm_client import (
     AsyncRewardClient,
-    DeadlineExceededError,
     Float32Array,
     InvalidSampleError,
     ModelInfo,
@@ -31,23 +32,19 @@ from rfm_client import (
     SimilarityResult,
     SimilaritySample,
     Trajectory,
-    UInt8Array,
-    as_array,
-    float_frames_to_uint8,
 )
-from rfm_client.frames import BlankFrames, what_is_shown
+from rfm_client.frames import BlankFrames, Sampling
 from rfm_client.options import first_names
-from rfm_client.serving import MIN_BYTES, Deadline, off_loop
+from rfm_client.serving import off_loop
 from rfm_gateway import schema
-from rfm_gateway.body import Batch, Decoded, invalid
+from rfm_gateway.body import Batch, BodyLimits, invalid
 from rfm_gateway.folder import RequestFiles
+from rfm_gateway.observe import within
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
-RGB_CHANNELS, RGBA_CHANNELS = 3, 4
-
-_TEXT_FRAME_PX = 32  # of the blank frame that is sent with a task to get only the task's embedding
+_BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the embedding of the task
 _SIDES = {  # the gateway's fields, by the client's names
     "first": "chosen_trajectory",
     "second": "rejected_trajectory",
@@ -56,25 +53,19 @@ _SIDES = {  # the gateway's fields, by the client's names
 }
 logger = logging.getLogger("rfm_gateway")
 
-Texts: TypeAlias = Mapping[
-    str, Float32Array | InvalidSampleError
-]  # by task: its embedding, or the error of the encoder
+Text: TypeAlias = Float32Array | InvalidSampleError  # the embedding of a task, or the encoder's error
 
 
 class Evaluator:
     """Scores batches with the server behind ``client``.
 
     folder: folder of files that samples may name, with links resolved; None: no files
-    max_decoded_bytes: limit of the decoded files of one request
     """
 
-    def __init__(
-        self, client: AsyncRewardClient, timeout_s: float, folder: Path | None = None, max_decoded_bytes: int = 0
-    ) -> None:
+    def __init__(self, client: AsyncRewardClient, limits: BodyLimits, folder: Path | None = None) -> None:
         self._client = client
-        self._timeout_s = timeout_s
+        self._limits = limits
         self._folder = folder
-        self._max_decoded_bytes = max_decoded_bytes
 
     async def evaluate(self, batch: Batch, request_id: str) -> schema.EvaluateBatchAnswer:
         """Return the answer to a whole batch. A missing sample would shift later scores, or be read as a reward of 0.
@@ -82,97 +73,68 @@ class Evaluator:
         Raises RequestValidationError that lists all invalid samples, HTTPException for files that are too large, and
         ServerError.
         """
-        deadline = Deadline(self._timeout_s)
-        try:
-            return await self._evaluate(batch, deadline, request_id)
-        except DeadlineExceededError as error:  # its message has the time limit of one call, not of all
-            raise deadline.exceeded("Triton") from error
+        with self._limits.decoding() as take:
+            scoring = self._evaluate(batch, RequestFiles(self._folder, take), request_id)
+            return await within(self._limits.timeout_s, scoring)
 
-    async def _evaluate(self, batch: Batch, deadline: Deadline, request_id: str) -> schema.EvaluateBatchAnswer:
-        served = await self._served(batch.samples, deadline)
-        texts = await self._texts(batch.samples, served, deadline, request_id)
-        files = RequestFiles(self._folder, Decoded(self._max_decoded_bytes))
-        by_prefix = batch.use_frame_steps and served.shows_whole_prefixes
-        conversion = _Conversion(served, texts, files, FRAME_STEPS if batch.use_frame_steps and not by_prefix else 0)
-        num_bytes = batch.num_bytes if self._folder is None else MIN_BYTES  # files may be large
+    async def _evaluate(self, batch: Batch, files: RequestFiles, request_id: str) -> schema.EvaluateBatchAnswer:
+        embeddings, frames = await self._served(batch.samples)
+        texts = await self._texts(batch.samples, request_id) if embeddings is not None else {}
+        by_prefix = batch.use_frame_steps and frames is not None and frames.scores_whole_prefixes
+        frame_steps = FRAME_STEPS if batch.use_frame_steps and not by_prefix else 0
+        conversion = _Conversion(embeddings, frames, texts, files, frame_steps)
+        num_bytes = batch.num_bytes if self._folder is None else None  # files may be large
         samples = await off_loop(num_bytes, conversion.samples, batch.samples)
-        await off_loop(num_bytes, _log_blank_samples, samples)
         asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
-        flat = await self._client.evaluate(
-            [each for of_sample in asked for each in of_sample],
-            return_errors=True,
-            timeout_s=deadline.remaining_s(),
-            request_id=request_id,
-        )
-        answers = iter(flat)
-        outcomes = [_joined([next(answers) for _ in of_sample]) for of_sample in asked]
-        failed = {index: outcome for index, outcome in enumerate(outcomes) if isinstance(outcome, RewardError)}
-        unfit = {index: error for index, error in failed.items() if isinstance(error, InvalidSampleError)}
-        if unfit:
-            raise _refused(unfit)
-        for error in failed.values():
-            raise error
-        results = [
-            outcome for outcome in outcomes if not isinstance(outcome, RewardError)
-        ]  # no outcome is an error here
-        group = 1 if served.frames is None or batch.use_frame_steps else await self._frames_per_value(results, deadline)
+        flat = chain.from_iterable(asked)
+        outcomes = iter(await self._client.evaluate(flat, return_errors=True, request_id=request_id))
+        results = _results([list(islice(outcomes, len(of_sample))) for of_sample in asked])
+        group = 1 if frames is None or batch.use_frame_steps else await self._frames_per_value(results)
         return _answer(batch.samples, results, group)
 
-    async def _frames_per_value(self, results: Sequence[Result], deadline: Deadline) -> int:
+    async def _frames_per_value(self, results: Sequence[Result]) -> int:
         """Return how many frames share a value. Raises ServerUnavailableError while another version is loaded."""
-        info = await self._client.model_info(frames=True, timeout_s=deadline.remaining_s())
+        info = await self._client.model_info(frames=True)
         unknown = {str(result.model_version) for result in results} - set(info.versions)
         if info.versions and unknown:
-            got = ", ".join(sorted(unknown))
-            expected = f"model_version: expected one of {', '.join(info.versions)}"
-            raise ServerUnavailableError(f"{expected}, got {got}: the checkpoint is being replaced, try again")
+            fault = f"model_version: expected one of {', '.join(info.versions)}, got {', '.join(sorted(unknown))}"
+            raise ServerUnavailableError(f"{fault}: the checkpoint is being replaced, try again")
         return info.frames_per_value
 
-    async def _served(self, samples: Sequence[schema.Sample], deadline: Deadline) -> _Served:
-        """Return the models that can score the samples.
+    async def _served(self, samples: Sequence[schema.Sample]) -> tuple[ModelInfo | None, ModelInfo | None]:
+        """Return the models for embeddings and for raw frames that can score the samples; None: not served, or unused.
 
         Asks about the model for frames only if a sample may need it, because the client does not cache that a model is
         missing and would send a request each time.
         """
-        trajectories = [t for sample in samples for t in sample.named_trajectories.values()]
-        needs_embeddings = any(map(_has_embeddings, trajectories))
-        embeddings = await self._model_info(deadline, frames=False) if needs_embeddings else None
-        has_frames = any(trajectory.frames is not None for trajectory in trajectories)
-        needs_frames = has_frames and not (embeddings is not None and all(map(_has_embeddings, trajectories)))
-        frames = await self._model_info(deadline, frames=True) if needs_frames else None
+        given = [trajectory for sample in samples for trajectory in sample.named_trajectories.values()]
+        embedded = [trajectory.has_embeddings for trajectory in given]
+        embeddings = await self._model_info(frames=False) if any(embedded) else None
+        has_frames = any(trajectory.frames is not None for trajectory in given)
+        needs_frames = has_frames and not (embeddings is not None and all(embedded))
+        frames = await self._model_info(frames=True) if needs_frames else None
         if embeddings is None and frames is None:  # raises ModelNotFoundError if the other model is missing, too
-            await self._client.model_info(frames=not needs_frames, timeout_s=deadline.remaining_s())
-        return _Served(embeddings, frames)
+            await self._client.model_info(frames=not needs_frames)
+        return embeddings, frames
 
-    async def _model_info(self, deadline: Deadline, *, frames: bool) -> ModelInfo | None:
-        try:
-            return await self._client.model_info(frames=frames, timeout_s=deadline.remaining_s())
-        except ModelNotFoundError:
-            return None
+    async def _model_info(self, *, frames: bool) -> ModelInfo | None:
+        with suppress(ModelNotFoundError):
+            return await self._client.model_info(frames=frames)
+        return None
 
-    async def _texts(
-        self, samples: Sequence[schema.Sample], served: _Served, deadline: Deadline, request_id: str
-    ) -> Texts:
+    async def _texts(self, samples: Sequence[schema.Sample], request_id: str) -> Mapping[str, Text]:
         """Return embeddings by task, for tasks without an embedding; empty without an encoder."""
-        tasks = {
-            first.task
-            for first, *_ in (tuple(sample.named_trajectories.values()) for sample in samples)
-            if _has_embeddings(first) and first.text_embedding is None and first.task and first.task.strip()
-        }
-        if not tasks or served.embeddings is None:
-            return {}
-        try:
-            texts = await asyncio.gather(*(self._text(task, deadline, request_id) for task in tasks))
+        firsts = [next(iter(sample.named_trajectories.values())) for sample in samples]
+        unread = [first.task for first in firsts if first.has_embeddings and first.text_embedding is None]
+        tasks = {task for task in unread if task and task.strip()}
+        with suppress(ModelNotFoundError):
+            texts = await asyncio.gather(*(self._text(task, request_id) for task in tasks))
             return dict(zip(tasks, texts, strict=True))
-        except ModelNotFoundError:
-            return {}
+        return {}
 
-    async def _text(self, task: str, deadline: Deadline, request_id: str) -> Float32Array | InvalidSampleError:
-        blank = np.zeros((1, _TEXT_FRAME_PX, _TEXT_FRAME_PX, 3), np.uint8)
+    async def _text(self, task: str, request_id: str) -> Text:
         try:
-            encoded = await self._client.encode(
-                Trajectory(frames=blank, task=task), timeout_s=deadline.remaining_s(), request_id=request_id
-            )
+            encoded = await self._client.encode(Trajectory(frames=_BLANK, task=task), request_id=request_id)
         except InvalidSampleError as error:  # of this task alone
             return error
         assert encoded.text_embedding is not None
@@ -180,34 +142,22 @@ class Evaluator:
 
 
 @dataclass(frozen=True)
-class _Served:
-    """The checkpoint's models for embeddings and for raw frames; None: not served."""
-
-    embeddings: ModelInfo | None
-    frames: ModelInfo | None
-
-    @property
-    def shows_whole_prefixes(self) -> bool:
-        """True for RoboReward, to which the evaluation server shows all frames of a prefix."""
-        return self.frames is not None and (self.frames.kind or "").startswith("RoboReward")
-
-
-@dataclass(frozen=True)
 class _Conversion:
     """Conversion of one request's samples.
 
-    texts: embeddings of tasks
-    files: the files that samples name
+    embedding_model, frame_model: models that score them; None: not served, or unused
+    texts: embeddings by task
     frame_steps: frames to which each prefix of a progress sample is sampled; 0: no dense mode
     """
 
-    served: _Served
-    texts: Texts
+    embedding_model: ModelInfo | None
+    frame_model: ModelInfo | None
+    texts: Mapping[str, Text]
     files: RequestFiles
     frame_steps: int
 
     def samples(self, samples: Sequence[schema.Sample]) -> list[Sample]:
-        """Return the client's samples.
+        """Return the client's samples, and log those that show nothing.
 
         Raises RequestValidationError that lists all invalid samples, and HTTPException as ``RequestFiles`` does.
         """
@@ -220,27 +170,25 @@ class _Conversion:
                 errors[index] = error
         if errors:
             raise _refused(errors)
+        _log_blank_samples(converted)
         return converted
 
     def _sample(self, sample: schema.Sample) -> Sample:
         given = sample.named_trajectories
-        by_embeddings = self.served.embeddings is not None and all(map(_has_embeddings, given.values()))
+        by_embeddings = self.embedding_model is not None and all(each.has_embeddings for each in given.values())
         trajectories: list[Trajectory] = []
-        for name, trajectory in given.items():
+        for name, each in given.items():
             try:
-                if by_embeddings:
-                    trajectories.append(self._of_embeddings(trajectory, needs_text=not trajectories))
-                else:
-                    trajectories.append(self._of_frames(trajectory))
+                is_first = not trajectories
+                trajectories.append(self._of_embeddings(each, is_first) if by_embeddings else self._of_frames(each))
             except InvalidSampleError as error:
                 raise error.inside(name) from None
         if isinstance(sample, schema.ProgressInput):
             return ProgressSample(trajectories[0], frame_steps=self.frame_steps)
-        if isinstance(sample, schema.PreferenceInput):
-            return PreferenceSample(*trajectories)
-        return SimilaritySample(*trajectories)
+        kind = PreferenceSample if isinstance(sample, schema.PreferenceInput) else SimilaritySample
+        return kind(*trajectories)
 
-    def _of_embeddings(self, given: schema.TrajectoryInput, *, needs_text: bool) -> Trajectory:
+    def _of_embeddings(self, given: schema.TrajectoryInput, needs_text: bool) -> Trajectory:
         video, text = given.video_embeddings, given.text_embedding
         if video is None:
             in_file = self.files.embeddings(given.embeddings_path or "")
@@ -250,41 +198,36 @@ class _Conversion:
             if isinstance(text, InvalidSampleError):
                 raise text
         trajectory = Trajectory(video_embeddings=video, text_embedding=text, task=given.task or "")
-        info = self.served.embeddings
-        assert info is not None and trajectory.video_embeddings is not None
-        _check_width("video_embeddings", trajectory.video_embeddings, info.video_dim)
-        if trajectory.text_embedding is not None:
-            _check_width("text_embedding", trajectory.text_embedding, info.text_dim)
-        elif needs_text:
-            got = "neither" if not (given.task and given.task.strip()) else "a task, and no encoder is served"
+        assert self.embedding_model is not None
+        widths = {"video_embeddings": self.embedding_model.video_dim, "text_embedding": self.embedding_model.text_dim}
+        for where, width in widths.items():
+            array: Float32Array | None = getattr(trajectory, where)
+            if array is not None and width not in (None, array.shape[-1]):
+                raise InvalidSampleError.at(where, f"[{'T, ' * (array.ndim - 1)}{width}]", str(list(array.shape)))
+        if trajectory.text_embedding is None and needs_text:
+            got = "a task, and no encoder is served" if given.task and given.task.strip() else "neither"
             raise InvalidSampleError.at("text_embedding", "an embedding, or a task to encode", got)
         return trajectory
 
     def _of_frames(self, given: schema.TrajectoryInput) -> Trajectory:
+        if given.frames is None and given.has_embeddings and self.embedding_model is not None:
+            raise InvalidSampleError.at("video_embeddings", "them in both trajectories or neither", "one of two")
         if given.frames is None:
-            what = "video_embeddings" if _has_embeddings(given) else "neither frames nor video_embeddings"
-            if _has_embeddings(given) and self.served.embeddings is not None:
-                raise InvalidSampleError.at("video_embeddings", "them in both trajectories or neither", "one of two")
-            raise InvalidSampleError.at("frames", "frames", what)
-        if self.served.frames is None:
-            raise InvalidSampleError.at(
-                "video_embeddings", "embeddings, since no model for raw frames is served", "frames"
-            )
-        if isinstance(given.frames, list):
-            return Trajectory(frames=self.files.frames(given.frames), task=given.task or "")
-        return Trajectory(frames=_uint8(given.frames), task=given.task or "")
+            got = "video_embeddings" if given.has_embeddings else "neither frames nor video_embeddings"
+            raise InvalidSampleError.at("frames", "frames", got)
+        if self.frame_model is None:
+            expected = "embeddings, since no model for raw frames is served"
+            raise InvalidSampleError.at("video_embeddings", expected, "frames")
+        frames = self.files.frames(given.frames) if isinstance(given.frames, list) else given.uint8_frames
+        return Trajectory(frames=frames, task=given.task or "")
 
 
 def _log_blank_samples(samples: Sequence[Sample]) -> None:
-    """Log a line about the samples with frames that show nothing."""
-    blank: dict[int, int] = {}
-    for index, sample in enumerate(samples):
-        for frames in (trajectory.frames for trajectory in sample.trajectories):
-            highest = None if frames is None else BlankFrames(frames).highest
-            if highest is not None:
-                blank[index] = max(highest, blank.get(index, 0))
+    shown = [(index, t.frames) for index, sample in enumerate(samples) for t in sample.trajectories]
+    blank = [(index, found) for index, t in shown if t is not None and (found := BlankFrames(t)).told]
     if blank:
-        names, told = first_names(blank, 12), what_is_shown(max(blank.values()))
+        names = first_names(dict.fromkeys(index for index, _ in blank), 12)
+        told = max((found for _, found in blank), key=lambda found: found.highest or 0).told
         logger.warning("samples %s: %s: their scores mean nothing", names, told)
 
 
@@ -296,46 +239,20 @@ def _prefixes(sample: Sample) -> list[Sample]:
     return [ProgressSample(Trajectory(frames=frames[:end], task=task)) for end in range(1, len(frames) + 1)]
 
 
-def _joined(outcomes: Sequence[Result | RewardError]) -> Result | RewardError:
-    """Return the last score of each prefix, or the first error; a single outcome as it is."""
-    if len(outcomes) == 1:
-        return outcomes[0]
-    results = [outcome for outcome in outcomes if isinstance(outcome, ProgressResult)]
-    if len(results) < len(outcomes):
-        return next(outcome for outcome in outcomes if isinstance(outcome, RewardError))
-    progress, success = (np.array([getattr(each, name)[-1] for each in results]) for name in ("progress", "success"))
-    return ProgressResult(progress=progress, success=success, model_version=results[-1].model_version)
+def _results(outcomes: Sequence[Sequence[Result | RewardError]]) -> list[Result]:
+    """Return the result of each sample from the outcomes of its prefixes, or from its only outcome.
 
-
-def _has_embeddings(trajectory: schema.TrajectoryInput) -> bool:
-    """True if the trajectory has embeddings, or a file of embeddings and no frames."""
-    in_file = trajectory.embeddings_path is not None and trajectory.frames is None
-    return trajectory.video_embeddings is not None or in_file
-
-
-def _uint8(frames: Any) -> UInt8Array:
-    """Return frames as uint8 [T, H, W, C], converted as the evaluation server does.
-
-    Floats are clipped and truncated. A single frame becomes a video of one frame. RGBA loses its alpha channel.
+    Raises RequestValidationError that lists all invalid samples, else the first error.
     """
-    array = as_array(frames)
-    if array.ndim == 3:
-        array = array[np.newaxis]
-    if array.ndim == 4 and array.shape[-1] == RGBA_CHANNELS:
-        array = array[..., :RGB_CHANNELS]
-    if array.dtype.kind == "f":
-        return float_frames_to_uint8(array)
-    if array.dtype != np.uint8 and array.dtype.kind in "iu" and array.size:
-        if array.min() < 0 or array.max() > 255:
-            raise InvalidSampleError.at("frames", "values in 0..255", f"{array.min()}..{array.max()}")
-        return array.astype(np.uint8)
-    return array  # Trajectory refuses all other types and shapes
-
-
-def _check_width(where: str, array: Float32Array, width: int | None) -> None:
-    if width is not None and array.shape[-1] != width:
-        axes = "[T, " if array.ndim > 1 else "["
-        raise InvalidSampleError.at(where, f"{axes}{width}]", str(list(array.shape)))
+    outcome_of = ((index, each) for index, of_sample in enumerate(outcomes) for each in reversed(of_sample))
+    failed = {index: error for index, error in outcome_of if isinstance(error, RewardError)}  # each sample's first
+    unfit = {index: error for index, error in failed.items() if isinstance(error, InvalidSampleError)}
+    if unfit:
+        raise _refused(unfit)
+    for error in failed.values():
+        raise error
+    results, whole = [cast("list[Result]", of_sample) for of_sample in outcomes], Sampling("all")
+    return [each[0] if len(each) == 1 else whole.joined(cast("list[ProgressResult]", each)) for each in results]
 
 
 def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:
@@ -355,17 +272,15 @@ def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: 
     """
     progress = [result for result in results if isinstance(result, ProgressResult)]
     preferences = [result.preference for result in results if isinstance(result, PreferenceResult)]
-    similar = [(s, r) for s, r in zip(samples, results, strict=True) if isinstance(r, SimilarityResult)]
-    success = [result.success[::group] for result in progress]
+    similarities = [result.similarity for result in results if isinstance(result, SimilarityResult)]
+    similar = [sample for sample in samples if isinstance(sample, schema.SimilarityInput)]
     answer = schema.EvaluateBatchAnswer()
     if progress:
-        answer.outputs_progress = schema.ProgressOutputs.model_construct(
-            progress_pred=[result.progress[::group].tolist() for result in progress]
-        )
-    if progress and all(np.isfinite(values).all() for values in success):
-        answer.outputs_success = schema.SuccessOutputs.model_construct(
-            success_probs=[values.tolist() for values in success]
-        )
+        values = [result.progress[::group].tolist() for result in progress]
+        answer.outputs_progress = schema.ProgressOutputs.model_construct(progress_pred=values)
+    if progress and all(np.isfinite(result.success[::group]).all() for result in progress):
+        values = [result.success[::group].tolist() for result in progress]
+        answer.outputs_success = schema.SuccessOutputs.model_construct(success_probs=values)
     if preferences:
         answer.outputs_preference = schema.PreferenceOutputs.model_construct(
             predictions=[int(preference > PREFERRED) for preference in preferences],
@@ -373,12 +288,12 @@ def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: 
             preference_labels=[CHOSEN_IS_FIRST] * len(preferences),
         )
     if similar:
-        references = [sample.ref_trajectory for sample, _ in similar if isinstance(sample, schema.SimilarityInput)]
+        references = [sample.ref_trajectory for sample in similar]
         answer.outputs_similarity = schema.SimilarityOutputs.model_construct(
-            sim_score_ref_sim=[result.similarity for _, result in similar],
+            sim_score_ref_sim=similarities,
             task=[reference.task for reference in references],
             data_source=[reference.data_source for reference in references],
-            data_gen_strategy=[getattr(sample, "data_gen_strategy", None) for sample, _ in similar],
+            data_gen_strategy=[sample.data_gen_strategy for sample in similar],
             metadata=[{} if reference.metadata is None else reference.metadata for reference in references],
         )
     return answer

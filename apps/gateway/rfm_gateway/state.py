@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Sequence
-
-import anyio
+from collections.abc import Callable
 
 from rfm_client import (
     AsyncRewardClient,
@@ -18,18 +16,10 @@ from rfm_client import (
     ServerError,
     ServerUnavailableError,
 )
-from rfm_client.serving import (
-    PROBE_PREFIX,
-    Credentials,
-    Deadline,
-    Device,
-    ServerStatus,
-    blank_trajectory,
-    encoder_name,
-    frames_name,
-    read_status,
-)
+from rfm_client.serving import ServerStatus
 from rfm_gateway import schema
+from rfm_gateway.config import GatewayConfig
+from rfm_gateway.observe import within
 
 HEALTH_TIMEOUT_S = 3.5  # of all probes; with HEALTH_KEPT_S less than the promised 5 s
 PROBE_TIMEOUT_S = 1.5  # of one probe; a slower model may be busy
@@ -40,25 +30,13 @@ MS_PER_S = 1e3
 
 
 class TritonState:
-    """The state of ``model`` on the server at ``url``, whose metrics are at ``metrics_url``.
-
-    clock_s: returns the time in seconds
-    """
+    """The state of the client's checkpoint. clock_s: returns the time in seconds"""
 
     def __init__(
-        self,
-        client: AsyncRewardClient,
-        url: str,
-        metrics_url: str | None,
-        model: str,
-        credentials: Credentials | None = None,
-        clock_s: Callable[[], float] = time.monotonic,
+        self, client: AsyncRewardClient, config: GatewayConfig, clock_s: Callable[[], float] = time.monotonic
     ) -> None:
         self._client = client
-        self._url = url
-        self._metrics_url = metrics_url
-        self._model = model
-        self._credentials = credentials
+        self._config = config
         self._clock_s = clock_s
         self._refreshing = asyncio.Lock()
         self._refreshed_s = float("-inf")
@@ -67,7 +45,7 @@ class TritonState:
 
     async def gpu_status(self) -> schema.GpuStatus:
         """Return the answer of ``/gpu_status``. Raises ServerError."""
-        return _gpu_status(await self._status(STATUS_TIMEOUT_S), self._model)
+        return self._gpu_status(await self._config.status(STATUS_TIMEOUT_S))
 
     async def health(self) -> schema.Health:
         """Return the answer of ``/health`` within HEALTH_TIMEOUT_S.
@@ -76,7 +54,7 @@ class TritonState:
         """
         async with self._refreshing:
             if self._clock_s() - self._refreshed_s >= HEALTH_KEPT_S:
-                self._health = await self._probe_all(Deadline(HEALTH_TIMEOUT_S))
+                self._health = await self._probe_all()
                 self._refreshed_s = self._clock_s()
             found = self._health
         if isinstance(found, str):
@@ -85,9 +63,8 @@ class TritonState:
 
     async def model_info(self) -> schema.ModelInformation:
         """Return the answer of ``/model_info``. Raises ServerError."""
-        deadline = Deadline(STATUS_TIMEOUT_S)
-        info = (await self._infos(deadline))[0]
-        devices = await self._devices(deadline)
+        info = (await within(STATUS_TIMEOUT_S, self._infos()))[0]
+        devices = await self._devices(STATUS_TIMEOUT_S)
         parts = info.network.get("parameters", {})
         total = sum(parts.values())
         return schema.ModelInformation(
@@ -105,28 +82,20 @@ class TritonState:
             },
         )
 
-    async def _status(self, timeout_s: float) -> ServerStatus:
-        return await asyncio.to_thread(
-            read_status, self._url, metrics_url=self._metrics_url, timeout_s=timeout_s, credentials=self._credentials
-        )
-
-    async def _devices(self, deadline: Deadline) -> schema.GpuStatus | None:
+    async def _devices(self, timeout_s: float) -> schema.GpuStatus | None:
         """Return the state of the devices; None if the metrics cannot be read, since scoring does not need them."""
         try:
-            with anyio.move_on_after(deadline.remaining_s()):
-                return await self.gpu_status()
+            return await within(timeout_s, self.gpu_status())
         except ServerError:
-            pass
-        return None
+            return None
 
-    async def _infos(self, deadline: Deadline) -> list[ModelInfo]:
+    async def _infos(self) -> list[ModelInfo]:
         """Return facts about the models for embeddings and for raw frames that are served now."""
         infos = []
         missing = None
         for frames in (False, True):
             try:
-                left_s = deadline.remaining_s()
-                infos.append(await self._client.model_info(frames=frames, refresh=True, timeout_s=left_s))
+                infos.append(await self._client.model_info(frames=frames, refresh=True))
             except ModelNotFoundError as error:
                 missing = error
         if not infos:
@@ -134,17 +103,16 @@ class TritonState:
             raise missing
         return infos
 
-    async def _probe_all(self, deadline: Deadline) -> schema.Health | str:
+    async def _probe_all(self) -> schema.Health | str:
         """Probe every model. Returns a text with the reason if a model neither answers nor is busy."""
+        ends_s = time.monotonic() + HEALTH_TIMEOUT_S
         try:
-            infos = await self._infos(deadline)
-            late = [name for name in await asyncio.gather(*map(self._late_name, infos)) if name is not None]
-            stall = await self._stall(late, deadline)
+            stall = await within(HEALTH_TIMEOUT_S, self._stall())
         except RewardError as error:
             return str(error)
         if stall is not None:
             return stall
-        devices = await self._devices(deadline)
+        devices = await self._devices(ends_s - time.monotonic())
         return schema.Health(
             status="healthy",
             available_gpus=None if devices is None else devices.available_gpus,
@@ -153,16 +121,17 @@ class TritonState:
 
     async def _late_name(self, info: ModelInfo) -> str | None:
         """Probe a model; return its name if the answer is late. Raises RewardError."""
-        blank = blank_trajectory(info.widths)
         try:
-            await self._client.progress(blank, timeout_s=PROBE_TIMEOUT_S, request_id=PROBE_PREFIX)
+            await self._client.probe(info, timeout_s=PROBE_TIMEOUT_S)
         except DeadlineExceededError:
             return info.name
         return None
 
-    async def _stall(self, late: Sequence[str], deadline: Deadline) -> str | None:
-        """Return why late models count as failed; None: they may be busy. Raises RewardError."""
-        status = await self._status(deadline.remaining_s()) if late else None
+    async def _stall(self) -> str | None:
+        """Return why models with late answers count as failed; None: they may be busy. Raises RewardError."""
+        names = await asyncio.gather(*map(self._late_name, await self._infos()))
+        late = [name for name in names if name is not None]
+        status = await self._config.status(HEALTH_TIMEOUT_S) if late else None
         now_s, known, self._late = self._clock_s(), self._late, {}
         for name in late:
             assert status is not None
@@ -174,44 +143,40 @@ class TritonState:
                 return f"{name}: no answer within {PROBE_TIMEOUT_S:g} s, and nothing finished for {STALL_S:g} s"
         return None
 
-
-def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
-    served = {name for device in status.devices for name in device.work}
-    # An ensemble is left out, since its parts count its requests.
-    scorer = model if model in served else frames_name(model)
-    parts = {scorer, encoder_name(model)}
-    devices = [device for device in status.devices if parts & device.work.keys()] or list(status.devices)
-    if not devices:
-        raise ServerUnavailableError(status.metrics_error or f"{status.metrics_url}: it names no device")
-    is_waiting = any(entry.requests_pending for entry in status.models)
-    last_used = max((entry.last_used_s for entry in status.models if entry.last_used_s), default=None)
-    stats = {
-        str(number): schema.GpuStats(
-            device=device.name,
-            status="processing" if is_waiting else "ready",
-            total_requests=device.work[scorer].requests if scorer in device.work else 0,
-            total_processing_time=sum(_busy_s(status, device, name) for name in parts),
-            last_used=last_used,
-            utilization=device.utilization,
-            memory_used_bytes=device.memory_used_bytes,
-            memory_total_bytes=device.memory_total_bytes,
+    def _gpu_status(self, status: ServerStatus) -> schema.GpuStatus:
+        names, served = self._client.model_names, {name for device in status.devices for name in device.work}
+        # An ensemble is left out, since its parts count its requests.
+        scorer = names["embeddings"] if names["embeddings"] in served else names["frames"]
+        busy_s = {name: _busy_s(status, name) for name in (scorer, names["encoder"])}
+        devices = [device for device in status.devices if busy_s.keys() & device.work.keys()] or list(status.devices)
+        if not devices:
+            raise ServerUnavailableError(status.metrics_error or f"{status.metrics_url}: it names no device")
+        is_waiting = any(entry.requests_pending for entry in status.models)
+        stats = {
+            str(number): schema.GpuStats(
+                device=device.name,
+                status="processing" if is_waiting else "ready",
+                total_requests=device.work[scorer].requests if scorer in device.work else 0,
+                total_processing_time=sum(of_device.get(device.name, 0.0) for of_device in busy_s.values()),
+                last_used=max((entry.last_used_s for entry in status.models if entry.last_used_s), default=None),
+                utilization=device.utilization,
+                memory_used_bytes=device.memory_used_bytes,
+                memory_total_bytes=device.memory_total_bytes,
+            )
+            for number, device in enumerate(devices)
+        }
+        count = len(devices)
+        return schema.GpuStatus(
+            total_gpus=count,
+            available_gpus=0 if is_waiting else count,
+            max_workers=count,
+            pool_size=count,
+            gpu_stats=stats,
         )
-        for number, device in enumerate(devices)
-    }
-    count = len(devices)
-    return schema.GpuStatus(
-        total_gpus=count,
-        available_gpus=0 if is_waiting else count,
-        max_workers=count,
-        pool_size=count,
-        gpu_stats=stats,
-    )
 
 
-def _busy_s(status: ServerStatus, device: Device, model: str) -> float:
-    """Return the seconds that a model computed on a device: Triton's total, by the device's share of the requests."""
-    on_all = sum(each.work[model].compute_s for each in status.devices if model in each.work)
-    if model not in device.work or not on_all:
-        return 0.0
-    batches_s = sum(entry.busy_ms for entry in status.models if entry.name == model) / MS_PER_S
-    return batches_s * device.work[model].compute_s / on_all
+def _busy_s(status: ServerStatus, model: str) -> dict[str, float]:
+    """Return the seconds that a model computed, by device: Triton's total, divided as the requests' time is."""
+    total_s = sum(entry.busy_ms for entry in status.models if entry.name == model) / MS_PER_S
+    shares = {device.name: device.work[model].compute_s for device in status.devices if model in device.work}
+    return {name: total_s * share / sum(shares.values()) for name, share in shares.items() if share}

@@ -8,26 +8,19 @@ with RewardClient("grpc://localhost:8001") as client:
     report = label(open_dataset("my_dataset"), ClientScorer(client), LabelOptions(cameras=("top",)))
 """
 
-from rfm_labels.datasets import (
-    Channels,
-    Dataset,
-    DatasetEpisode,
-    DatasetError,
-    Orient,
-    iter_episodes,
-    open_dataset,
-)
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, iter_episodes
+from rfm_labels.datasets.faults import DatasetError
+from rfm_labels.datasets.opening import open_dataset
 from rfm_labels.evaluation import Evaluation, LabelComparison, evaluate_labels, read_outcomes
 from rfm_labels.hdf5_tables import stored_in
-from rfm_labels.label import Report, label, label_with_ray
 from rfm_labels.label_files import Curve, EpisodeLabels, find_label_files, read_episode_labels, read_provenance
-from rfm_labels.options import LabelOptions, RayOptions, parse_episodes
-from rfm_labels.run import Watch
+from rfm_labels.labelling import Report, label
+from rfm_labels.options import LabelOptions, RayOptions, Watch, parse_episodes
+from rfm_labels.ray_engine import label_with_ray
 from rfm_labels.scorer import CheckpointFacts, ClientScorer, Scorer
 from rfm_labels.summary import Summary, summarise
 
 __all__ = [
-    "Channels",
     "CheckpointFacts",
     "ClientScorer",
     "Curve",
@@ -38,7 +31,6 @@ __all__ = [
     "Evaluation",
     "LabelComparison",
     "LabelOptions",
-    "Orient",
     "RayOptions",
     "Report",
     "Scorer",

@@ -17,18 +17,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_labels.datasets.lerobot_rows import column_types, read_table
-from rfm_labels.datasets.lerobot_v21 import EPISODES_FILE, json_lines
-from rfm_labels.datasets.protocol import DatasetError, require
-from rfm_labels.episode_scores import PROGRESS, SUCCESS
+from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
 from rfm_labels.hdf5_tables import full_path
-from rfm_labels.label_files import PROGRESS_ENDING, read_cost, read_label_table
+from rfm_labels.label_files import read_cost, read_label_table
+from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.summary import BACKWARDS_BY
+from rfm_labels.writing import PROGRESS_ENDING
 
 Floats = npt.NDArray[np.floating[Any]]
 
 _OUTCOMES = {"1": True, "0": False, "true": True, "false": False, "1.0": True, "0.0": False}
 _EPISODE, _SUCCESS = "episode", "success"  # columns of a CSV file of outcomes
+_ROUNDING = 1e-12  # of a balanced accuracy
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,41 +279,28 @@ def _order(progress: Floats) -> tuple[float, float] | None:
 
 def spearman(first: npt.NDArray[Any], second: npt.NDArray[Any]) -> float | None:
     """Return Spearman's rank correlation of two arrays [T]; equal values share a rank. None: an array is constant."""
-    ranks = np.stack([_ranks(first), _ranks(second)])
-    return None if (np.ptp(ranks, axis=1) == 0).any() else float(np.corrcoef(ranks)[0, 1])
+    from scipy.stats import spearmanr
+
+    is_constant = np.ptp(first) == 0 or np.ptp(second) == 0
+    return None if is_constant else float(spearmanr(first, second).statistic)
 
 
 def kendall(values: npt.NDArray[Any]) -> float | None:
     """Return Kendall's tau-b of values [T] with time; None: the values are constant."""
-    pairs = len(values) * (len(values) - 1) // 2
-    _, counts = np.unique(values, return_counts=True)
-    ties = int((counts * (counts - 1) // 2).sum())
-    if pairs == ties:
-        return None
-    concordance = sum(int(np.sign(values[lag:] - values[:-lag]).sum()) for lag in range(1, len(values)))
-    return float(concordance / np.sqrt(float(pairs) * (pairs - ties)))
+    from scipy.stats import kendalltau
 
-
-def _ranks(values: npt.NDArray[Any]) -> Floats:
-    """Return the rank of each value, from 0; equal values share their mean rank."""
-    _, where, counts = np.unique(values, return_inverse=True, return_counts=True)
-    ends = np.cumsum(counts)
-    ranks: Floats = (ends - (counts + 1) / 2)[where.reshape(-1)]
-    return ranks
+    return None if np.ptp(values) == 0 else float(kendalltau(values, np.arange(len(values))).statistic)
 
 
 def _ranking(numbers: Floats, is_success: npt.NDArray[np.bool_] | None) -> Ranking | None:
     if is_success is None or is_success.all() or not is_success.any():
         return None
-    ranks, positives = _ranks(numbers), int(is_success.sum())
-    negatives = len(numbers) - positives
-    auroc = (ranks[is_success].sum() - positives * (positives - 1) / 2) / (positives * negatives)
-    thresholds = np.unique(numbers)
-    accuracies = [
-        ((numbers[is_success] >= each).mean() + (numbers[~is_success] < each).mean()) / 2 for each in thresholds
-    ]
-    best = int(np.argmax(accuracies))
-    return Ranking(float(auroc), float(thresholds[best]), float(accuracies[best]))
+    from sklearn.metrics import roc_auc_score, roc_curve
+
+    false_positives, true_positives, thresholds = roc_curve(is_success, numbers, drop_intermediate=False)
+    accuracies = (true_positives + 1 - false_positives) / 2
+    best = np.flatnonzero(np.isclose(accuracies, accuracies.max(), rtol=0, atol=_ROUNDING))[-1]  # the lowest threshold
+    return Ranking(float(roc_auc_score(is_success, numbers)), float(thresholds[best]), float(accuracies[best]))
 
 
 def _mean(numbers: Sequence[float] | Floats) -> float | None:

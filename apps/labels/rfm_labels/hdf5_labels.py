@@ -13,18 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rfm_labels.blank_cameras import BLANK_KEY, from_metadata
-from rfm_labels.cost import Cost
-from rfm_labels.datasets.hdf5_attributes import attribute
-from rfm_labels.datasets.hdf5_contents import opened_hdf5
-from rfm_labels.datasets.protocol import require
-from rfm_labels.episode_scores import SCORES, Columns
-from rfm_labels.finished_episodes import IDENTITY, whole_file
+from rfm_labels.datasets.faults import require
+from rfm_labels.datasets.hdf5_contents import attribute, opened_hdf5
 from rfm_labels.hdf5_tables import BLANK, COST, EPISODES, PROVENANCE, columns_in
 from rfm_labels.in_place import BusyError, rewrite
-from rfm_labels.label_files import canonical_json
-from rfm_labels.labelled_before import LabelFile
+from rfm_labels.label_files import LabelFile
+from rfm_labels.metadata import BLANK_KEY, SCORES, Columns, Cost, blank_from_metadata, canonical_json
 from rfm_labels.plan import Item, Plan
+from rfm_labels.writing import IDENTITY, whole_file
 
 _DATASET_BYTES, _FILE_BYTES = 2**12, 2**20  # upper bounds of HDF5's overhead: for one column, for all attributes
 _REMEDY = "make room, or leave --in-place away: then the labels are in a file of their own"
@@ -32,8 +28,6 @@ _REMEDY = "make room, or leave --in-place away: then the labels are in a file of
 
 def hdf5_labels(file: Path, name: str) -> LabelFile | None:
     """Return the labels of this name in the file; None: no such labels. Raises DatasetError if it is no HDF5 file."""
-    if not file.exists():
-        return None
     with opened_hdf5(file) as opened:
         group = opened.get("data")
         attributes = getattr(group, "attrs", {})
@@ -48,7 +42,7 @@ def hdf5_labels(file: Path, name: str) -> LabelFile | None:
         digests,
         lambda items: _read(file, name, items),
         cost=Cost.parse(cost),
-        blank=from_metadata({BLANK_KEY: blank} if blank else {}),
+        blank=blank_from_metadata({BLANK_KEY: blank} if blank else {}),
     )
 
 

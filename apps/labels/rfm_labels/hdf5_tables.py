@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from rfm_client import Float32Array
+from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.hdf5 import is_hdf5
-from rfm_labels.datasets.hdf5_attributes import attribute
-from rfm_labels.datasets.hdf5_contents import demonstrations, members_of, opened_hdf5
-from rfm_labels.datasets.protocol import DatasetError, require
-from rfm_labels.episode_scores import PROGRESS, SCORES
+from rfm_labels.datasets.hdf5_contents import attribute, demonstrations, members_of, opened_hdf5
+from rfm_labels.metadata import PROGRESS, SCORES
 
 # Endings of attributes, after the labels' name.
 PROVENANCE, EPISODES, COST, BLANK = "provenance", "episodes", "cost", "blank_cameras"

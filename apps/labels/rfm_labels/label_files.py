@@ -1,188 +1,61 @@
 # SPDX-License-Identifier: MIT
-"""Write and read Parquet label files: a row for each frame, in the dataset's order. Needs pyarrow.
-
-``<name>_progress.parquet``: the format of LeRobot's reward-aligned behaviour cloning and of the Hub's visualizer.
-Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and those
-of each camera. If an episode has several tasks, ``progress`` is each frame's own, and ``progress_sparse`` the sum of
-what all tasks have gained.
-
-``reward_signals/<name>.parquet``: LeRobot's frame signals (schema version 1), as its open pull requests propose them.
-Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and
-those of each camera. The metadata describes each score column.
-"""
+"""Read label files of all formats: whole tables, single episodes, and how they were made. Needs pyarrow."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client import Float32Array
-from rfm_labels.blank_cameras import BLANK_KEY, BlankCameras, from_metadata
-from rfm_labels.cost import Cost
-from rfm_labels.datasets.lerobot_rows import INFO_FILE
-from rfm_labels.datasets.protocol import SIGNALS_FOLDER, DatasetError, require
-from rfm_labels.episode_scores import LOG_PROB, PROGRESS, SUCCESS, UNCLEAR, Columns
-from rfm_labels.finished_episodes import IDENTITY, whole_file
-from rfm_labels.hdf5_tables import (
-    BLANK,
-    COST,
-    PROVENANCE,
-    find_in_hdf5,
-    of_hdf5,
-    read_attribute,
-    read_hdf5_table,
+from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
+from rfm_labels.datasets.faults import DatasetError, listed, require
+from rfm_labels.datasets.lerobot_meta import INFO_FILE
+from rfm_labels.hdf5_tables import BLANK, COST, PROVENANCE, find_in_hdf5, of_hdf5, read_attribute, read_hdf5_table
+from rfm_labels.metadata import (
+    BLANK_KEY,
+    PROGRESS,
+    SUCCESS,
+    BlankCameras,
+    Columns,
+    Cost,
+    blank_from_metadata,
+    parsed_object,
 )
-from rfm_labels.labelled_before import LabelFile, parsed_object
-from rfm_labels.plan import Item, Plan
+from rfm_labels.plan import Item, Plan, make_plan
+from rfm_labels.writing import (
+    COST_KEY,
+    EPISODES_KEY,
+    IDENTITY,
+    PROGRESS_ENDING,
+    PROVENANCE_KEY,
+    SIGNAL_NAMES,
+    SIGNALS_PROVENANCE_KEY,
+)
 
-PROGRESS_ENDING = "_progress.parquet"
-PROVENANCE_KEY = b"rfm.provenance"
-SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
+Reader: TypeAlias = Callable[[Sequence[Item]], Iterator[tuple[Item, Columns]]]
 
-_EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run sees if its labels still hold
-_COST_KEY = b"rfm.cost"  # apart from the provenance, which is equal for equal runs
-_ROWS_AT_A_TIME = 2**17  # in a row group
 _OWN_NAME = "rfm"  # default of ``LabelOptions.name``
 _PROGRESS_NAMES = ("progress", "progress_sparse", "progress_dense")
-_TOTAL = "total"  # progress added up over the tasks of an episode
-_SIGNAL_NAMES = {PROGRESS: "progress", SUCCESS: "success_probability", LOG_PROB: "log_prob", UNCLEAR: "unclear"}
-_DESCRIPTIONS = {
-    PROGRESS: "Share of the task that is done",
-    SUCCESS: "Probability that the task is done",
-    LOG_PROB: "Logarithm of the probability that the frames so far complete the task",
-    UNCLEAR: "1 where the model's written answer states no single whole score",
-}
+_OTHERS = "those of others, or of videos that have changed or were copied (--verify knows copies by their content)"
 
 
-@dataclass(frozen=True)
-class Sidecar:
-    """A Parquet label file to write.
-
-    columns: each score column's name in the file, by its name in the parts
-    metadata: of the Parquet schema
-    """
-
-    path: Path
-    columns: Mapping[str, str]
-    metadata: Mapping[bytes, bytes]
-
-
-def progress_file(path: Path, plan: Plan, columns: Sequence[str], cost: Cost | None) -> Sidecar:
-    """Return the progress file for these columns of the parts. cost: None: unknown"""
-    checkpoint = plan.recipe.checkpoint
-    model = checkpoint.source or checkpoint.weights_digest
-    metadata = {
-        b"reward_model_path": (f"{model}@{checkpoint.revision}" if checkpoint.revision else model).encode(),
-        PROVENANCE_KEY: canonical_json(plan.provenance()),
-        **_of_run(plan, cost),
-    }
-    named = {name: name for name in columns}
-    if _has_several_tasks(plan):
-        return Sidecar(path, {_TOTAL: "progress_sparse", **named}, metadata)
-    return Sidecar(path, {**named, PROGRESS: "progress_sparse"}, metadata)
-
-
-def with_totals(labels: Any, plan: Plan) -> Any:
-    """Return the labels with all columns that the label files need. labels: table of ``Parts.read_all``
-
-    Reward-aligned behaviour cloning weights a frame by the difference of two frames' progress, and 0 if it falls. Where
-    an episode's task changes, progress begins anew, so the sum of all tasks' gains takes its place.
-    """
-    import pyarrow as pa
-
-    if not _has_several_tasks(plan):
-        return labels
-    progress = labels[PROGRESS].to_numpy()
-    total, begin = progress.copy(), 0
-    for item in plan.items:
-        end = begin + item.episode.num_frames
-        for first, _ in item.episode.tasks[1:]:
-            own = slice(begin + first, end)
-            total[own] = progress[own] - progress[own.start] + total[own.start - 1]
-        begin = end
-    return labels.append_column(_TOTAL, pa.array(total))
-
-
-def _has_several_tasks(plan: Plan) -> bool:
-    return any(item.episode.tasks for item in plan.items)
-
-
-def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost: Cost | None) -> Sidecar:
-    """Return the file of frame signals for these columns of the parts. cost: None: unknown"""
-    signals = {}
-    for column in columns:
-        score, dot, camera = column.partition(".")
-        signals[column] = f"reward.{name}.{_SIGNAL_NAMES[score]}{dot}{camera}"
-    metadata = {
-        "format": b"lerobot.frame_signals",
-        "schema_version": b"1",
-        "provenance": canonical_json(plan.provenance()),
-        "descriptors": canonical_json({signals[column]: _descriptor(column) for column in columns}),
-        "episode_indices": canonical_json([item.episode.index for item in plan.items]),
-    }
-    ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
-    named = {f"lerobot.reward_scoring.{key}".encode(): value for key, value in metadata.items()}
-    return Sidecar(path, ordered, {**named, **_of_run(plan, cost)})
-
-
-def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
-    """Return the metadata that both formats share."""
-    digests = {_EPISODES_KEY: canonical_json(plan.digests())}
-    return digests if cost is None else {**digests, _COST_KEY: cost.json()}
-
-
-def _descriptor(column: str) -> dict[str, Any]:
-    score, _, camera = column.partition(".")
-    return {
-        "description": _DESCRIPTIONS[score] + (f", seen by {camera}" if camera else ""),
-        "direction": "lower" if score == UNCLEAR else "higher",
-        "bounds": [None, 0.0] if score == LOG_PROB else [0.0, 1.0],
-        "unit": None,
-        "missing_values": "forbidden",
-        "allow_nan": False,  # the same in another revision of the proposal
-    }
-
-
-def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
-    """Write new files with the labels, then put all in place. Raises OSError; a failed write changes no file.
-
-    labels: table of ``Parts.read_all``
-    """
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    with ExitStack() as whole:
-        for sidecar in sidecars:
-            own = labels.select([*IDENTITY, *sidecar.columns])
-            own = own.rename_columns([*IDENTITY, *sidecar.columns.values()])
-            fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
-            schema = pa.schema(fields, metadata={**sidecar.metadata, **(labels.schema.metadata or {})})
-            sidecar.path.parent.mkdir(parents=True, exist_ok=True)
-            file = whole.enter_context(whole_file(sidecar.path))
-            parquet.write_table(own.cast(schema), file, row_group_size=_ROWS_AT_A_TIME)
-
-
-def parquet_labels(path: Path, option: str = "--name") -> LabelFile | None:
-    """Return the labels in the file; None: no file. ``option``: the command-line option that chooses another path."""
+def parquet_labels(path: Path, option: str = "--name") -> LabelFile:
+    """Return the labels in a file. ``option``: the command-line option that chooses another path."""
     from pyarrow import ArrowException, parquet
 
-    if not path.exists():
-        return None
     try:
         metadata = parquet.read_schema(path).metadata or {}
     except (OSError, ArrowException):
         metadata = {}
     provenance = metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY))
-    cost = Cost.parse(metadata.get(_COST_KEY))
-    blank = from_metadata(metadata)
-    digests = metadata.get(_EPISODES_KEY)
+    cost = Cost.parse(metadata.get(COST_KEY))
+    blank = blank_from_metadata(metadata)
+    digests = metadata.get(EPISODES_KEY)
     return LabelFile.of(path, provenance, digests, lambda items: _read(path, items), option, cost, blank)
 
 
@@ -194,11 +67,6 @@ def _read(path: Path, items: Sequence[Item]) -> Iterator[tuple[Item, Columns]]:
         start, end = np.searchsorted(episodes, [item.episode.index, item.episode.index + 1]).tolist()
         rows = table.slice(start, end - start)
         yield item, {name: rows[name].to_numpy() for name in names}
-
-
-def canonical_json(document: Any) -> bytes:
-    """Return the document as JSON; equal documents give equal bytes."""
-    return json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +113,7 @@ def find_label_files(root: Path) -> list[Path]:
 def read_label_table(file: Path, *, episode: int | None = None) -> Any:
     """Return a label file of any format as a pyarrow Table, with the parts' column names. Raises DatasetError.
 
-    Score columns: those of ``episode_columns``, as far as the file has them.
+    Score columns: those of ``SCORES``, as far as the file has them.
 
     file: Parquet, or HDF5 as ``find_label_files`` returns it
 
@@ -269,15 +137,15 @@ def read_cost(file: Path) -> Cost | None:
     """Return the cost of a file's labels; None: the file does not say. Raises DatasetError."""
     if in_hdf5 := of_hdf5(file):
         return Cost.parse(read_attribute(*in_hdf5, COST))
-    return Cost.parse(_metadata(file).get(_COST_KEY))
+    return Cost.parse(_metadata(file).get(COST_KEY))
 
 
 def read_blank(file: Path) -> BlankCameras:
     """Return the cameras that show nothing, as the metadata of a file's labels tell them. Raises DatasetError."""
     if in_hdf5 := of_hdf5(file):
         blank = read_attribute(*in_hdf5, BLANK)
-        return from_metadata({BLANK_KEY: blank} if blank else {})
-    return from_metadata(_metadata(file))
+        return blank_from_metadata({BLANK_KEY: blank} if blank else {})
+    return blank_from_metadata(_metadata(file))
 
 
 def read_provenance(file: Path) -> dict[str, Any]:
@@ -330,10 +198,94 @@ def _score_columns(file: Path, names: Sequence[str]) -> dict[str, str]:
     if progress is None:
         raise DatasetError.at(file, "a column of progress", ", ".join(names))
     before = progress.removesuffix("progress")
-    begins = {score: score if own is not None else before + signal for score, signal in _SIGNAL_NAMES.items()}
-    columns = {}  # in the order of ``episode_columns``
+    begins = {score: score if own is not None else before + signal for score, signal in SIGNAL_NAMES.items()}
+    columns = {}  # in the order of ``SCORES``
     for score, begin in begins.items():
         if (fused := progress if score == PROGRESS else begin) in names:
             columns[score] = fused
             columns |= {score + name.removeprefix(begin): name for name in names if name.startswith(f"{begin}.")}
     return columns
+
+
+@dataclass(frozen=True)
+class LabelFile:
+    """An existing label file.
+
+    flaw: why no run can keep its labels; None: its metadata tells how they were made
+    digests: digest of each labelled item, by episode number
+    read: yields the scores of items, as far as the file has them
+    option: command-line option that chooses another name
+    cost: of the last run that scored; None: unknown
+    blank: cameras that show nothing
+    """
+
+    path: Path
+    flaw: str | None
+    provenance: Mapping[str, Any]
+    digests: Mapping[int, str]
+    read: Reader
+    option: str
+    cost: Cost | None = None
+    blank: BlankCameras = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        path: Path,
+        provenance: Any,
+        digests: Any,
+        read: Reader,
+        option: str = "--name",
+        cost: Cost | None = None,
+        blank: BlankCameras | None = None,
+    ) -> LabelFile:
+        """Return the label file. provenance, digests: JSON texts of its metadata, None if absent"""
+        told, by_episode = parsed_object(provenance), parsed_object(digests)
+        if not str(told.get("writer")).startswith("rfm-client") or not isinstance(told.get("dataset"), dict):
+            return cls(path, "labels of another program", {}, {}, read, option)
+        known = {int(index): str(digest) for index, digest in by_episode.items() if index.isdecimal()}
+        flaw = None if known else "no digests of its episodes"
+        return cls(path, flaw, told, known, read, option, cost, blank or {})
+
+    def check(self, plan: Plan, dataset: Dataset, known: Mapping[int, Item]) -> Mapping[int, Item]:
+        """Return the file's items by episode number. Raises DatasetError if labels would be lost, or do not fit.
+
+        known: items of the plan, and of label files checked before
+        """
+        there, now = _settings(_recipe(self.provenance)), _settings(_recipe(plan.provenance()))
+        names = [name for name in dict.fromkeys([*now, *there]) if there.get(name) != now.get(name)]
+        differ = "; ".join(f"{name}: {there.get(name, 'none')} there, {now.get(name, 'none')} now" for name in names)
+        got = (self.provenance and differ) or self.flaw or ""
+        require(self.path, self.flaw is None and not differ, "no labels, or those of the same recipe", got)
+
+        lost = set(self.digests) - set(dataset.numbers)
+        expected = f"labels of the dataset's {len(dataset.numbers)} episodes"
+        require(self.path, not lost, expected, f"some of episode {min(lost, default=None)}")
+        others = [dataset.episode(index) for index in sorted(self.digests) if index not in known]
+        items = {item.episode.index: item for item in make_plan(dataset, plan.recipe, others).items}
+        found = {index: {**known, **items}[index] for index in self.digests}
+        changed = [index for index, digest in self.digests.items() if found[index].digest != digest]
+        require(self.path, len(changed) < len(self.digests), "labels of this dataset's episodes", _OTHERS)
+        chosen = {item.episode.index for item in plan.items}
+        left = sorted(set(changed) - chosen)
+        episodes = ", ".join(found[index].episode.name for index in left)
+        expected = f"no change since the labels in {self.path}, or --episodes with {listed(left)}"
+        require(episodes, not left, expected, "other frames or rows")
+        return found
+
+
+def _recipe(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """The provenance without the dataset's source: the episodes' digests identify the dataset."""
+    dataset = provenance.get("dataset", {})
+    return {**provenance, "writer": None, "dataset": {"kind": dataset.get("kind")}}
+
+
+def _settings(document: Mapping[str, Any]) -> dict[str, str]:
+    """Settings by their paths in messages, for example ``sampling.frames``."""
+    settings: dict[str, str] = {}
+    for name, value in document.items():
+        if isinstance(value, Mapping):
+            settings |= {f"{name}.{inner}": text for inner, text in _settings(value).items()}
+        elif value is not None:
+            settings[name] = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return settings

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Options of a labelling run, checked once: fields for programs, options for command lines."""
+"""What a caller gives to a labelling run: options, checked once for programs and command lines, and callbacks."""
 
 from __future__ import annotations
 
@@ -9,17 +9,45 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias, get_args
 
+from rfm_client import (
+    RewardError,
+)
 from rfm_client.frames import Fuse, Rule
 from rfm_client.options import ConfigError, Settings, checked_count, checked_finite, setting
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
+from rfm_labels.datasets.faults import listed, require
 
 Mode: TypeAlias = Literal["prefix", "whole"]
 Format: TypeAlias = Literal["progress", "signals", "hdf5"]
-
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_WORKERS = 4
-
 _NAME = re.compile(r"[A-Za-z0-9][\w-]{0,63}")
 _RANGE = re.compile(r"(\d+)(?::(\d+))?")
+
+
+class Watch:
+    """Callbacks of a run. They do nothing here; override those that you need."""
+
+    def note(self, text: str) -> None:
+        """Callback with a line for the user: a decision, or a warning."""
+
+    def checking(self, num_episodes: int) -> None:
+        """Callback before the check of all episodes."""
+
+    def checked(self, episode: DatasetEpisode) -> None:
+        """Callback when all frames of an episode are found."""
+
+    def begin(self, num_frames: int, num_finished: int) -> None:
+        """Callback before the first score, with the frames of the run, and those already finished."""
+
+    def scored(self, episode: DatasetEpisode) -> None:
+        """Callback when the episode is finished."""
+
+    def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
+        """Callback when the episode has failed."""
+
+
+QUIET = Watch()
 
 
 def parse_episodes(text: str) -> list[int]:
@@ -124,6 +152,9 @@ class LabelOptions(Settings):
             raise ConfigError("shard", f"expected i/n with i from 0 to n - 1, got {self.shard[0]}/{self.shard[1]}")
 
 
+DEFAULTS = LabelOptions()
+
+
 @dataclass(frozen=True)
 class RayOptions(Settings):
     """Ray cluster, number of actors and their GPUs. Raises ConfigError, a ValueError."""
@@ -138,3 +169,27 @@ class RayOptions(Settings):
         object.__setattr__(self, "actors", checked_count("actors", self.actors))
         object.__setattr__(self, "num_gpus_per_actor", checked_finite("num_gpus_per_actor", self.num_gpus_per_actor))
         super().__post_init__()
+
+
+def chosen_numbers(dataset: Dataset, options: LabelOptions) -> list[int]:
+    """Return the numbers of the episodes that the options choose. Raises DatasetError for an unknown episode."""
+    known = set(dataset.numbers)
+    wanted = sorted(known) if options.episodes is None else sorted(set(options.episodes))
+    missing = [number for number in wanted if number not in known]
+    got = f"{', '.join(map(str, missing[:5])) or 'none'}; it has {listed(sorted(known))}"
+    require("episodes", bool(wanted) and not missing, f"some of the {len(known)} of the dataset", got)
+    if options.filter_key is not None:
+        keys = ", ".join(dataset.filter_keys)
+        is_known = options.filter_key in dataset.filter_keys
+        expected = f"one of {keys}" if keys else "none, since the dataset has no filter keys"
+        require("filter_key", is_known, expected, repr(options.filter_key))
+        of_key = dataset.filter_keys[options.filter_key]
+        gone = [number for number in of_key if number not in known]
+        got = f"{', '.join(map(str, gone[:5])) or 'none'} in {options.filter_key}"
+        wanted = sorted(set(wanted) & set(of_key))
+        require("filter_key", bool(wanted) and not gone, f"some of the {len(known)} episodes of the dataset", got)
+    chosen = wanted[: options.limit]
+    if options.shard is not None:
+        i, n = options.shard
+        chosen = chosen[len(chosen) * i // n : len(chosen) * (i + 1) // n]
+    return chosen

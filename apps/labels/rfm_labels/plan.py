@@ -1,26 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""The plan of a labelling run, made before the first frame is scored: its episodes and its recipe."""
+"""The plan of a labelling run, made before the first frame is scored: its recipe, its episodes, all their faults."""
 
 from __future__ import annotations
 
 import importlib.metadata
+import itertools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from rfm_client import InvalidSampleError
+from rfm_client import InvalidSampleError, RewardError
 from rfm_client.frames import ChannelOrder, Correction, Fuse, Orientation, Sampling
-from rfm_labels.datasets.faults import listed
-from rfm_labels.datasets.protocol import (
-    Dataset,
-    DatasetEpisode,
-    chosen_cameras,
-    digest_of,
-    require,
-)
-from rfm_labels.options import LabelOptions, Mode
-from rfm_labels.scorer import CheckpointFacts
+from rfm_client.options import first_names
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
+from rfm_labels.datasets.faults import FaultsError, listed, require
+from rfm_labels.datasets.stored_files import digest_of
+from rfm_labels.options import QUIET, LabelOptions, Mode, Watch, chosen_numbers
+from rfm_labels.scorer import CheckpointFacts, Scorer
 
 _RECIPE_FORMAT = 4  # increased when the same recipe gives other scores or other digests
 _OF_TRAINING = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
@@ -54,7 +52,7 @@ class Recipe:
         another mode than ``whole`` with a checkpoint that needs the whole episode.
         """
         numbers = chosen_numbers(dataset, replace(options, shard=None))
-        cameras = chosen_cameras(dataset, options.cameras, numbers)
+        cameras = dataset.chosen_cameras(options.cameras, numbers)
         require(dataset.source, bool(cameras), "at least one camera", "none")
         if checkpoint.needs_whole_episode and options.mode != "whole":
             why = "of this model, whose scores are relative to the whole episode"
@@ -190,30 +188,6 @@ def selected(dataset: Dataset, options: LabelOptions) -> list[DatasetEpisode]:
     return episodes
 
 
-def chosen_numbers(dataset: Dataset, options: LabelOptions) -> list[int]:
-    """Return the numbers of the episodes that the options choose. Raises DatasetError for an unknown episode."""
-    known = set(dataset.numbers)
-    wanted = sorted(known) if options.episodes is None else sorted(set(options.episodes))
-    missing = [number for number in wanted if number not in known]
-    got = f"{', '.join(map(str, missing[:5])) or 'none'}; it has {listed(sorted(known))}"
-    require("episodes", bool(wanted) and not missing, f"some of the {len(known)} of the dataset", got)
-    if options.filter_key is not None:
-        keys = ", ".join(dataset.filter_keys)
-        is_known = options.filter_key in dataset.filter_keys
-        expected = f"one of {keys}" if keys else "none, since the dataset has no filter keys"
-        require("filter_key", is_known, expected, repr(options.filter_key))
-        of_key = dataset.filter_keys[options.filter_key]
-        gone = [number for number in of_key if number not in known]
-        got = f"{', '.join(map(str, gone[:5])) or 'none'} in {options.filter_key}"
-        wanted = sorted(set(wanted) & set(of_key))
-        require("filter_key", bool(wanted) and not gone, f"some of the {len(known)} episodes of the dataset", got)
-    chosen = wanted[: options.limit]
-    if options.shard is not None:
-        i, n = options.shard
-        chosen = chosen[len(chosen) * i // n : len(chosen) * (i + 1) // n]
-    return chosen
-
-
 def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisode]) -> Plan:
     """Return the plan of these episodes, without a look at a video's frames. Raises DatasetError for a missing file."""
     document = json.dumps(recipe.document(), sort_keys=True)
@@ -224,3 +198,105 @@ def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisod
         videos = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.cameras]
         items.append(Item(episode, digest_of(part.encode() for part in (document, about, *videos))))
     return Plan(items, recipe, {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision})
+
+
+@contextmanager
+def all_faults(dataset: Dataset, options: LabelOptions) -> Iterator[None]:
+    """Replace the error of a single episode by FaultsError with the faults of all chosen episodes.
+
+    Other errors pass. A shard reports the faults of all shards, because all need the same episodes.
+    """
+    try:
+        yield
+    except RewardError:
+        check_episodes(dataset, options)
+        raise
+
+
+def check_episodes(dataset: Dataset, options: LabelOptions) -> None:
+    """Check the tables and frames of all chosen episodes, without decoding. Raises FaultsError, DatasetError."""
+    numbers = chosen_numbers(dataset, replace(options, shard=None))
+    cameras = dataset.chosen_cameras(options.cameras, numbers)
+    faults: dict[int, RewardError] = {}
+    before: list[DatasetEpisode] = []
+    for number in numbers:
+        try:
+            episode = dataset.episode(number)
+            check_order([*before[-1:], episode])
+            for camera in cameras:
+                dataset.check(episode, camera)
+            before.append(episode)
+        except RewardError as fault:
+            faults[number] = fault
+    if faults:
+        raise FaultsError.of(faults, numbers)
+
+
+def check_order(episodes: Sequence[DatasetEpisode]) -> None:
+    """Raise DatasetError if two episodes share rows, or their rows have another order."""
+    for before, episode in itertools.pairwise(episodes):
+        end = before.first_index + before.num_frames
+        got = f"{episode.first_index}: renumber the rows in the order of the episodes"
+        expected = f"{end} or more, since {before.name} ends at {end - 1}"
+        require(f"{episode.name}: index", episode.first_index >= end, expected, got)
+
+
+def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch = QUIET) -> Plan:
+    """Check everything except the frames, report decisions to ``watch``, and return the plan.
+
+    Raises DatasetError, RewardError if the scorer does not answer, ValueError if the rule lacks its number of frames.
+    """
+    recipe = Recipe.of(options, dataset, scorer.checkpoint())
+    with all_faults(dataset, options):
+        episodes = selected(dataset, options)
+        check_order(episodes)
+    recipe.check_lengths(episodes)
+    several = sum(bool(episode.tasks) for episode in episodes)
+    if several:
+        how = "each stretch of frames with one task is scored by itself (--several-tasks first: all by the first task)"
+        watch.note(f"tasks: {several} episodes have several: {how}")
+        if "progress" in (options.formats or ("progress",)):
+            own = "the scores are in the column progress"
+            watch.note(f"progress_sparse: the sum of the gains in an episode's tasks, as LeRobot's RA-BC needs; {own}")
+    told = " ".join(dataset.notes)
+    cameras, faults = dataset.cameras_in(chosen_numbers(dataset, replace(options, shard=None)))
+    unused = {
+        name: f"{word} by name or mark, without colours; --cameras includes it"
+        for name, word in dataset.unused_cameras(cameras).items()
+    }
+    turned = [f"orient: {name} {turn} (asked for)" for name, turn in recipe.orientations.items() if name not in told]
+    swapped = [f"channels: {name} {order} (asked for)" for name, order in recipe.channels.items()]
+    left_out = [] if options.cameras else [f"left out: {name}: {why}" for name, why in {**faults, **unused}.items()]
+    tasks = _tasks_told(dataset, episodes)
+    for line in (*recipe.told(options), *left_out, *dataset.notes, *turned, *swapped, *tasks):
+        watch.note(line)
+    with all_faults(dataset, options):
+        return make_plan(dataset, recipe, episodes)
+
+
+def _tasks_told(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[str]:
+    """Return a line about episodes with the caller's task, and one about tasks that are not sentences."""
+    given, lines = dataset.given_task, []
+    if given.overrides:
+        lines.append(f"tasks: all {len(episodes)} episodes get --task")
+    elif given.text is not None:
+        num_given = sum(any(task == given.text for task, _ in episode.stretches) for episode in episodes)
+        lines.append(f"tasks: {len(episodes) - num_given} episodes keep their own sentence, {num_given} get --task")
+    return lines + _identifiers_told(task for episode in episodes for task, _ in episode.stretches)
+
+
+def _is_identifier(task: str) -> bool:
+    """True if a task is a single word of ASCII, such as ``PnPCupToDrawerClose`` or ``pick_place_cup``."""
+    return task.isascii() and len(task.split()) == 1
+
+
+def _identifiers_told(tasks: Iterable[str]) -> list[str]:
+    """Return a line that lists single-word tasks; empty if all tasks are sentences."""
+    known = dict.fromkeys(tasks)
+    found = [task for task in known if _is_identifier(task)]
+    if not found:
+        return []
+    remedy = "--task with --override-task gives all episodes a sentence, --task-column reads another column (LeRobot)"
+    return [
+        f"tasks: {len(found)} of {len(known)} are a single word, not a sentence ({first_names(found, 3)}); {remedy}"
+    ]

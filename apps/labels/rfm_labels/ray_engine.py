@@ -14,15 +14,17 @@ from typing import Any, TypeAlias
 
 from rfm_client import RewardError
 from rfm_labels.datasets.opening import open_dataset
-from rfm_labels.finished_episodes import Parts
-from rfm_labels.options import RayOptions
+from rfm_labels.labelling import Report, prepared, put_together
+from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, RayOptions, Watch
 from rfm_labels.plan import Plan
-from rfm_labels.run import FailedEpisode, Run, Watch, begin, by_episode
 from rfm_labels.scorer import Scorer
+from rfm_labels.scoring import FailedEpisode, Run, by_episode, unfinished
+from rfm_labels.writing import Parts
 
 Connect: TypeAlias = Callable[[], AbstractContextManager[Scorer]]
 
 _BATCHES_AN_ACTOR = 4  # at least, if there are enough episodes: all actors then end at about the same time
+_ANY_CLUSTER = RayOptions()
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ def finish_all_with_ray(job: RayJob, options: RayOptions, watch: Watch) -> list[
         import ray.data
     except ImportError as error:
         raise ImportError('labelling on a cluster needs Ray: pip install ./client "./apps/labels[ray]"') from error
-    pending = {item.key for item in begin(job.plan, Parts(job.parts), watch)}
+    pending = {item.key for item in unfinished(job.plan, Parts(job.parts), watch)}
     places = [place for place, item in enumerate(job.plan.items) if item.key in pending]
     if not places:
         return []
@@ -111,3 +113,27 @@ def _labelled(ray: Any, job: RayJob, options: RayOptions, places: Sequence[int])
         compute=ray.data.ActorPoolStrategy(size=min(options.actors, len(batches))),
         num_gpus=options.num_gpus_per_actor,
     )
+
+
+def label_with_ray(
+    source: str,
+    connect: Connect,
+    options: LabelOptions = DEFAULTS,
+    watch: Watch = QUIET,
+    *,
+    ray: RayOptions = _ANY_CLUSTER,
+    **opening: Any,
+) -> Report:
+    """Label as ``label`` does, on a Ray cluster. Each actor opens the dataset and connects by itself.
+
+    The files tell no cost of this run: actors start and end while others label.
+
+    source, opening: arguments of ``open_dataset``
+    connect: returns a context with a scorer, on any node; this process reads the checkpoint's facts with it
+    """
+    dataset = open_dataset(source, **opening)
+    with connect() as scorer:
+        outputs, plan, earlier = prepared(dataset, scorer, options, watch)
+    job = RayJob(source, opening, connect, plan, outputs.parts.url, options.workers)
+    failures = finish_all_with_ray(job, ray, watch)
+    return put_together(plan, outputs, failures, earlier, watch)

@@ -17,9 +17,9 @@ from rfm_client import (
     Trajectory,
     UInt8Array,
 )
-from rfm_labels.datasets.protocol import digest_of
+from rfm_labels.datasets.stored_files import digest_of
 
-IDENTITY = ("weights_digest", "settings_digest", "computation")  # equal if scores are
+DECISIVE = ("weights_digest", "settings_digest", "computation")  # equal if scores are
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class CheckpointFacts:
 
     def document(self) -> dict[str, Any]:
         """Return the facts for the provenance."""
-        told, newer = ("source", "revision", *IDENTITY, "weights"), ("computation", "weights")
+        told, newer = ("source", "revision", *DECISIVE, "weights"), ("computation", "weights")
         there = {name: value for name, value in asdict(self).items() if name in told}
         # Labels made before lack the newer fields, and the digests of episodes depend on the provenance.
         return {name: value for name, value in there.items() if value is not None or name not in newer}
@@ -122,9 +122,9 @@ class ClientScorer:
 
 def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:
     """Return name and digests of a model. Raises InvalidSampleError if servers differ in these or the computation."""
-    digests = {(info.name, *(getattr(info, name) for name in IDENTITY)) for info in infos}
+    digests = {(info.name, *(getattr(info, name) for name in DECISIVE)) for info in infos}
     if len(digests) > 1:
         told = " and ".join(sorted(", ".join(map(str, values)) for _, *values in digests))
-        expected = f"the same {', '.join(IDENTITY[:-1])} and {IDENTITY[-1]} at every server"
+        expected = f"the same {', '.join(DECISIVE[:-1])} and {DECISIVE[-1]} at every server"
         raise InvalidSampleError.at(f"model {infos[0].name}", expected, told)
     return digests.pop()[:3]

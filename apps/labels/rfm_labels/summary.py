@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client import SUCCESS_THRESHOLD
-from rfm_labels.datasets.protocol import require
-from rfm_labels.episode_scores import PROGRESS, SUCCESS
+from rfm_labels.datasets.faults import require
 from rfm_labels.label_files import read_label_table
+from rfm_labels.metadata import PROGRESS, SUCCESS
 
 BACKWARDS_BY = 0.01  # kappa of reward-aligned behaviour cloning; a smaller fall is noise
 _MOST_LISTED = 12

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 from fastapi import APIRouter, HTTPException, Request, Response
-from fastapi.responses import JSONResponse
+from pydantic_core import to_json
 
-from rfm_gateway.mounting import Decoded, while_connected
-from rfm_labels.datasets import DatasetError
+from rfm_gateway.mounting import BodyLimits, while_connected
 
 if TYPE_CHECKING:
     from rfm_page.shown import ShownDataset
@@ -25,7 +24,7 @@ Read = TypeVar("Read")
 _HEADERS = {"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
 
 
-def dataset_routes(datasets: Sequence[ShownDataset], timeout_s: float, max_video_bytes: int) -> APIRouter:
+def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIRouter:
     """Return the endpoints of the page's datasets. The evaluation server has no such endpoints."""
     router = APIRouter(include_in_schema=False)
 
@@ -36,42 +35,36 @@ def dataset_routes(datasets: Sequence[ShownDataset], timeout_s: float, max_video
         """
         if not 0 <= number < len(datasets):
             raise HTTPException(404, f"dataset: expected one of {len(datasets)}, got {number}")
-
-        def checked(shown: ShownDataset) -> Read:
-            shown.check()
-            return reading(shown)
-
-        try:
-            with anyio.move_on_after(timeout_s):
-                return await while_connected(request, asyncio.to_thread(checked, datasets[number]))
-        except DatasetError as error:
-            raise HTTPException(500, datasets[number].without_folder(str(error))) from None
-        raise HTTPException(504, f"dataset: expected an answer within {timeout_s:g} s, got none")
+        with anyio.move_on_after(limits.timeout_s):
+            return await while_connected(request, asyncio.to_thread(datasets[number].read, reading))
+        raise HTTPException(504, f"dataset: expected an answer within {limits.timeout_s:g} s, got none")
 
     @router.get("/viewer/datasets")
     async def names() -> Response:
         about = await asyncio.to_thread(lambda: [each.about for each in datasets])
-        return JSONResponse({"datasets": about})
+        return _json({"datasets": about})
 
     @router.get("/viewer/datasets/{dataset}")
     async def table(request: Request, dataset: int, labels: str | None = None) -> Response:
-        return JSONResponse(await read(request, dataset, lambda shown: shown.table(labels)))
+        return _json(await read(request, dataset, lambda shown: shown.table(labels)))
 
     @router.get("/viewer/datasets/{dataset}/faults")
     async def faults(request: Request, dataset: int) -> Response:
-        return JSONResponse(await read(request, dataset, lambda shown: shown.faults()))
+        return _json(await read(request, dataset, lambda shown: shown.faults()))
 
     @router.get("/viewer/datasets/{dataset}/episodes/{episode}")
     async def curves(request: Request, dataset: int, episode: int, labels: str | None = None) -> Response:
-        return JSONResponse(await read(request, dataset, lambda shown: shown.curves(episode, labels)))
+        return _json(await read(request, dataset, lambda shown: shown.curves(episode, labels)))
 
     @router.get("/viewer/datasets/{dataset}/episodes/{episode}/videos/{camera}")
     async def video(request: Request, dataset: int, episode: int, camera: int) -> Response:
-        taken = Decoded(max_video_bytes)
-        try:
-            clip = await read(request, dataset, lambda shown: shown.video(episode, camera, taken.take))
-        finally:
-            taken.end()
+        with limits.decoding() as take:
+            clip = await read(request, dataset, lambda shown: shown.video(episode, camera, take))
         return Response(clip, media_type="video/mp4", headers=_HEADERS)
 
     return router
+
+
+def _json(document: dict[str, Any]) -> Response:
+    """Return an answer in JSON, with null for NaN, which JSON does not have."""
+    return Response(to_json(document, inf_nan_mode="null"), media_type="application/json")

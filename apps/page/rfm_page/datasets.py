@@ -9,29 +9,17 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.frames import VideoError, video_stream
-from rfm_client.options import ConfigError
-from rfm_labels.datasets import (
-    INFO_FILE,
-    TASK_COLUMN,
-    DatasetEpisode,
-    DatasetError,
-    Info,
-    LeRobotDataset,
-    Span,
-    TaskOverride,
-)
+from rfm_client.frames import FrameFileError, Video
+from rfm_labels import DatasetEpisode
+from rfm_labels.datasets import LeRobotDataset, Span
 from rfm_page.links import check_links, links_in
 from rfm_page.shown import ShownDataset
-
-_AS_STORED = TaskOverride(column=TASK_COLUMN, is_needed=False)  # blank and outdated tasks are shown, too
 
 
 @dataclass(frozen=True)
@@ -41,26 +29,6 @@ class ShownLeRobot(ShownDataset):
     has_stored_pixels = True
 
     dataset: LeRobotDataset
-
-    @classmethod
-    def open(cls, folder: str) -> ShownLeRobot:
-        """Open the dataset in a folder. Raises ConfigError for any other folder, or links out of it."""
-        try:
-            import pyarrow  # noqa: F401
-        except ImportError:
-            expected = "expected pyarrow, which reads datasets, got none: pip install ./client ./apps/labels"
-            raise ConfigError("dataset", expected) from None
-        if not (Path(folder) / INFO_FILE).is_file():
-            expected = f"expected the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file, got {folder}"
-            raise ConfigError("dataset", expected)
-        root = Path(folder).resolve()
-        try:
-            half_s = 0.5 / Info.read(root).fps  # a player shows the nearest frame, too
-            shown = cls(root, root, LeRobotDataset(root, task=_AS_STORED, tolerance_s=half_s))
-            shown.check()
-            return shown
-        except DatasetError as error:
-            raise ConfigError("dataset", str(error)) from None
 
     def check(self) -> None:
         """Raise DatasetError for a link out of the folder."""
@@ -92,10 +60,7 @@ def _cut(span: Span, take: Callable[[int], object]) -> bytes:
     """
     clip = io.BytesIO()
     try:
-        with av.open(
-            str(span.file), format="mov"
-        ) as video:  # without format=, FFmpeg would open the files in a play list
-            stream = video_stream(video)
+        with Video(span.video.file, "mov").opened() as (video, stream):  # another format may name other files
             packets = _packets(video, stream, span, take)
             zero = min(packet.pts for packet in packets if packet.pts * stream.time_base > _begin_s(span))
             with av.open(clip, "w", format="mp4") as copy:
@@ -105,7 +70,7 @@ def _cut(span: Span, take: Callable[[int], object]) -> bytes:
                     packet.dts -= zero
                     packet.stream = written
                     copy.mux(packet)
-    except VideoError as error:
+    except FrameFileError as error:
         raise span.error(error.expected, error.got) from error
     except (av.FFmpegError, OSError) as error:
         raise span.error("a video of the episode", error.strerror or str(error)) from error

@@ -19,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client import UInt8Array
-from rfm_client.options import ConfigError
-from rfm_labels import find_label_files, stored_in
-from rfm_labels.datasets import DatasetEpisode, DatasetError, Hdf5Dataset, TaskOverride, chosen_cameras, opened_hdf5
+from rfm_labels import DatasetEpisode, DatasetError, find_label_files, stored_in
+from rfm_labels.datasets import Hdf5Dataset, opened_hdf5
 from rfm_page.links import check_links
 from rfm_page.shown import ShownDataset
 
@@ -37,17 +36,10 @@ class ShownHdf5(ShownDataset):
 
     dataset: Hdf5Dataset
 
-    @classmethod
-    def open(cls, file: str) -> ShownHdf5:
-        """Open a dataset. Raises ConfigError for another file, or one that needs other files."""
-        path = Path(file).resolve()
-        try:
-            dataset = Hdf5Dataset(path, task=TaskOverride(is_needed=False))
-            shown = cls(path.parent, path, dataset)
-            shown.check()
-            return shown
-        except (DatasetError, ImportError) as error:
-            raise ConfigError("dataset", str(error)) from None
+    @property
+    def path(self) -> Path:
+        """The file of the dataset."""
+        return self.dataset.file
 
     def check(self) -> None:
         """Raise DatasetError for data in other files, in the dataset or its labels."""
@@ -59,7 +51,7 @@ class ShownHdf5(ShownDataset):
     @property
     def cameras(self) -> Sequence[str]:
         """The cameras that are labelled without a choice."""
-        return chosen_cameras(self.dataset, ())
+        return self.dataset.chosen_cameras()
 
     @property
     def fps(self) -> float:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from rfm_labels.datasets import DatasetError
+from rfm_labels import DatasetError
 
 
 def links_in(folder: Path) -> Iterator[Path]:

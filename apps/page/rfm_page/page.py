@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""The page, as a gateway serves it: entry point ``rfm_gateway.page``."""
+"""Add the page to the gateway that serves it: entry point ``rfm_gateway.page``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fastapi import APIRouter, FastAPI
-
 from rfm_client.options import ConfigError
-from rfm_gateway.mounting import GatewayConfig, Surroundings, add_page
+from rfm_gateway.mounting import GatewayConfig, PageHost
 from rfm_page.dataset_routes import dataset_routes
 from rfm_page.live import live_routes
 from rfm_page.routes import viewer_routes
@@ -20,24 +18,13 @@ if TYPE_CHECKING:
 _PACKAGE = Path(__file__).parent
 
 
-def routes(surroundings: Surroundings) -> APIRouter:
-    """Return the page's endpoints. Raises ConfigError for a dataset that cannot be shown."""
-    config, router = surroundings.config, APIRouter()
-    router.include_router(viewer_routes(surroundings))
-    router.include_router(dataset_routes(shown_datasets(config), config.timeout_s, surroundings.max_decoded_bytes))
-    router.include_router(live_routes(surroundings.limits))
-    return router
-
-
-def add_files(app: FastAPI) -> None:
-    """Add the page at ``/``, and its files."""
+def add_page(host: PageHost) -> None:
+    """Add the page's endpoints and files to a gateway. Raises ConfigError for a dataset that cannot be shown."""
+    host.add_endpoints(viewer_routes(host))
+    host.add_endpoints(dataset_routes(shown_datasets(host.config), host.limits))
+    host.add_endpoints(live_routes(host.limits))
     folders = {"uplot": _PACKAGE / "vendored" / "uplot", "examples": _PACKAGE / "examples"}
-    add_page(app, "/", "/viewer", _PACKAGE / "static", **folders)
-
-
-def check(config: GatewayConfig) -> None:
-    """Raise ConfigError for a dataset that cannot be shown."""
-    shown_datasets(config)
+    host.add_files(_PACKAGE / "static", **folders)
 
 
 def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
@@ -45,10 +32,21 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
     if not config.dataset:
         return []
     try:
-        from rfm_labels.datasets import is_hdf5
+        import pyarrow  # noqa: F401
+
+        from rfm_labels import DatasetError
+        from rfm_labels.datasets import Hdf5Dataset, open_to_show
         from rfm_page.datasets import ShownLeRobot
         from rfm_page.hdf5_datasets import ShownHdf5
     except ModuleNotFoundError as error:
         told = f"expected the package {error.name}, which reads it, got none: pip install ./apps/labels"
         raise ConfigError("dataset", told) from None
-    return [ShownHdf5.open(path) if is_hdf5(Path(path)) else ShownLeRobot.open(path) for path in config.dataset]
+    datasets: list[ShownDataset] = []
+    try:
+        for path in config.dataset:
+            dataset = open_to_show(path)
+            datasets.append(ShownHdf5(dataset) if isinstance(dataset, Hdf5Dataset) else ShownLeRobot(dataset))
+            datasets[-1].check()
+    except (DatasetError, ImportError) as error:
+        raise ConfigError("dataset", str(error)) from None
+    return datasets

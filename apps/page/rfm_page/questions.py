@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,11 +21,12 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, Field, StringConstraints, ValidationError
 from starlette.datastructures import UploadFile
 
-from rfm_client import MAX_FRAME_STEPS, InvalidSampleError, ModelInfo, Trajectory
+from rfm_client import InvalidSampleError, ModelInfo, Trajectory
 from rfm_client.frames import ChannelOrder, Correction, Orientation, Rule, Sampling, frame_times_s, read_video
-from rfm_gateway.mounting import Decoded, field_errors, invalid
+from rfm_gateway.mounting import field_errors, invalid
 
 DEFAULT_FPS = 3.0  # the default of rfm-client score
+MOST_FRAMES = 4096  # of a prefix: more than any checkpoint takes
 KINDS = "MP4, MOV, WebM, Matroska, Ogg or AVI"
 
 _BEGINNING_BYTES = 12
@@ -54,7 +55,7 @@ class VideoRequest(BaseModel):
     model: str
     fps: Annotated[float, Field(gt=0, allow_inf_nan=False)] = DEFAULT_FPS
     rule: Rule | None = Field(None, alias="sampling")
-    frames: Annotated[int, Field(ge=1, le=MAX_FRAME_STEPS)] | None = None
+    frames: Annotated[int, Field(ge=1, le=MOST_FRAMES)] | None = None
     resize: bool = False
     orient: Orientation = "none"
     channels: ChannelOrder = "rgb"
@@ -83,17 +84,20 @@ class VideoRequest(BaseModel):
             where, _, message = str(error).partition(": ")
             raise invalid((where,), message) from None
 
-    async def video(self, uploads: Mapping[str, UploadFile], name: str, decoded: Decoded) -> ShownVideo:
-        """Read the uploaded video of this name. Raises RequestValidationError, and HTTPException as ``decoded``."""
+    async def video(self, uploads: Mapping[str, UploadFile], name: str, take: Callable[[int], object]) -> ShownVideo:
+        """Read the uploaded video of this name. Raises RequestValidationError, and what ``take`` raises.
+
+        take: called with the size of frames before they are decoded
+        """
         if name not in uploads:
             raise invalid((name,), "expected a video file, got none")
         try:
-            return await asyncio.to_thread(self._read, uploads[name], decoded)
+            return await asyncio.to_thread(self._read, uploads[name], take)
         except InvalidSampleError as error:
             where, _, message = error.message.partition(": ")
             raise invalid((name if where == "video" else where,), message) from None
 
-    def _read(self, upload: UploadFile, decoded: Decoded) -> ShownVideo:
+    def _read(self, upload: UploadFile, take: Callable[[int], object]) -> ShownVideo:
         name = upload.filename or "the video"
         upload.file.seek(0)
         container = _container(upload.file.read(_BEGINNING_BYTES))
@@ -105,7 +109,7 @@ class VideoRequest(BaseModel):
             with file.open("wb") as copy:
                 shutil.copyfileobj(upload.file, copy)
             try:
-                frames = read_video(file, self.fps, take=decoded.take, container=container)
+                frames = read_video(file, self.fps, take=take, container=container)
                 times_s = frame_times_s(file, len(frames), container=container)
             except InvalidSampleError as error:
                 raise InvalidSampleError(str(error).replace(str(file), name)) from None

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import json
 import logging
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import anyio
 import numpy as np
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
+from pydantic_core import to_json
 from starlette.datastructures import UploadFile
 
 from rfm_client import (
@@ -35,27 +35,15 @@ from rfm_client import (
     RewardError,
     Trajectory,
 )
-from rfm_client.frames import (
-    CHANNEL_ORDERS,
-    ORIENTATIONS,
-    RULES,
-    BlankFrames,
-    Rule,
-    Sampling,
-    fitted,
-    prefix_samples,
-    trained_rule,
-)
-from rfm_client.serving import DEFAULT_MODEL, frames_name, off_loop, read_status
-from rfm_gateway.mounting import Decoded, GatewayConfig, Surroundings, invalid, while_connected
-from rfm_page.numbers import numbers_or_null
+from rfm_client.frames import BlankFrames, ChannelOrder, Orientation, Rule, Sampling, resize_frames
+from rfm_client.serving import off_loop
+from rfm_gateway.mounting import GatewayConfig, PageHost, invalid, while_connected
 from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest
 
 MOST_PREFIXES = 32  # in a request
 MOST_BYTES = 64 * 2**20  # of the frames in a request
 STATUS_TIMEOUT_S = 5.0
 _AS_THEY_COME = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # the second tells proxies not to buffer
-_FRAMES_ENDING = frames_name("")
 
 logger = logging.getLogger("rfm_gateway")
 
@@ -71,19 +59,17 @@ class _Asked:
     request_id: str
 
 
-def viewer_routes(surroundings: Surroundings) -> APIRouter:
+def viewer_routes(host: PageHost) -> APIRouter:
     """Return the page's endpoints for videos. The evaluation server has no such endpoints."""
-    config, new_client, limits = surroundings.config, surroundings.new_client, surroundings.limits
-    max_decoded_bytes, metrics = surroundings.max_decoded_bytes, surroundings.metrics
+    config, limits, metrics = host.config, host.limits, host.metrics
     router = APIRouter(include_in_schema=False)
-    default_model = config.model or DEFAULT_MODEL
 
     @router.get("/viewer/served")
     async def served() -> Response:
-        models = [_told_of(name, info) for name, info in await _infos(config, new_client)]
-        rules = [{"name": rule, "frames": _frames_of(rule)} for rule in RULES]
-        about = {"models": models, "model": default_model, "rules": rules}
-        about |= {"orientations": list(ORIENTATIONS), "channel_orders": list(CHANNEL_ORDERS)}
+        models = [_told_of(name, info) for name, info in await _infos(config)]
+        rules = [{"name": rule, "frames": _frames_of(rule)} for rule in get_args(Rule)]
+        about = {"models": models, "model": config.checkpoint, "rules": rules}
+        about |= {"orientations": get_args(Orientation), "channel_orders": get_args(ChannelOrder)}
         return JSONResponse({**about, "fps": DEFAULT_FPS, "url": config.triton_url})
 
     @router.post("/viewer/score")
@@ -94,7 +80,7 @@ def viewer_routes(surroundings: Surroundings) -> APIRouter:
     @router.post("/viewer/compare")
     async def compare(request: Request) -> Response:
         asked = await read(request, "first", "second")
-        async with new_client(model=asked.question.model) as client:
+        async with config.client(asked.question.model) as client:
             answer = await while_connected(request, _preferences(client, asked))
         metrics.samples.labels("preference").inc(len(answer["orders"]))
         return JSONResponse(answer)
@@ -105,8 +91,8 @@ def viewer_routes(surroundings: Surroundings) -> APIRouter:
         Raises RequestValidationError, HTTPException and RewardError.
         """
         async with limits.form(request) as (fields, uploads):
-            question = VideoRequest.of(fields, default_model)
-            async with new_client(model=question.model) as client:
+            question = VideoRequest.of(fields, config.checkpoint)
+            async with config.client(question.model) as client:
                 info = await client.model_info(frames=True)
             sampling = question.sampling(info)
             videos = await while_connected(request, decoded(question, uploads, names))
@@ -115,12 +101,8 @@ def viewer_routes(surroundings: Surroundings) -> APIRouter:
     async def decoded(
         question: VideoRequest, uploads: Mapping[str, UploadFile], names: tuple[str, ...]
     ) -> tuple[ShownVideo, ...]:
-        taken = Decoded(max_decoded_bytes)
-        try:
-            with anyio.move_on_after(config.timeout_s):
-                return tuple([await question.video(uploads, name, taken) for name in names])
-        finally:
-            taken.end()
+        with limits.decoding() as take, anyio.move_on_after(config.timeout_s):
+            return tuple([await question.video(uploads, name, take) for name in names])
         raise invalid((names[0],), f"expected videos that are read within {config.timeout_s:g} s, got longer ones")
 
     async def events(asked: _Asked) -> AsyncIterator[str]:
@@ -132,10 +114,12 @@ def viewer_routes(surroundings: Surroundings) -> APIRouter:
         about = {"num_frames": num_frames, "times_s": times_s, "sampled_frames": asked.sampling.frames}
         yield _event("video", **about, blank=blank or None)
         try:
-            sample = ProgressSample(video.trajectory)
-            fit = await asyncio.to_thread(fitted, sample, asked.info, subsample=False, resize=asked.question.resize)
-            async with new_client(model=asked.question.model) as client:
-                async for points in _curve(client, fit.sample.trajectories[0], asked):
+            trajectory, size = video.trajectory, asked.info.frame_size if asked.question.resize else None
+            if size is not None:
+                frames = await asyncio.to_thread(resize_frames, trajectory.positions, size)
+                trajectory = Trajectory(frames=frames, task=trajectory.task)
+            async with config.client(asked.question.model) as client:
+                async for points in _curve(client, trajectory, asked):
                     version = points["model_version"]
                     metrics.samples.labels("progress").inc(len(points["progress"]))
                     yield _event("scores", **points)
@@ -150,20 +134,12 @@ def viewer_routes(surroundings: Surroundings) -> APIRouter:
     return router
 
 
-async def _infos(config: GatewayConfig, new_client: Callable[..., AsyncRewardClient]) -> list[tuple[str, ModelInfo]]:
+async def _infos(config: GatewayConfig) -> list[tuple[str, ModelInfo]]:
     """Return the served models for raw frames, by the name of their export. Raises RewardError."""
-    status = await asyncio.to_thread(
-        read_status,
-        config.triton_url,
-        metrics_url=config.metrics_url,
-        timeout_s=STATUS_TIMEOUT_S,
-        credentials=config.credentials,
-    )
-    ready = {model.name for model in status.models if model.state == "READY" and model.name.endswith(_FRAMES_ENDING)}
     infos = []
-    for name in sorted(each.removesuffix(_FRAMES_ENDING) for each in ready):
+    for name in (await config.status(STATUS_TIMEOUT_S)).checkpoints:
         try:
-            async with new_client(model=name) as client:
+            async with config.client(name) as client:
                 infos.append((name, await client.model_info(frames=True, timeout_s=STATUS_TIMEOUT_S)))
         except ModelNotFoundError:  # unloaded in the meantime
             continue
@@ -171,7 +147,7 @@ async def _infos(config: GatewayConfig, new_client: Callable[..., AsyncRewardCli
 
 
 def _told_of(name: str, info: ModelInfo) -> dict[str, Any]:
-    rule = trained_rule(info.trained_padding)
+    rule = Sampling.of(None, 1, None, trained_padding=info.trained_padding).rule
     about = {"name": name, "max_frames": info.max_frames, "rule": rule}
     return {**about, "versions": list(info.versions), "source": info.source}
 
@@ -197,7 +173,7 @@ async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Aske
     sampling, frames = asked.sampling, trajectory.frames
     sample_bytes = max(sampling.frames or 0, len(frames)) * math.prod(frames.shape[1:])
     most = max(min(MOST_PREFIXES, MOST_BYTES // sample_bytes), 1)
-    samples, first, count = prefix_samples(trajectory, sampling), 0, 1
+    samples, first, count = sampling.samples(trajectory), 0, 1
 
     def following() -> list[ProgressSample]:
         return list(itertools.islice(samples, count))
@@ -216,8 +192,8 @@ def _points(first: int, results: Sequence[ProgressResult], reads: Sequence[int |
     )
     return {
         "first": first,
-        "progress": numbers_or_null(progress.tolist()),
-        "success": numbers_or_null(success.tolist()),
+        "progress": progress.tolist(),
+        "success": success.tolist(),
         "model_version": results[-1].model_version,
     }
 
@@ -245,4 +221,4 @@ async def _preferences(client: AsyncRewardClient, asked: _Asked) -> dict[str, An
 
 
 def _event(name: str, **document: Any) -> str:
-    return f"event: {name}\ndata: {json.dumps(document, allow_nan=False)}\n\n"
+    return f"event: {name}\ndata: {to_json(document, inf_nan_mode='null').decode()}\n\n"  # JSON has no NaN

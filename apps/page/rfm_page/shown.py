@@ -11,16 +11,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
 from fastapi import HTTPException
 
 from rfm_client import SUCCESS_THRESHOLD
-from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, Correction
+from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_labels import (
     Curve,
+    Dataset,
+    DatasetEpisode,
+    DatasetError,
     EpisodeLabels,
     Summary,
     find_label_files,
@@ -29,8 +32,8 @@ from rfm_labels import (
     stored_in,
     summarise,
 )
-from rfm_labels.datasets import Dataset, DatasetEpisode, DatasetError, unused_cameras
-from rfm_page.numbers import numbers_or_null
+
+Read = TypeVar("Read")
 
 _SUMMARIES_AT_A_TIME = 8  # summaries in memory
 
@@ -39,8 +42,7 @@ _SUMMARIES_AT_A_TIME = 8  # summaries in memory
 class ShownDataset(ABC):
     """A dataset for the page.
 
-    root: its folder, with links resolved
-    path: its folder or file
+    dataset: as ``open_to_show`` returns it
     has_stored_pixels: True: its videos have every pixel as stored; False: they are encoded for the page
 
     Its methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
@@ -48,9 +50,17 @@ class ShownDataset(ABC):
 
     has_stored_pixels: ClassVar[bool]
 
-    root: Path
-    path: Path
     dataset: Dataset
+
+    @property
+    def root(self) -> Path:
+        """The folder, with links resolved."""
+        return self.dataset.root
+
+    @property
+    def path(self) -> Path:
+        """The folder or file."""
+        return self.root
 
     @abstractmethod
     def check(self) -> None:
@@ -74,6 +84,14 @@ class ShownDataset(ABC):
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
         """Return an episode's video as an MP4 file. take: as of ``video``. Raises DatasetError."""
 
+    def read(self, reading: Callable[[ShownDataset], Read]) -> Read:
+        """Check the dataset, then read from it. Raises HTTPException 500 with the fault of a broken dataset."""
+        try:
+            self.check()
+            return reading(self)
+        except DatasetError as error:
+            raise HTTPException(500, self._without_folder(str(error))) from None
+
     @property
     def about(self) -> dict[str, Any]:
         """The dataset's name and kind, and the names of its label files."""
@@ -83,12 +101,12 @@ class ShownDataset(ABC):
     def table(self, labels: str | None) -> dict[str, Any]:
         """Return a row for each episode, with a summary of its labels.
 
-        ``unused`` has what each camera shows instead of colours, as in ``unused_cameras``; null: it shows colours.
+        ``unused`` has what each camera shows instead of colours (``Dataset.unused_cameras``); null: colours.
         """
         file = self._labels(labels)
         status = None if file is None else stored_in(file).stat()
         summary = None if file is None or status is None else _summary(file, status.st_mtime_ns)
-        unused = unused_cameras(self.dataset, self.dataset.cameras)
+        unused = self.dataset.unused_cameras(self.dataset.cameras)
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
         return {
             "labels": None if file is None else self._name_of(file),
@@ -114,14 +132,14 @@ class ShownDataset(ABC):
     def faults(self) -> dict[str, str]:
         """Return the fault of each episode that cannot be labelled now, by number, as ``rfm-client label`` tells it."""
         found = {}
-        unused = unused_cameras(self.dataset, self.cameras)
+        unused = self.dataset.unused_cameras(self.cameras)
         cameras = [camera for camera in self.cameras if camera not in unused]
         for episode in self.dataset.episodes:
             try:
                 for camera in cameras:
                     self.dataset.check(episode, camera)
             except DatasetError as error:
-                found[str(episode.index)] = self.without_folder(str(error))
+                found[str(episode.index)] = self._without_folder(str(error))
         return found
 
     def curves(self, number: int, labels: str | None) -> dict[str, Any]:
@@ -145,7 +163,7 @@ class ShownDataset(ABC):
             raise HTTPException(404, f"camera: expected one of {len(self.cameras)} with videos, got {camera}")
         return self.mp4(self._episode(number), self.cameras[camera], take)
 
-    def without_folder(self, message: str) -> str:
+    def _without_folder(self, message: str) -> str:
         """Return a message without the folder's path, for users on other machines."""
         return message.replace(str(self.root), self.dataset.source)
 
@@ -173,7 +191,8 @@ class ShownDataset(ABC):
         told = read_provenance(file)
         orient = told.get("orientations", {}).get(camera)  # labels of version 0.1.0 have none
         order = told.get("channels", {}).get(camera)
-        return Correction(orient if orient in ORIENTATIONS else "none", order if order in CHANNEL_ORDERS else "rgb")
+        is_known = orient in get_args(Orientation), order in get_args(ChannelOrder)
+        return Correction(orient if is_known[0] else "none", order if is_known[1] else "rgb")
 
     def _name_of(self, file: Path) -> str:
         return file.relative_to(self.root).as_posix()
@@ -187,14 +206,14 @@ def _summary(file: Path, _changed_ns: int) -> Summary:
 def _rows(summary: Summary) -> list[dict[str, Any]]:
     """Return a row of the summary for each episode."""
     columns: dict[str, Sequence[Any]] = {
-        "final_progress": numbers_or_null(summary.final_progress.tolist()),
-        "backwards": numbers_or_null(summary.backwards.tolist()),
+        "final_progress": summary.final_progress.tolist(),
+        "backwards": summary.backwards.tolist(),
     }
     if summary.best_success is not None and summary.last_success is not None:
-        columns["best_success"] = numbers_or_null(summary.best_success.tolist())
-        columns["last_success"] = numbers_or_null(summary.last_success.tolist())
+        columns["best_success"] = summary.best_success.tolist()
+        columns["last_success"] = summary.last_success.tolist()
     if summary.disagreement is not None:
-        columns["disagreement"] = numbers_or_null(summary.disagreement.tolist())
+        columns["disagreement"] = summary.disagreement.tolist()
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
@@ -212,5 +231,5 @@ def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dic
         if labelled is not None:
             of_all = np.full(num_frames, np.nan)
             of_all[frames] = labelled
-            scores[name] = numbers_or_null(of_all.tolist())
+            scores[name] = of_all.tolist()
     return scores

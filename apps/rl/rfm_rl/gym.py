@@ -46,7 +46,7 @@ from rfm_rl.own_rewards import (
     warn_of_file,
     with_statistics,
 )
-from rfm_rl.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
+from rfm_rl.rewards import ClientSource, Info, RewardedEpisode, Rewarder, RewardOptions
 
 INFO = "reward_model"  # key in info
 
@@ -92,7 +92,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         check_frame_source(options, env.render_mode, env.observation_space)
         _check_statistics(env, options)
         super().__init__(env)
-        self._rewarder = EpisodeRewarder(client, options)
+        self._rewarder = Rewarder(client, options)
         self._options = options
         self._task = task
         self._autoresets = [layer for layer in _layers(env) if isinstance(layer, gymnasium.wrappers.Autoreset)]
@@ -120,7 +120,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
             return observation, 0.0, terminated, truncated, self._begin(observation, info)
         if self._has_ended:
             _check_shows_its_end(info)
-        episode.add(self._frame(observation))
+        episode.steps.keep(self._frame(observation))
         self._is_whole = True
         self._rewarder.score({episode: self._has_ended})
         reward = episode.reward(float(env_reward), bool(terminated))

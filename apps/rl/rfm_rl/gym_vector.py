@@ -15,12 +15,11 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 
-from rfm_client import InvalidSampleError, as_array, checked_mask
-from rfm_client.episodes import copied
+from rfm_client import InvalidSampleError, as_array
 from rfm_client.options import require
 from rfm_rl.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind, tasks_of
 from rfm_rl.own_rewards import RETURNS, correct_statistics, refuse_statistics
-from rfm_rl.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
+from rfm_rl.rewards import ClientSource, Info, RewardedEpisode, Rewarder, RewardOptions
 
 OfEnvs: TypeAlias = dict[int, RewardedEpisode]  # by number of the environment
 Mask: TypeAlias = npt.NDArray[np.bool_]
@@ -68,7 +67,7 @@ class RewardModelVectorWrapper(VectorWrapper):
             refuse_statistics(options.terminate_on_success, "RecordEpisodeStatistics(RewardModelVectorWrapper(...))")
         tasks = tasks_of(task, env.num_envs)
         super().__init__(env)  # after the checks: a refused wrapper must not close the environments when collected
-        self._rewarder = EpisodeRewarder(client, options)
+        self._rewarder = Rewarder(client, options)
         self._options = options
         self._autoreset_mode = autoreset_mode
         self._tasks = tasks
@@ -135,7 +134,9 @@ class RewardModelVectorWrapper(VectorWrapper):
         require("options", _MANI_SKILL_MASK not in (options or {}), "a reset of all environments", got)
         if options is None or _RESET_MASK not in options:
             return np.ones(self.num_envs, np.bool_), options
-        mask = checked_mask(_RESET_MASK, options[_RESET_MASK], self.num_envs)
+        mask = as_array(options[_RESET_MASK])
+        is_mask = mask.dtype == np.bool_ and mask.shape == (self.num_envs,)
+        require(_RESET_MASK, is_mask, f"bool [{self.num_envs}]", f"{mask.dtype} {list(mask.shape)}")
         return mask, {**options, _RESET_MASK: mask}
 
     def _check_was_masked(self, options: Info | None) -> None:
@@ -186,7 +187,7 @@ class RewardModelVectorWrapper(VectorWrapper):
             frame = self._frame(final.get(index, shown[index]))
             if index in final:
                 last[index] = frame = copied(frame)
-            episode.add(frame)
+            episode.steps.keep(frame)
             self._whole[index] = index not in final
         fresh = {}
         for index in (*np.flatnonzero(resetting).tolist(), *final):
@@ -241,6 +242,13 @@ def _like(given: Any, values: npt.NDArray[Any]) -> Any:
         return values
     typed = given.bool() if values.dtype == np.bool_ else given.float()  # ManiSkill's sparse rewards are bool
     return typed.new_tensor(values)
+
+
+def copied(frame: Any) -> Any:
+    """Return a copy of a frame, or of a dict of frames by camera."""
+    if isinstance(frame, Mapping):
+        return {camera: np.array(as_array(each)) for camera, each in frame.items()}
+    return np.array(as_array(frame))
 
 
 def check_differ(where: str, last: Any, first: Any, instead: str) -> None:

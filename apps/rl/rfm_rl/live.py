@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import base64
+import io
 import json
 import logging
 import math
@@ -19,21 +20,20 @@ import uuid
 import weakref
 from collections import deque
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from functools import partial
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 from urllib.parse import urlsplit
 
 import numpy as np
+from PIL import Image
 
 from rfm_client import UInt8Array
-from rfm_client.frames import as_jpeg, load_pillow
-from rfm_client.options import checked_count, checked_share, require
-from rfm_client.serving import Closing, Credentials
-
-if TYPE_CHECKING:
-    from rfm_client.episodes import StepScore
+from rfm_client.episodes import StepScore, SuccessRule
+from rfm_client.options import checked_count, require
+from rfm_client.serving import Credentials
 
 PATH = "/live/reports"
 REPORT_EVERY_S = 0.25
@@ -48,6 +48,7 @@ MOST_RUNNING = 1024  # newest episodes that are known to run
 MOST_ANSWER_BYTES = 300  # in a warning
 MOST_LETTERS = 2000  # of a text that a gateway takes
 LONGEST_PX = 256  # longer side of a reported frame
+JPEG_QUALITY = 85
 
 About: TypeAlias = Mapping[str, Any]  # identity of an episode
 Entry: TypeAlias = tuple[About, Mapping[str, Any] | None]  # its step; None: it has ended
@@ -80,7 +81,7 @@ class LiveEpisode:
         self._reporter.end(self._about)
 
 
-class LiveView(Closing):
+class LiveView(AbstractContextManager["LiveView"]):
     """The tab Live of a gateway's page, for episodes: ``client.episode(task, live=LiveView("http://robot:8100"))``.
 
     A view serves any number of episodes and clients, with at most four reports a second in all. It reports the scores
@@ -93,7 +94,7 @@ class LiveView(Closing):
 
     A context manager. It can be pickled: each process then reports by itself. A forked process reports nothing, and
     logs a warning.
-    Raises ValueError for unusable arguments, ImportError without Pillow (``rfm-client[resize]``).
+    Raises ValueError for unusable arguments.
     """
 
     def __init__(
@@ -107,7 +108,6 @@ class LiveView(Closing):
         headers: Mapping[str, str] | None = None,
         api_key: str | None = None,
     ) -> None:
-        load_pillow()
         self.name = name
         self._url = url
         self._credentials = Credentials(ca_file, client_certificate, client_key, headers or {}, api_key)
@@ -124,7 +124,7 @@ class LiveView(Closing):
         """
         checked_count("env", env, least=0)
         if threshold != math.inf:
-            checked_share("threshold", threshold)
+            SuccessRule(threshold)  # raises ValueError
         about = {"name": _shown(self.name), "task": _shown(task)}
         numbers = {"env": operator.index(env), "threshold": _or_none(threshold)}
         return LiveEpisode(self, self._reporter, {"id": uuid.uuid4().hex, **about, **numbers})
@@ -132,6 +132,9 @@ class LiveView(Closing):
     def close(self) -> None:
         """End the episodes. Return after the last report, or after two seconds. Later steps are not reported."""
         self._reporter.close()
+
+    def __exit__(self, *_raised: object) -> None:
+        self.close()
 
     def __reduce__(self) -> tuple[object, ...]:
         return partial(LiveView, self._url, name=self.name, **self._credentials.options), ()
@@ -286,8 +289,17 @@ def report_body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
             told["ended"] = True
         else:
             told["steps"].append(step)
-    pictures = {key: base64.b64encode(as_jpeg(frame, LONGEST_PX)).decode() for key, frame in frames.items()}
+    pictures = {key: base64.b64encode(_jpeg(frame)).decode() for key, frame in frames.items()}
     return json.dumps({"episodes": list(episodes.values()), "frames": pictures}, allow_nan=False).encode()
+
+
+def _jpeg(frame: UInt8Array) -> bytes:
+    """A frame, uint8 [H, W, 3], as a JPEG file with at most LONGEST_PX pixels on its longer side."""
+    image = Image.fromarray(frame)
+    image.thumbnail((LONGEST_PX, LONGEST_PX))
+    file = io.BytesIO()
+    image.save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)  # full resolution of colours
+    return file.getvalue()
 
 
 def _or_none(score: float) -> float | None:

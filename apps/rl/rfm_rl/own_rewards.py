@@ -49,7 +49,7 @@ def correct_statistics(infos: Info, index: int, episode: RewardedEpisode) -> Non
 
 
 def _statistics(episode: RewardedEpisode) -> dict[str, float]:
-    return {"r": episode.total_reward, "l": episode.frames.step}
+    return {"r": episode.total_reward, "l": episode.steps.step}
 
 
 class _HasFile(type):

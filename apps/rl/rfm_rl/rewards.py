@@ -4,17 +4,15 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from rfm_client import FrameSize, InvalidSampleError, ProgressResult, RewardClient, RewardError, UInt8Array
-from rfm_client.episodes import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, SuccessRule
+from rfm_client import InvalidSampleError, RewardClient, UInt8Array
+from rfm_client.episodes import Episode, EpisodeOptions, StepScore, SuccessRule
 from rfm_client.frames import ChannelOrder, Fuse, Orientation, Rule
 from rfm_client.options import checked_count, checked_finite, require
 from rfm_rl.live import LiveView
@@ -113,22 +111,13 @@ class RewardOptions:
         for name in ("every", "max_pending", "max_frames"):
             if getattr(self, name) is not None:
                 checked_count(name, getattr(self, name))
-        object.__setattr__(self, "cameras", self.scoring.cameras)
+        object.__setattr__(self, "cameras", EpisodeOptions(**self.scoring).cameras)
 
-    @cached_property
-    def scoring(self) -> EpisodeOptions:
-        """Options of the episode's steps. Raises ValueError."""
-        return EpisodeOptions(
-            sampling=self.sampling,
-            frames=self.max_frames,
-            cameras=self.cameras,
-            fuse=self.fuse,
-            orient=self.orient,
-            channels=self.channels,
-            resize=self.resize,
-            success=self.success_rule or SuccessRule(),
-            live=self.live,
-        )
+    @property
+    def scoring(self) -> dict[str, Any]:
+        """The arguments of ``client.episode`` for its steps."""
+        own = {"frames": self.max_frames, "success": self.success_rule or SuccessRule(), "timeout_s": None}
+        return {each.name: getattr(self, each.name) for each in fields(EpisodeOptions) if each.name not in own} | own
 
     @property
     def success_rule(self) -> SuccessRule | None:
@@ -171,21 +160,19 @@ class RewardOptions:
 
 
 class RewardedEpisode:
-    """One episode: its frames, newest known score, and open requests.
+    """The rewards of one episode: its newest known score, and open requests.
 
     index: number of its environment; None: the only environment
-    size: size to which frames shrink; None: no change
-    pending: open requests, with the future of each window
+    pending: scores of open requests
     known: the newest known score
     total_reward: sum of its rewards until now
     """
 
-    def __init__(self, options: RewardOptions, task: str, index: int | None, size: FrameSize | None) -> None:
-        where = "" if index is None else f"envs[{index}]"
+    def __init__(self, options: RewardOptions, episode: Episode, index: int | None) -> None:
         self.index = index
-        self.frames = EpisodeFrames(task, options.scoring, index or 0, where)
-        self._options, self._size = options, size
-        self.pending: list[tuple[StepRequest, list[Future[ProgressResult]]]] = []
+        self.steps = episode
+        self._options = options
+        self.pending: list[Future[list[StepScore]]] = []
         self.known: StepScore | None = None
         self._paid_progress = np.nan
         self.total_reward = 0.0
@@ -197,34 +184,24 @@ class RewardedEpisode:
     def is_unpaid(self) -> bool:
         """True if the episode goes on, and a step of it is not yet paid."""
         paid = 0 if self.known is None or self._options.mode == "final" else self.known.step
-        return not self._has_ended and self.frames.step > paid
-
-    def add(self, frame: Any) -> None:
-        """Add a copy of a frame, uint8 [H, W, 3], or of a dict of these by camera. Raises InvalidSampleError."""
-        self.frames.append(self.frames.checked(frame, self._size))
+        return not self._has_ended and self.steps.step > paid
 
     def collect(self) -> None:
         """Take over the scores of completed requests. Raises the RewardError of a failed request."""
-        for each in [each for each in self.pending if all(answer.done() for answer in each[1])]:
-            self.pending.remove(each)
-            question, answers = each
-            outcomes = []
-            for answer in answers:
-                error = answer.exception()
-                outcomes.append(error if isinstance(error, RewardError) else answer.result())
-            self.learn(*question.scores(outcomes))
+        for answer in [answer for answer in self.pending if answer.done()]:
+            self.pending.remove(answer)
+            self.learn(*answer.result())
 
     def cancel(self) -> None:
         """Cancel the requests that are still open."""
-        for _, answers in self.pending:
-            for answer in answers:
-                answer.cancel()
+        for answer in self.pending:
+            answer.cancel()
         self.pending.clear()
 
     def end(self) -> None:
-        """Cancel open requests, and tell the live view that the episode has ended."""
+        """Cancel open requests, and end the episode."""
         self.cancel()
-        self.frames.end()
+        self.steps.close()
         self._has_ended = True
 
     def learn(self, score: StepScore) -> None:
@@ -245,7 +222,6 @@ class RewardedEpisode:
         self.known = score
         self._has_succeeded |= rule is not None and score.succeeded
         self.succeeded |= ending is not None and score.succeeded
-        self.frames.report(score)
 
     def reward(self, env_reward: float, terminated: bool) -> float:
         """Return the reward of the newest step, once it has been scored if it is due.
@@ -269,11 +245,11 @@ class RewardedEpisode:
         """Return the newest known scores, and their lag in steps."""
         known = self.known or StepScore(np.nan, np.nan, False, -1, np.nan)
         told = {"progress": known.progress, "success": known.success, "step": known.step}
-        told |= {"lag": self.frames.step - known.step, "skipped": self.num_skipped}
+        told |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped}
         return told if self._options.success_rule is None else told | {"succeeded": self._has_succeeded}
 
 
-class EpisodeRewarder:
+class Rewarder:
     """Scores the episodes of environments through one client. Connects at the first request."""
 
     def __init__(self, client: ClientSource, options: RewardOptions) -> None:
@@ -297,7 +273,7 @@ class EpisodeRewarder:
         if unpaid is None:
             return
         where = "reset" if unpaid.index is None else f"envs[{unpaid.index}]: reset"
-        got = f"one after {unpaid.frames.step} steps, whose reward is lost"
+        got = f"one after {unpaid.steps.step} steps, whose reward is lost"
         self._has_dropped = not self._has_dropped  # a third reset may go on
         if not self._has_dropped and self._options.mode == "final":
             expected = "the end of an episode before it, where mode 'final' pays"
@@ -309,12 +285,12 @@ class EpisodeRewarder:
     def begin(self, task: str, frame: Any, index: int | None = None) -> RewardedEpisode:
         """Return a new episode with its first frame. Raises RewardError.
 
-        frame, index: as of RewardedEpisode
+        frame: uint8 [H, W, 3]; with cameras, a dict of these
+        index: number of its environment; None: the only environment
         """
-        size = self._client.model_info(frames=True).frame_size if self._options.resize else None
-        episode = RewardedEpisode(self._options, task, index, size)
-        episode.add(frame)
-        return episode
+        episode = self._client.episode(task, env=index, **self._options.scoring)
+        episode.keep(frame)
+        return RewardedEpisode(self._options, episode, index)
 
     def score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
         """Collect known scores, and request those of newest frames that are due. Raises RewardError.
@@ -341,7 +317,7 @@ class EpisodeRewarder:
             episode.collect()
             ends = ends or episode.succeeded
             is_first = episode.known is None
-            due = ends or is_first or self._options.is_due(episode.frames.step)
+            due = ends or is_first or self._options.is_due(episode.steps.step)
             waits = self._options.blocking or is_first or (ends and self._options.await_last)
             if ends:
                 episode.cancel()
@@ -350,21 +326,11 @@ class EpisodeRewarder:
             elif due and not ends and len(episode.pending) >= self._options.max_pending:
                 episode.num_skipped += 1
             elif due and not ends:
-                question = self._question([episode])
-                answers = [self._client.submit_window(window) for window in question.windows]
-                episode.pending.append((question, answers))
+                episode.pending.append(self._client.submit_episodes([episode.steps]))
         if awaited:
-            question = self._question(awaited)
-            scores = question.scores(self._client.score_windows(question.windows))
+            scores = self._client.score_episodes([episode.steps for episode in awaited])
             for episode, score in zip(awaited, scores, strict=True):
                 episode.learn(score)
-
-    def _question(self, episodes: Sequence[RewardedEpisode]) -> StepRequest:
-        """Request about their newest frames, sampled by the options and the checkpoint now served."""
-        asked_s = time.perf_counter()
-        scoring = self._options.scoring
-        info = self._client.model_info(frames=True)
-        return StepRequest([episode.frames for episode in episodes], scoring.sampling_for(info), asked_s)
 
     @property
     def _client(self) -> RewardClient:

@@ -18,10 +18,9 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from rfm_client import InvalidSampleError
-from rfm_client.episodes import copied
 from rfm_client.options import require
 from rfm_rl.gym import DEFAULTS, INFO, LOST, check_frame_source, tasks_of
-from rfm_rl.gym_vector import check_differ
+from rfm_rl.gym_vector import check_differ, copied
 from rfm_rl.own_rewards import (
     RELABELS,
     WritingMonitor,
@@ -29,7 +28,7 @@ from rfm_rl.own_rewards import (
     warn_of_file,
     with_statistics,
 )
-from rfm_rl.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
+from rfm_rl.rewards import ClientSource, Info, RewardedEpisode, Rewarder, RewardOptions
 
 try:
     from stable_baselines3.common.vec_env import (
@@ -100,7 +99,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         require("terminate_on_success", options.terminate_on_success is None, "None, since a VecEnv resets", instead)
         _check_own_rewards(venv)
         tasks = tasks_of(task, venv.num_envs)
-        self._rewarder = EpisodeRewarder(client, options)  # before super, which reads the attributes
+        self._rewarder = Rewarder(client, options)  # before super, which reads the attributes
         self._reward_options, self._tasks = options, tasks
         self._episodes: list[RewardedEpisode] = []
         self._is_whole = False  # all frames of the episodes are kept
@@ -144,7 +143,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
                 frames[index] = copied(self._final_frame(index, infos[index]))
             elif not self._reward_options.renders:
                 frames[index] = self._reward_options.frames_of(_of_env(observations, index))
-            episode.add(frames[index])
+            episode.steps.keep(frames[index])
         for index in ended:
             self._episodes[index] = self._begin(index, observations)
             if not self._reward_options.renders:  # a rendered frame is a copy

@@ -12,9 +12,9 @@ from typing import Annotated, Any, ClassVar, TypeAlias
 
 import typer
 
-from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.cli.command import STANDARD_OUTPUT, Given, OptionsOf, usage_errors
 from rfm_client.client import RewardClient
+from rfm_client.client_options import DEFAULT_TIMEOUT_S
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS

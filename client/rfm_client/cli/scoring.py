@@ -35,7 +35,7 @@ from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.contract.tasks import is_blank
 from rfm_client.frames.blank_frames import BlankFrames
 from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, with_frame_indices
-from rfm_client.frames.sampling import Sampling, of_prefixes, prefix_samples
+from rfm_client.frames.sampling import Sampling
 from rfm_client.plot import plot_scores
 
 if TYPE_CHECKING:
@@ -235,7 +235,7 @@ def fitted_to(
     info = client.model_info(frames=sample.trajectory.frames is not None)
     limits = (video.max_frames, info.max_frames if video.subsample and not samples_prefixes else None)
     limit = min((frames for frames in limits if frames is not None), default=None)
-    return fitted(sample, replace(info, max_frames=limit), subsample=True, resize=video.resize)
+    return fitted(sample, limit, info.frame_size if video.resize else None)
 
 
 def _evaluate(
@@ -255,11 +255,11 @@ def _evaluate(
         sampling = Sampling.of(prefix.sampling, prefix.frames, info.max_frames)
     except ValueError as error:  # the options are valid: the checkpoint lacks the number
         raise InvalidSampleError(f"--{error}") from error
-    samples = prefix_samples(sent.trajectory, sampling)
+    samples = sampling.samples(sent.trajectory)
     results: list[Result] = []
     while part := list(itertools.islice(samples, PREFIXES_AT_A_TIME)):
         results += client.evaluate(part)
-    told = of_prefixes(cast("list[ProgressResult]", results), sampling)
+    told = sampling.joined(cast("list[ProgressResult]", results))
     return cast(ProgressResult, with_frame_indices(told, fit.frame_indices))
 
 

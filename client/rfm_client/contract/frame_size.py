@@ -7,10 +7,10 @@ import re
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, cast
 
-Rule: TypeAlias = Literal["shortest", "longest", "exact"]
+Rule: TypeAlias = Literal["shortest", "exact"]
 
-_FORMS = "'shortest PX', 'longest PX' or 'exact HEIGHTxWIDTH'"
-_TEXT = re.compile(r"(?:(shortest|longest) ([1-9][0-9]*))|(?:(exact) ([1-9][0-9]*)x([1-9][0-9]*))")
+_FORMS = "'shortest PX' or 'exact HEIGHTxWIDTH'"
+_TEXT = re.compile(r"(?:(shortest) ([1-9][0-9]*))|(?:(exact) ([1-9][0-9]*)x([1-9][0-9]*))")
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,6 @@ class FrameSize:
     """The size to which a served checkpoint resizes every frame.
 
     rule: ``shortest`` (ReWiND's encoders): the shorter edge becomes px pixels, the other in proportion, rounded down;
-        ``longest`` (SmolVLM): the longer edge becomes px pixels, the other in proportion and even;
         ``exact``: the frame gets this height and width
     edges_px: (px,), or (height, width) for ``exact``
     """
@@ -28,7 +27,7 @@ class FrameSize:
 
     @classmethod
     def parse(cls, text: str) -> FrameSize:
-        """Parse ``shortest 256``, ``longest 512`` or ``exact 224x320``, as ``str`` writes them. Raises ValueError."""
+        """Parse ``shortest 256`` or ``exact 224x320``, as ``str`` writes them. Raises ValueError."""
         match = _TEXT.fullmatch(text)
         if match is None:
             raise ValueError(f"frame_size: expected {_FORMS}, got {text!r}")
@@ -43,13 +42,8 @@ class FrameSize:
         if self.rule == "exact":
             return min(height, self.edges_px[0]), min(width, self.edges_px[1])
         (px,) = self.edges_px
-        edge = min(height, width) if self.rule == "shortest" else max(height, width)
+        edge = min(height, width)
         if edge <= px:
             return height, width
-        # The server's own expressions: after other rounding it would resize again.
-        if self.rule == "shortest":
-            other = int(px * max(height, width) / edge)
-            return (px, other) if height <= width else (other, px)
-        other = int(px / (width / height)) if width >= height else int(px * (width / height))
-        other = max(other + other % 2, 1)
-        return (other, px) if width >= height else (px, other)
+        other = int(px * max(height, width) / edge)  # as by the server, which would resize again after other rounding
+        return (px, other) if height <= width else (other, px)

@@ -12,7 +12,6 @@ DEFAULT_MODEL = "rfm"  # scores embeddings; the names of the other models derive
 PROBE_PREFIX = "rfm-probe"  # of the request ids of probes, which a model's metrics leave out
 
 ADMIN_KEY_VARIABLE = "RFM_ADMIN_KEY"
-GATEWAY_KEY_VARIABLE = "RFM_GATEWAY_API_KEY"
 
 
 def encoder_name(model: str) -> str:

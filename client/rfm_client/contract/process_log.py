@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import secrets
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -16,7 +17,9 @@ from datetime import datetime, timezone
 from itertools import islice
 from urllib.parse import quote
 
+from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.settings import ConfigError
+from rfm_client.contract.wire import REQUEST_ID
 
 LEVEL_VARIABLE = "RFM_LOG_LEVEL"
 
@@ -24,6 +27,7 @@ _LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 _OURS = ("rfm", "rfm_client", "rfm_gateway")  # loggers that the level is for: at DEBUG, libraries would log too much
 _IN_IDS = "._:/+=@-"  # besides letters and digits
 _MOST_IDS, _MOST_LETTERS = 64, 64  # in a line
+_ID_BYTES = 8  # random, for a request without an id
 
 _requests: ContextVar[str] = ContextVar("requests", default="")
 
@@ -46,9 +50,15 @@ def write_log(process: str, environment: Mapping[str, str]) -> None:
         logging.getLogger(name).setLevel(level)
 
 
-def log_requests(ids: Iterable[str]) -> None:
-    """Name these requests in every line that is logged in this context from now on."""
-    _requests.set(_in_log(ids))
+def begin_request(given: str = "") -> str:
+    """Return the id of a request, and name it in every line that is logged in this context from now on.
+
+    given: the caller's id. A random id replaces an id that breaks log lines, or by which metrics would count a probe
+    """
+    is_usable = REQUEST_ID.fullmatch(given) and not given.startswith(PROBE_PREFIX)
+    request_id = given if is_usable else secrets.token_hex(_ID_BYTES)
+    _requests.set(_in_log([request_id]))
+    return request_id
 
 
 @contextmanager

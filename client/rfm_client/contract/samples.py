@@ -20,6 +20,7 @@ from rfm_client.contract.errors import InvalidSampleError
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 UInt8Array: TypeAlias = npt.NDArray[np.uint8]
+NamedFrame: TypeAlias = tuple[bytes, npt.NDArray[Any]]  # a frame's digest, and what a server has of the frame
 
 MIN_FRAME_STEPS = 2  # a prefix sampled to a single frame is no trajectory
 MAX_FRAME_STEPS = 4096  # more frames than any checkpoint takes
@@ -34,6 +35,8 @@ class Trajectory:
     video_embeddings: float32 [T, D], in place of ``frames``
     text_embedding: float32 [Dt], embedding of the task, for ``video_embeddings``
     task: a sentence, for ``frames``
+    named: in place of ``frames``, on a server: the digest of each frame with its pixels, uint8 [H, W, 3], or with its
+        embedding, float32 [D], which the encoders kept
 
     Raises InvalidSampleError.
     """
@@ -42,10 +45,12 @@ class Trajectory:
     video_embeddings: Float32Array | None = None
     text_embedding: Float32Array | None = None
     task: str = ""
+    named: tuple[NamedFrame, ...] | None = None
 
     def __post_init__(self) -> None:
-        if (self.frames is None) == (self.video_embeddings is None):
-            got = "neither" if self.frames is None else "both"
+        given = [each for each in (self.frames, self.video_embeddings, self.named) if each is not None]
+        if len(given) != 1:
+            got = "both" if given else "neither"
             raise InvalidSampleError.at("trajectory", "either frames or video_embeddings", got)
         check_task(self.task)
         if self.frames is not None and self.text_embedding is not None:
@@ -63,19 +68,20 @@ class Trajectory:
         """The trajectory with shapes in place of values."""
         arrays = {"frames": self.frames, "video_embeddings": self.video_embeddings, "text": self.text_embedding}
         shapes = [f"{name}={array.dtype} {list(array.shape)}" for name, array in arrays.items() if array is not None]
+        shapes += [] if self.named is None else [f"named={self.num_frames} frames"]
         return f"Trajectory({', '.join([*shapes, f'task={self.task!r}'])})"
 
     @property
     def positions(self) -> npt.NDArray[Any]:
         """``frames``, uint8 [T, H, W, 3], or ``video_embeddings``, float32 [T, D]: time is the first axis."""
         array = self.video_embeddings if self.frames is None else self.frames
-        assert array is not None  # by __post_init__
+        assert array is not None  # named frames are not one array
         return array
 
     @property
     def num_frames(self) -> int:
         """T, the number of frames."""
-        return int(self.positions.shape[0])
+        return len(self.positions if self.named is None else self.named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,9 +267,9 @@ def _check_text(trajectory: Trajectory, where: str) -> None:
     """Check the first trajectory's text, the only text that the model reads."""
     if not isinstance(trajectory, Trajectory):
         raise InvalidSampleError.at(where, "Trajectory", type(trajectory).__name__)
-    if trajectory.frames is None and trajectory.text_embedding is None:
+    if trajectory.video_embeddings is not None and trajectory.text_embedding is None:
         raise InvalidSampleError.at(f"{where}.text_embedding", "float32 [Dt] with video_embeddings", "None")
-    if trajectory.frames is not None and not trajectory.task.strip():
+    if trajectory.video_embeddings is None and not trajectory.task.strip():
         raise InvalidSampleError.at(f"{where}.task", "a task sentence with frames", repr(trajectory.task))
 
 

@@ -7,27 +7,23 @@ import asyncio
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import checked_mask
-from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, StepScores, copied
-from rfm_client.episodes.windows import EpisodeFrame
-from rfm_client.frames.sampling import Sampling
-from rfm_client.transport.deadline import Deadline
+from rfm_client.episodes.options import StepScore, StepScores
+from rfm_client.episodes.scorer import Asked, StepScorer
+from rfm_client.episodes.steps import Frame, Steps, check_cameras, copied
+from rfm_client.scoring.call import Call, CallOptions
 from rfm_client.transport.lifetime import AsyncClosing, Closing, OneProcess
-
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from rfm_client.async_client import AsyncRewardClient
-    from rfm_client.transport.loop_thread import LoopThread
+from rfm_client.transport.loop_thread import LoopThread
 
 
 class AsyncEpisodes(AsyncClosing, OneProcess):
@@ -36,21 +32,19 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
     A step takes as few requests as possible. All frames are kept until the episode ends, because later steps show them
     again.
 
-    tasks: sentence of each episode
-    timeout_s: longest time of a step, retries included; None: the client's
+    begin: method of the client that returns a call which begins now
+    steps: each episode
     """
 
-    def __init__(
-        self, client: AsyncRewardClient, tasks: Sequence[str], options: EpisodeOptions, timeout_s: float | None = None
-    ) -> None:
-        require("episodes", len(tasks) > 0, "at least one", "none")
-        self._client, self._options, self._timeout_s = client, options, timeout_s
-        self._tasks = list(tasks)
-        self._episodes = [self._new(index) for index in range(len(tasks))]
+    def __init__(self, scorer: StepScorer, begin: Callable[[CallOptions], Call], steps: list[Steps]) -> None:
+        require("episodes", len(steps) > 0, "at least one", "none")
+        self.steps = steps
+        self._scorer, self._begin, self._options = scorer, begin, steps[0].options
+        self._timed: CallOptions = {"timeout_s": self._options.timeout_s}
         self._adding = asyncio.Lock()
 
     def __len__(self) -> int:
-        return len(self._tasks)
+        return len(self.steps)
 
     async def add(self, frames: Any, mask: npt.ArrayLike | None = None) -> StepScores:
         """Add a frame to each episode, and return the scores of the episodes so far.
@@ -61,25 +55,19 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         Raises RewardError, ``episodes[3].frame: expected X, got Y``. Then no episode has grown, and the step may be
         repeated.
         """
-        asked_s = time.perf_counter()
-        deadline = None if self._timeout_s is None else Deadline(self._timeout_s)
+        asked_s, call = time.perf_counter(), self._begin(self._timed)
         async with self._adding:
             indices = _indices(mask, len(self))
-            sampling, size = await self._shown(deadline)
-            new = await self._checked(frames, indices, size)
-            added = [self._episodes[index] for index in indices]
-            for episode, frame in zip(added, new, strict=True):
-                episode.append(frame)
+            new = await self._checked(frames, indices, await self.frame_size(call))
+            added = [self.steps[index] for index in indices]
+            for steps, frame in zip(added, new, strict=True):
+                steps.append(frame)
             try:
-                question = StepRequest(added, sampling, asked_s)
-                outcomes = await self._client.score_windows(question.windows, timeout_s=_left_s(deadline))
-                scores = question.scores(outcomes)
+                scores = await self._scorer.scores([(steps, steps.newest) for steps in added], call, asked_s)
             except BaseException:
-                for episode in added:
-                    episode.pop()
+                for steps, frame in zip(added, new, strict=True):
+                    steps.remove(frame)
                 raise
-            for episode, score in zip(added, scores, strict=True):
-                episode.report(score)
             return self._gathered(dict(zip(indices, scores, strict=True)))
 
     async def reset(self, mask: npt.ArrayLike | None = None, task: str | Sequence[str] | None = None) -> None:
@@ -93,33 +81,27 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
             tasks = [task] * len(indices) if task is None or isinstance(task, str) else list(task)
             require("task", len(tasks) == len(indices), f"one for each of {len(indices)} episodes", len(tasks))
             for index, new in zip(indices, tasks, strict=True):
-                self._episodes[index].end()
-                self._tasks[index] = self._tasks[index] if new is None else new
-                self._episodes[index] = self._new(index)
+                self.steps[index].end()
+                self.steps[index] = self.steps[index].anew(new)
 
     async def close(self) -> None:
         """End the episodes, also in the live view, once no step is open."""
         async with self._adding:
-            for episode in self._episodes:
-                episode.end()
+            for steps in self.steps:
+                steps.end()
 
-    def _new(self, index: int) -> EpisodeFrames:
-        where = f"episodes[{index}]" if len(self) > 1 else ""
-        return EpisodeFrames(self._tasks[index], self._options, index, where)
+    async def frame_size(self, call: Call | None = None) -> FrameSize | None:
+        """Return the size to which frames shrink; None: no change. Raises RewardError."""
+        if not self._options.resize:
+            return None
+        return (await self._scorer.model_info(call or self._begin(self._timed))).frame_size
 
-    async def _shown(self, deadline: Deadline | None) -> tuple[Sampling, FrameSize | None]:
-        """Rule and frame size for the checkpoint. The client caches both until another version answers."""
-        info = await self._client.model_info(frames=True, timeout_s=_left_s(deadline))
-        return self._options.sampling_for(info), info.frame_size if self._options.resize else None
-
-    async def _checked(
-        self, frames: Any, indices: Sequence[int], size: FrameSize | None
-    ) -> list[tuple[EpisodeFrame, ...]]:
+    async def _checked(self, frames: Any, indices: Sequence[int], size: FrameSize | None) -> list[tuple[Frame, ...]]:
         """Check the new frames of these episodes, in as many threads as processors."""
         given = self._given(frames, indices)
 
-        def checked(some: Sequence[int]) -> list[tuple[EpisodeFrame, ...]]:
-            return [self._episodes[index].checked(given[index], size) for index in some]
+        def checked(some: Sequence[int]) -> list[tuple[Frame, ...]]:
+            return [self.steps[index].checked(given[index], size) for index in some]
 
         count = max(1, math.ceil(len(indices) / (os.cpu_count() or 1)))
         parts = [indices[first : first + count] for first in range(0, len(indices), count)]
@@ -130,10 +112,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
     def _given(self, frames: Any, indices: Sequence[int]) -> dict[int, Any]:
         """The new frame of each of these episodes; with cameras, a dict of frames."""
         cameras = self._options.cameras
-        names = sorted(frames) if isinstance(frames, Mapping) else []
-        expected = f"the cameras {list(cameras)}" if cameras else "one camera (cameras=... names several)"
-        got = f"frames of {names}" if names else type(frames).__name__
-        require("frames", names == sorted(cameras), f"frames of {expected}", got, InvalidSampleError)
+        check_cameras("frames", frames, cameras)
         of_cameras = {f"frames[{camera!r}]": frames[camera] for camera in cameras} or {"frames": frames}
         for where, each in of_cameras.items():
             count = len(each) if hasattr(each, "__len__") else type(each).__name__
@@ -149,7 +128,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         for index, score in scores.items():
             progress[index], success[index] = score.progress, score.success
             succeeded[index], unclear[index] = score.succeeded, score.unclear
-        steps = np.array([episode.step for episode in self._episodes], np.int64)
+        steps = np.array([steps.newest for steps in self.steps], np.int64)
         ms = max((score.ms for score in scores.values()), default=0.0)
         return StepScores(progress, success, succeeded, steps, ms, unclear)
 
@@ -157,10 +136,8 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
 class AsyncEpisode(AsyncClosing, OneProcess):
     """One episode that grows, for asyncio. ``AsyncRewardClient.episode`` builds it. An async context manager."""
 
-    def __init__(
-        self, client: AsyncRewardClient, task: str, options: EpisodeOptions, timeout_s: float | None = None
-    ) -> None:
-        self._episodes = AsyncEpisodes(client, [task], options, timeout_s)
+    def __init__(self, episodes: AsyncEpisodes) -> None:
+        self.episodes = episodes  # a single one
         self._open: asyncio.Task[StepScore] | None = None
         self._waiting: asyncio.Task[StepScore] | None = None  # for the open request to end
 
@@ -193,12 +170,12 @@ class AsyncEpisode(AsyncClosing, OneProcess):
     async def reset(self, task: str | None = None) -> None:
         """Begin a new episode, once no request is open; drop a waiting frame. ``task``: None: as before."""
         await self._settle()
-        await self._episodes.reset(task=task)
+        await self.episodes.reset(task=task)
 
     async def close(self) -> None:
         """End the episode, also in the live view, once no request is open; drop a waiting frame."""
         await self._settle()
-        await self._episodes.close()
+        await self.episodes.close()
 
     async def _settle(self) -> None:
         self._drop_waiting()
@@ -212,7 +189,7 @@ class AsyncEpisode(AsyncClosing, OneProcess):
 
     async def _add(self, frame: Any) -> StepScore:
         frames = {camera: [each] for camera, each in frame.items()} if isinstance(frame, Mapping) else [frame]
-        return (await self._episodes.add(frames)).of(0)
+        return (await self.episodes.add(frames)).of(0)
 
     async def _add_after(self, before: asyncio.Task[StepScore], frame: Any) -> StepScore:
         await asyncio.wait({before})
@@ -243,10 +220,36 @@ class Episodes(Closing, OneProcess):
 
 
 class Episode(Closing, OneProcess):
-    """AsyncEpisode without ``await``. ``RewardClient.episode`` builds it. A context manager."""
+    """AsyncEpisode without ``await``, and frames without a request. ``RewardClient.episode`` builds it.
+
+    A context manager.
+    """
 
     def __init__(self, episode: AsyncEpisode, loop: LoopThread, client: object) -> None:
         self._episode, self._loop, self._client = episode, loop, client
+        self._size: FrameSize | None = None  # to which ``keep`` shrinks frames
+        self._is_queued = False  # a request of ``add_nowait`` may be open
+
+    @property
+    def asked(self) -> Asked:
+        """The question about the newest frame, for ``RewardClient.score_episodes``."""
+        steps = self._episode.episodes.steps[0]
+        return steps, steps.newest
+
+    @property
+    def step(self) -> int:
+        """Number of the newest frame, from 0; -1: none yet."""
+        return self.asked[1]
+
+    def keep(self, frame: Any) -> None:
+        """Add a frame, and ask nothing: ``RewardClient.score_episodes`` scores it. frame: as in ``add``.
+
+        Raises InvalidSampleError; RewardError if the server does not tell the size for ``resize``.
+        """
+        steps, newest = self.asked
+        if newest < 0 and steps.options.resize:
+            self._size = self._loop.wait(self._episode.episodes.frame_size())
+        steps.append(steps.checked(frame, self._size))
 
     def add(self, frame: Any) -> StepScore:
         """Add a frame, uint8 [H, W, 3], and return the score, as ``AsyncEpisode.add``. Raises RewardError."""
@@ -255,6 +258,7 @@ class Episode(Closing, OneProcess):
     def add_nowait(self, frame: Any) -> Future[StepScore]:
         """Add a frame, and return the future of its score at once, as ``AsyncEpisode.add_nowait``."""
         frame = copied(frame)
+        self._is_queued = True
 
         async def answer() -> StepScore:
             return await self._episode.add_nowait(frame)
@@ -267,11 +271,10 @@ class Episode(Closing, OneProcess):
 
     def close(self) -> None:
         """End the episode, as ``AsyncEpisode.close``."""
-        self._loop.wait(self._episode.close())
-
-
-def _left_s(deadline: Deadline | None) -> float | None:
-    return None if deadline is None else deadline.remaining_s()
+        if self._is_queued:
+            self._loop.wait(self._episode.close())
+        else:
+            self.asked[0].end()
 
 
 def _indices(mask: npt.ArrayLike | None, count: int) -> list[int]:

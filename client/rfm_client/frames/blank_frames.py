@@ -59,19 +59,19 @@ class BlankFrames:
 
     @property
     def told(self) -> str:
-        """Description of the blank frames, from ``what_is_shown``; empty if the camera is not blank."""
-        return "" if self.highest is None else what_is_shown(self.highest)
+        """Description of the blank frames, from ``described``; empty if the camera is not blank."""
+        return "" if self.highest is None else self.described(self.highest)
 
-
-def what_is_shown(highest: int) -> str:
-    """Return a description of blank frames. highest: highest value in them"""
-    if highest == 0:
-        return "black pictures"
-    if highest <= _FLOATS:
-        return f"black pictures, no value above {highest} (multiply floats in 0..1 by 255 before they become uint8)"
-    return (
-        f"black pictures, no value above {highest}" if highest <= _BLACK else "pictures that are black or of one colour"
-    )
+    @staticmethod
+    def described(highest: int) -> str:
+        """Return a description of blank frames. highest: highest value in them"""
+        if highest == 0:
+            return "black pictures"
+        if highest > _BLACK:
+            return "pictures that are black or of one colour"
+        told = f"black pictures, no value above {highest}"
+        remedy = " (multiply floats in 0..1 by 255 before they become uint8)"
+        return told + remedy * (highest <= _FLOATS)
 
 
 def _is_flat(pixels: UInt8Array) -> bool:

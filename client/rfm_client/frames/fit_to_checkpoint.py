@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, with_trajectories
 from rfm_client.frames.resize import resize_frames
@@ -44,23 +44,22 @@ def snapshot(sample: Sample) -> Sample:
     return with_trajectories(sample, [copied(t) for t in sample.trajectories]) if isinstance(sample, Sample) else sample
 
 
-def fitted(sample: Sample, info: ModelInfo, *, subsample: bool, resize: bool) -> FittedSample:
-    """Return the sample with at most ``info.max_frames`` frames a trajectory, of at most ``info.frame_size``.
+def fitted(sample: Sample, max_frames: int | None, frame_size: FrameSize | None) -> FittedSample:
+    """Return the sample with at most ``max_frames`` frames a trajectory, of at most ``frame_size``.
 
-    subsample: leave frames out, as training does (``sampling.thinned``). Not in dense mode, where the server samples
-        each prefix
-    resize: shrink frames
+    max_frames: frames are left out as in training (``sampling.thinned``), but not in dense mode, where the server
+        samples each prefix; None: any number
+    frame_size: None: any size
     """
     dense = isinstance(sample, ProgressSample) and sample.frame_steps > 0
-    limit = info.max_frames if subsample and not dense else None
+    limit = None if dense else max_frames
     kept = [thinned(trajectory.num_frames, limit) for trajectory in sample.trajectories]
     trajectories = [
         t if indices is None else taken(t, indices) for t, indices in zip(sample.trajectories, kept, strict=True)
     ]
-    if resize and info.frame_size is not None:
-        size = info.frame_size
+    if frame_size is not None:
         trajectories = [
-            t if t.frames is None else replace(t, frames=resize_frames(t.frames, size)) for t in trajectories
+            t if t.frames is None else replace(t, frames=resize_frames(t.frames, frame_size)) for t in trajectories
         ]
     return FittedSample(with_trajectories(sample, trajectories), kept)
 

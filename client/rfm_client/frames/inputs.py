@@ -25,7 +25,7 @@ from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.pictures import upright_picture
 from rfm_client.frames.video import is_url, read_video
 
-BROKEN_NPY = (  # numpy's errors for a broken .npy header
+_BROKEN_NPY = (  # numpy's errors for a broken .npy header
     *(ValueError, TypeError, LookupError, SyntaxError),
     *(tokenize.TokenError, MemoryError, RecursionError),
 )
@@ -133,7 +133,7 @@ def _arrays(file: Path) -> Mapping[str, npt.NDArray[Any]]:
             if isinstance(loaded, np.ndarray):
                 return {"video_embeddings" if loaded.ndim == 2 else "frames": loaded}
             return {key: loaded[key] for key in loaded.files}
-    except (OSError, EOFError, BadZipFile, zlib.error, *BROKEN_NPY) as error:
+    except (OSError, EOFError, BadZipFile, zlib.error, *_BROKEN_NPY) as error:
         raise InvalidSampleError.at("file", "arrays of numbers and text, none pickled", f"{error} ({file})") from error
 
 

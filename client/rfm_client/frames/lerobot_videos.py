@@ -15,7 +15,8 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.frames.video_decoding import VideoError, import_av, read_packets
+from rfm_client.frames.pictures import FrameFileError
+from rfm_client.frames.video_decoding import import_av, read_packets
 
 _INSTEAD = (
     "label the dataset with rfm-client label, or name the part of the file that is one episode: start_s and end_s of "
@@ -95,7 +96,7 @@ def _num_frames(video: Path) -> int | None:
     try:
         with video.open("rb") as file:
             return read_packets(file).count
-    except (VideoError, import_av().FFmpegError, OSError):
+    except (FrameFileError, import_av().FFmpegError, OSError):
         return None
 
 

@@ -25,55 +25,92 @@ _UPRIGHT = {  # Pillow's name by EXIF orientation
 }
 _HEAD_BYTES = 2**13  # in which EXIF and XMP data begin
 _MARKS = (b"Exif", b"eXIf", b"type exif", b"adobe", b"WEBP")  # JPEG, PNG, older PNG, XMP; WebP has EXIF at its end
-
-
 _COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's modes of at most 8 bits a channel
 _BROKEN = (OSError, SyntaxError, ValueError)  # Pillow's errors for broken pixels, headers and EXIF data
 _DEEP = ";16"  # Pillow's mark of 16 bits a channel, which it cuts to 8
 
 
-class PictureError(Exception):
-    """A file that is not one readable picture. ``expected`` and ``got`` are the parts of a message."""
+class FrameFileError(ValueError):
+    """A file that is not one readable video or picture. ``expected`` and ``got`` are the parts of a message.
 
-    def __init__(self, expected: str, got: object) -> None:
-        super().__init__(expected, got)
+    where: place in the file, such as ``frame 3``; empty: the whole file
+    """
+
+    def __init__(self, expected: str, got: object, where: str = "") -> None:
+        super().__init__(expected, got, where)
         self.expected = expected
         self.got = got
+        self.where = where
 
 
-def pillow() -> str:
-    """Return Pillow's name and version. Raises ImportError with the extra to install."""
-    try:
-        import PIL
-    except ImportError as error:
-        raise ImportError("pictures need Pillow: pip install ./client ./apps/labels") from error
-    return f"Pillow {PIL.__version__}"
+class Picture:
+    """A picture of 8-bit colours. Needs Pillow.
+
+    stored: content of its file, path of its file, or a picture that Pillow has opened
+    """
+
+    def __init__(self, stored: Any) -> None:
+        self._stored = stored
+
+    @staticmethod
+    def decoder() -> str:
+        """Return Pillow's name and version. Raises ImportError with the extra to install."""
+        try:
+            import PIL
+        except ImportError as error:
+            raise ImportError("pictures need Pillow: pip install ./client ./apps/labels") from error
+        return f"Pillow {PIL.__version__}"
+
+    def check(self) -> None:
+        """Raise FrameFileError unless the colours have 8 bits. Only the header is read."""
+        opened_picture(self._stored).close()
+
+    def pixels(self) -> UInt8Array:
+        """Return uint8 [H, W, 3], upright by EXIF. Raises FrameFileError."""
+        is_file = isinstance(self._stored, bytes | Path)
+        return decoded_picture(opened_picture(self._stored) if is_file else self._stored)
+
+    @property
+    def exif_turn(self) -> int | None:
+        """The EXIF orientation, read without decoding; None: it changes nothing, or cannot be read."""
+        self.decoder()
+        from PIL import Image
+
+        head = self._stored[:_HEAD_BYTES] if isinstance(self._stored, bytes) else _head(self._stored)
+        if not any(mark in head for mark in _MARKS):
+            return None
+        try:
+            with Image.open(_file_of(self._stored)) as opened:
+                orientation = _orientation(opened)
+        except (*_BROKEN, Image.DecompressionBombError):  # ``check`` says what is wrong
+            return None
+        return orientation if orientation in _UPRIGHT else None
 
 
 def opened_picture(picture: bytes | Path) -> Any:
-    """Open a picture of 8-bit colours, or its file, and read only its header. Raises PictureError."""
-    pillow()
+    """Open a picture of 8-bit colours, or its file, and read only its header. Raises FrameFileError."""
+    Picture.decoder()
     from PIL import Image
 
     try:
-        opened = Image.open(picture if isinstance(picture, Path) else io.BytesIO(picture))
+        opened = Image.open(_file_of(picture))
     except (*_BROKEN, Image.DecompressionBombError) as error:
-        raise PictureError("an image", error) from error
+        raise FrameFileError("an image", error) from error
     is_deep = _DEEP in str(opened.tile)
     if is_deep or opened.mode not in _COLOURS:
         opened.close()
         expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
-        raise PictureError(expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
+        raise FrameFileError(expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
     return opened
 
 
 def decoded_picture(picture: Any) -> UInt8Array:
-    """Return the pixels of an opened picture, uint8 [H, W, 3], upright by EXIF, and close it. Raises PictureError."""
+    """Return the pixels of an opened picture, uint8 [H, W, 3], upright by EXIF, and close it. Raises FrameFileError."""
     with picture:
         try:
             return np.asarray(upright_picture(picture).convert("RGB"))
         except _BROKEN as error:
-            raise PictureError("an image", error) from error
+            raise FrameFileError("an image", error) from error
 
 
 def upright_picture(picture: Any) -> Any:
@@ -88,27 +125,13 @@ def upright_picture(picture: Any) -> Any:
     return picture if name is None else picture.transpose(Image.Transpose[name])
 
 
-def exif_turn(picture: bytes | Path) -> int | None:
-    """Return the EXIF orientation of a picture or file. None: it changes nothing, or cannot be read.
+def _file_of(picture: bytes | Path) -> Any:
+    return picture if isinstance(picture, Path) else io.BytesIO(picture)
 
-    Decodes no pixels.
-    """
-    pillow()
-    from PIL import Image
 
-    if isinstance(picture, Path):
-        with picture.open("rb", buffering=0) as file:
-            head = file.read(_HEAD_BYTES)
-    else:
-        head = picture[:_HEAD_BYTES]
-    if not any(mark in head for mark in _MARKS):
-        return None
-    try:
-        with Image.open(picture if isinstance(picture, Path) else io.BytesIO(picture)) as opened:
-            orientation = _orientation(opened)
-    except (*_BROKEN, Image.DecompressionBombError):  # ``opened_picture`` says what is wrong
-        return None
-    return orientation if orientation in _UPRIGHT else None
+def _head(file: Path) -> bytes:
+    with file.open("rb", buffering=0) as opened:
+        return opened.read(_HEAD_BYTES)
 
 
 def _orientation(picture: Any) -> int:

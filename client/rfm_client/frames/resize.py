@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import numpy as np
 
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import UInt8Array
-
-JPEG_QUALITY = 85
 
 
 def load_pillow() -> Any:
@@ -23,29 +20,18 @@ def load_pillow() -> Any:
     return Image
 
 
-def as_jpeg(frame: UInt8Array, longest_px: int) -> bytes:
-    """Return a frame, uint8 [H, W, 3], as a JPEG file with at most ``longest_px`` pixels on its longer side."""
-    image = load_pillow().fromarray(frame)
-    image.thumbnail((longest_px, longest_px))
-    file = io.BytesIO()
-    image.save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)  # full resolution of colours
-    return file.getvalue()
-
-
 def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:
     """Return frames, uint8 [T, H, W, 3], no larger than the checkpoint reads them; the same array if they fit.
 
-    Pillow resizes: Lanczos for the rule ``longest``, as SmolVLM does; otherwise bicubic. The network's input stays
-    identical for SmolVLM, and within a grey level or two for ReWiND. For Qwen's backbones it stays identical if they
-    read the size ``exact``. If they round it to whole patches, frames are resized twice, and single pixels differ by up
-    to 15.
+    Pillow resizes, bicubic. The network's input stays within a grey level or two for ReWiND. For Qwen's backbones it
+    stays identical if they read the size ``exact``. If they round it to whole patches, frames are resized twice, and
+    single pixels differ by up to 15.
     """
     Image = load_pillow()  # noqa: N806  Pillow's spelling
     height, width = size.fitted(frames.shape[1], frames.shape[2])
     if (height, width) == frames.shape[1:3]:
         return frames
-    resample = Image.Resampling.LANCZOS if size.rule == "longest" else Image.Resampling.BICUBIC
     resized = np.empty((len(frames), height, width, 3), np.uint8)
     for frame, smaller in zip(frames, resized, strict=True):
-        smaller[:] = Image.fromarray(frame).resize((width, height), resample)
+        smaller[:] = Image.fromarray(frame).resize((width, height), Image.Resampling.BICUBIC)
     return resized

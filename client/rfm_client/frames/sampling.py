@@ -33,14 +33,6 @@ _REWIND: tuple[Rule, ...] = ("rewind_pad16_online", "rewind_pad16_offline")
 _PADDED: tuple[Rule, ...] = ("rint_pad", *_REWIND)  # filled up to K slots with the newest frame
 
 
-def trained_rule(trained_padding: bool) -> Rule:
-    """Return the rule by which the checkpoint's training chose frames of a clip.
-
-    trained_padding: True if training padded clips shorter than K frames
-    """
-    return "rint_pad" if trained_padding else "rint"
-
-
 @dataclass(frozen=True, eq=False)
 class Prefix:
     """The frames that a rule shows of the frames 0 to t, and the slot whose score counts for frame t.
@@ -97,7 +89,7 @@ class Sampling:
 
         Raises ValueError if a required number is given by neither caller nor checkpoint.
         """
-        rule = rule or trained_rule(trained_padding)
+        rule = rule or ("rint_pad" if trained_padding else "rint")
         if frames is None and rule not in (*_REWIND, "all"):
             frames = trained_frames
             got = "none, and the checkpoint does not say how many it was trained on"
@@ -123,6 +115,31 @@ class Sampling:
             shown = np.append(shown, np.repeat(t, self.frames - len(shown)))
         return Prefix(shown, own_slot if self.rule == "rewind_pad16_offline" else len(shown) - 1)
 
+    def samples(self, trajectory: Trajectory) -> Iterator[ProgressSample]:
+        """Yield the sample of each prefix, for t from 0 to T - 1. Raises InvalidSampleError."""
+        for t in range(trajectory.num_frames):
+            yield ProgressSample(taken(trajectory, self.prefix(t).indices))
+
+    def joined(self, results: Sequence[ProgressResult]) -> ProgressResult:
+        """Return the episode's result: frame t's scores are those of prefix 0 to t at the slot ``Prefix.read``.
+
+        results: [T], for the samples of ``samples``
+
+        Raises InferenceFailedError for results of several versions of the checkpoint.
+        """
+        versions = sorted({str(result.model_version) for result in results})
+        if len(versions) > 1:
+            told = ", ".join(versions)
+            raise InferenceFailedError(f"model_version: expected one for all frames, got {told}: ask again")
+        read = [(result, self.prefix(t).read) for t, result in enumerate(results)]
+        marks = [result.unclear[slot] for result, slot in read if result.unclear is not None]
+        return ProgressResult(
+            progress=np.array([result.progress[slot] for result, slot in read], np.float32),
+            success=np.array([result.success[slot] for result, slot in read], np.float32),
+            unclear=np.array(marks) if len(marks) == len(results) else None,
+            model_version=results[-1].model_version,
+        )
+
 
 def thinned(num_frames: int, limit: int | None) -> FrameIndices | None:
     """Return the frames, int64 [limit], that training would keep of a longer clip; None: all are kept.
@@ -138,32 +155,6 @@ def taken(trajectory: Trajectory, indices: FrameIndices) -> Trajectory:
         return replace(trajectory, frames=trajectory.frames[indices])
     assert trajectory.video_embeddings is not None  # a Trajectory has frames or embeddings
     return replace(trajectory, video_embeddings=trajectory.video_embeddings[indices])
-
-
-def prefix_samples(trajectory: Trajectory, sampling: Sampling) -> Iterator[ProgressSample]:
-    """Yield the sample of each prefix, for t from 0 to T - 1. Raises InvalidSampleError."""
-    for t in range(trajectory.num_frames):
-        yield ProgressSample(taken(trajectory, sampling.prefix(t).indices))
-
-
-def of_prefixes(results: Sequence[ProgressResult], sampling: Sampling) -> ProgressResult:
-    """Return the episode's result: frame t's scores are those of prefix 0 to t at the slot ``Prefix.read``.
-
-    results: [T], for the samples of ``prefix_samples``
-
-    Raises InferenceFailedError for results of several versions of the checkpoint.
-    """
-    versions = sorted({str(result.model_version) for result in results})
-    if len(versions) > 1:
-        raise InferenceFailedError(f"model_version: expected one for all frames, got {', '.join(versions)}: ask again")
-    reads = [sampling.prefix(t).read for t in range(len(results))]
-    marks = [result.unclear[read] for result, read in zip(results, reads, strict=True) if result.unclear is not None]
-    return ProgressResult(
-        progress=np.array([result.progress[read] for result, read in zip(results, reads, strict=True)], np.float32),
-        success=np.array([result.success[read] for result, read in zip(results, reads, strict=True)], np.float32),
-        unclear=np.array(marks) if len(marks) == len(results) else None,
-        model_version=results[-1].model_version,
-    )
 
 
 def of_frames(result: ProgressResult, prefix: Prefix) -> ProgressResult:

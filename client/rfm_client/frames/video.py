@@ -22,14 +22,13 @@ from rfm_client.contract.numbers import checked_finite, checked_positive
 from rfm_client.contract.proxies import open_url
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.frames.lerobot_videos import check_local_video, check_video_behind
-from rfm_client.frames.pictures import PictureError, decoded_picture, opened_picture
+from rfm_client.frames.pictures import FrameFileError, decoded_picture, opened_picture
 from rfm_client.frames.video_decoding import (
     DAMAGED,
     REENCODE,
     UNDAMAGED,
     Packets,
     Upright,
-    VideoError,
     import_av,
     judged,
     read_packets,
@@ -107,15 +106,15 @@ def read_video(
                 return picture[np.newaxis]
             packets = read_packets(file, container)
             if not packets.fps and (is_part or fps is not None):
-                raise VideoError("a frame rate", "none")
+                raise FrameFileError("a frame rate", "none")
             if is_part:
                 frames = _part(file, packets, _within(packets, start_s, end_s), fps, take, container)
             else:
                 frames = _whole(file, packets, fps, take, container)
         if not frames:
-            raise VideoError("at least one frame", "none")
+            raise FrameFileError("at least one frame", "none")
         if len({frame.shape for frame in frames}) > 1:
-            raise VideoError("frames of one size", "several")
+            raise FrameFileError("frames of one size", "several")
         take(sum(frame.nbytes for frame in frames))
         return np.stack(frames)
 
@@ -138,7 +137,7 @@ def _errors_of(source: str | Path) -> Iterator[None]:
     """Raise errors of the block as InvalidSampleError with the source."""
     try:
         yield
-    except VideoError as error:
+    except FrameFileError as error:
         raise InvalidSampleError.at("video", error.expected, f"{error.got} ({source})") from error
     except InvalidSampleError as error:
         raise InvalidSampleError(f"{error} ({source})") from error
@@ -185,14 +184,11 @@ def _still(file: BinaryIO) -> UInt8Array | None:
     file.seek(0)
     if not is_still:
         return None
-    try:
-        picture = opened_picture(file.read())
-        num_pictures = 1 if picture.format == _WITH_PREVIEWS else getattr(picture, "n_frames", 1)
-        if num_pictures > 1:
-            raise VideoError("a video, or a single picture", f"{num_pictures} pictures in a {picture.format} file")
-        return decoded_picture(picture)
-    except PictureError as error:
-        raise VideoError(error.expected, str(error.got)) from error
+    picture = opened_picture(file.read())
+    num_pictures = 1 if picture.format == _WITH_PREVIEWS else getattr(picture, "n_frames", 1)
+    if num_pictures > 1:
+        raise FrameFileError("a video, or a single picture", f"{num_pictures} pictures in a {picture.format} file")
+    return decoded_picture(picture)
 
 
 def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
@@ -205,7 +201,7 @@ def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
     except (OSError, HTTPException, ValueError) as error:
         if isinstance(error, HTTPError):
             error.close()  # an HTTPError holds the connection
-        raise VideoError(_EXPECTED, str(error)) from error
+        raise FrameFileError(_EXPECTED, str(error)) from error
 
 
 def _within(packets: Packets, start_s: float | None, end_s: float | None) -> tuple[int, int]:
@@ -233,9 +229,9 @@ def _whole(
     total = len(times_s)
     if packets.num_hidden and not _rises(times_s):  # those hidden are others than the video means
         expected = f"{packets.count + packets.num_hidden} frames ({_REMUX})"
-        raise VideoError(expected, f"{total}, and time stamps in another order than the frames")
+        raise FrameFileError(expected, f"{total}, and time stamps in another order than the frames")
     if total < packets.count:
-        raise VideoError(f"{packets.count} frames, one for each packet", f"{total} ({_LOST})")
+        raise FrameFileError(f"{packets.count} frames, one for each packet", f"{total} ({_LOST})")
     if total > packets.count:  # a packet may hold several frames
         wanted = set(_picked(0, total, packets, fps).tolist())
         frames, _ = _decoded(file, lambda number, _: number in wanted, take, container)
@@ -250,12 +246,12 @@ def _part(
     begin_s, last_s = packets.times_s[part[0]], packets.times_s[part[1] - 1]
     frames, times_s = _decoded(file, lambda _, time_s: time_s in wanted_s, take, container)
     if packets.count != len(packets.times_s) or None in times_s:
-        raise VideoError(f"{packets.count} frames with time stamps", f"{len(packets.times_s)}")
+        raise FrameFileError(f"{packets.count} frames with time stamps", f"{len(packets.times_s)}")
     if not _rises(times_s):
-        raise VideoError(f"frames in the order of their time stamps ({_REMUX})", "another order")
+        raise FrameFileError(f"frames in the order of their time stamps ({_REMUX})", "another order")
     expected, total = part[1] - part[0], sum(begin_s <= time_s <= last_s for time_s in times_s if time_s is not None)
     if total != expected:
-        raise VideoError(f"{expected} frames in this part, one for each packet", f"{total} ({_LOST})")
+        raise FrameFileError(f"{expected} frames in this part, one for each packet", f"{total} ({_LOST})")
     return frames
 
 
@@ -292,4 +288,4 @@ def _judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
             yield each
             num_given += 1
     except import_av().FFmpegError as error:
-        raise VideoError(f"frame {num_given} to be decoded ({REENCODE})", str(error.strerror)) from error
+        raise FrameFileError(f"frame {num_given} to be decoded ({REENCODE})", str(error.strerror)) from error

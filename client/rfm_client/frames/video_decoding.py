@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.frames.broken_off import broken_off
+from rfm_client.frames.pictures import FrameFileError
 
 UNDAMAGED = "an undamaged frame"
 DAMAGED = "one that the decoder marks, or is made from such a one"
@@ -27,15 +28,6 @@ _MATRICES = (1, 4, _BT601, 7, _BT2020)  # that libswscale knows; it takes BT.601
 _SAME_MATRIX = {6: _BT601, 10: _BT2020}  # other numbers for the same matrix
 _BITS = 8  # most bits of a grey video's only channel; depth maps have more
 _NEARLY = math.tan(math.radians(1))  # FFmpeg's tolerance for quarter turns of a display matrix
-
-
-class VideoError(Exception):
-    """A file that is not one readable video. ``expected`` and ``got`` are the parts of a message."""
-
-    def __init__(self, expected: str, got: str) -> None:
-        super().__init__(expected, got)
-        self.expected = expected
-        self.got = got
 
 
 def import_av() -> Any:
@@ -58,16 +50,18 @@ def decoder() -> str:
 def video_stream(container: Any) -> Any:
     """Return the only video stream of an opened container. Attached pictures, such as cover art, do not count.
 
-    Raises VideoError for no stream, several streams, or depth maps.
+    Raises FrameFileError for no stream, several streams, or depth maps.
     """
     attached = import_av().stream.Disposition.attached_pic
     videos = {n: stream for n, stream in enumerate(container.streams.video) if not stream.disposition & attached}
     if not videos:
-        raise VideoError("a file with a video stream", "none")
+        raise FrameFileError("a file with a video stream", "none")
     if len(videos) > 1:
         codecs = {n: stream.codec_context for n, stream in videos.items()}
         told = ", ".join(f"0:v:{n} ({codec.name}, {codec.width}x{codec.height})" for n, codec in codecs.items())
-        raise VideoError("one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)", f"{len(videos)}: {told}")
+        raise FrameFileError(
+            "one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)", f"{len(videos)}: {told}"
+        )
     (stream,) = videos.values()
     _check_colours(stream.codec_context.format)
     return stream
@@ -103,11 +97,11 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
 
     container: FFmpeg's name of the file's format; None: FFmpeg guesses it
 
-    Raises VideoError, also for a truncated file and broken packets, and the errors of PyAV.
+    Raises FrameFileError, also for a truncated file and broken packets, and the errors of PyAV.
     """
     missing = broken_off(file)
     if missing is not None:
-        raise VideoError("a whole video file", missing)
+        raise FrameFileError("a whole video file", missing)
     file.seek(0)
     timed: list[tuple[float, int]] = []
     count = num_hidden = 0
@@ -120,12 +114,12 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
                 and not packet.is_keyframe
                 and stream.codec_context.name == "hevc"
             ):
-                raise VideoError(*_HEADLESS)  # FFmpeg 7 makes pictures up to the first key frame, without a mark
+                raise FrameFileError(*_HEADLESS)  # FFmpeg 7 makes pictures up to the first key frame, without a mark
             if not packet.size or packet.is_discard:
                 num_hidden += bool(packet.size)
                 continue
             if packet.is_corrupt:
-                raise VideoError("a whole video file", f"one whose packet {count} is broken ({REENCODE})")
+                raise FrameFileError("a whole video file", f"one whose packet {count} is broken ({REENCODE})")
             if packet.pts is not None:
                 timed.append((float(packet.pts * packet.time_base), packet.size))
             count += 1
@@ -146,12 +140,12 @@ class Upright:
         self._graph: Any = None
 
     def __call__(self, frame: Any) -> UInt8Array:
-        """Return uint8 [H, W, 3]. Raises VideoError for a frame that FFmpeg would show aslant."""
+        """Return uint8 [H, W, 3]. Raises FrameFileError for a frame that FFmpeg would show aslant."""
         try:
             image, matrix = self._rgb(frame), frame.side_data.get("DISPLAYMATRIX")
         except ValueError as error:  # PyAV 17.1 and newer fail at the EXIF data of a Motion JPEG video
             remedy = "encode it anew: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
-            raise VideoError(f"frames without EXIF data, which PyAV cannot read ({remedy})", str(error)) from error
+            raise FrameFileError(f"frames without EXIF data, which PyAV cannot read ({remedy})", str(error)) from error
         return image if matrix is None else np.ascontiguousarray(_shown(image, np.frombuffer(bytes(matrix), np.int32)))
 
     def _rgb(self, frame: Any) -> UInt8Array:
@@ -184,7 +178,7 @@ def _check_colours(pixels: Any) -> None:
     has_one = len(pixels.components) <= 2 and max(component.bits for component in pixels.components) > _BITS
     if has_one or "f16" in pixels.name or "f32" in pixels.name:
         remedy = "leave a depth camera out (--cameras), or convert the video: ffmpeg -i IN -pix_fmt yuv420p OUT"
-        raise VideoError(f"a video of colours ({remedy})", f"{pixels.name}, as depth maps have")
+        raise FrameFileError(f"a video of colours ({remedy})", f"{pixels.name}, as depth maps have")
 
 
 def _known_matrix(frame: Any) -> int:
@@ -208,7 +202,7 @@ def _shown(image: UInt8Array, matrix: npt.NDArray[np.int32]) -> UInt8Array:
     is_turned = max(abs(a), abs(d)) < _NEARLY * min(abs(b), abs(c))
     if not is_turned and max(abs(b), abs(c)) > _NEARLY * min(abs(a), abs(d)):
         got = f"one that is turned by {abs(math.degrees(math.atan2(b, a))):.0f} degrees, or skewed"
-        raise VideoError("a video that is shown upright or by quarter turns (turn it: ffmpeg -i IN OUT)", got)
+        raise FrameFileError("a video that is shown upright or by quarter turns (turn it: ffmpeg -i IN OUT)", got)
     across, down = (c, b) if is_turned else (a, d)
     image = image.swapaxes(0, 1) if is_turned else image
     return image[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1]

@@ -131,8 +131,9 @@ class SampleScorer:
             return fit
         call.deadline.remaining_s()
         info = await self.model_info(model_of(sample, self._model), call.deadline)
+        max_frames, frame_size = info.max_frames if call.subsample else None, info.frame_size if call.resize else None
         # in a thread, since resizing would block the event loop
-        return await asyncio.to_thread(fitted, sample, info, subsample=call.subsample, resize=call.resize)
+        return await asyncio.to_thread(fitted, sample, max_frames, frame_size)
 
     async def _scored(
         self, model: str, group: Sequence[int], samples: Mapping[int, Sample], call: Call

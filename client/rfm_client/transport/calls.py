@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import io
 import logging
 import os
 from collections.abc import Awaitable, Callable, Collection, Mapping
@@ -12,7 +11,6 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib import import_module
-from types import SimpleNamespace
 from typing import Any, ClassVar, Protocol, TypeVar
 
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
@@ -25,14 +23,13 @@ from rfm_client.contract.wire import Tensors
 from rfm_client.transport.connection import Connection, grpc_options
 from rfm_client.transport.credentials import SECURE_SCHEMES, Credentials
 from rfm_client.transport.deadline import timeout
-from rfm_client.transport.off_loop import MIN_BYTES, off_loop
+from rfm_client.transport.off_loop import off_loop
 from rfm_client.transport.request_size import check_size
 from rfm_client.transport.shared_memory import Region, SharedMemory
 
 Answered = TypeVar("Answered")
 
 _US_PER_S = 1_000_000
-_AS_IT_IS = {"Accept-Encoding": "identity"}  # else aiohttp asks for gzip, which hardly shrinks floats
 _SERVED_TIMEOUT_S = 2.0  # for the names of served models in an error
 
 logger = logging.getLogger("rfm_client")
@@ -78,12 +75,12 @@ def connect(url: str, *, shared_memory: bool = False, credentials: Credentials |
 
 
 class TritonTransport:
-    """Base for gRPC and HTTP: tritonclient's asyncio clients differ only in a few options.
+    """Base for gRPC and HTTP, whose asyncio clients differ only in a few options.
 
-    tritonclient's module is imported at first use. Its client belongs to the event loop that runs then.
+    tritonclient's module is imported at first use. The client belongs to the event loop that runs then.
     """
 
-    _module: ClassVar[str]  # of tritonclient
+    _module: ClassVar[str]  # of tritonclient, with its InferInput and InferRequestedOutput
     _as_json: ClassVar[dict[str, bool]] = {}  # makes its methods return dictionaries
     _proxy: str | None = None  # for errors
 
@@ -213,13 +210,11 @@ class TritonTransport:
 
     def _connected(self) -> Connection:
         if self._connection is None:
-            client = self._open()
-            self._credentials.show_with_each_request(client)
-            self._connection = Connection(client)
+            self._connection = Connection(self._open())
         return self._connection
 
     def _open(self) -> Any:
-        """Return tritonclient's client, which connects at first use."""
+        """Return a client with the methods of tritonclient's. It connects at first use, and shows the credentials."""
         raise NotImplementedError
 
 
@@ -244,44 +239,22 @@ class GrpcTransport(TritonTransport):
                 f"gRPC was used in process {process}, which forked this one: "
                 "have multiprocessing start its processes by spawn or forkserver"
             )
-        return self._triton.InferenceServerClient(
+        client = self._triton.InferenceServerClient(
             self._address, channel_args=grpc_options(self._address), **self._credentials.grpc_options(self._scheme)
         )
+        self._credentials.show_with_each_request(client)
+        return client
 
 
 class HttpTransport(TritonTransport):
-    """HTTP transport: one connection per concurrent call. Triton finishes a request even if its caller has left.
+    """HTTP transport: one connection per concurrent call. Triton finishes a request even if its caller has left."""
 
-    It follows no redirect, which would carry frames and headers to another server.
-    """
-
-    _module = "tritonclient.http.aio"
+    _module = "tritonclient.http"
 
     def _open(self) -> Any:
-        secure = {"ssl": True, "ssl_context": self._credentials.ssl_context} if self._scheme in SECURE_SCHEMES else {}
-        client = self._triton.InferenceServerClient(self._address, conn_limit=0, conn_timeout=None, **secure)
-        session = client._stub
-        client._stub = SimpleNamespace(
-            get=partial(self._straight, session.get), post=partial(self._straight, session.post), close=session.close
-        )
-        post = client._post
+        from rfm_client.transport.http import HttpClient
 
-        async def post_stream(request_uri: str, request_body: Any, headers: Any, query_params: Any) -> Any:
-            # aiohttp sends a stream piece by piece. Large bytes would block the event loop, and aiohttp warns.
-            is_large = isinstance(request_body, bytes) and len(request_body) >= MIN_BYTES
-            body = io.BytesIO(request_body) if is_large else request_body
-            return await post(request_uri, body, {**(headers or {}), **_AS_IT_IS}, query_params)
-
-        client._post = post_stream
-        return client
-
-    async def _straight(self, send: Callable[..., Awaitable[Any]], **request: Any) -> Any:
-        """Return the answer to a request. Raises InferenceFailedError for a redirect."""
-        answer = await send(allow_redirects=False, **request)
-        if triton.is_redirect(answer.status):
-            answer.release()
-            raise triton.redirected(self.url, answer.headers.get("Location", ""))
-        return answer
+        return HttpClient(f"{self._scheme}://{self._address}", self._credentials)
 
 
 def _outputs(answer: Any, names: Collection[str]) -> Tensors:

@@ -74,15 +74,6 @@ class Credentials:
             load_certificate(context, self.client_certificate, self.client_key, "client_certificate, client_key")
         return context
 
-    def http_options(self, scheme: str) -> dict[str, Any]:
-        """Return arguments for tritonclient's HTTP client without asyncio."""
-        if scheme not in SECURE_SCHEMES:
-            return {}
-        files = {"ca_certs": self.ca_file}  # None: the system's, not the library's own
-        if self.client_certificate is not None:
-            files |= {"certfile": self.client_certificate, "keyfile": self.client_key}
-        return {"ssl": True, "ssl_options": files}
-
     def grpc_options(self, scheme: str) -> dict[str, Any]:
         """Return arguments for tritonclient's gRPC clients."""
         if scheme not in SECURE_SCHEMES:

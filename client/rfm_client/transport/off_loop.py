@@ -14,9 +14,9 @@ MIN_BYTES = 2**20  # a smaller copy takes no longer than a change of thread
 
 
 async def off_loop(
-    num_bytes: int, work: Callable[Arguments, Returned], *arguments: Arguments.args, **options: Arguments.kwargs
+    num_bytes: int | None, work: Callable[Arguments, Returned], *arguments: Arguments.args, **options: Arguments.kwargs
 ) -> Returned:
-    """Return the result of ``work``, which handles ``num_bytes``; from MIN_BYTES it runs in a thread."""
-    if num_bytes < MIN_BYTES:
+    """Return the result of ``work``, which handles ``num_bytes``. From MIN_BYTES, or for None, it runs in a thread."""
+    if num_bytes is not None and num_bytes < MIN_BYTES:
         return work(*arguments, **options)
     return await asyncio.to_thread(work, *arguments, **options)

@@ -6,10 +6,11 @@ Where the repository's index needs a key (``rfm serve``), only loaded models are
 
 from __future__ import annotations
 
+import asyncio
 import re
 import textwrap
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from http.client import HTTPException
 from typing import Any, TypeAlias
@@ -19,6 +20,7 @@ from tritonclient.utils import InferenceServerException
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
+from rfm_client.contract.names import frames_name
 from rfm_client.contract.proxies import grpc_proxy, open_url
 from rfm_client.transport.connection import grpc_options
 from rfm_client.transport.credentials import Credentials
@@ -28,6 +30,7 @@ METRICS_PORT = 8002
 METRICS_OPTION = "--metrics-url"
 DEVICE_METRICS = "nv_cpu_utilization, nv_gpu_utilization, nv_*_memory_*_bytes"
 _PROCESSOR = "CPU"
+_FRAMES = frames_name("")  # end of the names of models for raw frames
 PENDING_METRIC = "nv_inference_pending_request_count"
 
 _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_total_bytes)")
@@ -45,6 +48,7 @@ _MS_PER_S = 1e3
 _US_PER_S = 1e6
 
 _Version: TypeAlias = tuple[str, str]  # name and version of a model
+_Told: TypeAlias = tuple[str, bool, list[dict[str, Any]], list[dict[str, Any]]]  # version, readiness, index, statistics
 
 
 @dataclass(frozen=True)
@@ -159,6 +163,12 @@ class ServerStatus:
     metrics_error: str | None
     devices: tuple[Device, ...]
 
+    @property
+    def checkpoints(self) -> list[str]:
+        """Names of the exported checkpoints whose model for raw frames is ready, in alphabetical order."""
+        ready = {model.name for model in self.models if model.state == "READY"}
+        return sorted(name.removesuffix(_FRAMES) for name in ready if name.endswith(_FRAMES))
+
 
 @dataclass(frozen=True)
 class _Metrics:
@@ -201,63 +211,60 @@ def read_status(
     return ServerStatus(url, version, is_ready, models, metrics_url, metrics.error, metrics.devices)
 
 
-def _read_server(
-    scheme: str, address: str, timeout_s: float, credentials: Credentials
-) -> tuple[str, bool, list[dict[str, Any]], list[dict[str, Any]]]:
-    """Triton's version, readiness, index and statistics, as its HTTP endpoints write them."""
-    is_grpc = scheme.startswith("grpc")
-    limited = {"client_timeout": timeout_s} if is_grpc else {}
-    as_json = {"as_json": True, **limited} if is_grpc else {}
-    options: dict[str, Any]
-    if is_grpc:
-        from tritonclient.grpc import InferenceServerClient
+def _read_server(scheme: str, address: str, timeout_s: float, credentials: Credentials) -> _Told:
+    if scheme.startswith("grpc"):
+        return _over_grpc(scheme, address, timeout_s, credentials)
+    return asyncio.run(asyncio.wait_for(_over_http(f"{scheme}://{address}", credentials), timeout_s))
 
-        options = {"channel_args": grpc_options(address), **credentials.grpc_options(scheme)}
-    else:
-        from tritonclient.http import InferenceServerClient
 
-        options = {"connection_timeout": timeout_s, "network_timeout": timeout_s, **credentials.http_options(scheme)}
+def _over_grpc(scheme: str, address: str, timeout_s: float, credentials: Credentials) -> _Told:
+    from tritonclient.grpc import InferenceServerClient
+
+    options = {"channel_args": grpc_options(address), **credentials.grpc_options(scheme)}
+    limited, as_json = {"client_timeout": timeout_s}, {"as_json": True, "client_timeout": timeout_s}
     client = InferenceServerClient(address, **options)
-    if not is_grpc:
-        client._get, client._post = (_straight(send, f"{scheme}://{address}") for send in (client._get, client._post))
     credentials.show_with_each_request(client)
     try:
         version = client.get_server_metadata(**as_json)["version"]
         statistics = client.get_inference_statistics(**as_json).get("model_stats", [])
-        index = _index(client, statistics, as_json, limited)
+        try:
+            index = client.get_model_repository_index(**as_json).get("models", [])
+        except InferenceServerException as error:
+            loaded = _loaded(statistics, error)
+            index = _index_of({each: client.is_model_ready(*each, **limited) for each in loaded})
         return version, client.is_server_ready(**limited), index, statistics
     finally:
         client.close()
 
 
-def _straight(send: Callable[..., Any], url: str) -> Callable[..., Any]:
-    """Return ``send`` with an error for a redirect, which it does not follow. Raises InferenceFailedError."""
+async def _over_http(url: str, credentials: Credentials) -> _Told:
+    from rfm_client.transport.http import HttpClient
 
-    def answer(**request: Any) -> Any:
-        response = send(**request)
-        if triton.is_redirect(response.status_code):
-            raise triton.redirected(url, response.get("location", ""))
-        return response
-
-    return answer
-
-
-def _index(
-    client: Any, statistics: list[dict[str, Any]], as_json: dict[str, Any], limited: dict[str, Any]
-) -> list[dict[str, Any]]:
-    """The repository's index or, if that needs a key, an index of the loaded models."""
+    client = HttpClient(url, credentials)
     try:
-        index = client.get_model_repository_index(**as_json)
-        return list(index.get("models", []) if as_json else index)
-    except InferenceServerException as error:
-        if triton.RESTRICTED not in (error.message() or ""):
-            raise
-    keys = sorted((entry["name"], int(entry["version"])) for entry in statistics)
+        version = (await client.get_server_metadata())["version"]
+        statistics = (await client.get_inference_statistics()).get("model_stats", [])
+        try:
+            index = await client.get_model_repository_index()
+        except InferenceServerException as error:
+            index = _index_of({each: await client.is_model_ready(*each) for each in _loaded(statistics, error)})
+        return version, await client.is_server_ready(), index, statistics
+    finally:
+        await client.close()
+
+
+def _loaded(statistics: Iterable[Mapping[str, Any]], error: InferenceServerException) -> list[_Version]:
+    """Return the loaded models, for an index that needs a key. Raises any other error again."""
+    if triton.RESTRICTED not in (error.message() or ""):
+        raise error
+    loaded = [(each["name"], each["version"]) for each in statistics]
+    return sorted(loaded, key=lambda each: (each[0], int(each[1])))
+
+
+def _index_of(ready: Mapping[_Version, bool]) -> list[dict[str, Any]]:
+    """Return an index of the loaded models. ready: whether each is ready"""
     states = {True: "READY", False: "UNAVAILABLE"}
-    return [
-        {"name": name, "version": str(version), "state": states[client.is_model_ready(name, str(version), **limited)]}
-        for name, version in keys
-    ]
+    return [{"name": name, "version": version, "state": states[is_so]} for (name, version), is_so in ready.items()]
 
 
 def _models(index: list[dict[str, Any]], statistics: list[dict[str, Any]], metrics: _Metrics) -> list[ModelStatus]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from rfm import families
 from rfm.engine import Engine, Outcome, Prepared
 from rfm.engine.execution import Execution
 from rfm.parameters import (
@@ -21,16 +22,14 @@ from rfm.parameters import (
 )
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client.contract import Result, RewardError, Sample, wire
-from rfm_client.contract.frame_refs import ProgressSampleRefs
 
 
-class TritonPythonModel(BatchModel[Sample | ProgressSampleRefs, Result]):
+class TritonPythonModel(BatchModel[Sample, Result]):
     """An instance: an engine on a device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
-        self.engine = Engine.from_checkpoint(
-            version / CHECKPOINT_FOLDER,
-            family=settings.get(FAMILY_PARAMETER),  # older configurations do not name it
+        self.engine = Engine.of(
+            families.load(version / CHECKPOINT_FOLDER, family=settings[FAMILY_PARAMETER]),
             device=device,
             dtype=getattr(torch, settings[DTYPE_PARAMETER]) if settings[DTYPE_PARAMETER] else None,
             token_budget=int(settings[BUDGET_PARAMETER]),
@@ -39,10 +38,11 @@ class TritonPythonModel(BatchModel[Sample | ProgressSampleRefs, Result]):
             cuda_graphs=settings.get(GRAPHS_PARAMETER) == "true",
         )
 
-    def decode(self, tensors: wire.Tensors) -> list[Sample | ProgressSampleRefs]:
-        return wire.decode_samples(tensors)
+    def decode(self, tensors: wire.Tensors) -> list[Sample]:
+        cache = self.engine.cache
+        return wire.decode_samples(tensors, None if cache is None else cache.found)
 
-    def prepare(self, question: Sample | ProgressSampleRefs) -> tuple[Prepared, int]:
+    def prepare(self, question: Sample) -> tuple[Prepared, int]:
         prepared = self.engine.prepare(question)
         if isinstance(prepared.rows, RewardError):
             raise prepared.rows

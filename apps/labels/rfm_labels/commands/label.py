@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import typer
 
@@ -25,37 +25,30 @@ from rfm_client.command_line import (
     table,
     with_options,
 )
-from rfm_client.frames import CHANNEL_ORDERS, ORIENTATIONS, Channels, Orient
+from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, Texts, setting
-from rfm_labels import blank_cameras
 from rfm_labels.commands.progress_bar import ProgressBar, Say
-from rfm_labels.datasets.faults import listed
+from rfm_labels.datasets.cameras import parsed_by_camera
+from rfm_labels.datasets.dataset import Dataset, SeveralTasks
+from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import SUFFIXES
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.opening import hdf5_files, open_dataset
-from rfm_labels.datasets.protocol import (
-    Dataset,
-    FaultsError,
-    SeveralTasks,
-    UnusedTaskError,
-    require,
-)
-from rfm_labels.episode_scores import FrameMemory, episode_scores
-from rfm_labels.finished_episodes import Parts
 from rfm_labels.hdf5_tables import dataset_stem, labels_in, own_file, stored_in
-from rfm_labels.label import Outputs, Report, check, label_with_ray, plan_labels
-from rfm_labels.label import label as label_dataset
 from rfm_labels.label_files import read_blank
-from rfm_labels.options import LabelOptions, RayOptions
-from rfm_labels.plan import Item, Plan, selected
-from rfm_labels.ray_engine import Connect
-from rfm_labels.run import Watch
+from rfm_labels.labelling import Outputs, Report, check
+from rfm_labels.labelling import label as label_dataset
+from rfm_labels.metadata import blank_by_camera, blank_lines
+from rfm_labels.options import LabelOptions, RayOptions, Watch
+from rfm_labels.plan import Item, Plan, check_episodes, plan_labels, selected
+from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
+from rfm_labels.scoring import FrameMemory, episode_scores
 from rfm_labels.summary import Summary, summarise
-from rfm_labels.survey import check_episodes
+from rfm_labels.writing import Parts
 
 _MIB = 2**20
-_OF_CAMERAS = (Orient, Channels)  # options with a value for each camera
+_OF_CAMERAS = ("orient", "channels")  # options with a value for each camera
 
 DatasetArgument = Annotated[
     str,
@@ -90,12 +83,12 @@ class EpisodeTexts(Settings):
         (),
         "Turn stored pictures upright, of all cameras or of one; may be repeated. Else as stored; LIBERO's HDF5 files "
         "flip-vertical.",
-        metavar="[CAMERA=]" + "|".join(ORIENTATIONS),
+        metavar="[CAMERA=]" + "|".join(get_args(Orientation)),
     )
     channels: Texts = setting(
         (),
         "Channel order of stored pictures, for all cameras or one; may be repeated. Default: rgb.",
-        metavar="[CAMERA=]" + "|".join(CHANNEL_ORDERS),
+        metavar="[CAMERA=]" + "|".join(get_args(ChannelOrder)),
     )
     tolerance_s: float = setting(
         TOLERANCE_S,
@@ -108,15 +101,15 @@ class EpisodeTexts(Settings):
         super().__post_init__()
         for option in _OF_CAMERAS:
             try:
-                option.parse(getattr(self, option.NAME))
+                parsed_by_camera(option, getattr(self, option))
             except ValueError as error:
-                raise ConfigError(option.NAME, str(error)) from None
+                raise ConfigError(option, str(error)) from None
 
     @property
     def opening(self) -> dict[str, Any]:
         """Arguments of ``open_dataset`` after the source."""
         given = {each.name: getattr(self, each.name) for each in fields(self)}
-        return given | {option.NAME: option.parse(given[option.NAME]) for option in _OF_CAMERAS}
+        return given | {option: parsed_by_camera(option, given[option]) for option in _OF_CAMERAS}
 
 
 @dataclass(frozen=True)
@@ -193,9 +186,9 @@ class LabelCommand:
             self._try()
             return ExitCode.OK
         if self.options.rrd is not None:
-            from rfm_client.recording import load_rerun
+            from rfm_client.recording import Recording
 
-            load_rerun()  # a missing package must not fail after the labelling
+            Recording(self.options.rrd)  # a missing package must not fail after the labelling
             self.options.rrd.mkdir(parents=True, exist_ok=True)
         report = self._label()
         status = self._tell(report)
@@ -293,7 +286,7 @@ class LabelCommand:
 
     def _record(self, folder: Path, report: Report) -> None:
         """Record the chosen episodes, also those labelled by an earlier run."""
-        from rfm_labels.recordings import record_episodes
+        from rfm_labels.pictures import record_episodes
 
         dataset = self._dataset()
         chosen = {episode.index for episode in selected(dataset, self.labels)}
@@ -311,7 +304,7 @@ class LabelCommand:
             files = [*outputs.progress, *outputs.signals]
             path = next((file for file in files if file.exists()), files[0])
         summary = summarise(path)
-        for line in blank_cameras.lines(read_blank(path), len(summary.episodes)):
+        for line in blank_lines(read_blank(path), len(summary.episodes)):
             self.say(f"note: {line}")
         self._show(summary, path)
 
@@ -356,7 +349,7 @@ def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int, watc
     with ThreadPoolExecutor(workers) as pool:
         blank = list(pool.map(score, first))
     took_s = time.monotonic() - began_s
-    for line in blank_cameras.lines(blank_cameras.by_camera(blank), len(first)):
+    for line in blank_lines(blank_by_camera(blank), len(first)):
         watch.note(line)
     return took_s * plan.num_frames / sum(item.episode.num_frames for item in first)
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from rfm_client import RewardError
-from rfm_labels.datasets.protocol import DatasetEpisode
-from rfm_labels.run import Watch
+from rfm_labels.datasets.dataset import DatasetEpisode
+from rfm_labels.options import Watch
 
 SPEED_OVER_S = 600.0  # an episode may take minutes
 

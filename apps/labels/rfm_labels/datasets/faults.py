@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""List the faults of all episodes, and the options that help."""
+"""Errors of a dataset, and the lines that tell the faults of many episodes with the options that help."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+
+from rfm_client import RewardError
+from rfm_client.options import require as require_that
 
 _MOST_SHOWN = 20
 
@@ -44,3 +47,36 @@ def fault_lines(faults: Mapping[int, str], numbers: Sequence[int], num_without_t
     if others:
         lines.append(f"to continue without the faulty episodes: --episodes {listed(others)}")
     return lines
+
+
+class DatasetError(RewardError, ValueError):
+    """A contradictory or unreadable dataset, reported as ``where: expected X, got Y``."""
+
+    @classmethod
+    def at(cls, where: object, expected: str, got: object) -> DatasetError:
+        """Return the error at a file, or at a place in it."""
+        return cls(f"{where}: expected {expected}, got {got}")
+
+
+class MissingTaskError(DatasetError):
+    """An episode without a task."""
+
+
+class UnusedTaskError(DatasetError):
+    """A task of the caller that no episode needs."""
+
+
+class FaultsError(DatasetError):
+    """Several faults, one per line, then the options that help."""
+
+    @classmethod
+    def of(cls, faults: Mapping[int, RewardError], numbers: Sequence[int]) -> FaultsError:
+        """Return the error of these episodes. numbers: of all chosen episodes"""
+        without_task = [fault for fault in faults.values() if isinstance(fault, MissingTaskError)]
+        messages = {number: str(fault) for number, fault in faults.items()}
+        return cls("\n".join(fault_lines(messages, numbers, len(without_task))))
+
+
+def require(where: object, condition: bool, expected: str, got: object) -> None:
+    """Raise DatasetError unless the condition holds."""
+    require_that(where, condition, expected, got, DatasetError)

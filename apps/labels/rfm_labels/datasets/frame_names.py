@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 
-from rfm_labels.datasets.protocol import DatasetError, require
+from rfm_labels.datasets.faults import DatasetError, require
 
 _NOT_IN_A_WORD = r"(?<![^\W_])"  # behind a letter or a digit, - and . separate: frame-1.png, frame.1.png, 2026-11-26
 _NUMBER = re.compile(

@@ -15,35 +15,27 @@ from typing import Any, NoReturn
 import numpy as np
 
 from rfm_client import RewardError, UInt8Array
-from rfm_client.frames import Corrections, Orientation
+from rfm_client.frames import Orientation
 from rfm_client.options import first_names
-from rfm_labels.datasets.hdf5_attributes import (
+from rfm_labels.datasets.cameras import AskedCorrections
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.faults import DatasetError, FaultsError, require
+from rfm_labels.datasets.hdf5_contents import (
     DOCUMENTS,
     attribute,
-    fps_of,
-    is_of_libero,
-    own_task_of,
-    task_of,
-    unread_documents,
-)
-from rfm_labels.datasets.hdf5_contents import (
     demonstrations,
     filter_keys,
+    fps_of,
+    is_of_libero,
+    lacking,
     members_of,
     opened_hdf5,
+    own_task_of,
+    task_of,
     unread,
+    unread_documents,
 )
-from rfm_labels.datasets.hdf5_sources import lacking
-from rfm_labels.datasets.protocol import (
-    Dataset,
-    DatasetEpisode,
-    DatasetError,
-    FaultsError,
-    TaskOverride,
-    corrections_of,
-    digest_of,
-    require,
-)
+from rfm_labels.datasets.stored_files import digest_of
 
 SUFFIXES = (".hdf5", ".h5")
 
@@ -71,7 +63,7 @@ class Hdf5Dataset(Dataset):
     kind = "HDF5"
 
     def __init__(
-        self, file: Path, *, task: TaskOverride = TaskOverride(), corrections: Corrections = Corrections()
+        self, file: Path, *, task: TaskOverride = TaskOverride(), corrections: AskedCorrections = AskedCorrections()
     ) -> None:
         self.file = file
         self.root = file.parent
@@ -103,9 +95,8 @@ class Hdf5Dataset(Dataset):
         if not known:
             self.cameras_in(self.numbers)  # raises the reason
         defaults: dict[str, Orientation] = dict.fromkeys(known, _LIBERO) if is_libero and not is_upright else {}
-        self.corrections = corrections_of(corrections, known, defaults)
-        orient = corrections.orient
-        untold = [camera for camera in known if orient.default is None and camera not in orient.cameras]
+        self.corrections = corrections.of_cameras(known, defaults)
+        untold = [camera for camera in known if {"", camera}.isdisjoint(corrections.orient)]
         self.notes = [*notes, *([] if is_upright else _notes(untold, is_libero))]
 
     def read_episode(self, number: int) -> DatasetEpisode:

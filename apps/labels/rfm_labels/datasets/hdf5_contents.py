@@ -1,8 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Read the demonstrations and filter keys of an HDF5 file, and list everything else. Needs h5py."""
+"""Read an HDF5 file: demonstrations, filter keys, attributes, and what it lacks. Needs h5py.
+
+h5py silently reads zeros in place of a missing source of a virtual dataset.
+"""
 
 from __future__ import annotations
 
+import json
+import math
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,10 +18,34 @@ from typing import Any
 import numpy as np
 
 from rfm_client.options import first_names
-from rfm_labels.datasets.hdf5_layouts import foreign_layout
-from rfm_labels.datasets.protocol import DatasetError, require
+from rfm_labels.datasets.faults import DatasetError, require
+
+DOCUMENTS = ("problem_info", "env_args")  # attributes of ``data`` with a JSON object
 
 _DEMO = re.compile(r"demo_(\d+)")
+_SENTENCES = ("language_instruction", "language", "lang")  # keys of the task in problem_info and env_args
+_DEFAULT_FPS = 20.0  # robosuite's
+_BLOCKS = "%b"  # in a source's name: HDF5 then counts only the sources that exist
+_GUIDE = 'see "HDF5 files in other layouts" in docs/guides/label_a_dataset.md'
+_ENCODED = "with JPEG files as pictures"
+_ALOHA = (
+    "ALOHA's layout, one episode per file (observations/images): convert its folder to LeRobot with openpi's "
+    "examples/aloha_real/convert_aloha_data_to_lerobot.py"
+)
+_ROBOMIND = (
+    f"RoboMIND's layout, one episode per file (observations/rgb_images) {_ENCODED}: convert its folder to LeRobot with "
+    f"robomind2lerobot of https://github.com/Tavish9/any4lerobot, or {_GUIDE}"
+)
+_ROBOTWIN = (
+    f"RoboTwin's layout, one episode per file (observation/CAMERA/rgb) {_ENCODED}: label the folder of videos beside "
+    f"it (video/), which shows the head camera, or {_GUIDE}"
+)
+_MANISKILL = (
+    "ManiSkill's layout (traj_0, traj_1 and so on): link its pictures (obs/sensor_data/CAMERA/rgb) into "
+    f"data/demo_<i>/obs/CAMERA, {_GUIDE}. A file without pictures gets them from python -m "
+    "mani_skill.trajectory.replay_trajectory -o rgb --save-traj"
+)
+_TRAJECTORY = re.compile(r"traj_\d+")
 
 
 @contextmanager
@@ -110,3 +140,143 @@ def _missing_number(name: str, names: Mapping[int, str]) -> int | None:
     """The number of a demonstration missing from the file; None for another name."""
     match = _DEMO.fullmatch(name)
     return int(match[1]) if match and int(match[1]) not in names else None
+
+
+def own_task_of(demo: Any) -> Any:
+    """Return the task in a demonstration's ``ep_meta``, as robomimic reads it, or in an attribute; None without one."""
+    attributes = getattr(demo, "attrs", {})
+    stored = document(attributes, "ep_meta")
+    own = next((stored[key] for key in _SENTENCES if stored.get(key)), None)
+    return own or next((attribute(attributes, key) for key in _SENTENCES if key in attributes), None)
+
+
+def task_of(attributes: Mapping[str, Any]) -> Any:
+    """Return the task of all demonstrations from the attributes of ``data``; None if there is none."""
+    documents = (document(attributes, name) for name in DOCUMENTS)
+    return next((found[key] for found in documents for key in _SENTENCES if found.get(key)), None)
+
+
+def is_of_libero(attributes: Mapping[str, Any]) -> bool:
+    """True if the attributes of ``data`` are LIBERO's."""
+    env_names = [attribute(attributes, "env_name"), document(attributes, "env_args").get("env_name")]
+    env_names.append(attribute(attributes, "tag"))
+    has_problem = not {"problem_name", "language_instruction"}.isdisjoint(document(attributes, "problem_info"))
+    is_named = any("libero" in str(name).lower() for name in env_names)
+    return has_problem or is_named or "bddl_file_name" in attributes
+
+
+def fps_of(attributes: Mapping[str, Any]) -> float:
+    """Return the frames per second: robosuite's control frequency, else its default."""
+    told = document(attributes, "env_args").get("env_kwargs")
+    fps = told.get("control_freq") if isinstance(told, dict) else None
+    return float(fps) if isinstance(fps, int | float) and 0 < fps < 1000 else _DEFAULT_FPS
+
+
+def document(attributes: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Return the JSON object in an attribute; empty if there is none."""
+    try:
+        found = json.loads(attribute(attributes, name))
+    except (ValueError, TypeError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def unread_documents(attributes: Mapping[str, Any]) -> list[str]:
+    """Return the names of attributes that should hold a JSON object but do not."""
+    broken = [name for name in DOCUMENTS if name in attributes and not document(attributes, name)]
+    return [name for name in broken if str(attribute(attributes, name)).strip() not in ("", "{}")]
+
+
+def attribute(attributes: Mapping[str, Any], name: str) -> Any:
+    """Return an attribute, with bytes as text, an array as a list, and a single element without the list.
+
+    Return None for an attribute that is missing, empty or unreadable.
+    """
+    try:
+        value = attributes.get(name)
+    except (OSError, RuntimeError, TypeError, ValueError):
+        return None
+    if isinstance(value, np.ndarray):
+        value = value.item() if value.size == 1 else value.tolist()
+    if hasattr(value, "dtype") and getattr(value, "shape", ()) is None:  # HDF5's null
+        return None
+    return value.decode(errors="replace") if isinstance(value, bytes) else value
+
+
+def lacking(dataset: Any) -> str:
+    """Return the file, dataset or frames missing from a virtual dataset or its sources; empty if nothing is."""
+    if not dataset.is_virtual:
+        return ""
+    sources = dataset.virtual_sources()
+    lacks = next(filter(None, (_lacking_source(dataset, each) for each in sources)), "")
+    is_whole = sum(_num_values(each.vspace) for each in sources) >= dataset.size
+    return lacks or ("" if is_whole else "a source for each frame")
+
+
+def _lacking_source(dataset: Any, source: Any) -> str:
+    import h5py
+
+    if _BLOCKS in source.file_name:
+        return ""
+    if source.file_name == ".":
+        return _lacking_in(dataset.file, source)
+    found = next((file for file in _places(dataset, source.file_name) if file.is_file()), None)
+    if found is None:
+        return f"the file {source.file_name}"
+    try:
+        with h5py.File(found, "r") as opened:
+            return _lacking_in(opened, source)
+    except OSError:
+        return f"the HDF5 file {found}"
+
+
+def _lacking_in(opened: Any, source: Any) -> str:
+    from h5py import h5s
+
+    stored = opened.get(source.dset_name)
+    if not hasattr(stored, "shape"):
+        return f"{source.dset_name} in {opened.filename}"
+    is_all = source.src_space.get_select_type() == h5s.SEL_ALL  # HDF5 refuses a source of another size
+    if is_all or _num_values(source.src_space) == math.inf:
+        return lacking(stored)
+    _, last = source.src_space.get_select_bounds()
+    is_whole = len(last) == stored.ndim and all(index < size for index, size in zip(last, stored.shape, strict=True))
+    return lacking(stored) if is_whole else f"{last[0] + 1} frames of {source.dset_name} in {opened.filename}"
+
+
+def _num_values(space: Any) -> float:
+    """Return the number of selected values; infinite for a selection without an end."""
+    try:
+        return int(space.get_select_npoints())
+    except RuntimeError:
+        return math.inf
+
+
+def _places(dataset: Any, name: str) -> list[Path]:
+    """The paths at which HDF5 looks for a source file."""
+    file = Path(dataset.file.filename)
+    prefixes = os.environ.get("HDF5_VDS_PREFIX", "").replace("${ORIGIN}", str(file.parent)).split(":")
+    folders = [*map(Path, filter(None, prefixes)), file.parent, Path(), file.resolve().parent]
+    return [folder / each for folder in folders for each in (name, Path(name).name)]
+
+
+def foreign_layout(opened: Any) -> str | None:
+    """Return the name of an open file's layout, with a remedy; None if it is unknown or has a reader."""
+    for group, layout in (("observations/rgb_images", _ROBOMIND), ("observations/images", _ALOHA)):
+        if group in opened:
+            return layout
+    cameras = opened.get("observation")
+    if hasattr(cameras, "keys") and any(f"{camera}/rgb" in cameras for camera in cameras):
+        return _ROBOTWIN
+    return _MANISKILL if "data" not in opened and any(map(_TRAJECTORY.fullmatch, opened)) else None
+
+
+def foreign_layout_of(file: Path) -> str | None:
+    """Return ``foreign_layout`` of a file; None also without h5py or for an unreadable file."""
+    try:
+        import h5py
+
+        with h5py.File(file, "r") as opened:
+            return foreign_layout(opened)
+    except (ImportError, OSError, RuntimeError):
+        return None

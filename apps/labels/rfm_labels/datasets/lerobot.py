@@ -11,28 +11,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from rfm_client import UInt8Array
-from rfm_client.frames import Corrections, decoder, pillow
-from rfm_client.options import checked_positive, first_names
-from rfm_labels.datasets import lerobot_v21, lerobot_v30
-from rfm_labels.datasets.faults import listed
+from rfm_client.frames import Picture, Video
+from rfm_client.options import checked_finite, first_names
+from rfm_labels.datasets.cameras import AskedCorrections
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
-from rfm_labels.datasets.lerobot_rows import Entry, Info, RowReader, column_types, read_table
-from rfm_labels.datasets.lerobot_tasks import TASK_COLUMN, Sentences, has_numbers, table_of
-from rfm_labels.datasets.protocol import (
-    Dataset,
-    DatasetEpisode,
-    DatasetError,
-    TaskOverride,
-    corrections_of,
-    digest_of,
-    require,
-)
-from rfm_labels.datasets.stored_pictures import check_picture, decoded_picture, turn_mark
-from rfm_labels.datasets.video_frames import Span, Times, decode, video_identity, video_packets
+from rfm_labels.datasets.lerobot_meta import Entry, Info, column_types, read_entries, read_table
+from rfm_labels.datasets.lerobot_rows import TASK_COLUMN, RowReader, Sentences, has_numbers, read_sentences, table_of
+from rfm_labels.datasets.stored_files import Span, Times, digest_of, faults_at, file_identity, turn_mark
 
 _VIDEOS_AT_A_TIME = 4  # whose packets stay in memory, or one of each camera
 _CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
@@ -53,13 +43,14 @@ class LeRobotDataset(Dataset):
         source: str | None = None,
         revision: str | None = None,
         task: TaskOverride = TaskOverride(),
-        corrections: Corrections = Corrections(),
+        corrections: AskedCorrections = AskedCorrections(),
         tolerance_s: float = TOLERANCE_S,
     ) -> None:
         try:
-            self._tolerance_s = checked_positive("tolerance_s", tolerance_s)
+            self._tolerance_s = checked_finite("tolerance_s", tolerance_s, "a number above 0")
         except ValueError as error:
             raise DatasetError(str(error)) from None
+        require("tolerance_s", tolerance_s > 0, "a number above 0", tolerance_s)
         self.root = root
         self.source = source or root.resolve().name
         self.revision = revision
@@ -67,13 +58,12 @@ class LeRobotDataset(Dataset):
         self.kind = f"LeRobot {info.version}"
         self.cameras = (*info.videos, *info.images)
         self.depth_cameras = info.depth
-        self.corrections = corrections_of(corrections, self.cameras)
-        version = lerobot_v30 if info.version == "v3.0" else lerobot_v21
-        entries: list[tuple[int, Entry | DatasetError]] = list(version.read_entries(info))
+        self.corrections = corrections.of_cameras(self.cameras)
+        entries = list(read_entries(info))
         self._entries = dict(entries)
         self.numbers = sorted(self._entries)  # may have gaps, where episodes were deleted
         self.given_task = task
-        self._rows = RowReader(self._sentences(version), task)
+        self._rows = RowReader(self._sentences(), task)
         self._rows_in = lru_cache(max(_VIDEOS_AT_A_TIME, len(info.videos)))(self._read_video)
         self._clocks: dict[int, str] = {}  # of the episodes that are read
         self._without_rows: dict[str, dict[Path, tuple[int, int]]] = {}  # frames without rows, all frames
@@ -88,7 +78,7 @@ class LeRobotDataset(Dataset):
         is_whole = num_frames == info.total_frames or len(lengths) < len(self._entries)
         require(root / "meta", is_whole, f"{info.total_frames} frames, as info.json says", num_frames)
 
-    def _sentences(self, version: ModuleType) -> Sentences:
+    def _sentences(self) -> Sentences:
         """The meaning of the task column. Raises DatasetError for an unknown column or a broken task table."""
         if self.given_task.overrides:
             return Sentences()
@@ -96,11 +86,11 @@ class LeRobotDataset(Dataset):
         file, types = self._types_of_rows() if column != TASK_COLUMN else (None, {})
         if file is not None and not has_numbers(file, types, column):
             return Sentences(column)
-        file, name = table_of(self.root, version.TASKS_FILE, column)
-        sentences = version.read_tasks(self.root, file, name)
-        if list(sentences) != list(range(len(sentences))) and file.suffix == ".parquet":
-            self.notes = [f"tasks: {file} is not in the order of {name}_index: {_BY_PLACE}"]
-        return Sentences(column, str(file.with_suffix("")), sentences)
+        table, name = table_of(self.info, column)
+        sentences, shown = read_sentences(table, name), table.relative_to(self.root)
+        if list(sentences) != list(range(len(sentences))) and table.suffix == ".parquet":
+            self.notes = [f"tasks: {shown} is not in the order of {name}_index: {_BY_PLACE}"]
+        return Sentences(column, str(shown.with_suffix("")), sentences)
 
     def _types_of_rows(self) -> tuple[Path | None, Mapping[str, str]]:
         """The first readable table of rows, and its column types."""
@@ -120,30 +110,33 @@ class LeRobotDataset(Dataset):
         return DatasetEpisode(number, entry.where, rows.tasks[0][1], len(rows.times_s), rows.first_index, tasks)
 
     def decoder(self, camera: str) -> str | None:
-        return decoder() if camera in self.info.videos else pillow()
+        return Video.decoder() if camera in self.info.videos else Picture.decoder()
 
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         if camera not in self.info.videos:
             return digest_of(image + turn_mark(image).encode() for image in self._images(episode, camera))
         video, from_s = self._entry(episode.index).videos[camera]
         clock = self._clocks[episode.index]
-        return f"{video_identity(video, verify=verify, revision=self.revision)} {from_s}{clock}"
+        return f"{file_identity(video, verify=verify, revision=self.revision)} {from_s}{clock}"
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
         if camera in self.info.videos:
-            video, frames = self._frames_of(episode, camera)
-            self._note_frames_without_rows(camera, video)
-            return sum(video.packets.num_bytes[frame] for frame in frames.tolist())
+            rows, frames = self._frames_of(episode, camera)
+            self._note_frames_without_rows(camera, rows)
+            return sum(rows.video.packets.num_bytes[frame] for frame in frames.tolist())
         images = self._images(episode, camera)
         for t, image in enumerate(images):
-            check_picture(_where(episode, camera, t), image)
+            with faults_at(_where(episode, camera, t)):
+                Picture(image).check()
         return sum(map(len, images))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         if camera in self.info.videos:
-            return decode(self.span(episode, camera))
-        images = self._images(episode, camera)
-        return (decoded_picture(_where(episode, camera, t), image) for t, image in enumerate(images))
+            yield from self.span(episode, camera).frames()
+            return
+        for t, image in enumerate(self._images(episode, camera)):
+            with faults_at(_where(episode, camera, t)):
+                yield Picture(image).pixels()
 
     @property
     def frame_notes(self) -> Sequence[str]:
@@ -159,16 +152,11 @@ class LeRobotDataset(Dataset):
         """Return float64 [T], each frame's time from the start of the episode. Raises DatasetError."""
         return self._rows.read(self._entry(episode.index)).times_s
 
-    def video(self, episode: DatasetEpisode, camera: str) -> Path:
-        """Return the episode's video file of a camera in ``info.videos``."""
-        return self._entry(episode.index).videos[camera][0]
-
     def span(self, episode: DatasetEpisode, camera: str) -> Span:
         """Return the episode's frames in that video. Raises DatasetError if a row has no frame of its own."""
-        file = self.video(episode, camera)
-        video, frames = self._frames_of(episode, camera)
-        where, container = f"{episode.name}: {camera}", _CONTAINER.get(file.suffix.lower())
-        return Span(file, video.packets.times_s[frames], 0.5 * video.apart_s(frames), where, container)
+        rows, frames = self._frames_of(episode, camera)
+        tolerance_s = 0.5 * rows.apart_s(frames)
+        return Span(rows.video, rows.video.packets.times_s[frames], tolerance_s, f"{episode.name}: {camera}")
 
     def _entry(self, number: int) -> Entry:
         entry = self._entries[number]
@@ -178,20 +166,20 @@ class LeRobotDataset(Dataset):
 
     def _frames_of(self, episode: DatasetEpisode, camera: str) -> tuple[VideoRows, Frames]:
         """An episode's video, and the numbers of its frames in it."""
-        video = self._rows_in(camera, self.video(episode, camera))
-        frames = video.frames[episode.index]
+        rows = self._rows_in(camera, self._entry(episode.index).videos[camera][0])
+        frames = rows.frames[episode.index]
         if isinstance(frames, DatasetError):
             raise frames
-        return video, frames
+        return rows, frames
 
-    def _note_frames_without_rows(self, camera: str, video: VideoRows) -> None:
+    def _note_frames_without_rows(self, camera: str, rows: VideoRows) -> None:
         """Keep the number of frames without rows if the rows of all episodes in the video are known."""
-        is_known = len(video.parts) == len(self._in_video[camera, video.file])
+        is_known = len(rows.parts) == len(self._in_video[camera, rows.video.file])
         if self.info.version == "v3.0":  # an episode whose metadata are broken may lie in any video
             is_known = is_known and all(isinstance(entry, Entry) for entry in self._entries.values())
-        if is_known and video.num_without_rows:
-            counts = (video.num_without_rows, len(video.packets.times_s))
-            self._without_rows.setdefault(camera, {})[video.file] = counts
+        if is_known and rows.num_without_rows:
+            counts = (rows.num_without_rows, len(rows.video.packets.times_s))
+            self._without_rows.setdefault(camera, {})[rows.video.file] = counts
 
     @cached_property
     def _in_video(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
@@ -203,14 +191,15 @@ class LeRobotDataset(Dataset):
 
     def _read_video(self, camera: str, file: Path) -> VideoRows:
         """A video with the rows of all readable episodes in it."""
-        packets = video_packets(file, _CONTAINER.get(file.suffix.lower()))
-        require(file, len(packets.times_s) > 0, "frames with time stamps", "none")
+        video = Video(file, _CONTAINER.get(file.suffix.lower()))
+        with faults_at(file):
+            require(file, len(video.packets.times_s) > 0, "frames with time stamps", "none")
         parts = []
         for entry in self._in_video[camera, file]:
             with suppress(DatasetError):  # raised again if that episode is read
                 times_s = entry.videos[camera][1] + self._rows.read(entry).times_s
                 parts.append(Part(entry.index, entry.where, times_s))
-        return VideoRows(camera, file, packets, parts, self.info.fps, self._tolerance_s)
+        return VideoRows(camera, video, parts, self.info.fps, self._tolerance_s)
 
     def _images(self, episode: DatasetEpisode, camera: str) -> list[bytes]:
         file = self._entry(episode.index).data_file

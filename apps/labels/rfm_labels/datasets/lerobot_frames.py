@@ -12,15 +12,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.frames import Packets
-from rfm_labels.datasets.protocol import DatasetError
-from rfm_labels.datasets.video_frames import Times
+from rfm_client.frames import Video
+from rfm_labels.datasets.faults import DatasetError
+from rfm_labels.datasets.stored_files import Times
 
 TOLERANCE_S = 1e-4  # LeRobot's default
 
@@ -47,8 +46,7 @@ class VideoRows:
     """
 
     camera: str
-    file: Path
-    packets: Packets
+    video: Video
     parts: Sequence[Part]
     fps: float
     tolerance_s: float
@@ -65,7 +63,9 @@ class VideoRows:
                 found[part.number] = self._fault(best, part, slice(start, end))
             elif any(other.is_faulty.sum() == best.is_faulty.sum() for other in others):
                 expected = "times that count from 0 s or from the first frame"
-                got = f"a frame at each time from both, and the first at {self.packets.times_s[0]:.4f} s; {_AGAIN}"
+                got = (
+                    f"a frame at each time from both, and the first at {self.video.packets.times_s[0]:.4f} s; {_AGAIN}"
+                )
                 found[part.number] = DatasetError.at(f"{part.where}: {self._where}", expected, got)
         return found
 
@@ -74,16 +74,16 @@ class VideoRows:
         """Number of frames without a row; 0 if an episode is faulty, because its frames are unknown."""
         if any(isinstance(frames, DatasetError) for frames in self.frames.values()):
             return 0
-        return len(self.packets.times_s) - len(self._rows_s)
+        return len(self.video.packets.times_s) - len(self._rows_s)
 
     def apart_s(self, frames: Frames) -> float:
         """Return the shortest time between one of these frames and a neighbour, at most the time between two rows."""
-        gaps_s = np.diff(self.packets.times_s, prepend=-np.inf, append=np.inf)
+        gaps_s = np.diff(self.video.packets.times_s, prepend=-np.inf, append=np.inf)
         return min(1 / self.fps, float(np.minimum(gaps_s[frames], gaps_s[frames + 1]).min()))
 
     @property
     def _where(self) -> str:
-        return f"{self.camera}: {self.file}"
+        return f"{self.camera}: {self.video.file}"
 
     @cached_property
     def _rows_s(self) -> Times:
@@ -92,9 +92,9 @@ class VideoRows:
     @cached_property
     def _matches(self) -> list[_Match]:
         """Matches, best first. LeRobot counts times from 0; if a video begins later, they may count from there."""
-        times_s = self.packets.times_s
+        times_s = self.video.packets.times_s
         zeros_s = [times_s[0], 0.0] if times_s[0] > self.tolerance_s else [0.0]
-        rounding_s = min(self.packets.tick_s, 0.25 / self.fps)
+        rounding_s = min(self.video.packets.tick_s, 0.25 / self.fps)
         float32_s = np.spacing(self._rows_s.astype(np.float32)).astype(np.float64)
         tolerances_s = max(self.tolerance_s, rounding_s) + float32_s
         matches = [_Match.of(times_s, zero_s + self._rows_s, tolerances_s) for zero_s in zeros_s]
@@ -103,7 +103,7 @@ class VideoRows:
     def _fault(self, match: _Match, part: Part, rows: slice) -> DatasetError:
         """The error of an episode's first faulty row."""
         k = rows.start + int(np.argmax(match.is_faulty[rows]))
-        times_s, frame, expected_s = self.packets.times_s, match.frames[k], match.expected_s[k]
+        times_s, frame, expected_s = self.video.packets.times_s, match.frames[k], match.expected_s[k]
         where = f"{part.where}, row {k - rows.start}: {self._where}"
         if not match.is_far[k]:
             got = f"that of {self._other_row(match, k)}; {_AGAIN}"
@@ -123,12 +123,12 @@ class VideoRows:
     @property
     def _rates(self) -> str:
         """A note on the frame rates of video and rows; empty if they are equal."""
-        if not self.packets.fps or f"{self.packets.fps:.2f}" == f"{self.fps:.2f}":
+        if not self.video.packets.fps or f"{self.video.packets.fps:.2f}" == f"{self.fps:.2f}":
             return ""
-        return f" (the video has {self.packets.fps:.2f} frames a second, meta/info.json says {self.fps:g})"
+        return f" (the video has {self.video.packets.fps:.2f} frames a second, meta/info.json says {self.fps:g})"
 
     def _remedy(self, match: _Match, rows: slice) -> str:
-        if self._rates and len(self._rows_s) == len(self.packets.times_s):
+        if self._rates and len(self._rows_s) == len(self.video.packets.times_s):
             return f"ffmpeg -r {self.fps:g} -i IN OUT gives it that rate"
         late_s = match.late_s[rows]
         most_s = math.ceil(np.abs(late_s).max() * 1e4) / 1e4

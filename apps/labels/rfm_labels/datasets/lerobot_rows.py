@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Tables of a LeRobot dataset: ``meta/info.json``, the entries of episodes, and their rows. Needs pyarrow."""
+"""Rows of a LeRobot dataset: the times and the task of each frame of an episode. Needs pyarrow.
+
+The column of the tasks has sentences, numbers of sentences in a table of ``meta``, or LeRobot's
+``language_persistent``, in which each entry with the style ``subtask`` holds from its time on. T rows of an episode.
+"""
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,119 +17,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_labels.datasets.lerobot_tasks import Sentences, values_in, values_of
-from rfm_labels.datasets.protocol import DatasetError, TaskOverride, digest_of, require
+from rfm_labels.datasets.dataset import TaskOverride
+from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.lerobot_meta import Entry, Info, json_lines, number_in, read_table
+from rfm_labels.datasets.stored_files import digest_of
 
-INFO_FILE = Path("meta", "info.json")
-VERSIONS = ("v2.0", "v2.1", "v3.0")
+TASK_COLUMN = "task_index"
 
 _ROW_COLUMNS = ("index", "episode_index", "frame_index", "timestamp")
 _TASKS = "tasks"  # key of the column that names the tasks
 _REGULAR_S, _FLOAT32 = 1e-4, 1e-7  # absolute and relative errors of a time stamp, a float32
 _FILES_AT_A_TIME = 4  # whose rows stay in memory
 _FOLLOW_THE_ROWS = "correct it, or follow the rows, as LeRobot's reader does: --task-column task_index"
-_OF_PICTURES = ("info", "video_info")  # keys in a feature of a camera, by version of the writer
-_DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
-
-
-@dataclass(frozen=True)
-class Info:
-    """Contents of ``meta/info.json``.
-
-    videos, images: keys of cameras with frames in video files, and in tables
-    depth: keys of the depth cameras in both
-    total_frames: of all episodes
-    data_path, video_path: templates of file paths
-    """
-
-    root: Path
-    version: str
-    fps: float
-    videos: tuple[str, ...]
-    images: tuple[str, ...]
-    depth: tuple[str, ...]
-    total_episodes: int
-    total_frames: int
-    chunks_size: int
-    data_path: str
-    video_path: str | None
-
-    @classmethod
-    def read(cls, root: Path) -> Info:
-        """Return the information in ``root``. Raises DatasetError."""
-        file = root / INFO_FILE
-        try:
-            document = json.loads(file.read_bytes())
-        except (OSError, ValueError, RecursionError) as error:
-            raise DatasetError.at(file, "a readable JSON file", error) from error
-        require(file, isinstance(document, dict), "a JSON object", type(document).__name__)
-
-        def field(name: str, *kinds: type) -> Any:
-            value = document.get(name)
-            is_of_kind = isinstance(value, kinds) and not isinstance(value, bool)
-            expected = " or ".join(kind.__name__ for kind in kinds)
-            require(f"{file}: {name}", is_of_kind, expected, "none" if value is None else repr(value))
-            return value
-
-        features = {key: feature for key, feature in field("features", dict).items() if isinstance(feature, dict)}
-        videos, images = (
-            tuple(key for key, feature in features.items() if feature.get("dtype") == kind)
-            for kind in ("video", "image")
-        )
-        version, fps = field("codebase_version", str), float(field("fps", int, float))
-        require(f"{file}: codebase_version", version in VERSIONS, f"one of {', '.join(VERSIONS)}", repr(version))
-        require(f"{file}: fps", 0 < fps < math.inf, "a number above 0", repr(fps))
-        return cls(
-            root,
-            version,
-            fps,
-            videos,
-            images,
-            depth=tuple(key for key in (*videos, *images) if _is_depth(features[key])),
-            total_episodes=field("total_episodes", int),
-            total_frames=field("total_frames", int),
-            chunks_size=field("chunks_size", int),
-            data_path=field("data_path", str),
-            video_path=field("video_path", str) if videos else None,
-        )
-
-    def path(self, template: str | None, **values: Any) -> Path:
-        """Return the file inside the dataset that a template names. Raises DatasetError."""
-        try:
-            path = (template or "").format(**values)
-        except (LookupError, ValueError) as error:
-            raise DatasetError.at(INFO_FILE, f"a path of {', '.join(values)}", repr(template)) from error
-        is_inside = bool(path) and not Path(path).is_absolute() and ".." not in Path(path).parts
-        require(INFO_FILE, is_inside, "a path inside the dataset", repr(path))
-        return self.root / path
-
-
-def _is_depth(feature: Mapping[str, Any]) -> bool:
-    told = [feature[name] for name in _OF_PICTURES if isinstance(feature.get(name), dict)]
-    return any(each.get(mark) is True for each in told for mark in _DEPTH_MARKS)
-
-
-@dataclass(frozen=True)
-class Entry:
-    """Metadata of one episode, in the same form for all versions.
-
-    tasks: sentences in the metadata
-    first_index: the dataset's number of its first frame; None: only the rows have it
-    data_file: Parquet file with its rows
-    videos: by camera, the video file and the episode's start in it, in seconds
-    """
-
-    index: int
-    tasks: Sequence[str]
-    length: int
-    first_index: int | None
-    data_file: Path
-    videos: Mapping[str, tuple[Path, float]]
-
-    @property
-    def where(self) -> str:
-        """The episode's name in messages."""
-        return f"episode {self.index}"
+_NUMBERS = re.compile(r"u?int\d+")
+_WHOLE_OR_NOT = re.compile(r"halffloat|float|double")  # numbers beside missing values
+_SENTENCES = re.compile(r"(dictionary<values=)?(large_)?string\b.*")
+_IDENTITY = ("index", "episode_index", "frame_index")
+_STYLE = "subtask"
+_INDEX_OF_PANDAS = "__index_level_0__"  # column of an index without a name
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,34 +107,6 @@ class RowReader:
         return task
 
 
-def read_table(file: Path, columns: list[str] | None = None, filters: Any = None) -> Any:
-    """Return a Parquet file's table. Raises DatasetError for a missing or broken file, or a missing column."""
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError as error:
-        raise ImportError("LeRobot datasets need pyarrow: pip install ./client ./apps/labels") from error
-    try:
-        table = parquet.read_table(file, columns=columns, filters=filters, partitioning=None)
-    except FileNotFoundError as error:
-        raise DatasetError.at(file, "a Parquet file", "none") from error
-    except (OSError, pyarrow.ArrowException) as error:
-        raise DatasetError.at(file, "a readable Parquet file", error) from error
-    for name in columns or []:
-        require(file, name in table.column_names, f"the column {name}", ", ".join(table.column_names))
-    return table
-
-
-def column_types(file: Path) -> Mapping[str, str]:
-    """Return the column types of a Parquet file, as pyarrow names them. Raises DatasetError for a broken file."""
-    from pyarrow import ArrowException, parquet
-
-    try:
-        return {field.name: str(field.type) for field in parquet.read_schema(file)}
-    except (OSError, ArrowException) as error:
-        raise DatasetError.at(file, "a readable Parquet file", error) from error
-
-
 def _read_columns(file: Path, task_column: str) -> Mapping[str, Any]:
     """The columns of a file; integers are int64, and -1 where the table has none."""
     import pyarrow
@@ -241,3 +121,118 @@ def _read_columns(file: Path, task_column: str) -> Mapping[str, Any]:
             raise DatasetError.at(f"{file}: {name}", "numbers", error) from error
         columns[name] = numbers.fill_null(np.nan if is_time else -1).to_numpy()
     return columns
+
+
+@dataclass(frozen=True)
+class Sentences:
+    """What the values of a column mean.
+
+    table: name of the sentence table, for messages
+    by_number: sentences by number
+    """
+
+    column: str = TASK_COLUMN
+    table: str = "meta/tasks"
+    by_number: Mapping[int, str | None] = field(default_factory=dict)
+
+    def find(self, value: Any) -> tuple[str, Any]:
+        """Return where the sentence of a value is, for messages, and the sentence."""
+        if value is None or isinstance(value, str):
+            return self.column, value
+        sentence = self.by_number.get(int(value)) if float(value).is_integer() else value
+        return f"{self.column.removesuffix('_index')} {value} in {self.table}", sentence
+
+
+def table_of(info: Info, column: str) -> tuple[Path, str]:
+    """Return the sentence table of a column, and the name of the sentences in it.
+
+    ``subtask_index`` has numbers of ``meta/subtasks`` if that exists; other columns have numbers of ``meta/tasks``.
+    """
+    tasks = info.root / "meta" / ("tasks.parquet" if info.version == "v3.0" else "tasks.jsonl")
+    name = column.removesuffix("_index")
+    own = tasks.with_name(f"{name}s{tasks.suffix}")
+    return (own, name) if name != column and own.is_file() else (tasks, "task")
+
+
+def _by_number(file: Path, sentences: Iterable[tuple[int, str | None]]) -> dict[int, str | None]:
+    found: dict[int, str | None] = {}
+    for number, sentence in sentences:
+        known = found.setdefault(number, sentence)
+        require(file, known == sentence, f"one sentence for the number {number}", f"{known!r} and {sentence!r}")
+    return found
+
+
+def has_numbers(file: Path, types: Mapping[str, str], column: str) -> bool:
+    """True if a column has numbers, False if it has sentences or subtasks. Raises DatasetError for another column.
+
+    file: table of rows, for messages
+    types: column types, as pyarrow names them
+    """
+    usable = {name: kind for name, kind in types.items() if _is_usable(kind) and name not in _IDENTITY}
+    candidates = [name for name, kind in usable.items() if not _WHOLE_OR_NOT.fullmatch(kind)]
+    require(f"{file}: task_column", column in usable, f"one of {', '.join(candidates)}", repr(column))
+    return bool(_NUMBERS.fullmatch(usable[column]) or _WHOLE_OR_NOT.fullmatch(usable[column]))
+
+
+def values_of(column: Any) -> Any:
+    """Return the values of a pyarrow column: whole numbers, or objects. A column of subtasks stays as it is."""
+    kind = str(column.type)
+    if _is_language(kind):
+        return column
+    if kind.startswith("dictionary"):
+        column = column.cast(column.type.value_type)
+    values = column.to_numpy()
+    if values.dtype.kind != "f":
+        return values
+    return np.array([None if np.isnan(value) else value for value in values], dtype=object)
+
+
+def values_in(where: str, column: Any, own: npt.NDArray[np.int64], times_s: npt.NDArray[np.float64]) -> Any:
+    """Return the values of an episode's rows, an array [T]. Raises DatasetError for two subtasks at one time.
+
+    column: as ``values_of`` returns it
+    own: int64 [T], positions of the episode's rows
+    times_s: float64 [T], times of the rows
+    """
+    if isinstance(column, np.ndarray):
+        return column[own]
+    stored: Sequence[Mapping[str, Any]] = column[int(own[0])].as_py() or []  # the same in all rows of an episode
+    told = {row["timestamp"]: row["content"] for row in stored if row["style"] == _STYLE}
+    is_one = all(told[row["timestamp"]] == row["content"] for row in stored if row["style"] == _STYLE)
+    require(where, is_one, f"one {_STYLE} at a time", "several")
+    starts_s = sorted(told)
+    contents = [None, *(told[start_s] for start_s in starts_s)]
+    return np.array([contents[k] for k in np.searchsorted(starts_s, times_s, side="right")], dtype=object)
+
+
+def _is_usable(kind: str) -> bool:
+    return any(each.fullmatch(kind) for each in (_NUMBERS, _WHOLE_OR_NOT, _SENTENCES)) or _is_language(kind)
+
+
+def _is_language(kind: str) -> bool:
+    fields = set(re.findall(r"(\w+): ", kind))
+    return "list<" in kind and {"content", "style", "timestamp"} <= fields
+
+
+def read_sentences(file: Path, name: str = "task") -> dict[int, str | None]:
+    """Return each sentence of a table of ``meta`` by its number. Raises DatasetError.
+
+    name: key of the sentences, in JSON lines; the numbers have the key ``<name>_index``
+
+    In Parquet, the sentences are the index of a pandas table. The column's name depends on the version of its writer.
+    """
+    if file.suffix != ".parquet":
+        lines = [(number_in(where, line, f"{name}_index"), line.get(name, "")) for where, line in json_lines(file)]
+        return _by_number(file, lines)
+    columns: dict[str, list[Any]] = read_table(file).to_pydict()
+    numbers = columns.pop(f"{name}_index", None)
+    texts = {
+        column: values
+        for column, values in columns.items()
+        if all(value is None or isinstance(value, str) for value in values)
+    }
+    of_pandas = next((column for column in (_INDEX_OF_PANDAS, name) if column in texts), None)
+    column = of_pandas or (next(iter(texts)) if len(texts) == 1 else None)
+    got = f"{'no ' * (numbers is None)}{name}_index and {len(texts)} of them"
+    require(file, numbers is not None and column is not None, f"{name}_index and one column of sentences", got)
+    return _by_number(file, list(zip(numbers or (), texts[column or ""], strict=True)))

@@ -5,29 +5,31 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from rfm_client.frames import ARRAY_SUFFIXES, Channels, Corrections, HubError, Orient, cached_snapshot
+from rfm_client.frames import ARRAY_SUFFIXES, ChannelOrder, Orientation, cached_snapshot
 from rfm_client.options import first_names
-from rfm_labels.datasets.array_files import ArrayFiles
-from rfm_labels.datasets.episode_files import (
-    TABLES,
+from rfm_labels.datasets.cameras import AskedCorrections
+from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset, SeveralTasks, TaskOverride
+from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.folders import (
+    ArrayFiles,
     Contents,
     EpisodeFiles,
+    FrameFolders,
+    VideoFolder,
     in_natural_order,
-    table_in,
+    is_picture,
 )
-from rfm_labels.datasets.frame_folders import FrameFolders, is_picture
 from rfm_labels.datasets.hdf5 import SUFFIXES, Hdf5Dataset, is_hdf5
-from rfm_labels.datasets.hdf5_layouts import foreign_layout_of
+from rfm_labels.datasets.hdf5_contents import foreign_layout_of
 from rfm_labels.datasets.lerobot import LeRobotDataset
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
-from rfm_labels.datasets.lerobot_rows import INFO_FILE
-from rfm_labels.datasets.protocol import SIGNALS_FOLDER, Dataset, DatasetError, SeveralTasks, TaskOverride, require
-from rfm_labels.datasets.task_tables import read_table_of_tasks
-from rfm_labels.datasets.videos import VideoFolder
+from rfm_labels.datasets.lerobot_meta import INFO_FILE, Info
+from rfm_labels.datasets.lerobot_rows import TASK_COLUMN
+from rfm_labels.datasets.task_tables import TABLES, read_table_of_tasks, table_in
 
 _HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
 _LAYOUTS = (
@@ -66,8 +68,8 @@ def open_dataset(
     override_task: bool = False,
     several_tasks: SeveralTasks = "each",
     task_column: str | None = None,
-    orient: Orient = Orient(),
-    channels: Channels = Channels(),
+    orient: Orientation | Mapping[str, Orientation] | None = None,
+    channels: ChannelOrder | Mapping[str, ChannelOrder] | None = None,
     tolerance_s: float = TOLERANCE_S,
 ) -> Dataset:
     """Return the dataset at a path, or download the Hub id ``org/name[@revision]``. An existing path wins.
@@ -78,14 +80,15 @@ def open_dataset(
         the first frame's, as in LeRobot's own scripts
     task_column: column of a LeRobot dataset's rows that names the tasks: sentences, numbers of sentences in
         ``meta/tasks``, or LeRobot's ``language_persistent``; None: ``task_index``, checked against the metadata
-    orient: turn of each camera's frames. HDF5 files marked as LIBERO's are turned by default
-    channels: order in which each camera's colours are stored: ``rgb`` (the default) or ``bgr``
+    orient: turn of the frames: one for all cameras, or a dict by camera, in which "" stands for the others; None: as
+        stored, but HDF5 files marked as LIBERO's are turned
+    channels: order in which the colours are stored, ``rgb`` or ``bgr``: one, or a dict; None: ``rgb``
     tolerance_s: of a LeRobot dataset's videos: most seconds between a row and its frame, as LeRobot's ``tolerance_s``
 
     Raises DatasetError.
     """
     path, given = Path(source), TaskOverride(task, override_task, several_tasks, task_column)
-    corrections = Corrections(orient, channels)
+    corrections = AskedCorrections.of(orient, channels)
     has_rows = not path.exists() or (path / INFO_FILE).is_file()
     require("task_column", task_column is None or has_rows, f"none, since {path} is no LeRobot dataset", task_column)
     if is_hdf5(path):
@@ -105,12 +108,26 @@ def _from_hub(name: str, revision: str | None, **opening: Any) -> LeRobotDataset
         folder = cached_snapshot(name, "dataset", revision)
     except ImportError as error:
         raise ImportError("datasets of the Hub need huggingface-hub: pip install ./client ./apps/labels") from error
-    except HubError as error:
+    except OSError as error:
         raise DatasetError.at(name, "a local dataset or one of the Hub", f"none: {error}") from error
     if not (folder / INFO_FILE).is_file():
         raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(folder) or "none")
     commit = folder.name  # the name of a snapshot's folder
     return LeRobotDataset(folder, source=name, revision=commit, **opening)
+
+
+def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset:
+    """Return the dataset of a LeRobot folder or an HDF5 file for a viewer. Raises DatasetError.
+
+    Blank and outdated tasks are shown, too, and a row's frame is the nearest, as a player shows it.
+    """
+    path = Path(source).resolve()
+    if is_hdf5(path):
+        return Hdf5Dataset(path, task=TaskOverride(is_needed=False))
+    if not (path / INFO_FILE).is_file():
+        raise DatasetError(f"expected the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file, got {source}")
+    task = TaskOverride(column=TASK_COLUMN, is_needed=False)
+    return LeRobotDataset(path, task=task, tolerance_s=0.5 / Info.read(path).fps)
 
 
 def hdf5_files(folder: str | Path) -> list[Path]:
@@ -126,7 +143,7 @@ def hdf5_files(folder: str | Path) -> list[Path]:
     return [root / name for name in in_natural_order(shown)]
 
 
-def _open_files(path: Path, task: TaskOverride, corrections: Corrections) -> Dataset:
+def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
     """The dataset of a folder with a file or a folder for each episode, or of its table. Raises DatasetError."""
     if path.is_file() and path.suffix.lower() not in (".csv", ".json"):
         raise DatasetError.at(path, _LAYOUTS, _unread(path) or "another file")

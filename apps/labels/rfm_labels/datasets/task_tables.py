@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Read ``tasks.csv`` and ``tasks.json``, which list the episodes of a folder with their tasks."""
+"""Read ``tasks.csv`` and ``tasks.json``, which list the episodes of a folder with their tasks.
+
+The CSV file has the columns ``video`` (or ``episode``) and ``task``, between commas, semicolons or tabs; a task with a
+comma is in quotes. The JSON file is ``{"video.mp4": "put the block in the bowl"}``. Paths are relative to the table,
+whose order is the order of the episodes.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +17,21 @@ from collections.abc import Iterator, Mapping, Set
 from pathlib import Path, PurePath
 from typing import Any, TypeAlias
 
-from rfm_labels.datasets.faults import shortened
-from rfm_labels.datasets.protocol import DatasetError, FaultsError, require
+from rfm_labels.datasets.faults import DatasetError, FaultsError, require, shortened
+
+TABLES = ("tasks.csv", "tasks.json")
 
 _NAMES = ("video", "episode")  # columns of the path
 _DELIMITERS = ",;\t"
 
 _Line: TypeAlias = tuple[str, str, Any]  # place, path and task
+
+
+def table_in(folder: Path) -> Path | None:
+    """Return the table of tasks in a folder; None: it has none. Raises DatasetError for two tables."""
+    found = [folder / name for name in TABLES if (folder / name).is_file()]
+    require(folder, len(found) < 2, f"one of {' and '.join(TABLES)}", "both")
+    return found[0] if found else None
 
 
 def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, Any]:

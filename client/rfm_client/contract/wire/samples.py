@@ -3,22 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
-from rfm_client.contract.frame_refs import (
-    DIGEST_BYTES,
-    EncoderSampleRefs,
-    ProgressSampleRefs,
-    TrajectoryRefs,
-    frame_digest,
-)
 from rfm_client.contract.samples import (
     EncoderSample,
+    NamedFrame,
     PreferenceSample,
     ProgressSample,
     Sample,
@@ -28,6 +22,7 @@ from rfm_client.contract.samples import (
     stackable,
 )
 from rfm_client.contract.wire.specs import (
+    DIGEST_BYTES,
     FRAME_DIGESTS,
     FRAME_STEPS,
     FRAMES,
@@ -36,15 +31,19 @@ from rfm_client.contract.wire.specs import (
     SECOND_FRAMES,
     TASK,
     TEXT_EMBEDDING,
+    UNKNOWN_FRAMES,
     VIDEO_EMBEDDINGS,
     SampleType,
     Tensors,
     encoder_inputs,
+    frame_digest,
     pad_stack,
 )
 
 Decoded = TypeVar("Decoded")
 Row: TypeAlias = dict[str, npt.NDArray[Any]]  # tensors of one sample
+Known: TypeAlias = Mapping[Any, npt.NDArray[Any]]  # pixels, or embeddings, of frames by digest
+Kept: TypeAlias = Callable[[Iterable[bytes]], Known]  # returns what a server keeps of these frames
 
 _SAMPLE_TYPES = {
     ProgressSample: SampleType.PROGRESS,
@@ -73,9 +72,12 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
     return tensors
 
 
-def decode_samples(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Sample | ProgressSampleRefs]:
-    """Return the samples of one request. Raises InvalidSampleError, which names the sample and the field."""
-    return _decode_rows(tensors, _decode_sample)
+def decode_samples(tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | None = None) -> list[Sample]:
+    """Return the samples of one request. Raises InvalidSampleError, which names the sample and the field.
+
+    kept: finds the pixels that the model keeps of frames; None: it keeps none
+    """
+    return _decode_rows(tensors, kept, _decode_sample)
 
 
 def encode_frames(trajectory: Trajectory) -> Tensors:
@@ -95,30 +97,34 @@ def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Traje
         raise InferenceFailedError(f"embeddings: {error}") from error
 
 
-def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[EncoderSample | EncoderSampleRefs]:
-    """Return the trajectories of each sample, without padding, for the encoder. Raises InvalidSampleError."""
-    return _decode_rows(tensors, _decode_encoder_sample)
+def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | None = None) -> list[EncoderSample]:
+    """Return the trajectories of each sample, without padding, for the encoder. Raises InvalidSampleError.
+
+    kept: finds the embeddings that the model keeps of frames; None: it keeps none
+    """
+    return _decode_rows(tensors, kept, _decode_encoder_sample)
 
 
-def encode_refs(trajectories: Sequence[TrajectoryRefs], sent: Sequence[UInt8Array]) -> Tensors:
-    """Return one request for the progress of trajectories with frame references.
+def encode_refs(videos: Sequence[Sequence[bytes]], tasks: Sequence[str], sent: Sequence[UInt8Array]) -> Tensors:
+    """Return one request for the progress of videos whose frames are named by their digests.
 
+    videos, tasks: the digests of the frames of each video, and its task
     sent: frames that the model may lack, uint8 [H, W, 3] of one size; empty: it has all frames
     """
-    count = len(trajectories)
+    count = len(videos)
     num_rows = -(-len(sent) // count)
     shape = sent[0].shape if sent else (1, 1, 3)  # an input is never empty
     frames = np.zeros((count, max(num_rows, 1), *shape), np.uint8)
     for index, frame in enumerate(sent):
         frames[index % count, index // count] = frame
-    digests = [[np.frombuffer(b"".join(named.digests), np.uint8).reshape(-1, DIGEST_BYTES)] for named in trajectories]
+    digests = [[np.frombuffer(b"".join(video), np.uint8).reshape(-1, DIGEST_BYTES)] for video in videos]
     return {
         SAMPLE_TYPE: np.full((count, 1), SampleType.PROGRESS, np.uint8),
-        NUM_FRAMES: np.array([[named.num_frames, 0] for named in trajectories], np.int32),
+        NUM_FRAMES: np.array([[len(video), 0] for video in videos], np.int32),
         FRAME_STEPS: np.zeros((count, 1), np.int32),
         FRAMES: frames,
         FRAME_DIGESTS: pad_stack(digests),
-        TASK: np.array([[named.task.encode()] for named in trajectories], np.object_),
+        TASK: np.array([[task.encode()] for task in tasks], np.object_),
     }
 
 
@@ -139,19 +145,22 @@ def _lengths(sample: Sample) -> tuple[int, int]:
 
 
 def _decode_rows(
-    tensors: Mapping[str, npt.NDArray[Any]], decode: Callable[[Row, dict[bytes, UInt8Array]], Decoded]
+    tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | None, decode: Callable[[Row, Known], Decoded]
 ) -> list[Decoded]:
-    """Decode each sample. The digests of the request's pixels are computed here."""
-    pixels = {}
+    """Decode each sample. The digests of the request's pixels are computed here, whatever the caller calls them."""
+    known: Known = {}
     if FRAME_DIGESTS in tensors:
         if SECOND_FRAMES in tensors:
             raise InvalidSampleError.at(FRAME_DIGESTS, f"none with {SECOND_FRAMES}", "both")
-        pixels = {frame_digest(frame): frame for frames in tensors[FRAMES] for frame in frames}
+        known = {frame_digest(frame): frame for frames in tensors[FRAMES] for frame in frames}
+        if kept is not None:
+            asked = {bytes(digest) for digests in tensors[FRAME_DIGESTS] for digest in digests}
+            known = {**kept(asked), **known}
     count = len(tensors[NUM_FRAMES])
     decoded = []
     for index in range(count):
         try:
-            decoded.append(decode({name: array[index] for name, array in tensors.items()}, pixels))
+            decoded.append(decode({name: array[index] for name, array in tensors.items()}, known))
         except InvalidSampleError as error:
             if count == 1:
                 raise
@@ -159,47 +168,51 @@ def _decode_rows(
     return decoded
 
 
-def _decode_sample(row: Row, pixels: dict[bytes, UInt8Array]) -> Sample | ProgressSampleRefs:
+def _decode_sample(row: Row, known: Known) -> Sample:
     sample_type, frame_steps = int(row[SAMPLE_TYPE][0]), int(row[FRAME_STEPS][0])
     lengths = row[NUM_FRAMES].tolist()
     if sample_type not in list(SampleType):
-        known = ", ".join(f"{t.value} ({t.name.lower()})" for t in SampleType)
-        raise InvalidSampleError.at(SAMPLE_TYPE, f"one of {known}", str(sample_type))
+        types = ", ".join(f"{t.value} ({t.name.lower()})" for t in SampleType)
+        raise InvalidSampleError.at(SAMPLE_TYPE, f"one of {types}", str(sample_type))
     if sample_type == SampleType.PROGRESS:
         if lengths[0] < 1 or lengths[1] != 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
         positions, _ = _positions(row, lengths)
-        if FRAME_DIGESTS in row:
-            return ProgressSampleRefs(_named(row, positions, pixels), frame_steps)
-        return ProgressSample(_trajectory(row, positions), frame_steps)
+        return ProgressSample(_trajectory(row, positions, known), frame_steps)
     if FRAME_DIGESTS in row:
         raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {FRAME_DIGESTS}", SampleType(sample_type).name.lower())
     if min(lengths) < 1:
         raise InvalidSampleError.at(NUM_FRAMES, "at least one frame of each of the two trajectories", str(lengths))
     if frame_steps != 0:
         raise InvalidSampleError.at(FRAME_STEPS, "0 unless the sample is of type progress", str(frame_steps))
-    first, second = (_trajectory(row, array) for array in _positions(row, lengths))
+    first, second = (_trajectory(row, array, known) for array in _positions(row, lengths))
     return (PreferenceSample if sample_type == SampleType.PREFERENCE else SimilaritySample)(first, second)
 
 
-def _decode_encoder_sample(row: Row, pixels: dict[bytes, UInt8Array]) -> EncoderSample | EncoderSampleRefs:
+def _decode_encoder_sample(row: Row, known: Known) -> EncoderSample:
     lengths = row[NUM_FRAMES].tolist()
     if lengths[0] < 1 or lengths[1] < 0:
         raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, at least 0]", str(lengths))
-    arrays = [array for array in _positions(row, lengths) if len(array)]
+    return EncoderSample(tuple(_trajectory(row, array, known) for array in _positions(row, lengths) if len(array)))
+
+
+def _trajectory(row: Row, positions: npt.NDArray[Any], known: Known) -> Trajectory:
     if FRAME_DIGESTS in row:
-        return EncoderSampleRefs(tuple(_named(row, array, pixels) for array in arrays))
-    return EncoderSample(tuple(_trajectory(row, array) for array in arrays))
-
-
-def _trajectory(row: Row, positions: npt.NDArray[Any]) -> Trajectory:
+        return Trajectory(named=_named([bytes(digest) for digest in positions], known), task=_task(row))
     if FRAMES in row:
         return Trajectory(frames=positions, task=_task(row))
     return Trajectory(video_embeddings=positions, text_embedding=row[TEXT_EMBEDDING])
 
 
-def _named(row: Row, digests: npt.NDArray[Any], pixels: dict[bytes, UInt8Array]) -> TrajectoryRefs:
-    return TrajectoryRefs(tuple(map(bytes, digests)), pixels, _task(row))
+def _named(digests: Sequence[bytes], known: Known) -> tuple[NamedFrame, ...]:
+    """Return what is known of each frame. Raises InvalidSampleError for unknown frames or unequal sizes."""
+    unknown = sum(digest not in known for digest in digests)
+    if unknown:
+        raise InvalidSampleError.at(FRAME_DIGESTS, UNKNOWN_FRAMES, f"{unknown} others")
+    sizes = sorted({known[digest].shape[:2] for digest in digests if known[digest].dtype == np.uint8})
+    if len(sizes) > 1:
+        raise InvalidSampleError.at(FRAME_DIGESTS, "digests of frames of one size", f"sizes {sizes}")
+    return tuple((digest, known[digest]) for digest in digests)
 
 
 def _positions(row: Row, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:

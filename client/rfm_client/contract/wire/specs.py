@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Names, types and dimensions of the tensors, defined only here. Letters as in the package."""
+"""Names, types and dimensions of the tensors, and the digest of a frame. Letters as in the package."""
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.frame_refs import DIGEST_BYTES
+from rfm_client.contract.samples import UInt8Array
 
 Tensors: TypeAlias = dict[str, npt.NDArray[Any]]
 
@@ -38,6 +39,8 @@ TIMING_MS = "timing_ms"
 REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # ids that a request may have
 
 UNKNOWN_FRAMES = "digests of frames that this model knows or has been sent"  # expected by the error for unknown digests
+
+DIGEST_BYTES = 32  # of SHA-256: nobody can make two frames with one digest
 
 VARIABLE = -1  # a dimension that differs between requests
 
@@ -73,6 +76,13 @@ _FRAMES_SPECS = (
     TensorSpec(TASK, "BYTES", (1,)),
 )
 _DIGESTS_SPEC = TensorSpec(FRAME_DIGESTS, "UINT8", (VARIABLE, DIGEST_BYTES), ragged=True, optional=True)
+
+
+def frame_digest(frame: UInt8Array) -> bytes:
+    """Return the SHA-256 of a frame, uint8 [H, W, 3]: of H and W (4 bytes each, little-endian), then the pixels."""
+    digest = hashlib.sha256(np.array(frame.shape[:2], "<u4").tobytes())
+    digest.update(np.ascontiguousarray(frame).data)
+    return digest.digest()
 
 
 def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:

@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: MIT
+"""Interface of a dataset: episodes with their tasks, and each camera's frames on demand.
+
+T frames of an episode, H x W pixels.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+
+from rfm_client import RewardError, Trajectory, UInt8Array
+from rfm_client.frames import Correction
+from rfm_client.options import is_blank
+from rfm_labels.datasets.cameras import camera_named, word_of_no_colours
+from rfm_labels.datasets.faults import DatasetError, FaultsError, MissingTaskError, UnusedTaskError, require
+
+SIGNALS_FOLDER = "reward_signals"  # folder of labels in a dataset's folder
+SeveralTasks: TypeAlias = Literal["each", "first"]
+
+
+@dataclass(frozen=True)
+class DatasetEpisode:
+    """One episode of a dataset.
+
+    index: its number in the dataset
+    name: its name in the dataset
+    task: of all frames, or of the first frame
+    first_index: the dataset's number of its first frame; the others follow
+    tasks: the first frame and the task of each stretch of frames with one task; empty: one task for all frames
+    """
+
+    index: int
+    name: str
+    task: str
+    num_frames: int
+    first_index: int
+    tasks: tuple[tuple[int, str], ...] = ()
+
+    @property
+    def stretches(self) -> list[tuple[str, int]]:
+        """Task and number of frames of each stretch of frames with one task, in order."""
+        tasks = self.tasks or ((0, self.task),)
+        ends = [*(first for first, _ in tasks[1:]), self.num_frames]
+        return [(task, end - first) for (first, task), end in zip(tasks, ends, strict=True)]
+
+
+@dataclass(frozen=True)
+class TaskOverride:
+    """The caller's task for episodes. Raises DatasetError for a blank text, or an override without a text.
+
+    text: task of episodes without their own; None: not given
+    overrides: True: ``text`` is the task of all episodes
+    several: of an episode with several tasks: ``each``: each frame has its own; ``first``: all have the first frame's
+    column: column of a LeRobot dataset's rows that names the tasks; None: ``task_index``, checked against the metadata
+    is_needed: False: an episode without a task has an empty one, and is no error
+    """
+
+    text: str | None = None
+    overrides: bool = False
+    several: SeveralTasks = "each"
+    column: str | None = None
+    is_needed: bool = True
+
+    def __post_init__(self) -> None:
+        is_said = not is_blank(self.text)
+        got = "none" if self.text is None else repr(self.text)
+        kinds = get_args(SeveralTasks)
+        require("several_tasks", self.several in kinds, f"one of {', '.join(kinds)}", repr(self.several))
+        require("task", is_said or (self.text is None and not self.overrides), "a sentence", got)
+        is_read = self.column is None or not self.overrides
+        require("task_column", is_read, "none with --override-task, which reads no tasks", self.column)
+
+    def of(self, where: object, own: object) -> str:
+        """Return the task of an episode; ``own`` is its own. Raises DatasetError without a task."""
+        if self.text is not None and (self.overrides or is_blank(own)):
+            return self.text
+        if isinstance(own, str) and not (self.is_needed and is_blank(own)):
+            return own
+        if not is_blank(own):
+            got = f'{own!r}: correct it, or add --task "SENTENCE" --override-task'
+            raise DatasetError.at(where, "a task as a sentence", got)
+        if not self.is_needed:
+            return ""
+        got = "none" if not own else repr(own)
+        raise MissingTaskError.at(where, "a task as a sentence", f'{got}: add --task "SENTENCE"')
+
+    def check_used(self, episodes: Sequence[DatasetEpisode]) -> None:
+        """Raise UnusedTaskError if the text is given, but is no episode's task."""
+        is_used = self.text is None or any(task == self.text for episode in episodes for task, _ in episode.stretches)
+        if not is_used:
+            got = f"{self.text!r}: leave it out, or put it in the place of theirs with --override-task"
+            raise UnusedTaskError.at("task", "none for episodes that all have tasks of their own", got)
+
+
+class Dataset(ABC):
+    """Episodes on disk. Opening a dataset reads its tables, but no frames.
+
+    kind: layout, for example ``LeRobot v3.0``
+    root: default folder for labels
+    source: id on the Hub, or name of the folder or file
+    revision: commit on the Hub; None: local
+    cameras: names, in the dataset's order
+    depth_cameras: cameras that the dataset marks as those of distances, used only if named
+    left_out: pictures that cannot be scored, with the reason; not in ``cameras``
+    numbers: of all episodes, in order
+    filter_keys: numbers of the episodes of each filter key, such as ``train``
+    given_task: the caller's task
+    corrections: how ``frames`` makes stored frames upright RGB, by camera; others are left as stored
+    notes: lines for the caller to read before scoring
+    """
+
+    kind: str
+    root: Path
+    source: str
+    revision: str | None = None
+    cameras: Sequence[str] = ()
+    depth_cameras: Sequence[str] = ()
+    left_out: Mapping[str, str] = {}
+    numbers: Sequence[int] = ()
+    filter_keys: Mapping[str, Sequence[int]] = {}
+    given_task: TaskOverride = TaskOverride()
+    corrections: Mapping[str, Correction] = {}
+    notes: Sequence[str] = ()
+
+    @property
+    def frame_notes(self) -> Sequence[str]:
+        """Further lines for the caller, about the frames of the episodes that ``check`` has seen."""
+        return ()
+
+    @cached_property
+    def episodes(self) -> Sequence[DatasetEpisode]:
+        """All episodes, by index. Raises DatasetError, which tells the faults of all."""
+        episodes = self.read(self.numbers)
+        self.given_task.check_used(episodes)
+        return episodes
+
+    def episode(self, number: int) -> DatasetEpisode:
+        """Return one of the episodes in ``numbers``. Only the first call reads it. Raises DatasetError."""
+        if number not in self._read:
+            self._read[number] = self.read_episode(number)
+        return self._read[number]
+
+    def read(self, numbers: Sequence[int]) -> list[DatasetEpisode]:
+        """Return these of the episodes. Raises FaultsError."""
+        episodes, faults = [], {}
+        for number in numbers:
+            try:
+                episodes.append(self.episode(number))
+            except RewardError as fault:
+                faults[number] = fault
+        if faults:
+            raise FaultsError.of(faults, numbers)
+        return episodes
+
+    @cached_property
+    def _read(self) -> dict[int, DatasetEpisode]:
+        return {}
+
+    @abstractmethod
+    def read_episode(self, number: int) -> DatasetEpisode:
+        """Read and check the tables of an episode. A fault of another episode is no error. Raises DatasetError."""
+
+    def cameras_in(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
+        """Return ``cameras`` and ``left_out`` of these episodes alone. Raises DatasetError if they share no camera."""
+        return self.cameras, self.left_out
+
+    def chosen_cameras(self, names: Iterable[str] = (), numbers: Sequence[int] | None = None) -> tuple[str, ...]:
+        """Return the cameras of these names; without names, all but those in ``unused_cameras``.
+
+        numbers: episodes that need the cameras; None: all
+
+        A name may omit LeRobot's ``observation.images.``. Raises DatasetError for an unknown camera, or if none is
+        named and none is used without.
+        """
+        cameras, left_out = self.cameras_in(self.numbers if numbers is None else numbers)
+        some = f"some of {', '.join(cameras)}"
+        chosen = []
+        for name in names:
+            camera = camera_named(name, cameras)
+            if camera is None:
+                reason = f", which is left out: {left_out[name]}" if name in left_out else ""
+                raise DatasetError.at("cameras", some, f"{name!r}{reason}")
+            chosen.append(camera)
+        unused = self.unused_cameras(cameras)
+        chosen = chosen or [camera for camera in cameras if camera not in unused]
+        kinds = " and ".join(dict.fromkeys(unused.values()))
+        require("cameras", bool(chosen or not cameras), f"{some} named: all are {kinds} cameras", "none")
+        return tuple(chosen)
+
+    def unused_cameras(self, cameras: Sequence[str]) -> Mapping[str, str]:
+        """Return which of these cameras are used only if named, and what they show instead of colours, as ``depth``.
+
+        The dataset marks a depth camera, or a word in the name of the camera says so.
+        """
+        named = {camera: word for camera in cameras if (word := word_of_no_colours(camera))}
+        return named | {camera: "depth" for camera in cameras if camera in self.depth_cameras}
+
+    @abstractmethod
+    def decoder(self, camera: str) -> str | None:
+        """Return the library that decodes the camera's frames, with its version; None: they are stored as pixels."""
+
+    @abstractmethod
+    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        """Return a text that identifies the episode's stored frames. Raises DatasetError.
+
+        For a video, its size and modification time, or its SHA-256 with ``verify``. For pictures in a table, their
+        digest, because other programs write into tables too.
+        """
+
+    @abstractmethod
+    def check(self, episode: DatasetEpisode, camera: str) -> int:
+        """Find every frame of the episode without decoding. Return their size in bytes, as stored.
+
+        Raises DatasetError for missing or contradictory data.
+        """
+
+    @abstractmethod
+    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
+        """Yield the T frames in order, uint8 [H, W, 3], as stored, each decoded once. Raises DatasetError."""
+
+    def frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
+        """Yield the T frames in order, uint8 [H, W, 3], upright RGB by ``corrections``. Raises DatasetError."""
+        correction = self.corrections.get(camera, Correction())
+        return (correction.applied(frame) for frame in self.stored_frames(episode, camera))
+
+
+def iter_episodes(
+    dataset: Dataset, cameras: Sequence[str] | None = None
+) -> Iterator[tuple[DatasetEpisode, Mapping[str, Trajectory]]]:
+    """Yield each episode with its trajectory from each camera. Raises DatasetError.
+
+    cameras: some of the dataset's; None: as ``Dataset.chosen_cameras`` without names
+
+    Only one episode's frames are in memory at a time.
+    """
+    names = dataset.chosen_cameras(cameras or ())
+    for episode in dataset.episodes:
+        for camera in names:
+            dataset.check(episode, camera)
+        videos = {camera: np.stack(list(dataset.frames(episode, camera))) for camera in names}
+        yield episode, {camera: Trajectory(frames=video, task=episode.task) for camera, video in videos.items()}

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: MIT
+"""A folder with a video, a file of arrays, or a folder of pictures (2.png before 10.png) for each episode.
+
+A table of tasks (``task_tables``) orders the episodes. Without a table, the caller names the task, and the order is
+that of the names, with 2 before 10. Videos need PyAV, pictures Pillow.
+"""
+
+from __future__ import annotations
+
+import re
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from rfm_client import InvalidSampleError, RewardError, Trajectory, UInt8Array, load_trajectory
+from rfm_client.frames import Picture, Video
+from rfm_labels.datasets.cameras import AskedCorrections
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.frame_names import in_order_of_numbers
+from rfm_labels.datasets.stored_files import Span, digest_of, faults_at, file_identity, turn_mark
+
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+_FILES_AT_A_TIME = 4
+_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+_LEAVE_OUT = "remove it, or leave it out (--episodes)"
+
+
+@dataclass(frozen=True)
+class Contents:
+    """The episodes of a folder, and what the caller says of them.
+
+    root: folder to which the names are relative
+    tasks: each episode's task by its path; None: no task
+    table: file of the tasks, or the folder, for messages
+    """
+
+    root: Path
+    tasks: Mapping[str, Any]
+    table: Path
+    task: TaskOverride
+    corrections: AskedCorrections
+
+
+class EpisodeFiles(Dataset):
+    """Episodes in files or folders of their own."""
+
+    def __init__(self, contents: Contents) -> None:
+        self.root = contents.root
+        self.source = contents.root.resolve().name
+        self.corrections = contents.corrections.of_cameras(self.cameras)
+        self.given_task = contents.task
+        self.numbers = range(len(contents.tasks))
+        self._contents, self._names = contents, list(contents.tasks)
+        self._lengths: dict[str, int] = {}
+        self._firsts = [0]
+
+    def read_episode(self, number: int) -> DatasetEpisode:
+        """Read an episode, and count the frames before it; a broken one before it has none. Raises DatasetError."""
+        name = self._names[number]
+        own = self._contents.tasks[name] or self.own_task(self.root / name)
+        task = self.given_task.of(f"{self._contents.table}: {name}", own)
+        num_frames = self._length(name)
+        while len(self._firsts) <= number:
+            self._firsts.append(self._firsts[-1] + self._length_or_0(self._names[len(self._firsts) - 1]))
+        return DatasetEpisode(number, name, one_line(task), num_frames, self._firsts[number])
+
+    def _length(self, name: str) -> int:
+        if name not in self._lengths:
+            self._lengths[name] = self.length(self.root / name)
+            require(self.root / name, self._lengths[name] > 0, "frames", "none")
+        return self._lengths[name]
+
+    def _length_or_0(self, name: str) -> int:
+        try:
+            return self._length(name)
+        except RewardError:  # raised again if this episode is read
+            return 0
+
+    @abstractmethod
+    def length(self, file: Path) -> int:
+        """Return the number of frames of an episode. Raises DatasetError."""
+
+    def own_task(self, file: Path) -> str | None:
+        """Return the task that an episode's file holds; None: it holds no task. Raises DatasetError."""
+        return None
+
+
+def in_natural_order(names: Iterable[str]) -> list[str]:
+    """Return names of episodes, sorted with their numbers as integers: ``2`` before ``10``, ``1.2`` before ``1.10``.
+
+    ``frame_names`` orders frames, whose numbers may be times.
+    """
+
+    def key(name: str) -> tuple[list[tuple[int, str]], str]:
+        parts = re.split(r"(\d+)", name)
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name
+
+    return sorted(names, key=key)
+
+
+def one_line(task: Any) -> Any:
+    """Return a task with each run of spaces and line breaks as one space, and none at the ends."""
+    return " ".join(task.split()) if isinstance(task, str) else task
+
+
+class VideoFolder(EpisodeFiles):
+    """Episodes in videos, each in a file of its own."""
+
+    kind = "videos"
+    cameras = ("video",)
+
+    def __init__(self, contents: Contents) -> None:
+        super().__init__(contents)
+        self._videos = lru_cache(_FILES_AT_A_TIME)(Video)
+
+    def length(self, file: Path) -> int:
+        video = self._videos(file)
+        video.check_is_one_episode()
+        with faults_at(file):
+            packets = video.packets
+        expected = f"{packets.count} frames with time stamps (ffmpeg -framerate FPS -i IN OUT.mp4 gives them)"
+        require(file, len(packets.times_s) == packets.count, expected, len(packets.times_s))
+        return packets.count
+
+    def decoder(self, camera: str) -> str | None:
+        return Video.decoder()
+
+    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        return file_identity(self.root / episode.name, verify=verify)
+
+    def check(self, episode: DatasetEpisode, camera: str) -> int:
+        self.chosen_cameras([camera])
+        file = self.root / episode.name
+        with faults_at(file):
+            return sum(self._videos(file).packets.num_bytes)
+
+    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
+        file = self.root / episode.name
+        video = self._videos(file)
+        with faults_at(file):
+            times_s = video.packets.times_s
+        gaps_s = times_s[1:] - times_s[:-1]
+        tolerance_s = 0.5 * float(gaps_s.min()) if len(gaps_s) else 0.5
+        return Span(video, times_s, tolerance_s, episode.name).frames()
+
+
+class ArrayFiles(EpisodeFiles):
+    """Episodes in files of arrays. A ``.npz`` file may hold its task."""
+
+    kind = "arrays"
+    cameras = ("frames",)
+
+    def __init__(self, contents: Contents) -> None:
+        super().__init__(contents)
+        self._facts = lru_cache(None)(_facts)
+
+    def length(self, file: Path) -> int:
+        return self._facts(file)[0]
+
+    def own_task(self, file: Path) -> str | None:
+        return self._facts(file)[1]
+
+    def decoder(self, camera: str) -> str | None:
+        return None
+
+    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        return file_identity(self.root / episode.name, verify=verify)
+
+    def check(self, episode: DatasetEpisode, camera: str) -> int:
+        file = self.root / episode.name
+        frames = _frames(file)
+        require(file, len(frames) == episode.num_frames, f"{episode.num_frames} frames", len(frames))
+        return int(frames.nbytes)
+
+    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
+        return iter(_frames(self.root / episode.name))
+
+
+def _facts(file: Path) -> tuple[int, str | None]:
+    """The number of frames, and the task. The file is read whole: only all its values tell if they are frames."""
+    trajectory = _read(file)
+    return trajectory.num_frames, trajectory.task or None
+
+
+def _frames(file: Path) -> UInt8Array:
+    frames = _read(file).frames
+    assert frames is not None  # ``_read`` refuses embeddings
+    return frames
+
+
+def _read(file: Path) -> Trajectory:
+    """The frames and the task in a file. Raises DatasetError, also for embeddings."""
+    try:
+        trajectory = load_trajectory(file)
+    except InvalidSampleError as error:
+        raise DatasetError(f"{file}: {error}") from error
+    got = "embeddings: score them with rfm-client score"
+    require(file, trajectory.frames is not None, "frames, uint8 [T, H, W, 3]", got)
+    return trajectory
+
+
+class FrameFolders(EpisodeFiles):
+    """Episodes in folders of pictures."""
+
+    kind = "folders of frames"
+    cameras = ("frames",)
+
+    def length(self, file: Path) -> int:
+        return len(_pictures_in(file))
+
+    def decoder(self, camera: str) -> str | None:
+        return Picture.decoder()
+
+    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        files = _pictures_in(self.root / episode.name)
+        stored = ((file, file_identity(file, verify=verify)) for file in files)
+        return digest_of(f"{file.name} {identity}{turn_mark(file)}".encode() for file, identity in stored)
+
+    def check(self, episode: DatasetEpisode, camera: str) -> int:
+        num_bytes = 0
+        for file in self._files(episode):
+            with faults_at(file):
+                Picture(file).check()
+            num_bytes += file.stat().st_size
+        return num_bytes
+
+    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
+        for file in self._files(episode):
+            with faults_at(file):
+                yield Picture(file).pixels()
+
+    def _files(self, episode: DatasetEpisode) -> list[Path]:
+        folder = self.root / episode.name
+        files = _pictures_in(folder)
+        require(folder, len(files) == episode.num_frames, f"{episode.num_frames} frames", len(files))
+        return files
+
+
+def is_picture(file: Path) -> bool:
+    """True for a PNG or JPEG file, by its name; False for a hidden one."""
+    return file.suffix.lower() in PICTURE_SUFFIXES and not file.name.startswith(".") and file.is_file()
+
+
+def _pictures_in(folder: Path) -> list[Path]:
+    """The frames of an episode, in order. Raises DatasetError without frames, or for frames of several kinds."""
+    try:
+        found = [each for each in folder.iterdir() if not each.name.startswith(".")]
+    except OSError as error:
+        raise DatasetError.at(folder, "a folder of PNG or JPEG files", error.strerror) from error
+    names = in_natural_order([each.name for each in found if is_picture(each)])
+    folders = in_natural_order([each.name for each in found if each.is_dir()])
+    got = f"an empty folder: {_LEAVE_OUT}" if not found else f"other files: {_LEAVE_OUT}"
+    if folders:
+        remedy = f"list the folders of one camera in tasks.csv ({folder.name}/{folders[0]})"
+        got = f"the folders {', '.join(folders[:3])}: {remedy}, or leave it out (--episodes)"
+    require(folder, bool(names), "PNG or JPEG files", got)
+    by_format = {_FORMATS[Path(name).suffix.lower()]: name for name in reversed(names)}
+    told = " and ".join(f"{kind} ({name})" for kind, name in sorted(by_format.items()))
+    require(folder, len(by_format) == 1, "frames of one format", f"{told}: give each format a folder of its own")
+    return [folder / name for name in in_order_of_numbers(folder, names)]

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: MIT
+"""Metadata of a LeRobot dataset: ``meta/info.json``, and an entry for each episode. Needs pyarrow.
+
+In v2.0 and v2.1 each episode has a table, and a video of each camera. In v3.0 many share a table and a video, found by
+file numbers and time stamps.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rfm_client.options import checked_count
+from rfm_labels.datasets.faults import DatasetError, require
+
+INFO_FILE = Path("meta", "info.json")
+VERSIONS = ("v2.0", "v2.1", "v3.0")
+EPISODES_FILE = Path("meta", "episodes.jsonl")
+EPISODES_FOLDER = Path("meta", "episodes")
+
+_OF_PICTURES = ("info", "video_info")  # keys in a feature of a camera, by version of the writer
+_DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
+_OF_AN_EPISODE = (
+    *("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"),
+    *("data/chunk_index", "data/file_index"),
+)
+_OF_A_VIDEO = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+
+
+@dataclass(frozen=True)
+class Info:
+    """Contents of ``meta/info.json``.
+
+    videos, images: keys of cameras with frames in video files, and in tables
+    depth: keys of the depth cameras in both
+    total_frames: of all episodes
+    data_path, video_path: templates of file paths
+    """
+
+    root: Path
+    version: str
+    fps: float
+    videos: tuple[str, ...]
+    images: tuple[str, ...]
+    depth: tuple[str, ...]
+    total_episodes: int
+    total_frames: int
+    chunks_size: int
+    data_path: str
+    video_path: str | None
+
+    @classmethod
+    def read(cls, root: Path) -> Info:
+        """Return the information in ``root``. Raises DatasetError."""
+        file = root / INFO_FILE
+        try:
+            document = json.loads(file.read_bytes())
+        except (OSError, ValueError, RecursionError) as error:
+            raise DatasetError.at(file, "a readable JSON file", error) from error
+        require(file, isinstance(document, dict), "a JSON object", type(document).__name__)
+
+        def field(name: str, *kinds: type) -> Any:
+            value = document.get(name)
+            is_of_kind = isinstance(value, kinds) and not isinstance(value, bool)
+            expected = " or ".join(kind.__name__ for kind in kinds)
+            require(f"{file}: {name}", is_of_kind, expected, "none" if value is None else repr(value))
+            return value
+
+        features = {key: feature for key, feature in field("features", dict).items() if isinstance(feature, dict)}
+        videos, images = (
+            tuple(key for key, feature in features.items() if feature.get("dtype") == kind)
+            for kind in ("video", "image")
+        )
+        version, fps = field("codebase_version", str), float(field("fps", int, float))
+        require(f"{file}: codebase_version", version in VERSIONS, f"one of {', '.join(VERSIONS)}", repr(version))
+        require(f"{file}: fps", 0 < fps < math.inf, "a number above 0", repr(fps))
+        return cls(
+            root,
+            version,
+            fps,
+            videos,
+            images,
+            depth=tuple(key for key in (*videos, *images) if _is_depth(features[key])),
+            total_episodes=field("total_episodes", int),
+            total_frames=field("total_frames", int),
+            chunks_size=field("chunks_size", int),
+            data_path=field("data_path", str),
+            video_path=field("video_path", str) if videos else None,
+        )
+
+    def path(self, template: str | None, **values: Any) -> Path:
+        """Return the file inside the dataset that a template names. Raises DatasetError."""
+        try:
+            path = (template or "").format(**values)
+        except (LookupError, ValueError) as error:
+            raise DatasetError.at(INFO_FILE, f"a path of {', '.join(values)}", repr(template)) from error
+        is_inside = bool(path) and not Path(path).is_absolute() and ".." not in Path(path).parts
+        require(INFO_FILE, is_inside, "a path inside the dataset", repr(path))
+        return self.root / path
+
+
+def _is_depth(feature: Mapping[str, Any]) -> bool:
+    told = [feature[name] for name in _OF_PICTURES if isinstance(feature.get(name), dict)]
+    return any(each.get(mark) is True for each in told for mark in _DEPTH_MARKS)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Metadata of one episode, in the same form for all versions.
+
+    tasks: sentences in the metadata
+    first_index: the dataset's number of its first frame; None: only the rows have it
+    data_file: Parquet file with its rows
+    videos: by camera, the video file and the episode's start in it, in seconds
+    """
+
+    index: int
+    tasks: Sequence[str]
+    length: int
+    first_index: int | None
+    data_file: Path
+    videos: Mapping[str, tuple[Path, float]]
+
+    @property
+    def where(self) -> str:
+        """The episode's name in messages."""
+        return f"episode {self.index}"
+
+
+def read_table(file: Path, columns: list[str] | None = None, filters: Any = None) -> Any:
+    """Return a Parquet file's table. Raises DatasetError for a missing or broken file, or a missing column."""
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ImportError("LeRobot datasets need pyarrow: pip install ./client ./apps/labels") from error
+    try:
+        table = parquet.read_table(file, columns=columns, filters=filters, partitioning=None)
+    except FileNotFoundError as error:
+        raise DatasetError.at(file, "a Parquet file", "none") from error
+    except (OSError, pyarrow.ArrowException) as error:
+        raise DatasetError.at(file, "a readable Parquet file", error) from error
+    for name in columns or []:
+        require(file, name in table.column_names, f"the column {name}", ", ".join(table.column_names))
+    return table
+
+
+def column_types(file: Path) -> Mapping[str, str]:
+    """Return the column types of a Parquet file, as pyarrow names them. Raises DatasetError for a broken file."""
+    from pyarrow import ArrowException, parquet
+
+    try:
+        return {field.name: str(field.type) for field in parquet.read_schema(file)}
+    except (OSError, ArrowException) as error:
+        raise DatasetError.at(file, "a readable Parquet file", error) from error
+
+
+def read_entries(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
+    """Yield the number of each episode with its metadata, or with their fault. Raises DatasetError."""
+    return _entries_v30(info) if info.version == "v3.0" else _entries_v21(info)
+
+
+def _entries_v21(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
+    for where, line in json_lines(info.root / EPISODES_FILE):
+        index = number_in(where, line, "episode_index")
+        try:
+            yield index, _entry_v21(info, where, index, line)
+        except DatasetError as error:
+            yield index, error
+
+
+def _entry_v21(info: Info, where: str, index: int, line: Mapping[str, Any]) -> Entry:
+    values = {"episode_chunk": index // info.chunks_size, "episode_index": index}
+    tasks = line.get("tasks")
+    return Entry(
+        index=index,
+        tasks=[task for task in tasks if isinstance(task, str)] if isinstance(tasks, list) else [],
+        length=number_in(where, line, "length"),
+        first_index=None,
+        data_file=info.path(info.data_path, **values),
+        videos={key: (info.path(info.video_path, **values, video_key=key), 0.0) for key in info.videos},
+    )
+
+
+def _entries_v30(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
+    files = sorted((info.root / EPISODES_FOLDER).rglob("*.parquet"))
+    require(info.root / EPISODES_FOLDER, bool(files), "Parquet files", "none")
+    of_videos = [f"videos/{key}/{name}" for key in info.videos for name in _OF_A_VIDEO]
+    for file in files:
+        for row in read_table(file, [*_OF_AN_EPISODE, *of_videos]).to_pylist():
+            index = row["episode_index"]
+            require(f"{file}: episode_index", index is not None, "a value", "none")
+            try:
+                yield index, _entry_v30(info, file, row)
+            except DatasetError as error:
+                yield index, error
+
+
+def _entry_v30(info: Info, file: Path, row: dict[str, Any]) -> Entry:
+    index, length = row["episode_index"], row["length"]
+    where = f"episode {index}: {file}"
+    for name, value in row.items():
+        require(f"{where}: {name}", value is not None, "a value", "none")
+    first, end = row["dataset_from_index"], row["dataset_to_index"]
+    require(f"{where}: length", end - first == length, f"{end - first}, from {first} to {end}", length)
+    data = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
+    return Entry(
+        index=index,
+        tasks=row["tasks"],
+        length=length,
+        first_index=first,
+        data_file=info.path(info.data_path, **data),
+        videos={key: _video(info, where, row, key) for key in info.videos},
+    )
+
+
+def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
+    chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _OF_A_VIDEO)
+    lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
+    is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: with frames of a discarded take
+    expected = f"{expected_s:.4f} s for {row['length']} frames"
+    require(f"{where}: videos/{key}: from_timestamp to to_timestamp", is_long_enough, expected, f"{lasts_s:.4f} s")
+    return info.path(info.video_path, video_key=key, chunk_index=chunk, file_index=number), float(from_s)
+
+
+def json_lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield each object of a file of JSON lines, after its place for messages. Raises DatasetError."""
+    try:
+        texts = file.read_text(encoding="utf-8-sig").split("\n")  # a sentence may have other separators of lines
+    except FileNotFoundError as error:
+        raise DatasetError.at(file, "a file of JSON lines", "none") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError.at(file, "a readable file of JSON lines", str(error)) from error
+    for number, text in enumerate(texts, 1):
+        where = f"{file}: line {number}"
+        if not text.strip():
+            continue
+        try:
+            line = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise DatasetError.at(where, "a JSON object", str(error)) from error
+        require(where, isinstance(line, dict), "a JSON object", type(line).__name__)
+        yield where, line
+
+
+def number_in(where: str, line: Mapping[str, Any], name: str) -> int:
+    """Return a whole number of 0 or more in a line of JSON. Raises DatasetError."""
+    try:
+        return checked_count(f"{where}: {name}", line.get(name), least=0)
+    except ValueError as error:
+        raise DatasetError(str(error)) from error

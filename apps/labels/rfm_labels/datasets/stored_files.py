@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""Files of frames in datasets: what identifies them, and their faults with the place. H x W pixels."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client import UInt8Array
+from rfm_client.frames import FrameFileError, Picture, Video
+from rfm_labels.datasets.faults import DatasetError
+
+Times = npt.NDArray[np.float64]
+
+_READ_BYTES = 2**20
+_DIGESTS_AT_A_TIME = 2**16
+
+
+def digest_of(parts: Iterable[bytes]) -> str:
+    """Return a digest of the parts and of the bounds between them."""
+    digest = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def file_identity(file: Path, *, verify: bool, revision: str | None = None) -> str:
+    """Return a text that identifies a file: its size and modification time, or with ``verify`` its SHA-256.
+
+    revision: commit on the Hub; replaces the time, which differs on every machine
+
+    Raises DatasetError.
+    """
+    try:
+        status = file.stat()
+        if verify:
+            return _sha256(file, status.st_size, status.st_ctime_ns)
+    except FileNotFoundError as error:
+        raise DatasetError.at(file, "a video file", "none") from error
+    except OSError as error:
+        raise DatasetError.at(file, "a readable video file", error.strerror) from error
+    return f"{status.st_size} {revision or status.st_mtime_ns}"
+
+
+@lru_cache(_DIGESTS_AT_A_TIME)
+def _sha256(file: Path, _size: int, _changed_ns: int) -> str:
+    digest = hashlib.sha256()
+    with file.open("rb") as opened:
+        while content := opened.read(_READ_BYTES):
+            digest.update(content)
+    return digest.hexdigest()
+
+
+def turn_mark(picture: bytes | Path) -> str:
+    """Return a text for ``Dataset.identity`` if EXIF data turn a picture, as earlier labels did not; else ""."""
+    turn = Picture(picture).exif_turn
+    return "" if turn is None else f" EXIF {turn}"
+
+
+@contextmanager
+def faults_at(where: object) -> Iterator[None]:
+    """Raise the block's FrameFileError as DatasetError at this place."""
+    try:
+        yield
+    except FrameFileError as error:
+        place = f"{where}: {error.where}" if error.where else where
+        raise DatasetError.at(place, error.expected, error.got) from error
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """The frames of one episode in a video, T of them.
+
+    times_s: float64 [T], rising time stamps in the video
+    tolerance_s: half the time between frames
+    where: episode and camera, for messages
+    """
+
+    video: Video
+    times_s: Times
+    tolerance_s: float
+    where: str
+
+    def frames(self) -> Iterator[UInt8Array]:
+        """Yield the T frames, uint8 [H, W, 3], upright. Raises DatasetError for a missing or damaged frame."""
+        with faults_at(f"{self.where}: {self.video.file}"):
+            yield from self.video.frames_at(self.times_s, self.tolerance_s)
+
+    def error(self, expected: str, got: object) -> DatasetError:
+        """Return the error of this span's video."""
+        return DatasetError.at(f"{self.where}: {self.video.file}", expected, got)

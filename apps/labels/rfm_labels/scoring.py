@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: MIT
+"""Score the episodes of a plan that have no part yet, several at a time. T frames, H x W pixels.
+
+Each camera of an episode is decoded once, its frames are scored, and the scores of the cameras are fused.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from traceback import clear_frames
+from typing import Any
+
+import numpy as np
+
+from rfm_client import (
+    AccessDeniedError,
+    DeadlineExceededError,
+    Float32Array,
+    InferenceFailedError,
+    InvalidSampleError,
+    ModelNotFoundError,
+    ProcessEndedError,
+    ProgressResult,
+    ProgressSample,
+    RewardError,
+    ServerUnavailableError,
+    Trajectory,
+    UInt8Array,
+)
+from rfm_client.frames import BlankFrames, resize_frames
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
+from rfm_labels.datasets.faults import require
+from rfm_labels.metadata import SCORES, SUCCESS, UNCLEAR, Columns, Cost
+from rfm_labels.options import Watch
+from rfm_labels.plan import Item, Plan, Recipe
+from rfm_labels.scorer import DECISIVE, Scorer
+from rfm_labels.writing import Parts
+
+FRAMES_AT_A_TIME = 64  # in a request to the encoder, as in its forward pass
+MAX_BYTES = 32 * 2**20  # of the samples in one call of the scorer
+MAX_FRAME_BYTES = 2 * 2**30  # of all workers of a process
+
+_NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNotFoundError, AccessDeniedError)
+
+
+@dataclass(frozen=True)
+class FailedEpisode:
+    """An episode without labels, and the reason."""
+
+    episode: DatasetEpisode
+    error: RewardError
+
+
+class _StoppedError(RewardError):
+    """The run is stopping; the next run labels the episode."""
+
+
+class Run:
+    """The labelling of a plan with threads of this process."""
+
+    def __init__(self, plan: Plan, dataset: Dataset, scorer: Scorer, parts: Parts, watch: Watch) -> None:
+        self._plan, self._dataset, self._scorer, self._parts, self._watch = plan, dataset, scorer, parts, watch
+        self._memory = FrameMemory()
+        self._stopping = threading.Event()
+        self._lock = threading.Lock()
+        self._failures: list[FailedEpisode] = []
+        self._cause: Exception | None = None
+        self._frames_scored, self._seconds = 0, 0.0
+
+    @property
+    def cost(self) -> Cost | None:
+        """What ``finish_all`` scored, and its time; None: it scored nothing."""
+        return Cost(self._frames_scored, self._seconds) if self._frames_scored else None
+
+    def finish_all(self, workers: int) -> list[FailedEpisode]:
+        """Label all items without a part, ``workers`` at a time, and return the failures.
+
+        Raises, once the episodes in progress have ended, RewardError if the server is gone, OSError for a full disk.
+        """
+        pending = unfinished(self._plan, self._parts, self._watch)
+        began_s = time.monotonic()
+        with ThreadPoolExecutor(workers, thread_name_prefix="rfm-label") as pool:
+            try:
+                list(pool.map(self._label, pending))
+            except BaseException:
+                self._stopping.set()
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        self._seconds = time.monotonic() - began_s
+        if self._cause is not None:
+            raise self._cause
+        return by_episode(self._failures)
+
+    def _label(self, item: Item) -> None:
+        try:
+            self._go_on()
+            if not self._parts.has(item):  # another process may have finished it
+                self._score(item)
+            self._watch.scored(item.episode)
+        except _StoppedError:
+            return
+        except RewardError as error:
+            is_of_one = isinstance(error, ProcessEndedError)  # at both tries of the client
+            if isinstance(error, _NOT_ABOUT_ONE_EPISODE) and not is_of_one:
+                self._stop(error)
+                return
+            with self._lock:
+                self._failures.append(FailedEpisode(item.episode, error))
+            self._watch.failed(item.episode, error)
+        except (OSError, ImportError) as error:
+            self._stop(error)
+
+    def _score(self, item: Item) -> None:
+        recipe, memory = self._plan.recipe, self._memory
+        try:
+            scores = episode_scores(self._dataset, item.episode, self._scorer, recipe, memory=memory, go_on=self._go_on)
+        except InferenceFailedError:  # the cause may be a new checkpoint
+            self._check_checkpoint()
+            raise
+        self._check_checkpoint()
+        self._parts.write(item, scores.columns, scores.blank)
+        with self._lock:
+            self._frames_scored += item.episode.num_frames
+
+    def _check_checkpoint(self) -> None:
+        """Stop the run and raise _StoppedError if another checkpoint is served now."""
+        try:
+            planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
+            for name in DECISIVE:
+                if getattr(now, name) != getattr(planned, name):
+                    raise InvalidSampleError.at(name, getattr(planned, name), getattr(now, name))
+        except InvalidSampleError as error:
+            self._stop(error)
+            raise _StoppedError from error
+
+    def _stop(self, cause: Exception) -> None:
+        with self._lock:
+            self._cause = self._cause or cause
+        self._stopping.set()
+
+    def _go_on(self) -> None:
+        if self._stopping.is_set():
+            raise _StoppedError
+
+
+def unfinished(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
+    """Return the items without a part, and report the number of frames to ``watch``."""
+    finished = parts.finished(plan.items)
+    watch.begin(plan.num_frames, sum(item.episode.num_frames for item in plan.items if item.key in finished))
+    return [item for item in plan.items if item.key not in finished]
+
+
+def by_episode(failures: Sequence[FailedEpisode]) -> list[FailedEpisode]:
+    """Return the failures in the order of their episodes."""
+    return sorted(failures, key=lambda failure: failure.episode.index)
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeScores:
+    """The scores of an episode.
+
+    columns: columns of the labels, float32 [T] each
+    blank: highest value of the frames of each camera that shows nothing, as in ``BlankFrames``
+    """
+
+    columns: Columns
+    blank: Mapping[str, int]
+
+
+class FrameMemory:
+    """A limit on the bytes of frames that all workers hold together; a larger video is held alone."""
+
+    def __init__(self, max_bytes: int = MAX_FRAME_BYTES) -> None:
+        self._max_bytes = max_bytes
+        self._held_bytes = 0
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def holding(self, num_bytes: int) -> Iterator[None]:
+        """Wait until ``num_bytes`` fit, and hold them during the block. Nested calls can deadlock."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._held_bytes or self._held_bytes + num_bytes <= self._max_bytes)
+            self._held_bytes += num_bytes
+        try:
+            yield
+        except Exception as error:
+            clear_frames(error.__traceback__)  # otherwise the error's traceback keeps the frames in memory
+            raise
+        finally:
+            with self._changed:
+                self._held_bytes -= num_bytes
+                self._changed.notify_all()
+
+
+def episode_scores(
+    dataset: Dataset,
+    episode: DatasetEpisode,
+    scorer: Scorer,
+    recipe: Recipe,
+    *,
+    memory: FrameMemory,
+    go_on: Callable[[], None],
+) -> EpisodeScores:
+    """Return the scores of an episode, and its cameras that show nothing. Raises RewardError.
+
+    Columns: ``progress``, and ``success``, ``log_prob`` and ``unclear`` (1: unclear, of any camera) if the checkpoint
+    gives them. Several cameras add ``progress.<camera>`` and so on.
+
+    memory: shared by all workers, for the frames of one camera at a time; unused if the checkpoint encodes frames
+    go_on: called between requests; its exception ends the episode
+
+    Each stretch of frames with one task is scored by itself, as an episode of this task.
+    """
+    by_camera: dict[str, list[ProgressResult]] = {}
+    shown = {camera: BlankFrames() for camera in recipe.cameras}
+    for camera in recipe.cameras:
+        frames = _checked(dataset.frames(episode, camera), episode, camera, shown[camera])
+        for number, (task, count) in enumerate(episode.stretches, 1):
+            is_last = number == len(episode.stretches)  # reads on, to find frames too many
+            chunks = _shrunk(frames if is_last else itertools.islice(frames, count), recipe, go_on)
+            if recipe.checkpoint.encodes:
+                result = _scores(_joined([scorer.encode(chunk, task) for chunk in chunks]), scorer, recipe, go_on)
+            else:
+                first = next(chunks)
+                with memory.holding(first[0].nbytes * count):
+                    result = _scores(_held(first, chunks, task, count), scorer, recipe, go_on)
+            by_camera.setdefault(camera, []).append(result)
+    highest = {camera: frames.highest for camera, frames in shown.items()}
+    blank = {camera: value for camera, value in highest.items() if value is not None}
+    return EpisodeScores(_columns(by_camera, episode, recipe), blank)
+
+
+def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: DatasetEpisode, recipe: Recipe) -> Columns:
+    columns: Columns = {}
+    for name in SCORES:
+        parts = [[getattr(result, name) for result in results] for results in by_camera.values()]
+        if parts[0][0] is None:
+            continue
+        scores = [np.concatenate(of_camera).astype(np.float32, copy=False) for of_camera in parts]
+        if name == SUCCESS and all(np.isnan(score).all() for score in scores):
+            continue
+        _check_numbers(name, scores, episode)
+        fuse: Any = np.max if name == UNCLEAR else getattr(np, recipe.fuse)  # mean, min or max
+        columns[name] = np.asarray(fuse(np.stack(scores), axis=0), np.float32)
+        if len(by_camera) > 1:
+            columns |= {f"{name}.{camera}": score for camera, score in zip(by_camera, scores, strict=True)}
+    return columns
+
+
+def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]) -> ProgressResult:
+    if recipe.in_one_pass(trajectory.num_frames):
+        (result,) = scorer.evaluate([ProgressSample(trajectory)])
+        return result
+    results: list[ProgressResult] = []
+    for together in _by_bytes(recipe.sampling.samples(trajectory)):
+        go_on()
+        results += scorer.evaluate(together)
+    return recipe.sampling.joined(results)
+
+
+def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], None]) -> Iterator[UInt8Array]:
+    """Yield arrays of at most FRAMES_AT_A_TIME frames, resized if the recipe says so."""
+    while chunk := list(itertools.islice(frames, FRAMES_AT_A_TIME)):
+        go_on()
+        stacked = np.stack(chunk)
+        if recipe.resize and recipe.checkpoint.frame_size is not None:
+            stacked = resize_frames(stacked, recipe.checkpoint.frame_size)
+        yield stacked
+
+
+def _joined(parts: Sequence[Trajectory]) -> Trajectory:
+    embeddings = np.concatenate([part.positions for part in parts])
+    return Trajectory(video_embeddings=embeddings, text_embedding=parts[0].text_embedding)
+
+
+def _held(first: UInt8Array, others: Iterator[UInt8Array], task: str, count: int) -> Trajectory:
+    frames = np.empty((count, *first.shape[1:]), np.uint8)
+    start = 0
+    for chunk in itertools.chain([first], others):
+        frames[start : start + len(chunk)] = chunk
+        start += len(chunk)
+    return Trajectory(frames=frames, task=task)
+
+
+def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:
+    """Yield lists of samples, each of at most MAX_BYTES or a single sample."""
+    together: list[ProgressSample] = []
+    num_bytes = 0
+    for sample in samples:
+        if together and num_bytes + sample.trajectory.positions.nbytes > MAX_BYTES:
+            yield together
+            together, num_bytes = [], 0
+        together.append(sample)
+        num_bytes += sample.trajectory.positions.nbytes
+    if together:
+        yield together
+
+
+def _checked(
+    frames: Iterator[UInt8Array], episode: DatasetEpisode, camera: str, shown: BlankFrames
+) -> Iterator[UInt8Array]:
+    """Yield the frames, counted in ``shown``. Raises DatasetError for a wrong number of frames, or several sizes."""
+    where, count, shape = f"{episode.name}: {camera}", 0, None
+    for frame in frames:
+        shape = shape or frame.shape
+        require(f"{where}: frame {count}", frame.shape == shape, f"the size {shape}", frame.shape)
+        count += 1
+        if count <= episode.num_frames:
+            shown.add(frame)
+            yield frame
+    require(where, count == episode.num_frames, f"{episode.num_frames} frames", count)
+
+
+def _check_numbers(name: str, scores: list[Float32Array], episode: DatasetEpisode) -> None:
+    for score in scores:
+        if score.shape != (episode.num_frames,) or not np.isfinite(score).all():
+            got = "NaN: this checkpoint does not predict it" if np.isnan(score).any() else str(list(score.shape))
+            raise InferenceFailedError(f"{name}: expected a score of each of {episode.num_frames} frames, got {got}")

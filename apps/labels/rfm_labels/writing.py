@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: MIT
+"""Write labels: a part for each finished episode, then Parquet files for a whole dataset. Needs pyarrow and fsspec.
+
+A part is a Parquet file in a folder or at an fsspec URL, and exists whole or not at all. Its name has the digest of
+everything that decides its labels, so any run may use it.
+
+``<name>_progress.parquet``: the format of LeRobot's reward-aligned behaviour cloning and of the Hub's visualizer.
+Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and those
+of each camera. If an episode has several tasks, ``progress`` is each frame's own, and ``progress_sparse`` the sum of
+what all tasks have gained.
+
+``reward_signals/<name>.parquet``: LeRobot's frame signals (schema version 1), as its open pull requests propose them.
+Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and
+those of each camera. The metadata describes each score column.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.metadata import (
+    LOG_PROB,
+    PROGRESS,
+    SUCCESS,
+    UNCLEAR,
+    Columns,
+    Cost,
+    blank_by_camera,
+    blank_from_metadata,
+    blank_to_metadata,
+    canonical_json,
+)
+from rfm_labels.plan import Item, Plan
+
+IDENTITY = ("index", "episode_index", "frame_index")  # columns of every table of labels
+PROGRESS_ENDING = "_progress.parquet"
+PROVENANCE_KEY = b"rfm.provenance"
+SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
+EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run sees if its labels still hold
+COST_KEY = b"rfm.cost"  # apart from the provenance, which is equal for equal runs
+SIGNAL_NAMES = {PROGRESS: "progress", SUCCESS: "success_probability", LOG_PROB: "log_prob", UNCLEAR: "unclear"}
+
+_DIGEST_KEY = b"rfm.digest"
+_SUFFIX = ".parquet"
+_ROWS_AT_A_TIME = 2**17  # in a row group
+_TOTAL = "total"  # progress added up over the tasks of an episode
+_DESCRIPTIONS = {
+    PROGRESS: "Share of the task that is done",
+    SUCCESS: "Probability that the task is done",
+    LOG_PROB: "Logarithm of the probability that the frames so far complete the task",
+    UNCLEAR: "1 where the model's written answer states no single whole score",
+}
+
+
+class Parts:
+    """The parts of a labelling run. Raises ImportError for a missing package, OSError for a place without write access.
+
+    url: a folder, or an fsspec URL, for example ``s3://bucket/folder``
+    """
+
+    def __init__(self, url: str) -> None:
+        try:
+            import pyarrow  # noqa: F401
+            from fsspec.core import url_to_fs
+            from fsspec.implementations.local import LocalFileSystem
+        except ImportError as error:
+            raise ImportError("labelling needs pyarrow and fsspec: pip install ./client ./apps/labels") from error
+        self.url = url
+        self._fs, self._root = url_to_fs(url)
+        self._is_local = isinstance(self._fs, LocalFileSystem)
+        with self._writing():
+            self._fs.makedirs(self._root, exist_ok=True)
+
+    def finished(self, items: Sequence[Item]) -> set[str]:
+        """Return the keys of the items whose parts exist."""
+        self._fs.invalidate_cache()
+        names = {path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False)}
+        return {item.key for item in items if item.key + _SUFFIX in names}
+
+    def has(self, item: Item) -> bool:
+        """True if the item's part exists."""
+        return bool(self._fs.exists(self._path(item)))
+
+    def write(self, item: Item, columns: Columns, blank: Mapping[str, int]) -> None:
+        """Write the item's part, whole or not at all. Raises OSError. columns, blank: as in ``EpisodeScores``"""
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        count, first = item.episode.num_frames, item.episode.first_index
+        rows = (np.arange(first, first + count), np.full(count, item.episode.index), np.arange(count))
+        identity = {name: values.astype(np.int64) for name, values in zip(IDENTITY, rows, strict=True)}
+        about = blank_to_metadata(blank_by_camera([(item.episode.index, blank)]))
+        table = pa.table({**identity, **columns}).replace_schema_metadata({_DIGEST_KEY: item.digest, **about})
+        content = io.BytesIO()
+        parquet.write_table(table, content)
+        with self._writing():
+            if self._is_local:
+                with whole_file(Path(self._path(item))) as file:
+                    file.write_bytes(content.getvalue())
+            else:
+                self._fs.pipe_file(self._path(item), content.getvalue())  # object stores show only whole objects
+
+    def read(self, item: Item) -> Any:
+        """Return the item's part, a pyarrow Table. Raises DatasetError if it is missing, damaged or of another item."""
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        path = self._path(item)
+        try:
+            # no Arrow threads: a thread that releases Python's bytes while the interpreter ends aborts the process
+            part = parquet.ParquetFile(pa.BufferReader(self._fs.cat_file(path)), pre_buffer=False)
+            table = part.read(use_threads=False)
+        except FileNotFoundError as error:
+            raise DatasetError.at(path, "a part for each episode", "none") from error
+        except (OSError, pa.ArrowException) as error:
+            raise DatasetError.at(path, "a whole part", f"{error}: delete it, and run the same command") from error
+        digest = (table.schema.metadata or {}).get(_DIGEST_KEY, b"").decode()
+        is_own = digest == item.digest and table.num_rows == item.episode.num_frames
+        got = f"another, of {table.num_rows} frames: delete it, and run the same command"
+        require(path, is_own, f"the part of {item.episode.name}", got)
+        return table
+
+    def read_all(self, plan: Plan) -> Any:
+        """Return a pyarrow Table with the rows of all items of a plan, in order, and the blank cameras as metadata.
+
+        Raises DatasetError for a part that is missing, damaged, out of order, or has other columns than the first part.
+        """
+        import pyarrow as pa
+
+        tables: list[Any] = []
+        blank: list[tuple[int, Mapping[str, int]]] = []
+        following = -1
+        for item in plan.items:
+            table, name, first = self.read(item), item.episode.name, item.episode.first_index
+            names = (tables or [table])[0].column_names
+            require(name, table.column_names == names, f"the columns {', '.join(names)}", ", ".join(table.column_names))
+            require(name, first > following, f"rows after {following}", first)
+            following = first + item.episode.num_frames - 1
+            told = blank_from_metadata(table.schema.metadata)
+            blank += [(episode, {camera: value}) for camera, of in told.items() for episode, value in of.items()]
+            tables.append(table.replace_schema_metadata(None))
+        about = blank_to_metadata(blank_by_camera(blank))
+        return pa.concat_tables(tables).replace_schema_metadata(about)
+
+    def _path(self, item: Item) -> str:
+        return f"{self._root}/{item.key}{_SUFFIX}"
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Add the remedy to an OSError."""
+        try:
+            yield
+        except OSError as error:
+            got = f"{error.strerror or error}: make room or name another place with --parts, and run the same command"
+            raise OSError(f"{self.url}: expected a folder that can be written, got {got}") from error
+
+
+@contextmanager
+def whole_file(target: Path) -> Iterator[Path]:
+    """Yield a file to write, which replaces ``target`` in one step after the block, but not after an exception."""
+    written = target.with_name(f".tmp-{uuid.uuid4().hex}")
+    try:
+        yield written
+        with written.open("rb") as whole:
+            os.fsync(whole.fileno())
+        written.replace(target)
+    finally:
+        written.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class Sidecar:
+    """A Parquet label file to write.
+
+    columns: each score column's name in the file, by its name in the parts
+    metadata: of the Parquet schema
+    """
+
+    path: Path
+    columns: Mapping[str, str]
+    metadata: Mapping[bytes, bytes]
+
+
+def progress_file(path: Path, plan: Plan, columns: Sequence[str], cost: Cost | None) -> Sidecar:
+    """Return the progress file for these columns of the parts. cost: None: unknown"""
+    checkpoint = plan.recipe.checkpoint
+    model = checkpoint.source or checkpoint.weights_digest
+    metadata = {
+        b"reward_model_path": (f"{model}@{checkpoint.revision}" if checkpoint.revision else model).encode(),
+        PROVENANCE_KEY: canonical_json(plan.provenance()),
+        **_of_run(plan, cost),
+    }
+    named = {name: name for name in columns}
+    if _has_several_tasks(plan):
+        return Sidecar(path, {_TOTAL: "progress_sparse", **named}, metadata)
+    return Sidecar(path, {**named, PROGRESS: "progress_sparse"}, metadata)
+
+
+def with_totals(labels: Any, plan: Plan) -> Any:
+    """Return the labels with all columns that the label files need. labels: table of ``Parts.read_all``
+
+    Reward-aligned behaviour cloning weights a frame by the difference of two frames' progress, and 0 if it falls. Where
+    an episode's task changes, progress begins anew, so the sum of all tasks' gains takes its place.
+    """
+    import pyarrow as pa
+
+    if not _has_several_tasks(plan):
+        return labels
+    progress = labels[PROGRESS].to_numpy()
+    total, begin = progress.copy(), 0
+    for item in plan.items:
+        end = begin + item.episode.num_frames
+        for first, _ in item.episode.tasks[1:]:
+            own = slice(begin + first, end)
+            total[own] = progress[own] - progress[own.start] + total[own.start - 1]
+        begin = end
+    return labels.append_column(_TOTAL, pa.array(total))
+
+
+def _has_several_tasks(plan: Plan) -> bool:
+    return any(item.episode.tasks for item in plan.items)
+
+
+def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost: Cost | None) -> Sidecar:
+    """Return the file of frame signals for these columns of the parts. cost: None: unknown"""
+    signals = {}
+    for column in columns:
+        score, dot, camera = column.partition(".")
+        signals[column] = f"reward.{name}.{SIGNAL_NAMES[score]}{dot}{camera}"
+    metadata = {
+        "format": b"lerobot.frame_signals",
+        "schema_version": b"1",
+        "provenance": canonical_json(plan.provenance()),
+        "descriptors": canonical_json({signals[column]: _descriptor(column) for column in columns}),
+        "episode_indices": canonical_json([item.episode.index for item in plan.items]),
+    }
+    ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
+    named = {f"lerobot.reward_scoring.{key}".encode(): value for key, value in metadata.items()}
+    return Sidecar(path, ordered, {**named, **_of_run(plan, cost)})
+
+
+def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
+    """Return the metadata that both formats share."""
+    digests = {EPISODES_KEY: canonical_json(plan.digests())}
+    return digests if cost is None else {**digests, COST_KEY: cost.json()}
+
+
+def _descriptor(column: str) -> dict[str, Any]:
+    score, _, camera = column.partition(".")
+    return {
+        "description": _DESCRIPTIONS[score] + (f", seen by {camera}" if camera else ""),
+        "direction": "lower" if score == UNCLEAR else "higher",
+        "bounds": [None, 0.0] if score == LOG_PROB else [0.0, 1.0],
+        "unit": None,
+        "missing_values": "forbidden",
+        "allow_nan": False,  # the same in another revision of the proposal
+    }
+
+
+def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
+    """Write new files with the labels, then put all in place. Raises OSError; a failed write changes no file.
+
+    labels: table of ``Parts.read_all``
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    with ExitStack() as whole:
+        for sidecar in sidecars:
+            own = labels.select([*IDENTITY, *sidecar.columns])
+            own = own.rename_columns([*IDENTITY, *sidecar.columns.values()])
+            fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
+            schema = pa.schema(fields, metadata={**sidecar.metadata, **(labels.schema.metadata or {})})
+            sidecar.path.parent.mkdir(parents=True, exist_ok=True)
+            file = whole.enter_context(whole_file(sidecar.path))
+            parquet.write_table(own.cast(schema), file, row_group_size=_ROWS_AT_A_TIME)

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: MIT
+"""The description of a served checkpoint. An export stores it as JSON in config.pbtxt; client and server read it."""
+
+from __future__ import annotations
+
+import json
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rfm_client.contract.frame_size import FrameSize
+
+DESCRIPTION_PARAMETER = "description"  # of config.pbtxt
+
+
+@dataclass(frozen=True, kw_only=True)
+class Origin:
+    """Facts that only the export knows: the exported files do not show them.
+
+    source: Hub id of the exported checkpoint, or the end of its path; None: unknown
+    revision: exported commit of the Hub; None: the checkpoint was a folder
+    license: licence of the weights, by the checkpoint's model card or config.json; None: unknown
+    run_config: config.yaml of the training run, without secrets; empty: the checkpoint has none
+    computation: number type, PyTorch version and attention kernel, as at the export; None: unknown
+    weights_difference: largest difference of progress from the full checkpoint's, which the export measured on noise
+        when it rounded weights; None: not measured
+    """
+
+    source: str | None = None
+    revision: str | None = None
+    license: str | None = None
+    run_config: Mapping[str, Any] = field(default_factory=dict)
+    computation: str | None = None
+    weights_difference: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description(Origin):
+    """A checkpoint, or a part of it: inputs, outputs, limits, origin. The family writes it, the export completes it.
+
+    A new fact is a field with a default, so that older exports stay readable. Unknown fields in JSON are ignored.
+
+    kind: name of the reward model, such as TOPReward; None: unknown
+    network: ``class`` and, of an exported checkpoint, ``config`` and the number of weights of each part
+        (``parameters``)
+    video_dim, text_dim: widths D and Dt of embeddings that the model reads, or writes as an encoder; None: neither
+    progress_bins: number C of progress bins of a discrete checkpoint; None: continuous
+    trained_frames: most frames of a trajectory in training; None: unknown
+    trained_padding: True if training padded shorter trajectories with their last frame, as upstream does, or if unknown
+    network_frames: frames of the longest trajectory that the network can score; None: no limit
+    frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
+    frames_per_value: consecutive frames that share a score; 2 if a vision-language model reads trajectories as videos
+    has_preference, has_success, has_similarity: True if the checkpoint gives these scores
+    has_log_prob: True if it gives log-probabilities (``log_prob=True`` of a call)
+    marks_unclear: True if its results mark unclear written answers (``unclear``)
+    may_not_answer: True if its answer may hold no score, also on blank frames. It then gets no warm-up, because Triton
+        does not load a model whose warm-up fails
+    needs_whole_episode: True if its scores are relative to the whole episode, so it cannot score while one runs
+    asks_in_words: True for an ordinary language model, which has no heads, so that none is missing
+    keeps_features: True if it can cache features of frames; it then takes samples with frame references
+    uses_graphs: True if its predictor can score small batches with CUDA graphs
+    is_large: True if float32 on the CPU is slow; exports are verified in the dtype that serves, on a GPU with room
+    weights_digest: 16 hex digits, digest of the exported weights; None: not exported
+    settings_digest: 16 hex digits, digest of all else that decides scores: files beside the weights (configuration,
+        tokenizer, image processor), dtype, kind of device; None: not exported
+    """
+
+    kind: str | None = None
+    network: Mapping[str, Any] = field(default_factory=dict)
+    video_dim: int | None = None
+    text_dim: int | None = None
+    progress_bins: int | None = None
+    trained_frames: int | None = None
+    trained_padding: bool = True
+    network_frames: int | None = None
+    frame_size: FrameSize | None = None
+    frames_per_value: int = 1
+    has_preference: bool = False
+    has_success: bool = False
+    has_similarity: bool = False
+    has_log_prob: bool = False
+    marks_unclear: bool = False
+    may_not_answer: bool = False
+    needs_whole_episode: bool = False
+    asks_in_words: bool = False
+    keeps_features: bool = False
+    uses_graphs: bool = False
+    is_large: bool = False
+    weights_digest: str | None = None
+    settings_digest: str | None = None
+
+    @property
+    def widths(self) -> tuple[int, int] | None:
+        """``video_dim`` and ``text_dim``; None: the model reads raw frames and writes scores."""
+        return None if self.video_dim is None or self.text_dim is None else (self.video_dim, self.text_dim)
+
+    @property
+    def max_frames(self) -> int | None:
+        """Most frames of a trajectory: the smaller limit of training and network; None: both unknown."""
+        return min((each for each in (self.trained_frames, self.network_frames) if each is not None), default=None)
+
+    @property
+    def lacks(self) -> tuple[str, ...]:
+        """Names of the scores among preference, similarity and success that the checkpoint does not give."""
+        return tuple(name for name in ("preference", "similarity", "success") if not getattr(self, f"has_{name}"))
+
+    @property
+    def weights(self) -> str | None:
+        """Form of rounded weights (int8, nf4), whose scores are not the full checkpoint's; None: not rounded."""
+        found = self.network.get("config", {}).get("weights")
+        return found if isinstance(found, str) else None
+
+    def to_json(self) -> str:
+        """Return the description as the JSON that ``parse`` reads."""
+        return json.dumps(vars(self), default=str)  # str: of a FrameSize
+
+    @classmethod
+    def parse(cls, text: str) -> Description:
+        """Return the description of the parameter DESCRIPTION_PARAMETER. Raises ValueError."""
+        expected = f"parameter {DESCRIPTION_PARAMETER}: expected the JSON object of an export"
+        try:
+            told = json.loads(text)
+        except ValueError as error:
+            raise ValueError(f"{expected}, got {f'{text!r:.80}: {error}' if text else 'none'}") from None
+        if not isinstance(told, dict):
+            raise ValueError(f"{expected}, got {text!r:.80}")
+        kinds = typing.get_type_hints(cls)
+        return cls(**{name: _read(name, value, kinds[name]) for name, value in told.items() if name in kinds})
+
+
+def _read(name: str, value: Any, kind: Any) -> Any:
+    """Return the field ``name`` of type ``kind``. Raises ValueError for a value of another type."""
+    is_union = typing.get_origin(kind) in (types.UnionType, typing.Union)
+    parts = tuple(typing.get_origin(part) or part for part in (typing.get_args(kind) if is_union else (kind,)))
+    try:
+        read = FrameSize.parse(value) if FrameSize in parts and isinstance(value, str) else value
+    except ValueError as error:
+        raise ValueError(f"parameter {DESCRIPTION_PARAMETER}: {error}") from None
+    if not isinstance(read, parts):
+        expected = " or ".join("null" if part is types.NoneType else part.__name__ for part in parts)
+        raise ValueError(f"parameter {DESCRIPTION_PARAMETER}: {name}: expected {expected}, got {value!r:.80}")
+    return read

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: MIT
+"""Options of an episode, and the scores of its steps. N episodes, H x W pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypedDict
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.checks import require
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.numbers import checked_count, checked_share
+from rfm_client.contract.results import SUCCESS_THRESHOLD
+from rfm_client.contract.samples import Float32Array, UInt8Array
+from rfm_client.frames.camera_fusion import FUSES, Fuse
+from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
+from rfm_client.frames.sampling import Rule, Sampling
+
+
+@dataclass(frozen=True)
+class StepScore:
+    """The score of one episode at its newest frame.
+
+    progress: how much of the task is done, 0..1
+    success: probability that the task is done; NaN: the checkpoint does not predict it
+    succeeded: True if the success rule holds; False where success is NaN
+    step: index of the scored frame in the episode, from 0
+    ms: milliseconds to the answer, without the wait for an open ``add_nowait`` request
+    unclear: True if a camera's written answer states no single whole score (RoboReward only)
+    """
+
+    progress: float
+    success: float
+    succeeded: bool
+    step: int
+    ms: float
+    unclear: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class StepScores:
+    """The scores of N episodes, each at its newest frame.
+
+    progress, success: float32 [N], as in StepScore; NaN where ``mask`` left an episode out
+    succeeded: bool [N]; False where ``mask`` left an episode out, or success is NaN
+    step: int64 [N], number of each newest frame, from 0; -1: none yet
+    ms: time to the answer, milliseconds
+    unclear: bool [N], as in StepScore
+    """
+
+    progress: Float32Array
+    success: Float32Array
+    succeeded: npt.NDArray[np.bool_]
+    step: npt.NDArray[np.int64]
+    ms: float
+    unclear: npt.NDArray[np.bool_]
+
+    def of(self, index: int) -> StepScore:
+        """Return the score of one episode."""
+        numbers = float(self.progress[index]), float(self.success[index])
+        succeeded, unclear = bool(self.succeeded[index]), bool(self.unclear[index])
+        return StepScore(*numbers, succeeded, int(self.step[index]), self.ms, unclear)
+
+
+@dataclass(frozen=True)
+class SuccessRule:
+    """A step succeeds if most of the last distinct frames of its own sample reach ``threshold``.
+
+    threshold: least success of such a frame, 0..1
+    last: number of frames that vote; each distinct frame votes once, however often it is repeated or padded
+
+    Raises ValueError.
+    """
+
+    threshold: float = SUCCESS_THRESHOLD
+    last: int = 1
+
+    def __post_init__(self) -> None:
+        checked_share("threshold", self.threshold)
+        checked_count("last", self.last)
+
+
+class StepReport(Protocol):
+    """One episode in a view."""
+
+    def add(self, frame: UInt8Array, score: StepScore) -> None:
+        """Take a step. Return at once, and raise nothing. frame: uint8 [H, W, 3], which will not change any more."""
+
+    def end(self) -> None:
+        """Take the end of the episode. Return at once, and raise nothing."""
+
+
+class StepView(Protocol):
+    """A view to which episodes report each step, such as ``rfm_rl.LiveView``."""
+
+    def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> StepReport:
+        """Return a new episode. env: its number among those that grow together, from 0; threshold: of success"""
+
+
+class StepKeywords(TypedDict, total=False):
+    """The fields of EpisodeOptions, as keyword arguments."""
+
+    sampling: Rule | None
+    frames: int | None
+    cameras: Sequence[str]
+    fuse: Fuse
+    orient: Orientation | Mapping[str, Orientation]
+    channels: ChannelOrder | Mapping[str, ChannelOrder]
+    resize: bool
+    success: SuccessRule
+    live: StepView | None
+    timeout_s: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeOptions:
+    """How each step of an episode is scored. Raises ValueError for contradictory options.
+
+    sampling: a rule of ``rfm_client.frames.sampling``; None: the rule of the checkpoint's training
+    frames: the rule's number of frames; None: the rule's own if fixed, else ``ModelInfo.max_frames``. If the rule needs
+        a number and the checkpoint has none, the first step raises ValueError
+    cameras: names of the cameras with a frame in each step; empty: a single camera without a name
+    fuse: how to combine the scores of several cameras
+    orient: rotation or flip that makes frames upright, applied first: an Orientation, or a dict by camera; cameras that
+        it omits are not turned
+    channels: order of the colours in the given frames, ``rgb`` or ``bgr``: one for all cameras, or a dict by camera
+    resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
+        then differ slightly
+    success: rule of a step's success
+    live: view to which each step is reported, with the first camera's frame; it delays no step
+    timeout_s: longest time of a step, retries included; None: the client's
+    """
+
+    sampling: Rule | None = None
+    frames: int | None = None
+    cameras: Sequence[str] = ()
+    fuse: Fuse = "mean"
+    orient: Orientation | Mapping[str, Orientation] = "none"
+    channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
+    resize: bool = False
+    success: SuccessRule = SuccessRule()
+    live: StepView | None = None
+    timeout_s: float | None = None
+
+    def __post_init__(self) -> None:
+        require("cameras", not isinstance(self.cameras, str), "a sequence of names", repr(self.cameras))
+        object.__setattr__(self, "cameras", tuple(self.cameras))
+        is_each_once = len(set(self.cameras)) == len(self.cameras)
+        require("cameras", is_each_once, "names that differ", list(self.cameras))
+        require("fuse", self.fuse in FUSES, f"one of {', '.join(FUSES)}", repr(self.fuse))
+        Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
+        cameras = list(self.cameras)
+        expected = f"some of the cameras {cameras}" if cameras else "one for all frames, as cameras names none"
+        for name, given in (("orient", self.orient), ("channels", self.channels)):
+            unknown = [] if isinstance(given, str) else [repr(each) for each in given if each not in cameras]
+            require(name, not unknown, expected, ", ".join(unknown))
+        self.corrections  # noqa: B018  raises ValueError for an unknown value
+
+    @property
+    def corrections(self) -> list[Correction]:
+        """Correction of each camera's frames, in the order of the cameras."""
+        return [Correction.of(camera, self.orient, self.channels) for camera in self.cameras or ("",)]
+
+    def sampling_for(self, info: ModelInfo) -> Sampling:
+        """Return the rule with its number of frames for a checkpoint.
+
+        Raises ValueError without a needed number, InvalidSampleError if the checkpoint needs the whole episode.
+        """
+        info.check_scores_prefixes()
+        return Sampling.of(self.sampling, self.frames, info.max_frames, trained_padding=info.trained_padding)

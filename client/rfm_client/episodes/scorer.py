@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: MIT
+"""Scores of steps, by progress requests that send only the frames that the server lacks.
+
+A server may lack more frames than expected: it restarted, dropped frames, or is another server. Then it refuses, and
+all pixels are sent. In both cases the answer equals that for a ``ProgressSample`` of the same frames.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
+from itertools import groupby, islice
+from typing import TypeAlias
+from weakref import WeakKeyDictionary
+
+from rfm_client.contract import wire
+from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.names import frames_name
+from rfm_client.contract.results import ProgressResult, Result
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.episodes.options import StepScore
+from rfm_client.episodes.steps import Steps, Window
+from rfm_client.scoring.call import Call
+from rfm_client.scoring.samples import SampleScorer, for_each
+from rfm_client.transport.off_loop import off_loop
+
+MAX_NEW_BYTES = 3 * 2**20  # of a request's frames: the server prepares a request while the next is sent
+MAX_REMEMBERED = 2**17  # digests of sent frames; the oldest are forgotten
+_OUTPUTS = (wire.PROGRESS, wire.SUCCESS)
+
+
+Asked: TypeAlias = tuple[Steps, int]  # an episode, and the number of the step to score
+
+
+class _Server:
+    """Digests of the frames that one server has received. number: index of the server"""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self._sent: OrderedDict[bytes, None] = OrderedDict()
+
+    def __contains__(self, digest: bytes) -> bool:
+        return digest in self._sent
+
+    def remember(self, digests: Iterable[bytes]) -> None:
+        for digest in digests:
+            self._sent[digest] = None
+            self._sent.move_to_end(digest)
+        while len(self._sent) > MAX_REMEMBERED:
+            self._sent.popitem(last=False)
+
+    def forget(self, digests: Iterable[bytes]) -> None:
+        for digest in digests:
+            self._sent.pop(digest, None)
+
+
+class StepScorer:
+    """Scores steps for one client, in its event loop. A new episode goes to the server with the fewest episodes.
+
+    model: name of the exported model
+    """
+
+    def __init__(self, model: str, scorer: SampleScorer, num_servers: int) -> None:
+        self._model = frames_name(model)
+        self._scorer = scorer
+        self._servers = [_Server(number) for number in range(num_servers)]
+        self._server_of: WeakKeyDictionary[object, _Server] = WeakKeyDictionary()  # of each episode that goes on
+
+    async def model_info(self, call: Call) -> ModelInfo:
+        """Return the description of the model that scores windows. Raises RewardError."""
+        return await self._scorer.model_info(self._model, call.deadline)
+
+    async def scores(self, asked: Sequence[Asked], call: Call, asked_s: float) -> list[StepScore]:
+        """Return and report the score of each step, from as few requests as possible. Raises RewardError, ValueError.
+
+        asked_s: start of the caller's wait, by ``time.perf_counter``
+        """
+        info = await self.model_info(call)
+        shown = [steps.windows(step, info) for steps, step in asked]
+        outcomes = iter(await self._all_outcomes([each for _, windows in shown for each in windows], info, call))
+        ms = (time.perf_counter() - asked_s) * 1e3
+        scores = [
+            steps.score(step, prefix, list(islice(outcomes, len(windows))), ms)
+            for (steps, step), (prefix, windows) in zip(asked, shown, strict=True)
+        ]
+        for (steps, _), score in zip(asked, scores, strict=True):
+            steps.report(score)
+        return scores
+
+    async def _all_outcomes(self, windows: Sequence[Window], info: ModelInfo, call: Call) -> list[Result | RewardError]:
+        self._scorer.tell_of_length(max((len(window.frames) for window in windows), default=0), info)
+        if not info.by_digest:
+            return await self._whole(windows, call)
+        num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame of each window is new
+        await off_loop(num_new, lambda: [frame.digest for window in windows for frame in window.frames])
+        outcomes: dict[int, Result | RewardError] = {}
+        parts = list(self._parts(windows, info.max_batch_size))
+        outputs = (*_OUTPUTS, *[wire.UNCLEAR] * info.marks_unclear)
+        asked = (self._outcomes([windows[index] for index in part], outputs, call) for part in parts)
+        answered = await asyncio.gather(*asked)
+        for part, of_part in zip(parts, answered, strict=True):
+            outcomes.update(zip(part, of_part, strict=True))
+        return [outcomes[index] for index in range(len(windows))]
+
+    def _parts(self, windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
+        """Indices of the windows of each request.
+
+        A request has frames of one size, for one server, at most ``limit`` windows, and at most MAX_NEW_BYTES unless a
+        window alone has more.
+        """
+        servers = [self._server(window) for window in windows]
+
+        def alike(index: int) -> tuple[int, tuple[int, ...]]:
+            return servers[index].number, windows[index].frames[0].pixels.shape
+
+        for _, together in groupby(sorted(range(len(windows)), key=alike), key=alike):
+            part: list[int] = []
+            sent: set[bytes] = set()
+            for index in together:
+                frames = windows[index].frames
+                own = {frame.digest for frame in frames if frame.digest not in servers[index]}
+                num_bytes = _padded_bytes(len(part) + 1, len(sent | own), frames[0].pixels.nbytes)
+                if part and (len(part) == limit or num_bytes > MAX_NEW_BYTES):
+                    yield part
+                    part, sent = [], set()
+                part.append(index)
+                sent |= own
+            yield part
+
+    async def _outcomes(
+        self, windows: Sequence[Window], outputs: Sequence[str], call: Call
+    ) -> Sequence[Result | RewardError]:
+        """Send a request; if it fails, perhaps because the server lacks frames, send all pixels."""
+        server = self._server(windows[0])
+        call = call.at(server.number)
+        new = {frame.digest: frame.pixels for window in windows for frame in window.frames}
+        digests = list(new)
+        sent = [pixels for digest, pixels in new.items() if digest not in server]
+        try:
+            results = await self._request(windows, sent, outputs, call)
+        except (InvalidSampleError, InferenceFailedError):  # the server may lack frames
+            server.forget(digests)
+            outcomes = await self._whole(windows, call)
+            if not any(isinstance(outcome, RewardError) for outcome in outcomes):
+                server.remember(digests)
+            return outcomes
+        except RewardError as error:
+            return for_each(error, len(windows))
+        server.remember(digests)
+        return results
+
+    def _server(self, window: Window) -> _Server:
+        """Return the server of a window's episode; of a new episode, one with the fewest episodes."""
+        if window.episode not in self._server_of:
+            counts = Counter(self._server_of.values())
+            fewest = min(counts[server] for server in self._servers)
+            # at random: each of many clients may have a single episode
+            self._server_of[window.episode] = random.choice([each for each in self._servers if counts[each] == fewest])
+        return self._server_of[window.episode]
+
+    async def _request(
+        self, windows: Sequence[Window], sent: Sequence[UInt8Array], outputs: Sequence[str], call: Call
+    ) -> Sequence[ProgressResult]:
+        request_id = next(call.request_ids)
+        num_bytes = _padded_bytes(len(windows), len(sent), sent[0].nbytes if sent else 0)
+        videos, tasks = [window.digests for window in windows], [window.task for window in windows]
+        tensors = partial(wire.encode_refs, videos, tasks, sent)
+        try:
+            answer = await self._scorer.infer(self._model, num_bytes, tensors, outputs, call, request_id)
+        except RewardError as error:
+            error.request_id = request_id
+            raise
+        return [
+            wire.decode_progress(answer.tensors, row, len(window.frames), answer.model_version)
+            for row, window in enumerate(windows)
+        ]
+
+    async def _whole(self, windows: Sequence[Window], call: Call) -> list[Result | RewardError]:
+        samples = await off_loop(sum(w.num_bytes for w in windows), lambda: [window.sample for window in windows])
+        return await self._scorer.outcomes(samples, call)
+
+
+def _padded_bytes(num_windows: int, num_frames: int, frame_bytes: int) -> int:
+    """Bytes of a request's frames, which are spread evenly over its windows, with padding."""
+    return num_windows * -(-num_frames // num_windows) * frame_bytes

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: MIT
+"""Read a checkpoint, check what the user asks for, and tell where the checkpoint comes from: all that an export needs.
+
+``max_batch_size`` is the largest batch that still makes a GPU score more samples a second. Small batches leave a GPU
+idle while the CPU launches kernels. From about SATURATING_FLOP on, each further sample adds its full time: on an H200,
+8 samples of a Robometer-4B take 16 ms each, and so do 32. A larger batch gains nothing, makes every caller wait for its
+end, and leaves nothing to the other GPUs.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+
+from rfm import families
+from rfm.checkpoint.content import read_run_config
+from rfm.checkpoint.hub import check_links, commit_of
+from rfm.checkpoint.provenance import Decision, is_folder, license_of, source_name
+from rfm.checkpoint.run_config import find_run_config
+from rfm.checkpoint.weights import num_values
+from rfm.config import ExportConfig
+from rfm.engine.computation import computation
+from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, config_fields
+from rfm_client.contract import ProgressSample
+from rfm_client.contract.description import Description, Origin
+from rfm_client.contract.synthetic import random_trajectory
+from rfm_export.errors import ExportError
+
+Say: TypeAlias = Callable[[str], object]  # takes a line for the user
+
+SATURATING_FLOP = 20e12  # of matrix products
+MOST_SAMPLES = 64  # small networks hardly gain from more
+TYPICAL_FRAMES, TYPICAL_PX = 8, 224
+TYPICAL_TASK = "put the red block in the bowl"
+_TERA = 1e12
+
+_SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for example hub_token, wandb_api_key
+
+
+@dataclass(frozen=True)
+class Source:
+    """The checked input of an export.
+
+    description, of_encoders: of the checkpoint and of its encoders, without digests, whose files do not exist yet
+    settings: with a ``max_batch_size``
+    num_gpus: that serve the export; 0: the CPU
+    device: for the comparison of scores, as the user names it; None: the default
+    decisions: settings that the scores depend on
+    full: loads the checkpoint with full weights; None: the settings round nothing
+    """
+
+    family: Family
+    checkpoint: Checkpoint
+    encoders: FrameEncoders | None
+    description: Description
+    of_encoders: Description | None
+    settings: ExportConfig
+    num_gpus: int
+    device: torch.device | None = None
+    decisions: Sequence[Decision] = ()
+    full: Callable[[], Checkpoint] | None = None
+
+
+def read_for_export(
+    source: str | Path, settings: ExportConfig, family: str | None, device: str | None, say: Say, *, other_machine: bool
+) -> Source:
+    """Read and check all that an export needs, before it writes. Parameters and errors as of ``export``."""
+    if not other_machine:
+        _check_gpus(settings.num_gpus)
+    named = None if device is None else device_named(device)
+    read = read_source(source, settings, family, say)
+    _check_graphs(settings, read.checkpoint.description)
+    return replace(read, settings=with_batch_size(settings, read.checkpoint, say), device=named)
+
+
+def read_source(source: str | Path, settings: ExportConfig, family: str | None, say: Say) -> Source:
+    """Read a checkpoint. Tell the user the file of the training run's settings, and possible faults."""
+    folder = families.find(source, say)
+    options = Options.of(settings)
+    kind = families.choose(folder, family, options)
+    checkpoint = families.load_from(folder, kind, options)
+    check_links(folder)
+    encoders = checkpoint.encoders()
+    if (run_config := find_run_config(folder)) is not None:
+        say(f"{run_config}: read as the settings of the training run")
+    for note in families.notes(folder, checkpoint):
+        say(note)
+    told = [] if settings.dtype is None else [Decision("served_dtype", settings.dtype, "--dtype")]
+    gpus = num_gpus(settings)
+    computed = computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0)
+    told.append(Decision("computation", computed, "installed PyTorch"))
+    origin = origin_of(source, folder, computed)
+    of_encoders = None if encoders is None else described_encoders(encoders.description, origin)
+    full = (
+        None if options.weights is None else partial(families.load_from, folder, kind, replace(options, weights=None))
+    )
+    decisions = [*checkpoint.decisions(), *told]
+    description = described(checkpoint, origin)
+    return Source(kind, checkpoint, encoders, description, of_encoders, settings, gpus, None, decisions, full)
+
+
+def device_named(name: str) -> torch.device:
+    """Return the device of this name. Raises ExportError if this machine does not have it."""
+    there, why = ["cpu"], f": PyTorch {torch.__version__} finds no GPU; --device cpu"
+    if torch.cuda.is_available():
+        there, why = ["cpu", "cuda", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))], ""
+    if name not in there:
+        raise ExportError(f"device: expected one of {', '.join(there)}, got {name}{why}")
+    return torch.device(name)
+
+
+def _check_gpus(num_gpus: int | None) -> None:
+    """Raise ExportError for more GPUs than this machine has: Triton would refuse to load the models."""
+    there = torch.cuda.device_count()
+    if num_gpus is not None and num_gpus > there:
+        raise ExportError(
+            f"num_gpus: expected at most {there}, got {num_gpus}; --other-machine exports for a machine with more, "
+            "--num-gpus 0 for the CPU"
+        )
+
+
+def _check_graphs(settings: ExportConfig, description: Description) -> None:
+    """Raise ExportError if CUDA graphs are on but nothing would use them."""
+    if settings.cuda_graphs and not description.uses_graphs:
+        expected = "an RFM, Robometer or RoboReward checkpoint (its expected score) on a Qwen backbone"
+        raise ExportError(f"cuda_graphs: expected {expected}, got another; leave out --cuda-graphs")
+    if settings.cuda_graphs and not num_gpus(settings):
+        raise ExportError(
+            "cuda_graphs: expected an export for GPUs, got one for the CPU; leave out --cuda-graphs, or name "
+            "--num-gpus with --other-machine"
+        )
+
+
+def num_gpus(settings: ExportConfig) -> int:
+    """Return the number of GPUs that serve the export; 0: the CPU."""
+    return torch.cuda.device_count() if settings.num_gpus is None else settings.num_gpus
+
+
+def with_batch_size(settings: ExportConfig, checkpoint: Checkpoint, say: Say) -> ExportConfig:
+    """Return the settings with a ``max_batch_size``: the user's, else the saturating one.
+
+    say: takes a line for the user about a number below MOST_SAMPLES
+    Raises CheckpointError.
+    """
+    if settings.max_batch_size is not None:
+        return settings
+    sample = typical_sample(checkpoint)
+    flop = checkpoint.flop(sample)
+    number = saturating_samples(flop)
+    if number < MOST_SAMPLES:
+        (trajectory,) = sample.trajectories
+        shown = f"{trajectory.num_frames} frames of {TYPICAL_PX}x{TYPICAL_PX}"
+        why = f"one sample of {shown} takes {flop / _TERA:.1f} TFLOP, and a GPU is saturated at about"
+        say(f"max_batch_size is {number}: {why} {SATURATING_FLOP / _TERA:.0f} (--max-batch-size sets another number)")
+    return replace(settings, max_batch_size=number)
+
+
+def saturating_samples(flop: float) -> int:
+    """Return the power of two, from 1 to MOST_SAMPLES, that comes nearest to SATURATING_FLOP. flop: of one sample"""
+    power = round(math.log2(SATURATING_FLOP / max(flop, 1.0)))
+    return int(2 ** min(max(power, 0), math.log2(MOST_SAMPLES)))
+
+
+def typical_sample(checkpoint: Checkpoint) -> ProgressSample:
+    """Return a progress sample with the frames of training, else TYPICAL_FRAMES."""
+    description = checkpoint.description
+    num_frames = description.trained_frames or TYPICAL_FRAMES
+    if description.network_frames is not None:
+        num_frames = min(num_frames, description.network_frames)
+    size_px = (TYPICAL_PX, TYPICAL_PX)
+    random = np.random.default_rng(0)
+    return ProgressSample(random_trajectory(random, num_frames, description.widths, task=TYPICAL_TASK, size_px=size_px))
+
+
+def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
+    """Return the checkpoint's origin: source, commit, training run's config.yaml, licence.
+
+    The source of a folder is the end of its path. config.yaml becomes JSON without secrets.
+
+    source: as the user named it
+    folder: the checkpoint's files, from the Hub in a snapshot named by its commit
+    computation: as in ``Origin``
+    """
+    file = find_run_config(folder)
+    return Origin(
+        source=source_name(source),
+        revision=None if is_folder(source) else commit_of(folder),
+        license=license_of(folder),
+        run_config={} if file is None else _public(read_run_config(file)),
+        computation=computation,
+    )
+
+
+def origin_in(description: Description) -> Origin:
+    """Return the origin in an exported description."""
+    return Origin(**{each.name: getattr(description, each.name) for each in fields(Origin)})
+
+
+def described(checkpoint: Checkpoint, origin: Origin) -> Description:
+    """Return the checkpoint's description without the digests of weights and settings, whose files do not exist yet."""
+    return replace(checkpoint.description, **vars(origin), network=_network(checkpoint))
+
+
+def described_encoders(encoders: Description, origin: Origin) -> Description:
+    """Return the description of encoders, exported with a scorer of this origin."""
+    return replace(encoders, source=origin.source, revision=origin.revision)
+
+
+def _public(value: Any) -> Any:
+    """A YAML value in JSON's types, without texts whose keys name a secret."""
+    if isinstance(value, dict):
+        kept = {str(key): inner for key, inner in value.items() if not _is_secret(str(key), inner)}
+        return {key: _public(inner) for key, inner in kept.items()}
+    if isinstance(value, (list, tuple, set)):
+        return [_public(inner) for inner in value]
+    is_plain = value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value))
+    return value if is_plain else str(value)
+
+
+def _is_secret(key: str, value: Any) -> bool:
+    return isinstance(value, (str, bytes)) and _SECRET.search(key) is not None
+
+
+def _network(checkpoint: Checkpoint) -> dict[str, Any]:
+    parameters: Counter[str] = Counter()
+    for name, count in num_values(checkpoint.parts[NETWORK]).items():
+        parameters[name.partition(".")[0]] += count
+    return {
+        **checkpoint.description.network,
+        "config": config_fields(checkpoint.config),
+        "parameters": dict(sorted(parameters.items())),  # as in the exported file, whose tensors are in another order
+    }
