@@ -7,7 +7,7 @@ TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
 .PHONY: help demo test test-all nightly test-newest check parity bench bench-full gpu gpu-packages perf chaos soak format model_repository \
-  clean ops-check ops-tools audit lock mutate docs prose version
+  clean ops-check ops-tools audit lock mutate docs prose internal-imports pictures version
 
 # What can be made: this list.
 help:
@@ -156,6 +156,14 @@ docs: | $(VENV)
 # Count the words that make docstrings, comments and documents hard to read. It fails nothing.
 prose:
 	$(PYTHON) tools/prose.py
+
+# Print the share of test lines in files that import internal names, for each folder of tests.
+internal-imports:
+	$(PYTHON) tools/internal_imports.py
+
+# Draw the pictures of the page in docs/images anew. Needs Chromium: make ops-tools.
+pictures: $(INSTALLED)
+	PYTHONPATH=tests/support:tests/page:examples $(BIN)/python tools/page_pictures.py
 
 # Report known vulnerabilities of the pinned packages. Needs the network.
 audit: $(INSTALLED)

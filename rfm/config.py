@@ -21,6 +21,8 @@ from rfm_client.contract.settings import ConfigError, Settings, setting
 if TYPE_CHECKING:
     import torch
 
+__all__ = ["ExportConfig", "ServeConfig"]
+
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 DEFAULT_SAMPLE_TOKENS = 131_072

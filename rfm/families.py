@@ -9,10 +9,23 @@ from pathlib import Path
 
 from rfm.checkpoint.content import WEIGHTS, CheckpointError
 from rfm.checkpoint.hub import find as find
-from rfm.checkpoint.provenance import assumed
+from rfm.checkpoint.provenance import Decision, assumed
 from rfm.checkpoint.run_config import HEADS, SIMILARITY, constant_heads, training_notes
 from rfm.checkpoint.weights import check_values
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, VideoPrompt, Weights
+
+__all__ = [
+    "FAMILIES",
+    "CheckpointError",
+    "Decision",
+    "choose",
+    "encoders_of",
+    "find",
+    "load",
+    "load_from",
+    "named",
+    "notes",
+]
 
 # Packages in the order in which they are tried. ReWiND comes last: its first checkpoints do not name their network.
 FAMILIES = ("rfm.topreward", "rfm.roboreward", "rfm.vlm", "rfm.rewind")

@@ -15,24 +15,20 @@ import rfm_export
 from commands import RUN
 from engines import load_engine, serve_config
 from environments import MODEL, LateClient
-from one_model import CRASHES, BriefServer
 from paths import ROOT
 from patients import references  # noqa: F401  a fixture
-from reference_server import Served
 from rfm.engine import Engine
 from rfm.launch import endpoints
-from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
+from servers import CRASHES, Endpoints, Served, start_triton
 
 pytest_plugins = ("gateway_fixtures",)
-
 SHARED = ("served", "triton")  # fixtures that start a server for the tests of many files
 LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the others run meanwhile
 
 torch.set_num_threads(1)
-os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start, which share the cores with other tests
-os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started
+os.environ["OMP_NUM_THREADS"] = "1"  # of processes that tests start, since other tests need the cores
+os.environ[RUN] = uuid.uuid4().hex  # marks the processes of this run
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test asks the network
 worker, workers = os.getenv("PYTEST_XDIST_WORKER", "gw0"), os.getenv("PYTEST_XDIST_WORKER_COUNT", "1")
 endpoints.PORTS = endpoints.PORTS[int(worker.removeprefix("gw")) :: int(workers)]  # no two workers choose the same port
@@ -46,15 +42,12 @@ def engine() -> Callable[[str], Engine]:
 
 @pytest.fixture(scope="session")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """The one server of all tests that only ask: a reference checkpoint of each kind, and the demo's as ``rfm``."""
+    """The shared server: a reference checkpoint of each kind, and the demo's as ``rfm``."""
     folder = tmp_path_factory.mktemp("served")
     repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
     for config in goldens.SERVED:
         rfm_export.export(config.checkpoint, repository, serve_config(config, config.name))
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-    ):
+    with start_triton(repository) as server:
         yield Served(server)
 
 
@@ -95,7 +88,7 @@ def protocol(request: pytest.FixtureRequest) -> str:
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
-    """Run a test once more if it failed while Triton 2.51 aborted or hung at its start, as it does now and then."""
+    """Run a failed test again if Triton 2.51 aborted or hung at the start, which happens now and then."""
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
     CRASHES.clear()
     reports = runtestprotocol(item, nextitem=nextitem, log=False)
@@ -110,9 +103,9 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whoever asks a shared server asks a Triton. Where several processes test, one of them has that server.
+    """Mark tests with a shared server ``triton``, and keep them in one of the test processes.
 
-    The tests of a file stay together, too, since they share what its fixtures start.
+    The tests of a file also stay together, since they share servers.
     """
     for item in items:
         shared = next((name for name in SHARED if name in getattr(item, "fixturenames", ())), None)

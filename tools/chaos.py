@@ -33,7 +33,7 @@ from callers import WIDTHS
 from faults import CALLERS, CHECKPOINT, FAULTS, TRITON, Row, site
 from paths import ROOT
 from rfm.config import ExportConfig
-from rfm_serve import MODEL
+from servers import MODEL
 
 ENCODERS = ROOT / "model_repository" / "rfm_encoder" / "1"
 MOST_MIB_PER_MIN = 1e6 / 2**20  # largest growth of memory in a soak

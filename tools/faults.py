@@ -22,11 +22,10 @@ from paths import ROOT
 from rfm.config import ExportConfig
 from rfm.launch.model_processes import has_ended
 from rfm.launch.repository_folder import MODEL_FILE
-from rfm.launch.triton_server import Endpoints
 from rfm.supervise.supervisor import GATEWAY
 from rfm_client import RewardClient
 from rfm_client.contract import descriptors
-from rfm_serve import MODEL, RFM, Serving, children, serving, wait_for
+from servers import MODEL, RFM, Endpoints, Serving, children, serving, wait_for
 
 CHECKPOINT = ROOT / "model_repository" / "rfm" / "1" / "checkpoint"
 TRITON, OTHER = "triton", f"{MODEL}_b"

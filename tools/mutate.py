@@ -31,6 +31,8 @@ PARTS = {
     "rfm/vlm/*.py": "families/test_vlm*.py families/test_nf4.py families/test_rounded.py families/test_forms.py families/test_shot_cache.py"
     " export/test_provenance.py",
     "rfm/triton_model/batch_model.py": "triton/test_batch_model.py triton/test_pipeline.py",
+    "rfm/triton_model/pipeline.py": "triton/test_pipeline.py",
+    "client/rfm_client/scoring/batching.py": "contract/test_samples.py client/test_client_servers.py",
 }
 CONFIG = """
 [cosmic-ray]

@@ -14,7 +14,16 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PRODUCT = ("apps", "client", "commands", "export", "model_repository", "rfm")
-WORDS = {"what": r"what", "one": r"ones?", "that": r"that", "nobody, somebody": r"(no|some|who(ever)?)(body|ever)"}
+BESIDE = ("tests", "tools", "examples", "benchmarks")
+WORDS = {
+    "what": r"what",
+    "one": r"ones?",
+    "that": r"that",
+    "of": r"of",
+    "its, their": r"its|their",
+    "each": r"each",
+    "nobody, somebody": r"(no|some|who(ever)?)(body|ever)",
+}
 
 
 def tracked(*patterns: str) -> list[Path]:
@@ -34,6 +43,15 @@ def prose(file: Path) -> Iterator[str]:
             yield token.string
 
 
+def help_texts(file: Path) -> Iterator[str]:
+    """Yield the help texts of options in a Python file: ``setting(default, help)`` and ``help=...``."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Call):
+            told = [word.value for word in node.keywords if word.arg == "help"]
+            told += node.args[1:2] if ast.unparse(node.func) == "setting" else []
+            yield from (text.value for text in told if isinstance(text, ast.Constant) and isinstance(text.value, str))
+
+
 def frequencies(texts: Iterator[str]) -> str:
     """Return the number of words, and the frequency of each counted word in a thousand."""
     words = re.findall(r"[A-Za-z']+", "\n".join(texts).lower())
@@ -45,12 +63,15 @@ def frequencies(texts: Iterator[str]) -> str:
 
 
 def main() -> None:
-    """Print the counts of code and documents."""
-    code = [file for file in tracked("*.py") if file.relative_to(ROOT).parts[0] in PRODUCT]
-    for package in PRODUCT:
-        files = [file for file in code if file.relative_to(ROOT).parts[0] == package]
-        print(f"{package}: {frequencies(text for file in files for text in prose(file))}")
-    print(f"all code: {frequencies(text for file in code for text in prose(file))}")
+    """Print the counts of code, help texts and documents."""
+    by_folder: dict[str, list[Path]] = {}
+    for file in tracked("*.py"):
+        by_folder.setdefault(file.relative_to(ROOT).parts[0], []).append(file)
+    for folder in (*PRODUCT, *BESIDE):
+        print(f"{folder}: {frequencies(text for file in by_folder[folder] for text in prose(file))}")
+    code = [file for folder in PRODUCT for file in by_folder[folder]]
+    print(f"the product's code: {frequencies(text for file in code for text in prose(file))}")
+    print(f"help texts: {frequencies(text for file in code for text in help_texts(file))}")
     documents = [file for file in tracked("*.md") if file.name != "CHANGELOG.md"]
     print(f"documents, without CHANGELOG.md: {frequencies(file.read_text() for file in documents)}")
     classes = Counter(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Videos, clients and a repository for the tests of the client."""
+"""A video and a repository for the tests of the client."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    """The demo's checkpoint, which has one instance on one thread."""
+    """The demo's checkpoint with a single instance."""
     folder = tmp_path / "model_repository"
     shutil.copytree(ROOT / "model_repository" / "rfm", folder / "rfm")
     return folder

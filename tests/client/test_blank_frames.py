@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which frames show nothing: black ones and those of one colour, but no dark scene."""
+"""Blank frames: black or of a single colour, but no dark scene."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from encoding import encode
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.blank_frames import BlankFrames, is_blank
-from rfm_client.frames.video import read_video
+from rfm_client import UInt8Array
+from rfm_client.frames import BlankFrames, read_video
+from rfm_client.frames.blank_frames import is_blank
 
 VIDEOS = Path(__file__).parents[1] / "videos"
 SIZE = (48, 64, 3)
@@ -23,7 +23,7 @@ NOISE = np.random.default_rng(0).integers(0, 256, SIZE, np.uint8)
 
 
 def with_pixel(frame: UInt8Array, value: int) -> UInt8Array:
-    """The frame with a pixel of this value at a place that a coarse grid misses."""
+    """Return the frame with a pixel of this value between the points of a coarse grid."""
     marked = frame.copy()
     marked[13, 17] = value
     return marked

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 import signal
@@ -15,7 +14,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import tritonclient.http
 from typer.main import get_command
@@ -26,27 +24,14 @@ from client_commands import (
     TASK,
     WIDTHS,
     ask,
-    assert_scores,
     columns,
     invoke,
     rows,
     run,
-    web_server,
 )
-from reference_server import Served
-from rfm.launch.repository_api import RepositoryApi
-from rfm_client import (
-    FrameScores,
-    ProgressResult,
-)
-from rfm_client.cli.command import EXIT_CODES, ExitCode
-from rfm_client.cli.commands import app
-from rfm_client.cli.documents import frame_document
-from rfm_client.cli.scoring import unique_stems
-from rfm_client.cli.show import number
-from rfm_client.cli.synthetic import SyntheticSamples, parse_lengths
-from rfm_client.contract.wire import encode_samples
-from rfm_serve import wait_for
+from in_process import rfm_client_app
+from rfm_client.command_line import ExitCode
+from servers import RepositoryApi, Served, folder_server, wait_for
 from trajectories import random_trajectory
 from vlm import PLAIN as VLM
 
@@ -69,7 +54,7 @@ def test_status_tells_what_triton_counts(served: Served) -> None:
         (server,) = json.loads(result.stdout)["servers"]
         return server, {model["name"]: model for model in server["models"]}
 
-    wait_for(lambda: (shown()[1][MODEL]["batches"] or {"count": 0})["count"])  # the model tells once a second
+    wait_for(lambda: (shown()[1][MODEL]["batches"] or {"count": 0})["count"])  # the model reports once a second
     server, models = shown()
     assert (server["ready"], server["version"], server["metrics_error"]) == (True, "2.51.0", None)
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
@@ -92,7 +77,7 @@ def test_status_tells_what_triton_counts(served: Served) -> None:
     assert 0 < cpu["memory_used_bytes"] < cpu["memory_total_bytes"]
 
 
-BATCHES = {  # of two instances: 40 batches, 120 samples; of each batch, the work
+BATCHES = {  # of two instances: 40 batches, 120 samples; the work of each batch
     "batch_samples_count": (10, 30),
     "batch_samples_sum": (30, 90),
     "collate_seconds_sum": (0.5, 0.5),
@@ -118,7 +103,7 @@ def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) ->
             for instance, value in enumerate(values)
         )
     )
-    with web_server(tmp_path) as url:
+    with folder_server(tmp_path) as url:
         result = invoke("status", "--url", served.url("grpc"), "--metrics-url", f"{url}/metrics")
     assert result.exit_code == 0
     requests, batches = rows(result.stdout, f"{MODEL} ")
@@ -140,62 +125,12 @@ def test_status_without_metrics_shows_the_rest_and_says_so(served: Served) -> No
     assert (requests[1:3], requests[5:]) == (["1", "READY"], ["-", "-"])
 
 
-SAMPLES = {"embeddings": ("progress", False), "pairs": ("similarity", False), "frames": ("preference", True)}
-
-
-@pytest.mark.parametrize(("kind", "use_frames"), SAMPLES.values(), ids=SAMPLES)
-def test_sample_and_bench_input_ask_for_the_same_samples(
-    served: Served, tmp_path: Path, kind: Any, use_frames: bool
-) -> None:
-    words = ["--sample-type", kind, "--num-samples", 3, "--num-frames", "2,5", "--seed", 5]
-    words += ["--use-frames"] if use_frames else []
-    result = ask(served, "sample", *words, "--json", "-")
-    assert (result.exit_code, result.stderr) == (0, "")
-    with served.client("grpc", MODEL) as client:
-        samples = SyntheticSamples(kind, 3, parse_lengths("2,5"), use_frames, seed=5).samples(client)
-        expected = client.evaluate(samples)
-    for answer, scores in zip(json.loads(result.stdout)["samples"], expected, strict=True):
-        if isinstance(scores, ProgressResult):
-            assert_scores(answer, scores)
-        else:
-            assert answer[kind] == pytest.approx(getattr(scores, kind), abs=1e-4)
-            for name in ("first", "second") if kind == "preference" else ("reference", "other"):
-                assert_scores(answer[name], getattr(scores, name))
-
-    target = tmp_path / "new" / "folder" / "input.json"
-    result = ask(served, "bench-input", *words, "--output", target)
-    name = f"{MODEL}_frames" if use_frames else MODEL
-    command = f"perf_analyzer -m {name} -i grpc -u {served.url('grpc').removeprefix('grpc://')} --input-data {target}"
-    assert result.stdout == f"{command} --async --concurrency-range 1:16:5\n"
-    for request, sample in zip(json.loads(target.read_text())["data"], samples, strict=True):
-        tensors = encode_samples([sample])
-        assert request.keys() == tensors.keys()
-        for tensor, array in tensors.items():  # as perf_analyzer reads them, with the batch axis that it adds
-            content = request[tensor]["content"]
-            if isinstance(content, list):
-                flat = np.array([text.encode() for text in content], np.object_)
-            else:
-                flat = np.frombuffer(base64.b64decode(content["b64"], validate=True), array.dtype.newbyteorder("<"))
-            np.testing.assert_array_equal(flat.reshape(1, *request[tensor]["shape"]), array)
-
-
 def test_synthetic_samples_are_frames_where_embeddings_are_not_read(served: Served, tmp_path: Path) -> None:
     result = ask(served, "sample", "--num-samples", 2, model=VLM)
     assert (result.exit_code, result.stderr) == (0, "")
     assert "progress of random frames" in result.stdout
     written = ask(served, "bench-input", "--num-samples", 1, "--output", tmp_path / "input.json", model=VLM)
     assert written.stdout.startswith(f"perf_analyzer -m {VLM}_frames ")
-
-
-def test_sample_shows_a_table_and_tells_of_each_that_fails(served: Served) -> None:
-    result = ask(served, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", "3,17")
-    assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
-    for index, line in enumerate(result.stderr.splitlines()):
-        assert line.startswith(f"rfm-client: samples[{index}]: num_frames: expected at most 16")
-    good = ask(served, "sample", "--sample-type", "preference", "--num-samples", 1)
-    with served.client("grpc", MODEL) as client:
-        (expected,) = client.evaluate(SyntheticSamples("preference", 1).samples(client))
-    assert f"P(first) = {expected.preference:.4f}" in good.stdout  # type: ignore[union-attr]
 
 
 def free_url() -> str:
@@ -325,10 +260,10 @@ def test_a_missing_package_costs_a_line(served: Served, monkeypatch: pytest.Monk
 
 def test_every_command_and_option_has_help_and_exit_codes_are_documented() -> None:
     general = " ".join(invoke("--help").stdout.split())
-    assert EXIT_CODES in general
+    (exit_codes,) = re.findall(r"Exit codes: .* one a line\.", general)
     for code in ExitCode:
-        assert re.search(rf"\b{code.value} ", EXIT_CODES), code
-    commands = get_command(app).commands  # type: ignore[attr-defined]
+        assert re.search(rf"\b{code.value} ", exit_codes), code
+    commands = get_command(rfm_client_app).commands  # type: ignore[attr-defined]
     assert commands.keys() == {
         "score",
         "compare",
@@ -344,7 +279,7 @@ def test_every_command_and_option_has_help_and_exit_codes_are_documented() -> No
         assert name in general
         assert command.help, name
         shown = " ".join(invoke(name, "--help").stdout.split())
-        assert EXIT_CODES in shown
+        assert exit_codes in shown
         for parameter in command.params:
             assert parameter.help, (name, parameter.name)
             for option in parameter.opts:
@@ -356,16 +291,3 @@ def test_the_shell_can_complete_commands() -> None:
     assert "_RFM_CLIENT_COMPLETE=complete_bash" in script
     asked = {"COMP_WORDS": "rfm-client st", "COMP_CWORD": "1", "_RFM_CLIENT_COMPLETE": "complete_bash"}
     assert run(**asked).stdout.split() == ["status"]
-
-
-def test_a_score_that_is_not_told_is_null_and_shown_as_a_dash() -> None:
-    scores = FrameScores(progress=np.float32([0.25, 0.5]), success=np.full(2, np.nan, np.float32))
-    document = frame_document(scores, None)
-    assert (document["progress"], document["success"]) == ([0.25, 0.5], None)
-    assert [number(value) for value in (None, float("nan"), 0.5)] == ["-", "-", "0.5000"]
-
-
-def test_files_about_videos_of_one_name_do_not_overwrite_each_other() -> None:
-    names = ["a/clip.mp4", "b/clip.mp4", "http://host/clip.mp4?size=2", "other.tar.mp4"]
-    assert unique_stems(names) == ["clip", "clip_2", "clip_3", "other.tar"]
-    assert unique_stems(["x/a.mp4", "a_2.mp4", "y/a.mp4"]) == ["a", "a_2", "a_3"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a person sees of rfm-client: tables on a terminal of 80 columns, and results as they come."""
+"""rfm-client on a terminal with 80 columns: tables, and results as they come."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from rich.console import Console
 
 import clip
 from client_commands import RFM_CLIENT, TASK
-from rfm.launch.triton_server import Endpoints
-from rfm_client.cli.command import ExitCode
-from rfm_client.cli.show import shortened, status_tables, table
-from rfm_client.transport.status import ModelStatus, ServerStatus
+from rfm_client.cli.show import shortened, status_tables
+from rfm_client.command_line import ExitCode, table
+from rfm_client.serving import ServerStatus
+from rfm_client.transport.status import ModelStatus
+from servers import Endpoints
 from terminals import WIDTH, on_terminal
 
 pytestmark = pytest.mark.triton
@@ -35,7 +36,7 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def shown(endpoints: Endpoints, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[str], list[str]]:
-    """The words and lines that a command about the demo's checkpoint shows, which fit the terminal."""
+    """Run a command about the demo's checkpoint. Return words and lines, which fit the terminal."""
     told, lines = on_terminal(*asked, "--url", endpoints.grpc_url)
     assert told == code, lines
     assert max(map(len, lines)) <= WIDTH

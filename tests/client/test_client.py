@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Calls of the client: answers, errors, deadlines, what is asked of a served model."""
+"""Calls of the client: answers, errors, deadlines, and the description of a served model."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from engines import load_engine
-from mixtures import FRAMES_MODEL, MODEL, TOLERANCE, assert_same, mixed_samples, plug
-from reference_server import Served
+from mixtures import FRAMES_MODEL, MODEL, assert_same, mixed_samples, plug
 from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
     InvalidSampleError,
+    ModelInfo,
     ModelNotFoundError,
     PreferenceSample,
     ProgressResult,
@@ -33,14 +33,12 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.frames.resize import resize_frames
-from rfm_client.transport.calls import Answer, GrpcTransport
-from rfm_client.transport.concurrency import MAX_BYTES, ConcurrencyLimiter
-from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.deadline import Deadline
+from rfm_client.frames import resize_frames
+from servers import Served
 from shelves import Shelf
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
+from transports import Answer, Connection
 
 NOBODY = "grpc://127.0.0.1:1"  # a port where nothing listens
 KINDS: dict[type, str] = {
@@ -119,7 +117,7 @@ def test_a_deadline_ends_a_call_and_no_other(served: Served, protocol: str) -> N
     full = [ProgressSample(random_trajectory(0, 40), frame_steps=16) for _ in range(64)]
     with served.client(protocol) as client, ThreadPoolExecutor(3) as pool:
         plugs = [pool.submit(client.evaluate, full) for _ in range(3)]
-        next(as_completed(plugs))  # two more are to come before what is asked now
+        next(as_completed(plugs))  # two more come before the next call
         with pytest.raises(DeadlineExceededError, match=r"no answer within 0\.05 s"):
             client.progress(random_trajectory(0, 4), timeout_s=0.05)
         for each in plugs:
@@ -138,25 +136,6 @@ def test_a_cancelled_future_disturbs_no_other(served: Served) -> None:
             future.result()
 
 
-def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> None:
-    async def ask() -> None:
-        room = ConcurrencyLimiter(10).room
-        async with room(MAX_BYTES // 2, Deadline(1)), room(MAX_BYTES // 2 - 1, Deadline(1)):
-            with pytest.raises(DeadlineExceededError):
-                async with room(2, Deadline(0.05)):
-                    pytest.fail("there was no room")
-            async with room(1, Deadline(1)):
-                pass
-        async with room(3 * MAX_BYTES, Deadline(1)):
-            with pytest.raises(DeadlineExceededError):
-                async with room(0, Deadline(0.05)):
-                    pytest.fail("there was no room")
-        async with room(MAX_BYTES, Deadline(1)):  # what was given up was given back
-            pass
-
-    asyncio.run(ask())
-
-
 def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(served: Served) -> None:
     video = ProgressSample(Trajectory(frames=np.zeros((1, 8, 8, 3), np.uint8), task="none"))
     with served.client("grpc") as client:  # MODEL has no encoders
@@ -165,7 +144,7 @@ def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(se
 
 
 def test_requests_in_flight_are_bounded(served: Served) -> None:
-    class Counting(GrpcTransport):
+    class Counting(Connection):
         now = most = 0
 
         async def infer(self, *arguments: object, **options: object) -> Answer:
@@ -176,7 +155,7 @@ def test_requests_in_flight_are_bounded(served: Served) -> None:
             finally:
                 self.now -= 1
 
-    transport = Counting(served.url("grpc"), Credentials(), shared_memory=False)
+    transport = Counting(served.url("grpc"))
     with RewardClient("", transports=[transport], model=MODEL, max_in_flight=3) as client:
         for future in [client.submit(sample) for sample in mixed_samples(30)]:
             future.result()
@@ -344,7 +323,7 @@ def test_an_async_client_tells_once_of_more_frames_than_in_training(
 
 
 class Described(Shelf):
-    """A server that counts the questions about its model. lacks_description: it answers none"""
+    """Counts the questions about the model. lacks_description: answers none"""
 
     num_described = 0
     lacks_description = False

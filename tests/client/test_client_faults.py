@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Servers that stop, hang and come back, connections that die, and memory that is shared with them."""
+"""Servers that stop, hang and come back, dying connections, and shared memory."""
 
 from __future__ import annotations
 
@@ -8,21 +8,19 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from callers import Callers, Exam, progress_of
 from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
 from mixtures import MODEL, assert_same, plug, wait_until_at_work
-from one_model import OneModelServer, answered
 from proxies import Proxy
-from reference_server import Served
 from repositories import bound_queue, configure
-from rfm.launch.triton_server import Endpoints
 from rfm_client import (
     DeadlineExceededError,
     ProgressResult,
@@ -31,7 +29,7 @@ from rfm_client import (
     RewardClient,
     ServerUnavailableError,
 )
-from rfm_serve import wait_for
+from servers import Endpoints, OneModelServer, Served, answered, wait_for
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -39,51 +37,10 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 PATIENCE_S = 60.0
 
 
-class Outcomes:
-    """What came of the calls of several threads."""
-
-    def __init__(self) -> None:
-        self._all: list[Result | Exception] = []
-        self._changed = threading.Condition()
-
-    def append(self, outcome: Result | Exception) -> None:
-        with self._changed:
-            self._all.append(outcome)
-            self._changed.notify_all()
-
-    def wait_for(self, kind: type, count: int = 20) -> None:
-        """Returns when ``count`` more of that kind have come."""
-        with self._changed:
-            start = len(self._all)
-            enough = lambda: sum(isinstance(outcome, kind) for outcome in self._all[start:]) >= count  # noqa: E731
-            assert self._changed.wait_for(enough, PATIENCE_S)
-
-    @property
-    def errors(self) -> list[Exception]:
-        return [outcome for outcome in self._all if isinstance(outcome, Exception)]
-
-
-@contextmanager
-def calling(client: RewardClient, threads: int = 2) -> Iterator[Outcomes]:
-    """Within it, threads ask without pause."""
-    outcomes = Outcomes()
-    stop = threading.Event()
-
-    def ask(seed: int) -> None:
-        while not stop.is_set():
-            try:
-                outcomes.append(client.progress(trajectory(seed)))
-            except Exception as error:  # noqa: BLE001  whatever it is, the test looks at it
-                outcomes.append(error)
-
-    with ThreadPoolExecutor(threads) as pool:
-        running = [pool.submit(ask, seed) for seed in range(threads)]
-        try:
-            yield outcomes
-        finally:
-            stop.set()
-            for thread in running:
-                thread.result()
+def calling(client: RewardClient, scores: list[np.ndarray[Any, Any]]) -> Callers:
+    """Return two threads that ask without pause. scores: of the trajectories 0 and 1"""
+    samples = [ProgressSample(trajectory(seed)) for seed in range(2)]
+    return Callers(progress_of(client), Exam(samples, scores), 2)
 
 
 def test_calls_survive_restarts_and_kills_of_servers(tmp_path: Path, repository: Path) -> None:
@@ -93,38 +50,35 @@ def test_calls_survive_restarts_and_kills_of_servers(tmp_path: Path, repository:
         first, second = (
             started.enter_context(OneModelServer(*server)) for server in zip(repositories, both, strict=True)
         )
-        outcomes: list[Outcomes] = []
-        clients: list[RewardClient] = []
+        sharing = callers.enter_context(RewardClient(both[0].grpc_url, timeout_s=PATIENCE_S, shared_memory=True))
+        scores = [sharing.progress(trajectory(number)).progress for number in range(2)]
+        shared = sharing.progress(heavy(), frame_steps=2)
+        asking: list[Callers] = []
         for protocol in ("grpc", "http"):
             urls = [url_of(endpoints, protocol) for endpoints in both]
             for servers in (urls[:1], urls):
                 client = callers.enter_context(RewardClient(servers, timeout_s=PATIENCE_S))
-                outcomes.append(callers.enter_context(calling(client)))
-                clients.append(client)
-        sharing = callers.enter_context(RewardClient(both[0].grpc_url, timeout_s=PATIENCE_S, shared_memory=True))
-        expected, shared = clients[0].progress(trajectory(0)), sharing.progress(heavy(), frame_steps=2)
+                asking.append(callers.enter_context(calling(client, scores)))
         wait_for(lambda: all(answered(endpoints) for endpoints in both))  # the load is shared
         first.stop()
         started.enter_context(OneModelServer(repositories[0], both[0]))
-        for each in outcomes:
-            each.wait_for(ProgressResult)
+        for each in asking:
+            each.wait_for_all()
         assert_same(sharing.progress(heavy(), frame_steps=2), shared)
         assert len(regions(both[0])) == 1
         second.kill()
-        for each in outcomes:
-            each.wait_for(ProgressResult)
+        for each in asking:
+            each.wait_for_all()
         started.enter_context(OneModelServer(repositories[1], both[1]))
         wait_for(lambda: answered(both[1]) > 0)  # it is asked again
-        assert [each.errors for each in outcomes] == [[]] * len(outcomes)
-        for client in clients:
-            assert_same(client.progress(trajectory(0)), expected)
+        assert [(each.lost, each.wrong) for each in asking] == [([], 0)] * len(asking)
 
 
 def test_a_server_that_hangs_costs_one_call_and_is_left_out(demo_server: Endpoints, protocol: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as hung:
         urls = [f"{protocol}://127.0.0.1:{hung.getsockname()[1]}", url_of(demo_server, protocol)]
         with RewardClient(urls, timeout_s=2) as client:
-            client.wait_ready(30)  # the one that is ready is enough
+            client.wait_ready(30)  # a single ready server is enough
             outcomes: list[Result | Exception] = []
             for _ in range(6):
                 outcomes += client.evaluate([ProgressSample(trajectory(0))], return_errors=True)
@@ -158,7 +112,7 @@ def test_a_request_that_the_server_does_not_take_goes_over_a_new_connection_with
 
 
 def test_calls_that_share_a_connection_with_one_that_hits_its_deadline_go_on(demo_server: Endpoints) -> None:
-    """Over a connection that is alive and slow: a call that has more time keeps it."""
+    """A slow connection stays open for calls with more time."""
     with Proxy(demo_server.grpc_port) as proxy, RewardClient(f"grpc://127.0.0.1:{proxy.port}") as client:
         expected = client.progress(trajectory(0))
         with proxy.held():
@@ -206,7 +160,7 @@ def test_shared_memory_changes_no_answer(demo_server: Endpoints, protocol: str) 
             for answer, plain in zip(client.evaluate(samples), expected, strict=True):
                 assert_same(answer, plain)
         assert len(regions(demo_server) - mapped) == 1  # one, used again and again
-        assert ours_in_dev_shm() == named  # its name is gone while it is in use
+        assert ours_in_dev_shm() == named  # the name is gone during use
 
 
 @pytest.mark.usefixtures("nothing_shared_is_left")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Clients that are closed, forked, or used from callbacks, and what is refused when one is made."""
+"""Clients that are closed, forked, or used from callbacks, and arguments that the constructor refuses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ import pytest
 
 from mixtures import MODEL, assert_same, plug
 from paths import ROOT
-from reference_server import Served
 from rfm_client import (
     AsyncRewardClient,
     ClientClosedError,
@@ -37,6 +36,7 @@ from rfm_client import (
     RewardError,
 )
 from rfm_rl import RewardModelWrapper
+from servers import Served
 from trajectories import random_trajectory
 
 
@@ -76,7 +76,7 @@ def test_closing_an_async_client_ends_the_calls_of_other_tasks(served: Served, p
         asked = [asyncio.create_task(client.score(sample)) for sample in plug()]
         assert await client.is_ready()
         cancelled = asked.pop()
-        if sys.version_info >= (3, 11):  # before, nobody can tell who cancelled it
+        if sys.version_info >= (3, 11):  # older versions do not tell who cancelled it
             cancelled.cancel()
         await client.close()
         if sys.version_info >= (3, 11):
@@ -108,7 +108,7 @@ os.wait()
 
 
 def test_a_fork_is_told_to_make_its_own_client_and_that_grpc_was_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GRPC_ENABLE_FORK_SUPPORT", "0")  # its handlers may crash a fork
+    monkeypatch.setenv("GRPC_ENABLE_FORK_SUPPORT", "0")  # gRPC's handlers may crash a fork
     done = subprocess.run([sys.executable, "-c", FORKING], capture_output=True, text=True, timeout=60)
     inherited, used = done.stdout.splitlines()
     assert "which forked this one: make one in each process" in inherited

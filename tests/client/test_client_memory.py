@@ -20,12 +20,12 @@ from rfm_client.contract import triton
 from rfm_client.transport.shared_memory import FOLDER, MIN_REGION_BYTES, MIN_SHARED_BYTES, SharedMemory
 
 SMALL = np.ones(MIN_SHARED_BYTES, np.uint8)
-LARGE = np.ones(MIN_REGION_BYTES + 1, np.uint8)  # more than the region of a small one holds
+LARGE = np.ones(MIN_REGION_BYTES + 1, np.uint8)  # too large for a small array's region
 WITHIN_S = 30.0
 
 
 class Triton:
-    """Maps what it is told to. failure: of registering; answers: cleared, it registers and does not answer"""
+    """Maps regions. failure: raised on registering; answers: when cleared, it registers without an answer"""
 
     def __init__(self) -> None:
         self.mapped: list[str] = []
@@ -55,7 +55,7 @@ Test = Callable[[Triton, SharedMemory], Coroutine[Any, Any, None]]
 
 
 def run(test: Test) -> None:
-    """With a server and memory that is shared with it, of which nothing is left."""
+    """With a server and shared memory, of which nothing is left."""
 
     async def within() -> None:
         server, memory = Triton(), SharedMemory("grpc://stand:1")
@@ -71,7 +71,7 @@ def run(test: Test) -> None:
 
 
 async def lend(server: Triton, memory: SharedMemory, array: np.ndarray[Any, Any] = SMALL) -> str:
-    """Name of the region that the array was in."""
+    """Return the name of the array's region."""
     async with memory.lend(server, array) as region:
         assert region is not None
         return region.name

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Servers that go over to another version, and several of which one lacks the model. Stand-ins tell what they like."""
+"""Servers that change versions, and a server without the model. All are stand-ins."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
     InferenceFailedError,
+    ModelInfo,
     ModelNotFoundError,
     ProgressResult,
+    ProgressSample,
     RewardError,
     ServerUnavailableError,
 )
-from rfm_client.contract import wire
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.transport.calls import Answer
 from trajectories import random_trajectory
+from transports import Answer, Tensors
 
 NUM_FRAMES = 4
 SEEN = random_trajectory(0, NUM_FRAMES)
@@ -36,15 +36,17 @@ class Stand:
     def __init__(self, url: str = "grpc://stand:1", error: RewardError | None = None) -> None:
         self.url = url
         self.error = error
-        self.num_ends = 0  # of its next requests: under each its connection ends
+        self.num_ends = 0  # the connection ends during the next N requests
         self.down_s = 0.0  # for so long after each end it takes no connection
-        self.is_silent = False  # it takes connections, and answers nobody
+        self.is_silent = False  # accepts connections and never answers
+        self.max_batch_size = 64
+        self.sizes: list[int] = []  # samples per answered request
         self._up_s = 0.0
         self.version = 1
         self.asked: Counter[str] = Counter()
 
     async def infer(
-        self, model: str, inputs: wire.Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+        self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
         self.asked["infer"] += 1
         if self.is_down:
@@ -55,13 +57,14 @@ class Stand:
             raise DeadlineExceededError("no answer in time")
         is_end = self.num_ends > 0
         self.num_ends -= is_end
-        await asyncio.sleep(0.01)  # all come before one of them ends
+        await asyncio.sleep(0.01)  # all come before the first ends
         if is_end:
             self.go_down(self.down_s)
             raise lost()
         if self.error is not None:
             raise self.error
-        shape = inputs[wire.NUM_FRAMES].shape[0], wire.num_positions(inputs)
+        shape = len(inputs["num_frames"]), inputs["num_frames"].sum(axis=1).max()
+        self.sizes.append(shape[0])
         tensors = {name: np.full(shape, 0.5, np.float32) for name in outputs}
         return Answer(tensors, str(self.version))
 
@@ -69,7 +72,7 @@ class Stand:
         self.asked["model_info"] += 1
         if self.error is not None:
             raise self.error
-        return ModelInfo(name=model, versions=(str(self.version),), max_batch_size=64)
+        return ModelInfo(name=model, versions=(str(self.version),), max_batch_size=self.max_batch_size)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         return self.error is None and not self.is_down
@@ -86,7 +89,7 @@ class Stand:
 
 
 def lost() -> ServerUnavailableError:
-    """What a call gets if its connection ends during it."""
+    """Return the error of a call whose connection ends."""
     error = ServerUnavailableError("Socket closed")
     error.may_have_ended_server = True
     return error
@@ -116,13 +119,40 @@ def test_what_is_known_of_a_model_is_forgotten_when_another_version_answers() ->
 
 
 def ask(stands: list[Stand], calls: int = 1, *, timeout_s: float = 4.0) -> list[object]:
-    """What comes of calls side by side."""
+    """Return the outcomes of concurrent calls."""
 
     async def outcomes() -> list[object]:
         async with AsyncRewardClient("", transports=stands, timeout_s=timeout_s) as client:
             return await asyncio.gather(*(client.progress(SEEN) for _ in range(calls)), return_exceptions=True)
 
     return asyncio.run(asyncio.wait_for(outcomes(), WITHIN_S))
+
+
+def test_a_request_has_no_more_samples_than_a_batch() -> None:
+    stand = Stand()
+    stand.max_batch_size = 3
+
+    async def evaluate() -> None:
+        async with AsyncRewardClient("", transports=[stand]) as client:
+            assert len(await client.evaluate([ProgressSample(SEEN)] * 7)) == 7
+
+    asyncio.run(asyncio.wait_for(evaluate(), WITHIN_S))
+    assert sorted(stand.sizes) == [1, 3, 3]
+
+
+def test_pauses_double_and_half_of_each_is_random(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Callers of a server that is down would come back together without chance."""
+    drawn: list[tuple[float, float]] = []
+
+    def lowest(low: float, high: float) -> float:
+        drawn.append((low, high))
+        return low
+
+    monkeypatch.setattr("random.uniform", lowest)
+    stand = Stand()
+    stand.go_down(0.3)
+    assert kinds(ask([stand])) == {ProgressResult}
+    assert drawn[:3] == [(0.05, 0.1), (0.1, 0.2), (0.2, 0.4)]
 
 
 def kinds(outcomes: list[object]) -> set[type]:

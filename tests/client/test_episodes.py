@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import httpx
 import numpy as np
@@ -21,9 +21,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import goldens
 import rfm_export
+import transports
 from engines import serve_config
 from mixtures import TOLD_S
-from reference_server import Served
 from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,
@@ -33,20 +33,18 @@ from rfm_client import (
     RewardClient,
     ServerUnavailableError,
     Trajectory,
+    UInt8Array,
 )
-from rfm_client.contract import wire
-from rfm_client.contract.samples import UInt8Array
 from rfm_client.episodes import Episode
-from rfm_client.frames.sampling import RULES, Rule, Sampling
-from rfm_client.transport.calls import Answer, GrpcTransport
-from rfm_client.transport.credentials import Credentials
-from rfm_serve import Serving, serving
+from rfm_client.frames import Rule, Sampling
+from servers import Served, Serving, serving
+from tolerances import BATCHED_VLM_TOLERANCE, TOLERANCE
+from transports import Answer, Tensors
 
 MODEL = "enc_c1_t1_disc10"
 IMAGES, VIDEO = "q3_tok_disc10", "q25_video_avg_disc10"
 TASK = "stack the cups"
 FOUR = Sampling("rint_pad", 4)
-TOLERANCE, VLM_TOLERANCE = 1e-5, 1e-4
 
 
 def video(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array:
@@ -54,7 +52,7 @@ def video(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array
 
 
 def offline(client: RewardClient, frames: UInt8Array, sampling: Sampling = FOUR, task: str = TASK) -> ProgressResult:
-    """Each frame's score from the prefix that ends with it, all pixels sent."""
+    """Return the scores of all prefixes, with all pixels sent."""
     results = client.evaluate(list(sampling.samples(Trajectory(frames=frames, task=task))))
     return sampling.joined([result for result in results if isinstance(result, ProgressResult)])
 
@@ -71,21 +69,13 @@ def assert_same(
     np.testing.assert_allclose(scores, (expected.progress, expected.success), rtol=0, atol=tolerance)
 
 
-class Recording(GrpcTransport):
-    """To the real server; notes the inputs of each request."""
-
-    def __init__(self, url: str) -> None:
-        super().__init__(url, Credentials(), shared_memory=False)
-        self.requests: list[wire.Tensors] = []
-
-    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **more: str) -> Answer:
-        self.requests.append(inputs)
-        return await super().infer(model, inputs, outputs, timeout_s, **more)
+class Recording(transports.Recording):
+    """A connection to the real server."""
 
     @property
     def digests(self) -> set[bytes]:
         """Digests of all frames in the requests."""
-        return {row.tobytes() for inputs in self.requests for row in inputs[wire.FRAME_DIGESTS].reshape(-1, 32)}
+        return {row.tobytes() for inputs in self.requests for row in inputs["frame_digests"].reshape(-1, 32)}
 
     @property
     def most_bytes(self) -> int:
@@ -104,7 +94,7 @@ def client(transport: Recording) -> Iterator[RewardClient]:
 
 
 STEPPED = [
-    *((MODEL, rule, "grpc") for rule in RULES),
+    *((MODEL, rule, "grpc") for rule in get_args(Rule)),
     *((model, rule, "http") for model in (IMAGES, VIDEO) for rule in ("rint_pad", "linspace_trunc")),
     (IMAGES, "rint_pad", "grpc"),
 ]
@@ -113,20 +103,20 @@ STEPPED = [
 @pytest.mark.parametrize(("model", "rule", "protocol"), STEPPED)
 def test_steps_have_the_scores_of_the_whole(served: Served, model: str, rule: Rule, protocol: str) -> None:
     number = None if rule == "all" or rule.startswith("rewind") else 7 if model == MODEL else 4
-    frames = video(RULES.index(rule), 16 if rule == "all" else 40, (40, 56) if model == MODEL else (56, 84))
+    frames = video(get_args(Rule).index(rule), 16 if rule == "all" else 40, (40, 56) if model == MODEL else (56, 84))
     with served.client(protocol, model) as client, client.episode(TASK, sampling=rule, frames=number) as episode:
         assert client.model_info(frames=True).by_digest
-        tolerance = TOLERANCE if model == MODEL else VLM_TOLERANCE
+        tolerance = TOLERANCE if model == MODEL else BATCHED_VLM_TOLERANCE
         assert_same(online(episode, frames), offline(client, frames, Sampling(rule, number)), tolerance)
 
 
 def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: Served) -> None:
-    """Of a model that reads videos, each new pair of frames is encoded, as a model that reads frames reads each."""
+    """A video model encodes each new pair of frames; an image model encodes each frame."""
     encoders = {MODEL: f"{MODEL}_encoder", IMAGES: f"{IMAGES}_frames", VIDEO: f"{VIDEO}_frames"}
     frames = video(100, 12, (56, 84))
 
     def encoded() -> dict[str, float]:
-        """Frames so far, by model. Each has told Triton of all by now."""
+        """Return the frames so far by model, after the models' reports."""
         time.sleep(TOLD_S)
         families = list(text_string_to_metric_families(httpx.get(served.endpoints.metrics_url).text))
         samples = [sample for family in families for sample in family.samples]
@@ -138,19 +128,19 @@ def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: S
         with RewardClient([], transports=[transport], model=model) as client, client.episode(TASK, frames=4) as episode:
             first = online(episode, frames)
             episode.reset()
-            np.testing.assert_allclose(online(episode, frames), first, rtol=0, atol=VLM_TOLERANCE)
+            np.testing.assert_allclose(online(episode, frames), first, rtol=0, atol=BATCHED_VLM_TOLERANCE)
         return transport, first
 
     before = encoded()
     firsts = {}
     for model in encoders:
         transport, firsts[model] = step(model)
-        assert [len(inputs[wire.FRAMES][0]) for inputs in transport.requests] == [1] * 2 * len(frames)
+        assert [len(inputs["frames"][0]) for inputs in transport.requests] == [1] * 2 * len(frames)
         assert transport.most_bytes < frames[0].nbytes + 512
         repeated = transport.requests[len(frames) :]
-        assert {inputs[wire.FRAMES].shape for inputs in repeated} == {(1, 1, 1, 1, 3)}  # known: not even sent
+        assert {inputs["frames"].shape for inputs in repeated} == {(1, 1, 1, 1, 3)}  # known: not even sent
     for model in encoders:  # another client sends them, and a caller of plain tensors uses the cache, too
-        np.testing.assert_allclose(step(model)[1], firsts[model], rtol=0, atol=VLM_TOLERANCE)
+        np.testing.assert_allclose(step(model)[1], firsts[model], rtol=0, atol=BATCHED_VLM_TOLERANCE)
     with served.client("http", MODEL) as plain:
         plain.progress(Trajectory(frames=frames[::-1], task=TASK))
     pairs = {tuple(pair) for t in range(12) for pair in FOUR.prefix(t).indices.reshape(-1, 2).tolist()}
@@ -175,7 +165,7 @@ class Failing(Recording):
 
     is_down = False
 
-    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **more: str) -> Answer:
+    async def infer(self, model: str, inputs: Tensors, outputs: Any, timeout_s: float, **more: str) -> Answer:
         if self.is_down:
             raise ServerUnavailableError("Connection refused")
         return await super().infer(model, inputs, outputs, timeout_s, **more)
@@ -191,7 +181,7 @@ def test_episodes_are_shared_out_among_servers_and_stay(served: Served) -> None:
         episodes = client.episodes(6, TASK, frames=4)
         added = [episodes.add(frames) for frames in videos]
         for transport in transports:
-            assert [len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests] == [2] * len(videos)
+            assert [len(inputs["num_frames"]) for inputs in transport.requests] == [2] * len(videos)
             assert transport.most_bytes < 2 * (videos[0, 0].nbytes + 512)
         first, second, third = (transport.digests for transport in transports)
         assert len(first | second | third) == len(first) + len(second) + len(third) == videos[:, :, 0, 0, 0].size
@@ -202,7 +192,7 @@ def test_episodes_are_shared_out_among_servers_and_stay(served: Served) -> None:
             transport.requests.clear()
         episodes.reset([True, True, True, False, False, False])
         episodes.add(videos[0])
-        asked = [sum(len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests) for transport in transports]
+        asked = [sum(len(inputs["num_frames"]) for inputs in transport.requests) for transport in transports]
         assert asked == [2, 2, 2]  # the new ones went to the servers with the fewest
 
 
@@ -323,7 +313,7 @@ def test_the_newest_frame_takes_the_place_of_one_that_waits(client: RewardClient
 
 
 def test_frames_stay_in_the_order_in_which_they_were_added(served: Served, client: RewardClient) -> None:
-    """Whether they are waited for or not, with a reset between them, and where somebody stops to wait for one."""
+    """With and without waiting, with a reset in between, and after a caller stops waiting."""
     frames = video(113, 5)
 
     async def play() -> tuple[list[float], list[int]]:
@@ -403,25 +393,25 @@ def test_large_frames_go_in_several_requests(transport: Recording, client: Rewar
     large = video(116, 5, (700, 700))  # 1.5 MB each
     episodes = client.episodes(5, TASK, frames=2)
     scores = episodes.add(large)
-    assert sorted(len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests) == [1, 2, 2]
+    assert sorted(len(inputs["num_frames"]) for inputs in transport.requests) == [1, 2, 2]
     expected = [offline(client, large[[index]], Sampling("rint_pad", 2)).progress[0] for index in range(5)]
     np.testing.assert_allclose(scores.progress, expected, atol=TOLERANCE)
     alike = client.episodes(5, TASK, frames=2)
-    alike.add(np.repeat(video(117, 1, (700, 700)), 5, axis=0))  # each row of a request is as long as its longest
+    alike.add(np.repeat(video(117, 1, (700, 700)), 5, axis=0))  # all rows of a request have the length of the longest
     assert transport.most_bytes < 4 * 2**20
 
 
 def test_a_request_of_very_many_frames_is_refused_before_memory_is_taken(transport: Recording) -> None:
     inputs = {
-        wire.FRAMES: np.zeros((1, 1, 1, 1, 3), np.uint8),
-        wire.FRAME_DIGESTS: np.zeros((1, 140_000, 32), np.uint8),
-        wire.NUM_FRAMES: np.array([[140_000, 0]], np.int32),
-        wire.TASK: np.array([[TASK.encode()]], np.object_),
+        "frames": np.zeros((1, 1, 1, 1, 3), np.uint8),
+        "frame_digests": np.zeros((1, 140_000, 32), np.uint8),
+        "num_frames": np.array([[140_000, 0]], np.int32),
+        "task": np.array([[TASK.encode()]], np.object_),
     }
 
     async def ask() -> None:
         try:
-            await transport.infer(f"{MODEL}_encoder", inputs, [wire.VIDEO_EMBEDDINGS], 30)
+            await transport.infer(f"{MODEL}_encoder", inputs, ["video_embeddings"], 30)
         finally:
             await transport.close()
 
@@ -487,7 +477,7 @@ def test_a_model_that_is_not_served_and_tasks_that_are_too_few_are_told(served: 
 
 @contextmanager
 def own(folder: Path, name: str, feature_cache_mib: int) -> Iterator[Serving]:
-    """An ``rfm serve`` of one model, whose process a test may kill."""
+    """An ``rfm serve`` with a model process that a test may kill."""
     config, repository = goldens.config(name), folder / "model_repository"
     export_config = replace(serve_config(config, name), feature_cache_mib=feature_cache_mib)
     rfm_export.export(config.checkpoint, repository, export_config)
@@ -513,7 +503,9 @@ def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(tmp
                 scores.append(episode.add(frames[len(scores)]))
         expected = offline(client, frames)
     assert [score.step for score in scores] == list(range(len(frames)))
-    assert_same(([score.progress for score in scores], [score.success for score in scores]), expected, VLM_TOLERANCE)
+    assert_same(
+        ([score.progress for score in scores], [score.success for score in scores]), expected, BATCHED_VLM_TOLERANCE
+    )
 
 
 @pytest.mark.slow

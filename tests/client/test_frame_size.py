@@ -10,9 +10,8 @@ import torch
 from rfm.engine.pixels import Normalisation
 from rfm.rewind.encoders import ImagePreprocessor
 from rfm.vlm.images import QwenImages, fitted_size
-from rfm_client.contract.frame_size import FrameSize
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.resize import resize_frames
+from rfm_client import FrameSize, UInt8Array
+from rfm_client.frames import resize_frames
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,7 @@ import torch
 from PIL import Image
 
 from pictures import TOP, WRIST
-from rfm_client import InvalidSampleError, Trajectory
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.inputs import as_trajectory, load_trajectory
+from rfm_client import InvalidSampleError, Trajectory, UInt8Array, as_trajectory, load_trajectory
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (4, 6, 8, 3), np.uint8)
 
@@ -263,7 +261,7 @@ def test_frames_of_files_that_are_stored_as_bgr_become_rgb(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])
 def test_exif_data_turn_pictures(tmp_path: Path, suffix: str) -> None:
-    """Also those that a caller has opened, and those with EXIF data that do not turn them."""
+    """Also opened ones, and those with EXIF data but without a turn."""
     stored = np.repeat(np.repeat(FRAMES[0], 8, axis=0), 8, axis=1)
     for orientation, upright in ((1, stored), (6, np.rot90(stored, -1))):
         exif = Image.Exif()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A video of several LeRobot episodes is not one trajectory."""
+"""A video of several LeRobot episodes is not a trajectory."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from pictures import TOP, numbered, numbers, write_video
-from rfm_client import InvalidSampleError
-from rfm_client.frames.inputs import load_trajectory
-from rfm_client.frames.video import frame_times_s, read_video
+from rfm_client import InvalidSampleError, load_trajectory
+from rfm_client.frames import frame_times_s, read_video
 
 
 def lerobot_dataset(root: Path, version: str, video: str, episodes: int) -> Path:

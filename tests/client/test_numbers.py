@@ -11,13 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rfm_client import RewardClient
-from rfm_client.contract.results import FrameScores
+from rfm_client import FrameScores, RewardClient, load_trajectory
 from rfm_client.episodes import EpisodeOptions, SuccessRule
-from rfm_client.frames.inputs import load_trajectory
-from rfm_client.frames.sampling import Sampling
-from rfm_client.frames.video import read_video
-from rfm_labels.options import LabelOptions, RayOptions
+from rfm_client.frames import Sampling, read_video
+from rfm_labels import LabelOptions, RayOptions
 from rfm_rl import RewardOptions
 
 URL = "grpc://127.0.0.1:1"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The same clip has the same curve, whichever way it is asked for, where nothing but the task is said."""
+"""By default a clip gets the same curve through every door."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import pytest
 from pyarrow import parquet
 
 from client_commands import invoke
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient, load_trajectory
-from rfm_client.frames.sampling import Sampling
+from rfm_client.frames import Sampling
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
+from servers import Endpoints
+from tolerances import TOLERANCE
 from toy_world import Task, make_clip
 from toy_world.video import write_video
 
 pytestmark = pytest.mark.triton
 
 TASK = "put the red block in the bowl"
-TOLERANCE = 1e-5
 
 
 @pytest.fixture(scope="module")

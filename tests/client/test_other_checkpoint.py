@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from coded_env import CodedEnv
-from rfm_client import InvalidSampleError, RewardClient
-from rfm_client.contract import FrameSize
+from rfm_client import FrameSize, InvalidSampleError, RewardClient
 from rfm_rl import RewardModelWrapper, RewardOptions
 from shelves import V1, V2, Shelf
 
@@ -32,7 +31,7 @@ def test_as_many_frames_are_shown_as_the_checkpoint_was_trained_on_by_now(wraps:
             episode = client.episode(TASK)
             for _ in range(5):
                 episode.add(FRAME)
-    # the fourth answer tells that another checkpoint is served
+    # the fourth answer is by another checkpoint
     assert [shape[1] for shape in shelf.shapes] == [4, 4, 4, 4, 8]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Proxies that the environment names, and addresses of this machine that are IPv6's, before a real Triton."""
+"""Proxies from the environment, and local IPv6 addresses, with a real Triton."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import pytest
 from client_commands import invoke
 from gateways import running
 from proxies import HttpProxy, Proxy
-from rfm.launch.triton_server import Endpoints
 from rfm_client import DeadlineExceededError, RewardClient
 from rfm_client.contract.proxies import grpc_proxy, open_url
-from rfm_client.transport.status import read_status
+from rfm_client.serving import read_status
+from servers import Endpoints
 
 pytestmark = pytest.mark.triton
 
@@ -108,7 +108,7 @@ EXCEPTED = {
 def test_which_proxy_grpc_takes(
     proxy: HttpProxy, monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], expected: str | None
 ) -> None:
-    """gRPC itself is asked, too: of a proxy that it takes the host is asked."""
+    """Also ask gRPC itself, which asks its proxy for the host."""
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     assert grpc_proxy("server.lab:8001") == expected

@@ -16,14 +16,13 @@ import rerun
 from PIL import Image
 
 from client_commands import TASK, invoke
-from rfm.launch.triton_server import Endpoints
-from rfm_client import FrameScores
-from rfm_client.cli.command import ExitCode
-from rfm_client.frames.inputs import load_trajectory
-from rfm_client.frames.video import frame_times_s
-from rfm_client.recording import FRAME, TIME, Recording
+from rfm_client import FrameScores, load_trajectory
+from rfm_client.command_line import ExitCode
+from rfm_client.frames import frame_times_s
+from rfm_client.recording import Recording
+from servers import Endpoints
 
-JPEG_ERROR = 30  # of a pixel, by which the compressed picture may differ
+JPEG_ERROR = 30  # largest difference after compression
 NS_PER_S = 1e9
 
 
@@ -32,7 +31,7 @@ def entities(file: Path) -> set[str]:
 
 
 def logged(file: Path, timeline: str, entity: str, component: str) -> tuple[list[Any], list[Any]]:
-    """Times and values of a component, in the order of time."""
+    """Return a component's times and values in order."""
     view = rerun.dataframe.load_recording(file).view(index=timeline, contents=entity)
     table = view.select(timeline, f"{entity}:{component}").read_all()
     times, values = table.column(0).cast("int64").to_pylist(), table.column(1).to_pylist()
@@ -59,7 +58,7 @@ def test_score_records_frames_and_curves_on_one_timeline(demo_server: Endpoints,
     frames = load_trajectory(video, fps=10).frames
     assert frames is not None
     expected_ns = np.rint(frame_times_s(video, len(frames)) * NS_PER_S)
-    times, images = logged(out, TIME, "/clip/image", "Blob")
+    times, images = logged(out, "video_time", "/clip/image", "Blob")
     np.testing.assert_allclose(times, expected_ns, atol=1)
     for image, frame in zip(images, frames, strict=True):
         shown = np.asarray(Image.open(io.BytesIO(bytes(image))))
@@ -67,10 +66,10 @@ def test_score_records_frames_and_curves_on_one_timeline(demo_server: Endpoints,
     indices = scores["clip"]["frame_indices"]
     assert len(indices) == 7
     for name in ("progress", "success"):
-        curve_times, values = logged(out, TIME, f"/clip/{name}", "Scalar")
-        assert curve_times == [times[index] for index in indices]  # the video and its curves meet
+        curve_times, values = logged(out, "video_time", f"/clip/{name}", "Scalar")
+        assert curve_times == [times[index] for index in indices]  # video and curves meet
         np.testing.assert_array_equal(values, scores["clip"][name])
-        steps, values = logged(out, FRAME, f"/seen/{name}", "Scalar")
+        steps, values = logged(out, "frame", f"/seen/{name}", "Scalar")
         assert steps == scores["seen"]["frame_indices"]
         np.testing.assert_array_equal(values, scores["seen"][name])
 
@@ -84,9 +83,9 @@ def test_a_score_that_is_not_predicted_has_no_curve_and_nothing_makes_no_file(tm
     file = tmp_path / "one.rrd"
     found = {entity for entity in entities(file) if "__" not in entity}
     assert found == {r"/a\/b/progress", r"/a\/b/image/front", "/timed/progress", "/untimed/progress"}
-    assert logged(file, TIME, "/timed/progress", "Scalar") == ([500_000_000, 1_500_000_000], [0.25, 0.5])
-    assert logged(file, TIME, "/untimed/progress", "Scalar") == ([], [])
-    assert logged(file, FRAME, "/untimed/progress", "Scalar") == ([0, 1], [0.25, 0.5])
+    assert logged(file, "video_time", "/timed/progress", "Scalar") == ([500_000_000, 1_500_000_000], [0.25, 0.5])
+    assert logged(file, "video_time", "/untimed/progress", "Scalar") == ([], [])
+    assert logged(file, "frame", "/untimed/progress", "Scalar") == ([0, 1], [0.25, 0.5])
     with Recording(tmp_path / "none.rrd"):
         pass
     assert not (tmp_path / "none.rrd").exists()

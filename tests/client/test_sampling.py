@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -15,18 +15,18 @@ import goldens
 from client_commands import MODEL, TASK, ask, assert_scores, invoke
 from every_score import assert_same_scores, every_score
 from paths import GOLDEN
-from reference_server import Served
-from rfm_client import FrameScores, ProgressResult, ProgressSample, Trajectory
-from rfm_client.frames.inputs import load_trajectory
-from rfm_client.frames.sampling import RULES, Rule, Sampling, of_prefixes, thinned
+from rfm_client import FrameScores, ProgressResult, ProgressSample, Trajectory, load_trajectory
+from rfm_client.frames import Rule, Sampling
+from rfm_client.frames.sampling import thinned
+from servers import Served
 
 VECTORS = GOLDEN / "sampling-vectors.json"
 ELSEWHERE = goldens.ROOT.parent / VECTORS.name  # beside the further reference cases, where there are some
-READINGS = {"rewind_pad16": ("rewind_pad16_online", "rewind_pad16_offline")}  # the two of one function
+READINGS = {"rewind_pad16": ("rewind_pad16_online", "rewind_pad16_offline")}  # two arguments of the same function
 
 
 def cases(file: Path) -> Iterator[tuple[Sampling, int, list[int]]]:
-    """A rule with its number of frames, the newest frame, and what the original shows of the frames up to it."""
+    """A rule with a number of frames, the newest frame, and the frames that the original picks."""
     for frames, lengths in json.loads(file.read_text()).items():
         for length, rules in lengths.items():
             for name, indices in rules.items():
@@ -55,16 +55,16 @@ def test_each_rule_shows_the_frames_that_the_original_takes(file: Path) -> None:
         if sampling.rule == "rint_pad":
             unpadded = Sampling("rint", sampling.frames).prefix(t).indices
             assert unpadded.tolist() == indices[: min(t + 1, sampling.frames or 0)], (sampling, t)
-    assert {rule for rule, _ in seen} == set(RULES) - {"all", "rint"}
+    assert {rule for rule, _ in seen} == set(get_args(Rule)) - {"all", "rint"}
     assert len(seen) == 3 * 6 + 2
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", get_args(Rule))
 def test_the_scores_of_prefixes_keep_all_that_the_model_gives(rule: Rule) -> None:
     sampling = Sampling(rule, None if rule in ("all", "rewind_pad16_online", "rewind_pad16_offline") else 3)
     prefixes = [sampling.prefix(t) for t in range(20)]
     results = [every_score(t, len(prefix.indices)) for t, prefix in enumerate(prefixes)]
-    whole = of_prefixes([ProgressResult(**vars(result), model_version="1") for result in results], sampling)
+    whole = sampling.joined([ProgressResult(**vars(result), model_version="1") for result in results])
     newest = [result.at(np.array([prefix.read])) for result, prefix in zip(results, prefixes, strict=True)]
     assert_same_scores(whole, FrameScores.joined(newest))
 

@@ -14,11 +14,10 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from coded_env import CodedEnv, Recorder
-from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.transport.calls import Answer
+from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError, UInt8Array
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
 from shelves import Shelf
+from transports import Answer
 
 TASK = "stack the cups"
 COUNT = 10
@@ -151,14 +150,14 @@ def test_the_warning_names_the_episode_and_the_camera(recorder: Recorder, caplog
 
 
 class Dim(CodedEnv):
-    """Its pictures are floats in 0..1 that became uint8."""
+    """The pictures are floats in 0..1 that became uint8."""
 
     def _drawn(self) -> UInt8Array:
         return dim(self.t, 1)
 
 
 class Dark(CodedEnv):
-    """Its pictures are black."""
+    """The pictures are black."""
 
     def _drawn(self) -> UInt8Array:
         return np.zeros((32, 32, 3), np.uint8)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from contextlib import contextmanager
 import grpc
 import numpy as np
 import pytest
+from tritonclient.grpc import service_pb2
 
 from rfm_client import (
     DeadlineExceededError,
@@ -23,11 +23,7 @@ from rfm_client import (
     ServerUnavailableError,
     Trajectory,
 )
-from rfm_client.contract.triton import error_of, invalid_sample
-from rfm_client.transport.connection import grpc_options
-from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.request_size import check_size
-from rfm_client.transport.status import read_status
+from rfm_client.serving import Credentials, read_status
 from trajectories import random_trajectory
 
 TIMEOUT_S = 1.0
@@ -94,10 +90,10 @@ MISBEHAVING: dict[str, tuple[str, Misbehaviour, type[RewardError], bool]] = {
 def test_whatever_answers_the_error_is_ours(
     protocol: str, answer: Misbehaviour, kind: type[RewardError], may_have_ended: bool
 ) -> None:
-    """Whether a server may have ended during a request over gRPC is asked of a real Triton in tests/triton."""
+    """tests/triton asks a real Triton whether a server may have ended during a request over gRPC."""
     with (
         listening(answer) as port,
-        # With retries the last try may be under way when its time is up, which is another error.
+        # With retries the last try may still run at the deadline, which is another error.
         RewardClient(f"{protocol}://127.0.0.1:{port}", timeout_s=TIMEOUT_S, retry=False) as client,
     ):
         if answer in (silent, dying):
@@ -108,7 +104,7 @@ def test_whatever_answers_the_error_is_ours(
 
 
 def test_a_redirect_is_told_and_never_followed() -> None:
-    """It would carry frames and headers to a server that nobody named."""
+    """It would carry frames and headers to an unknown server."""
     arrived: list[bytes] = []
 
     def stranger(connection: socket.socket) -> None:
@@ -148,64 +144,44 @@ def test_a_request_over_two_gib_is_refused_before_it_is_copied(protocol: str) ->
     )
 
 
-def test_what_goes_through_shared_memory_does_not_count() -> None:
-    inputs = {"frames": np.broadcast_to(np.zeros(1, np.uint8), 2**31), "task": np.array([b"lift"], np.object_)}
-    check_size(inputs, {"frames"})
-    with pytest.raises(InvalidSampleError, match=r"^frames: "):
-        check_size(inputs, set())
+def test_triton_is_told_the_time_of_a_call_in_microseconds() -> None:
+    """Triton drops later requests from a queue exported with ``queue_timeout_ms``."""
+    told_us: list[int] = []
 
+    def infer(request: service_pb2.ModelInferRequest, context: grpc.ServicerContext) -> None:
+        told_us.append(request.parameters["timeout"].int64_param)
+        context.abort(grpc.StatusCode.INVALID_ARGUMENT, "enough")
 
-@pytest.mark.parametrize(
-    ("message", "may_have_ended"),
-    [
-        ("Stream removed (Socket closed)", True),
-        ("Stream removed (recvmsg:Connection reset by peer (104))", True),
-        ("Stream removed (sendmsg: Broken pipe (32))", True),
-        ("upstream connect error or disconnect/reset before headers. reset reason: connection termination", True),
-        ("upstream connect error or disconnect/reset before headers. reset reason: remote connection failure", False),
-        (
-            "failed to connect to all addresses; last error: UNKNOWN: ipv4:10.0.0.1:8001: Connection reset by peer",
-            False,
-        ),
-        ("connections to all backends failing; last error: UNKNOWN: ipv4:10.0.0.1:1: Connection reset by peer", False),
-        ("the queue is full: 8 requests wait already", False),
-        ("Stub process 'rfm_0_0' is not healthy.", True),
-    ],
-)
-def test_which_errors_a_request_may_have_caused(message: str, may_have_ended: bool) -> None:
-    error = error_of("StatusCode.UNAVAILABLE", message, invalid_sample)
-    assert isinstance(error, ServerUnavailableError)
-    assert error.may_have_ended_server is may_have_ended
-
-
-def test_requests_are_spread_over_the_addresses_of_a_name() -> None:
-    """A list of addresses stands for the name: none of several can be had without a DNS server."""
-    counts = [0, 0]
-
-    def serve(number: int) -> grpc.Server:
-        def answer(content: bytes, _context: grpc.ServicerContext) -> bytes:
-            counts[number] += 1
-            return content
-
-        handlers = {"Echo": grpc.unary_unary_rpc_method_handler(answer)}
-        server = grpc.server(ThreadPoolExecutor(1), (grpc.method_handlers_generic_handler("test", handlers),))
-        ports.append(server.add_insecure_port("127.0.0.1:0"))
-        server.start()
-        return server
-
-    ports: list[int] = []
-    servers = [serve(number) for number in range(2)]
-    target = f"ipv4:{','.join(f'127.0.0.1:{port}' for port in ports)}"
+    handlers = {
+        "ModelInfer": grpc.unary_unary_rpc_method_handler(
+            infer, request_deserializer=service_pb2.ModelInferRequest.FromString
+        )
+    }
+    server = grpc.server(ThreadPoolExecutor(1))
+    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("inference.GRPCInferenceService", handlers)])
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
     try:
-        with grpc.insecure_channel(target, grpc_options("name:8001")) as channel:
-            echo = channel.unary_unary("/test/Echo")
-            end_s = time.monotonic() + WITHIN_S
-            while not all(counts):
-                assert echo(b"once") == b"once"
-                assert time.monotonic() < end_s
+        with RewardClient(f"grpc://127.0.0.1:{port}") as client, pytest.raises(InvalidSampleError, match="enough"):
+            client.progress(random_trajectory(0, 2), timeout_s=WITHIN_S)
     finally:
-        for server in servers:
-            server.stop(None)
+        server.stop(None)
+    (waits_us,) = told_us
+    assert 0.5 * WITHIN_S < waits_us / 1e6 <= WITHIN_S
+
+
+def test_a_second_of_silence_costs_a_connection_its_later_calls() -> None:
+    connections: list[socket.socket] = []
+
+    def dumb(connection: socket.socket) -> None:
+        connections.append(connection)
+        silent(connection)
+
+    with listening(dumb) as port, RewardClient(f"grpc://127.0.0.1:{port}", retry=False) as client:
+        for timeout_s in (1.1, 0.2):
+            with pytest.raises(DeadlineExceededError):
+                client.progress(random_trajectory(0, 2), timeout_s=timeout_s)
+        assert len(connections) == 2
 
 
 def test_a_name_that_nobody_knows_is_told() -> None:

@@ -9,9 +9,8 @@ import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
+from typing import Any
 
 import av
 import numpy as np
@@ -19,9 +18,9 @@ import pytest
 
 import clip
 from pictures import numbered, numbers, write_video
-from rfm_client import InvalidSampleError
-from rfm_client.frames.inputs import load_trajectory
-from rfm_client.frames.video import read_video
+from rfm_client import InvalidSampleError, load_trajectory
+from rfm_client.frames import read_video
+from servers import FolderRequest, web_server
 
 
 def test_a_video_is_read_whole_or_at_a_frame_rate(video: Path) -> None:
@@ -37,7 +36,7 @@ def test_memory_is_told_before_it_is_taken(video: Path) -> None:
     frame_bytes = clip.SIZE_PX**2 * 3
     told: list[int] = []
     frames = read_video(video, 1, take=told.append)
-    assert len(told) > len(frames) + 1  # at each frame that is decoded, so that what it raises ends the reading soon
+    assert len(told) > len(frames) + 1  # called for each decoded frame, so an error there ends the reading soon
     assert [size for size in told if size] == [*[frame_bytes] * len(frames), frames.nbytes]
 
     def refuse(num_bytes: int) -> None:
@@ -77,11 +76,15 @@ def test_a_sound_is_no_video(tmp_path: Path) -> None:
     assert str(refused.value) == f"video: expected a file with a video stream, got none ({tmp_path / 'sound.mp4'})"
 
 
-class FileRequest(SimpleHTTPRequestHandler):
-    """Serves the files of a folder, and notes what was asked for; ``/short/...`` ends before its end."""
+class FileRequest(FolderRequest):
+    """Serves the files of a folder and records the paths; ``/short/...`` ends early."""
 
-    def do_GET(self) -> None:
-        self.server.asked.append(self.path)  # type: ignore[attr-defined]
+    def __init__(self, asked: list[str], *connection: Any, **options: Any) -> None:
+        self.asked = asked
+        super().__init__(*connection, **options)
+
+    def do_GET(self) -> None:  # noqa: N802  the base class's name
+        self.asked.append(self.path)
         file = Path(self.directory, Path(self.path.partition("?")[0]).name)
         if not file.exists():
             self.send_error(404)
@@ -92,22 +95,13 @@ class FileRequest(SimpleHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(content[:-9] if self.path.startswith("/short/") else content)
 
-    def log_message(self, format: str, *args: object) -> None:
-        pass
-
 
 @contextmanager
 def serving(folder: Path) -> Iterator[tuple[str, list[str]]]:
-    """The URL of a server of the folder's files, and the paths that it is asked for."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(FileRequest, directory=str(folder))) as server:
-        server.asked = []  # type: ignore[attr-defined]
-        thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}", server.asked  # type: ignore[attr-defined]
-        finally:
-            server.shutdown()
-            thread.join()
+    """Serve the folder's files. Yields the URL and the requested paths."""
+    asked: list[str] = []
+    with web_server(partial(FileRequest, asked, directory=str(folder))) as url:
+        yield url, asked
 
 
 def test_a_url_is_downloaded_once_and_read_as_the_file_is(video: Path) -> None:

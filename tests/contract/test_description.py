@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from rfm_client import FrameSize, InferenceFailedError
+from rfm_client import FrameSize, InferenceFailedError, ModelInfo
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
-from rfm_client.contract.model_info import ModelInfo
 
 # A value of each field, none of them its default.
 FULL = Description(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The log of `rfm serve`, the gateway and the model processes, each written by a process of its own."""
+"""The log lines of `rfm serve`, the gateway and the model processes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from rfm_client.contract.process_log import LEVEL_VARIABLE, write_log
-from rfm_client.contract.settings import ConfigError
+from rfm_client.options import ConfigError
+from rfm_client.serving import write_log
 
 HEAD = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z"
 PROGRAM = """
@@ -48,7 +48,7 @@ with about(["a-1", "b\\n2,c"]):
 
 
 def test_a_log_that_cannot_be_written_ends_nothing() -> None:
-    """A full disk, a pipe that nobody reads, and no standard error at all."""
+    """A full disk, a pipe without a reader, and no standard error."""
     code = """
 for _ in range(1000):
     log.warning("a line")
@@ -63,6 +63,6 @@ sys.exit(7)
 
 
 def test_the_level_is_a_variable() -> None:
-    assert run('log.debug("told")', env={**os.environ, LEVEL_VARIABLE: "debug"}).stderr.endswith(": told\n")
+    assert run('log.debug("told")', env={**os.environ, "RFM_LOG_LEVEL": "debug"}).stderr.endswith(": told\n")
     with pytest.raises(ConfigError, match="RFM_LOG_LEVEL: expected one of DEBUG, INFO, WARNING, ERROR, got 'LOUD'"):
-        write_log("rfm-serve", {LEVEL_VARIABLE: "loud"})
+        write_log("rfm-serve", {"RFM_LOG_LEVEL": "loud"})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What results say: votes over success, rewards, verdicts."""
+"""Results: votes over success, rewards, verdicts."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def test_a_sample_of_a_larger_request_is_named_in_its_error() -> None:
 
 
 def test_requests_of_two_frame_sizes_are_bounded_by_what_is_sent() -> None:
-    """The longest first trajectory and the longest second one may be of two samples."""
+    """The longest first and second trajectories may belong to different samples."""
     small, large = (np.zeros((9, height, 400, 3), np.uint8) for height in (100, 400))
     counts = [(1, 9), (9, 1), (5, 5), (2, 8), (8, 2), (1, 1)]
     pairs = [[Trajectory(frames=small[:n], task="lift"), Trajectory(frames=large[:m], task="lift")] for n, m in counts]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The wire contract from both ends: what one side writes the other reads, without a server between them."""
+"""The wire contract without a server: one side writes, the other reads."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_samples_of_all_kinds_and_lengths_arrive_as_they_were(make: Any) -> None
     for got, wanted in zip(wire.decode_samples(tensors), samples, strict=True):
         assert type(got) is type(wanted)
         assert getattr(got, "frame_steps", 0) == getattr(wanted, "frame_steps", 0)
-        text = wanted.trajectories[0]  # of a pair there is one
+        text = wanted.trajectories[0]  # a pair has one
         for one, other in zip(got.trajectories, wanted.trajectories, strict=True):
             np.testing.assert_array_equal(one.positions, other.positions)
             assert one.task == text.task
@@ -119,10 +119,10 @@ def lacking(name: str, row: int, at: slice) -> wire.Tensors:
 @pytest.mark.parametrize(
     ("name", "row", "at"),
     [
-        ("progress", 0, slice(0, 2)),  # what was asked
+        ("progress", 0, slice(0, 2)),  # the requested trajectory
         ("progress", 1, slice(0, 1)),  # all of a pair's first trajectory
         ("success", 0, slice(1, 2)),  # a part
-        ("success", 1, slice(0, 2)),  # a pair's first trajectory, and a part of its second
+        ("success", 1, slice(0, 2)),  # the first trajectory of a pair, and part of the second
         ("progress", 1, slice(2, 3)),
         ("preference", 1, slice(0, 1)),
         ("similarity", 2, slice(0, 1)),
@@ -217,7 +217,7 @@ def test_named_frames_arrive_with_those_that_are_sent(num_sent: int, shape: tupl
 
 
 def request(lengths: tuple[int, int], kind: int, steps: int = 0, stray: int = 0) -> wire.Tensors:
-    """Four positions. stray: so many behind the frames are no zeros"""
+    """Return a request with four positions. stray: number of nonzero positions behind the frames"""
     return {
         "sample_type": np.array([[kind]], np.uint8),
         "num_frames": np.array([lengths], np.int32),

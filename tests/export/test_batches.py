@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A batch ends where a GPU is saturated: the export derives its size from the work of a typical sample."""
+"""The export derives the batch size that saturates a GPU from the work of a typical sample."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TEXT_2B = {"hidden_size": 2048, "intermediate_size": 6144, "num_attention_heads"
 
 
 def of_real_size(checkpoint: Any, text: Mapping[str, int] | None = None) -> Any:
-    """A small reference checkpoint with the network of Qwen3-VL-4B, or ``text`` of another; its weights are not read."""
+    """A small reference checkpoint that claims the network of Qwen3-VL-4B or ``text``. The weights are not read."""
     sizes = {part: {**checkpoint.config.backbone[part], **QWEN3_4B[part]} for part in QWEN3_4B}
     sizes["text_config"] |= text or {}
     sizes["vision_config"]["out_hidden_size"] = sizes["text_config"]["hidden_size"]

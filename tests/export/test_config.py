@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One file, its sections, the options that win over it, and what a gateway beside the server takes from it."""
+"""The configuration file: sections, options that override it, and the gateway beside the server."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from typer.testing import CliRunner, Result
 from labelling import LEROBOT
 from paths import ROOT
 from rfm.config import ExportConfig, ServeConfig
-from rfm.launch.triton_server import Endpoints
 from rfm.supervise.supervisor import GatewayProcess, Supervisor
-from rfm_client.contract.settings import ConfigError, settings_of
+from rfm_client.options import ConfigError, settings_of
 from rfm_commands import cli
 from rfm_commands.config import SECTIONS, Config
+from rfm_gateway import GatewayConfig
 from rfm_gateway.command import OPTIONS
-from rfm_gateway.config import GatewayConfig
+from servers import Endpoints
 
 REPOSITORY = ROOT / "model_repository"
 
@@ -80,7 +80,7 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path, text: str) -> None:
     assert read(tmp_path, text) == Config()
 
 
-BAD = {  # text, and what the message says behind the file's name
+BAD = {  # text, and the message after the file name
     "unknown key": ("num_gpu: 1", r"num_gpu: expected one of export, .* unknown key; perhaps num_gpus or export\.num_gpus$"),
     "unknown key of a section": ("gateway: {foo: 1}", r"gateway\.foo: expected one of gateway\.port, .*, got an unknown key$"),
     "a key of another section": ("serve: {num_gpus: 1}", r"serve\.num_gpus: .*; perhaps num_gpus or export\.num_gpus$"),

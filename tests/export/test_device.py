@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where an export is compared with its checkpoint. GPUs that this machine has not are made up."""
+"""The device on which an export is compared with the checkpoint. Missing GPUs are made up."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
-from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from captures import CalledAgain
 from engines import serve_config
+from in_process import rfm
 from labelling import LEROBOT
 from rfm import families
 from rfm.engine import Engine
 from rfm.engine.graphs import Captured, Function, Graphs
 from rfm.family import NETWORK
-from rfm_commands.cli import app
-from rfm_export.errors import ExportDiffersError
+from rfm_export import ExportDiffersError
 from rfm_export.source import device_named
 from rfm_export.verify import WORKING_ROOM, device_for, needing_room, verify_graphs
 
@@ -34,7 +33,7 @@ PLAIN = goldens.config("q3_tok_disc10")
 
 @pytest.fixture
 def free_bytes(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """What is free on each GPU."""
+    """Free bytes on each GPU."""
     free: list[float] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: bool(free))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: len(free))
@@ -86,10 +85,10 @@ def test_a_lack_of_room_is_told_in_a_line() -> None:
 def test_the_command_says_where_it_compares(tmp_path: Path) -> None:
     words = ["export", "--repository", str(tmp_path / "models"), "--checkpoint", str(LARGE.checkpoint)]
     words += ["--base-model", str(LARGE.base_model)]
-    done = CliRunner().invoke(app, [*words, "--num-gpus", "0", "--device", "cpu"])
+    done = rfm(*words, "--num-gpus", "0", "--device", "cpu")
     assert done.exit_code == 0, done.output
     assert "the export's scores are compared with the checkpoint's on cpu (--device names another one)" in done.output
-    refused = CliRunner().invoke(app, [*words, "--device", "tpu"])
+    refused = rfm(*words, "--device", "tpu")
     assert (refused.exit_code, "device: expected one of cpu" in refused.output) == (1, True)
 
 
@@ -109,7 +108,7 @@ class Failing(CalledAgain):
 
 
 def compare(capture: CalledAgain) -> tuple[Graphs, list[str]]:
-    """Compare the graphs of a reference checkpoint with its plain passes; also return what is said."""
+    """Compare a reference checkpoint's graphs with plain passes. Also return the messages."""
     checkpoint, graphs, said = families.load(PLAIN.checkpoint, **PLAIN.sources), Graphs(capture), list[str]()
     engine = Engine(checkpoint.predictor(torch.device("cpu")), graphs=graphs)
     verify_graphs(lambda: engine, checkpoint.description, said.append)
@@ -146,6 +145,6 @@ def test_a_configuration_names_graphs_only_if_they_are_on(tmp_path: Path, cuda_g
 def test_label_refuses_a_device_that_is_not_there(free_bytes: list[float]) -> None:
     assert not free_bytes  # no GPU
     words = ["label", str(LEROBOT / "toy_v21"), "--checkpoint", str(SMALL.checkpoint), "--device", "0"]
-    done = CliRunner().invoke(app, words)
+    done = rfm(*words)
     assert done.exit_code == 1
     assert "rfm: device: expected one of cpu, got 0: PyTorch " in done.stderr

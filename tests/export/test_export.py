@@ -14,18 +14,16 @@ import yaml
 from google.protobuf import text_format
 from safetensors.torch import load_file, save_file
 from tritonclient.grpc import model_config_pb2 as pb
-from typer.testing import CliRunner
 
 import goldens
 import rfm_export
-from engines import serve_config
+from engines import serve_config, training_run
+from in_process import rfm
 from paths import ROOT
 from repositories import changing, description_of, forget_input
-from rfm.checkpoint.content import CheckpointError, read_run_config
+from rfm.families import CheckpointError
 from rfm.rewind.checkpoint import RewindCheckpoint
-from rfm_client.contract import wire
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Origin
-from rfm_commands.cli import app
 from rfm_export import ExportDiffersError, ExportError
 from rfm_export.source import origin_of
 
@@ -39,7 +37,7 @@ def export(config: goldens.Config, repository: Path, **changes: Any) -> int:
 
 
 def read(repository: Path, name: str) -> pb.ModelConfig:
-    """As Triton reads it."""
+    """Parse the file like Triton."""
     return text_format.Parse((repository / name / "config.pbtxt").read_text(), pb.ModelConfig())
 
 
@@ -120,7 +118,7 @@ def test_frames_go_through_the_encoder_into_the_scorer(exported: Path) -> None:
 
 
 def test_two_instances_a_gpu_or_one_on_the_cpu(exported: Path, tmp_path: Path) -> None:
-    """Of a network over embeddings: one scores while the other reads."""
+    """Two instances of a network over embeddings: one scores while the other reads."""
     (group,) = read(exported, "rfm").instance_group
     assert (group.kind, group.count, list(group.gpus)) == (pb.ModelInstanceGroup.KIND_CPU, 1, [])
     settings = replace(serve_config(EMBEDDINGS), num_gpus=2)
@@ -159,7 +157,7 @@ def test_an_export_that_differs_from_its_checkpoint_is_not_published(
 
 
 def test_a_checkpoint_that_gives_no_numbers_is_not_published(tmp_path: Path) -> None:
-    """All of its weights are numbers; what the network makes of them is not."""
+    """All weights are numbers, but the network's output is not."""
     checkpoint = tmp_path / "checkpoint"
     shutil.copytree(EMBEDDINGS.checkpoint, checkpoint)
     file = checkpoint / "model.safetensors"
@@ -185,11 +183,11 @@ def test_a_model_keeps_its_inputs_and_outputs(tmp_path: Path) -> None:
 def test_a_model_may_gain_an_optional_input_and_lose_none(tmp_path: Path) -> None:
     export(FRAMES, tmp_path)
     for name in ("rfm_encoder", "rfm_frames"):
-        forget_input(tmp_path, name, wire.SECOND_FRAMES)
+        forget_input(tmp_path, name, "second_frames")
     assert export(FRAMES, tmp_path) == 2
-    assert wire.SECOND_FRAMES in dims(read(tmp_path, "rfm_frames").input)
+    assert "second_frames" in dims(read(tmp_path, "rfm_frames").input)
     assert export(FRAMES, tmp_path, feature_cache_mib=0) == 3
-    assert wire.FRAME_DIGESTS not in dims(read(tmp_path, "rfm_frames").input)
+    assert "frame_digests" not in dims(read(tmp_path, "rfm_frames").input)
     config = read(tmp_path, "rfm_encoder")
     config.input.add(name="third_frames", data_type=pb.TYPE_UINT8, dims=[1], optional=True)
     (tmp_path / "rfm_encoder" / "config.pbtxt").write_text(text_format.MessageToString(config))
@@ -252,7 +250,7 @@ def test_an_export_says_what_the_run_did_not_train(
     tmp_path: Path, changes: dict[str, dict[str, object]], expected: list[str]
 ) -> None:
     checkpoint = shutil.copytree(EMBEDDINGS.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
-    run = read_run_config(EMBEDDINGS.checkpoint.parent / "config.yaml")
+    run = training_run(EMBEDDINGS.checkpoint.parent / "config.yaml")
     for section, values in changes.items():
         run[section] |= values
     (checkpoint / "config.yaml").write_text(yaml.safe_dump(run))
@@ -289,11 +287,11 @@ def test_upstream_s_file_exports_whatever_its_batch_size_unless_it_names_gpus_th
     file.write_text(EVAL_CONFIG_SERVER.replace("num_gpus: 1", f"num_gpus: {there + 1}"))
     command = ["export", "--config", str(file), "--checkpoint", str(EMBEDDINGS.checkpoint)]
     command += ["--repository", str(repository)]
-    refused = CliRunner().invoke(app, command)
+    refused = rfm(*command)
     assert refused.exit_code == 1
     assert f"rfm: num_gpus: expected at most {there}, got {there + 1}; --other-machine exports" in refused.stderr
     assert not repository.exists()
-    exported = CliRunner().invoke(app, [*command, "--other-machine"])
+    exported = rfm(*command, "--other-machine")
     assert exported.exit_code == 0, exported.output
     config = read(repository, "rfm")
     assert list(config.instance_group[0].gpus) == list(range(there + 1))
@@ -301,7 +299,7 @@ def test_upstream_s_file_exports_whatever_its_batch_size_unless_it_names_gpus_th
 
 
 def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
-    """That of an ensemble is of its parts' files, one after the other."""
+    """An ensemble's digest covers the files of all parts in order."""
 
     def digest(*folders: str) -> str:
         files = (file for folder in folders for file in sorted((exported / folder).rglob("*.safetensors")))
@@ -364,7 +362,7 @@ def test_the_configuration_of_the_training_run_is_kept_without_its_secrets(tmp_p
     config, checkpoint = goldens.config("legacy_keys_l2"), tmp_path / "checkpoint"
     shutil.copytree(config.checkpoint, checkpoint)
     file = checkpoint / "config.yaml"
-    run = json.loads(json.dumps(read_run_config(file)))
+    run = json.loads(json.dumps(training_run(file)))
     secrets = "{hub_token: hf_secret, WANDB_API_KEY: secret, max_token: 5, day: 2026-01-02}"
     file.write_text(f"{file.read_text()}\nreports: {secrets}\n")
     rfm_export.export(checkpoint, tmp_path / "model_repository", serve_config(config))

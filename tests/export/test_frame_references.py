@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frame references are offered where one cache sees all frames: Triton, not the client, chooses the GPU of a request."""
+"""Frame references need a single cache for all frames, since Triton chooses the GPU of a request."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What decided each setting of a checkpoint: said, written beside it, and refused where it contradicts the run."""
+"""The source of each setting: printed, written beside the checkpoint, refused where it contradicts the run."""
 
 from __future__ import annotations
 
@@ -15,16 +15,14 @@ import pytest
 import torch
 import yaml
 from transformers import AutoTokenizer
-from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from engines import serve_config
+from in_process import rfm
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.provenance import PROVENANCE, Decision
 from rfm.config import ExportConfig
-from rfm_commands.cli import app
+from rfm.families import CheckpointError, Decision
 
 PLAIN, VIDEO, POOLED, ADAPTER = (
     "q3_tok_disc10",
@@ -52,7 +50,7 @@ def rewritten(file: Path, change: Callable[[Any], object]) -> None:
 
 @pytest.fixture
 def vlm(tmp_path: Path) -> Callable[[str], tuple[Path, Path]]:
-    """Copies of a vision-language checkpoint and of its base model, whose folder has the name that the run gives it."""
+    """Copies of a vision-language checkpoint and the base model, in a folder with the name from the run."""
 
     def copy(name: str) -> tuple[Path, Path]:
         config = goldens.config(name)
@@ -64,7 +62,7 @@ def vlm(tmp_path: Path) -> Callable[[str], tuple[Path, Path]]:
 
 
 def explained(folder: Path, base: Path | None = None) -> tuple[dict[str, Decision], list[str]]:
-    """The decisions on the checkpoint by name, and what was said of assumptions and contradictions."""
+    """Decisions by name, and the messages about assumptions and contradictions."""
     said: list[str] = []
     settings = ExportConfig(num_gpus=0, base_model=None if base is None else str(base))
     decisions = {each.name: each for each in rfm_export.explain(folder, settings, say=said.append)}
@@ -119,7 +117,7 @@ def test_the_scale_of_lora_says_its_file(vlm: Callable[[str], tuple[Path, Path]]
     assert decisions["lora"].value == {"r": 4, "lora_alpha": 8.0}
 
 
-# Of a checkpoint whose setting is read from it: the keys, and the value without them.
+# Settings from a checkpoint: the keys, and the value without them.
 KEYS: dict[str, tuple[str, list[str], object]] = {
     "dtype": (PLAIN, ["model.torch_dtype"], "bfloat16"),
     "per_frame_progress_token": (
@@ -158,7 +156,7 @@ def test_what_config_yaml_does_not_say_is_assumed_aloud(
     ("version", "source", "is_assumed"),
     [
         ("4.57.6", "config.json: transformers_version 4.57.6", False),
-        ("5.5.4", "default: no file names transformers 4", False),  # a line of its own tells
+        ("5.5.4", "default: no file names transformers 4", False),  # has a separate line
         (None, "default: no file names transformers 4", True),
     ],
 )
@@ -204,13 +202,13 @@ def test_an_export_keeps_the_table_beside_the_checkpoint_and_nothing_reads_it(tm
     settings = replace(serve_config(source), dtype="float32")
     rfm_export.export(source.checkpoint, repository, settings)
     checkpoint = repository / "rfm" / "1" / "checkpoint"
-    kept = [Decision(**row) for row in json.loads((checkpoint / PROVENANCE).read_text())]
+    kept = [Decision(**row) for row in json.loads((checkpoint / "provenance.json").read_text())]
     computed = f"float32, torch {torch.__version__}, scaled_dot_product_attention"
     told = [Decision("served_dtype", "float32", "--dtype"), Decision("computation", computed, "installed PyTorch")]
     assert kept == [*explained(source.checkpoint)[0].values(), *told]
 
     assert rfm_export.check(repository, settings) == []
-    (checkpoint / PROVENANCE).write_text("no JSON")
+    (checkpoint / "provenance.json").write_text("no JSON")
     assert rfm_export.check(repository, settings) == []  # which compares settings_digest
     assert families.load(checkpoint).config == families.load(source.checkpoint).config
 
@@ -292,7 +290,7 @@ def test_an_adapter_of_a_run_that_began_with_a_checkpoint_needs_its_base_named(
 def test_explain_prints_the_table_and_writes_nothing(tmp_path: Path) -> None:
     folder, repository = goldens.config(REWIND).checkpoint, tmp_path / "repository"
     command = ["export", "--checkpoint", str(folder), "--repository", str(repository), "--num-gpus", "0"]
-    result = CliRunner().invoke(app, [*command, "--explain"])
+    result = rfm(*command, "--explain")
     assert result.exit_code == 0, result.output
     assert [line.split()[0] for line in result.stdout.splitlines()] == [*explained(folder)[0], "computation"]
     assert not repository.exists()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an export needs of the file system, what Triton sees of a repository meanwhile, and what it loads."""
+"""File permissions for an export, the repository as Triton sees it meanwhile, and the files that Triton loads."""
 
 from __future__ import annotations
 
@@ -15,20 +15,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from commands import REPOSITORY
 from engines import serve_config
-from reference_server import Served
+from in_process import rfm
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
-from rfm_commands.cli import app
 from rfm_export import ExportError
 from rfm_export.publish import alone, read_config, staging
-from rfm_serve import model_processes, wait_for
+from servers import Served, model_processes, wait_for
 from spoilt import WEIGHTS, copied, files_in, weights
 
 PLAIN, SMALL = goldens.config("c1_t1_disc10"), goldens.config("legacy_keys_l2")
@@ -42,7 +40,7 @@ def export(repository: Path, name: str = "rfm", config: goldens.Config = SMALL, 
 
 @contextmanager
 def as_any_user(folder: Path) -> Iterator[None]:
-    """A context in which this process, in ``folder``, has the rights of a user who may not do everything."""
+    """A context in which this process, in ``folder``, has an ordinary user's rights."""
     user = os.geteuid()
     try:
         if user == 0:
@@ -62,12 +60,12 @@ def test_a_file_that_may_not_be_read_is_told(tmp_path: Path, monkeypatch: pytest
 
 
 def test_only_the_repository_must_be_writable(tmp_path: Path) -> None:
-    folder = Path(tempfile.mkdtemp(prefix="rfm-mounted-"))  # pytest's own is closed to nobody
+    folder = Path(tempfile.mkdtemp(prefix="rfm-mounted-"))  # pytest's folder is open to everybody
     repository, checkpoint = folder / "repository", shutil.copytree(SMALL.checkpoint, folder / "checkpoint")
     repository.mkdir()
     if os.geteuid() == 0:
         os.chown(repository, NOBODY, NOBODY)
-    export(tmp_path / "other")  # imports what nobody need be allowed to read
+    export(tmp_path / "other")  # imports modules that other users may not read
     try:
         with as_any_user(folder):
             assert not os.access(folder, os.W_OK, effective_ids=True)
@@ -89,7 +87,7 @@ def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path, room: int) -> N
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
     try:
         words = ["export", "--checkpoint", str(SMALL.checkpoint), "--repository", str(repository)]
-        result = CliRunner().invoke(app, words)
+        result = rfm(*words)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert files_in(tmp_path) == before
@@ -162,7 +160,7 @@ def check_loadable(repository: Path) -> None:
 def test_an_export_that_dies_at_any_moment_leaves_a_repository_that_loads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_before: int, fewest: int
 ) -> None:
-    """Between any two operations of the file system on the repository: what is there then, a kill would leave.
+    """Check the repository between any two file operations, where a kill could strike.
 
     At first those move three folders; later three versions, warm-up files and five configurations.
     """
@@ -190,7 +188,7 @@ def test_an_export_that_dies_at_any_moment_leaves_a_repository_that_loads(
 
 @pytest.mark.triton
 def test_triton_does_not_see_what_is_staged(served: Served) -> None:
-    """Nor what an export left that was killed."""
+    """Nor the remains of a killed export."""
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
         before = {entry.name for entry in api.index()}
         with staging(served.repository, ["rfm"]) as scratch:
@@ -204,7 +202,7 @@ def test_triton_does_not_see_what_is_staged(served: Served) -> None:
 
 @pytest.mark.triton
 def test_an_export_changes_no_model_of_another_name(served: Served) -> None:
-    """One that is loaded again has the processes that it had, since its files are what they were."""
+    """A model with unchanged files keeps its processes when it is loaded again."""
 
     export(served.repository, "kept")
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
@@ -221,7 +219,7 @@ def test_an_export_changes_no_model_of_another_name(served: Served) -> None:
 
 @pytest.mark.triton
 def test_weights_that_have_changed_since_their_export_are_not_served(served: Served) -> None:
-    """Those of each version are compared with its own configuration: one for all tells the newest one's."""
+    """Each version is compared with its own configuration; the shared one describes the newest."""
     export(served.repository, "changed")
     folder = served.repository / "changed" / "1" / "checkpoint"
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:

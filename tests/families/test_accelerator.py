@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Both families and the encoders on GPUs that PyTorch pretends to have: the CPU's numbers, and few waits of the host."""
+"""Both families and the encoders on pretended GPUs: the CPU's numbers, and few waits of the host."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from engines import load_engine
 from pretended import CUDA, SECOND, Seen, pretended
 from reward_models import ROOT, references
 from rfm import families
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.triton_model.placement import Placement
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Sample
 from vlm import PLAIN, assert_close, video
@@ -33,14 +32,14 @@ def engine_there(name: str, feature_cache_mib: int = 0, device: torch.device = C
     config = goldens.config(name)
     checkpoint = families.load(config.checkpoint, **config.sources)
     options = {"device": device, "dtype": torch.float32, "feature_cache_mib": feature_cache_mib}
-    with torch.inference_mode():  # what is made in it needs no views that count versions
+    with torch.inference_mode():  # tensors made in it need no version counters
         return Engine.of(checkpoint, encoders=checkpoint.encoders(), **options)
 
 
-# How often the host waits in a batch like one that was scored before: for values, and for copies to the device.
-# Of vision-language ones all scores are read at once.
+# Waits of the host in a batch like an earlier one: for values, and for copies to the device.
+# Vision-language models read all scores at once.
 WAITS = {
-    "c1_t1_disc10": (5, 11),  # progress, its logits, success, questions twice; the parts of a batch
+    "c1_t1_disc10": (5, 11),  # progress, logits, success, questions twice; the parts of a batch
     "legacy_keys_l2": (4, 11),
     "enc_c1_t1_disc10": (8, 15),
     **{config.name: (1, 0) for config in goldens.VLM},
@@ -53,7 +52,7 @@ WAITS = {
 def test_a_device_gives_the_reference_answers_and_waits_no_more_often_than_it_must(
     seen: Seen, config: goldens.Config
 ) -> None:
-    """The device is the second, which is not the current one: no tensor may lie elsewhere."""
+    """The network is on the second device, not the current one; no tensor may lie elsewhere."""
     engine = engine_there(config.name, device=SECOND)
     cases = [case for case in config.cases() if not case.is_refused]
     for case in [*cases[:1], *(case for case in cases if "mixed" in case.file.stem)]:
@@ -136,7 +135,7 @@ MIXED: list[Sample] = [
 def test_batches_that_are_collated_while_others_are_scored_have_the_cpu_s_scores(seen: Seen, name: str) -> None:
     engine = engine_there(name, feature_cache_mib=1)
     engine.token_budget = 100
-    for _ in range(2):  # the second time, what was made of frames is kept on the device
+    for _ in range(2):  # the second time, frame features are on the device
         for result, expected in zip(engine.evaluate(MIXED), load_engine(name).evaluate(MIXED), strict=True):
             assert_close(result, expected, 1e-5)
     assert seen.calls.count("Stream") == 1

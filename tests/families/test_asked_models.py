@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An ordinary Qwen3-VL that is asked in words: its language head, and what decides each of its settings."""
+"""An ordinary Qwen3-VL that answers in words: the language head, and the source of each setting."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from torch import Tensor
 import rfm_export
 from reward_models import BASE, ROOT, as_before_marks
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.provenance import Decision
 from rfm.config import ExportConfig
 from rfm.engine import Engine
+from rfm.families import CheckpointError, Decision
 from rfm_client import ProgressResult, ProgressSample, Trajectory
 
 CHECKPOINT = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
@@ -30,7 +29,7 @@ SAMPLE = ProgressSample(
     Trajectory(frames=np.random.default_rng(0).integers(0, 256, (3, 64, 96, 3), np.uint8), task="stack the cups")
 )
 HEAD, EMBEDDING, TIED = "lm_head.weight", "model.language_model.embed_tokens.weight", "tie_word_embeddings"
-STATED: dict[str, tuple[bool | None, bool | None]] = {  # in config.json and in its text_config
+STATED: dict[str, tuple[bool | None, bool | None]] = {  # in config.json and in text_config
     "both": (True, True),
     "the model's": (True, None),
     "the text model's": (False, True),
@@ -39,7 +38,7 @@ STATED: dict[str, tuple[bool | None, bool | None]] = {  # in config.json and in 
 
 
 def with_head(folder: Path, stated: tuple[bool | None, bool | None], head: Callable[[Tensor, Tensor], Tensor]) -> Path:
-    """A copy of CHECKPOINT with this ``tie_word_embeddings``; ``head``: its head from the head and the embedding."""
+    """A copy of CHECKPOINT with this ``tie_word_embeddings``. head: makes the head from head and embedding"""
     shutil.copytree(CHECKPOINT, folder, copy_function=shutil.copyfile)
     content = json.loads((folder / "config.json").read_text())
     for part, tied in zip((content, content["text_config"]), stated, strict=True):

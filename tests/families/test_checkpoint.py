@@ -12,7 +12,7 @@ import subprocess
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,19 +26,14 @@ from torch import Tensor
 import goldens
 import local_hub
 import reward_models
-from paths import ROOT
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.hub import best_tag, find
-from rfm.checkpoint.run_config import find_run_config
-from rfm.rewind.network import RewindConfig
-from rfm.vlm.network import VlmConfig
+from rfm.families import CheckpointError
 from spoilt import Spoil, conversion, convert, copied, in_json, settings, text, weights
 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
-MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # its configs say l2 and 32 bins, its weights 5 bins
+MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # the configs say l2 and 32 bins, the weights 5 bins
 IN_RUN_FOLDER = "c1_t1_disc10"  # config.yaml in the parent folder
-WITH_IMAGES = "q3_tok_disc10"  # a vision-language one: each frame an image, with a progress token
+WITH_IMAGES = "q3_tok_disc10"  # vision-language: every frame an image, with a progress token
 ADAPTER = "q25_peft_adapter_disc10"
 ENCODED = "enc_c1_t1_disc10"
 TAG = "best-p-rank-0.8500-step-123"
@@ -46,7 +41,7 @@ TAG = "best-p-rank-0.8500-step-123"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A copy of a reference checkpoint that a test may spoil."""
+    """A copy of a reference checkpoint for a test to spoil."""
     return copied(goldens.config(CONTINUOUS), tmp_path / "checkpoint")
 
 
@@ -64,7 +59,6 @@ def test_config_yaml_may_be_called_otherwise(folder: Path, place: str) -> None:
     target.parent.mkdir(exist_ok=True)
     (folder / "config.yaml").rename(target)
     assert families.load(folder).config == expected
-    assert find_run_config(folder) == target.resolve()
 
 
 OTHER_RUNS = {
@@ -93,12 +87,6 @@ def test_config_yaml_of_another_run_above_the_checkpoint_is_refused(
     assert str(refusal.value).endswith(f"; copy the run's config.yaml into {folder}, also if it is this one")
     (folder / "config.yaml").write_text(right)
     families.load(folder, base_model=str(golden.base_model))
-
-
-@pytest.mark.parametrize("config", [VlmConfig, RewindConfig])
-def test_what_decides_each_setting_is_documented(config: type[VlmConfig | RewindConfig]) -> None:
-    documented = next((ROOT / "docs").rglob("checkpoints.md")).read_text()
-    assert [field.name for field in fields(config) if f"`{field.name}`" not in documented] == []
 
 
 def assert_same(after: Any, before: Any) -> None:
@@ -165,7 +153,7 @@ def lost_shard(folder: Path) -> None:
 
 
 def in_two(weights: dict[str, Tensor], names: tuple[str, str]) -> tuple[dict[str, dict[str, Tensor]], str]:
-    """The weights of each shard, and the index."""
+    """Return the weights by shard, and the index."""
     keys = sorted(weights)
     shards = {
         name: {key: weights[key] for key in part} for name, part in zip(names, (keys[:20], keys[20:]), strict=True)
@@ -341,7 +329,7 @@ STATES = ("optimizer.pt", "scheduler.pt", "rng_state.pth", "rng_state_0.pth", "t
 
 
 def sharing_memory(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """As tied weights are; a safetensors file holds none that share."""
+    """Share memory between tensors, like tied weights; safetensors files cannot."""
     both = torch.stack([weights["first_embedding_A"], weights["first_embedding_B"]])
     return weights | {"first_embedding_A": both[0], "first_embedding_B": both[1]}
 
@@ -478,7 +466,7 @@ ASKED = {
 
 
 def first_half(folder: Path) -> None:
-    """What an unfinished download leaves: a file of its whole size, whose second half is 0."""
+    """Zero the second half of a file, as an unfinished download leaves it."""
     content = (folder / "model.safetensors").read_bytes()
     begin = 8 + int.from_bytes(content[:8], "little")
     kept = begin + (len(content) - begin) // 2
@@ -537,18 +525,6 @@ def test_yaml_constructs_nothing(folder: Path, tmp_path: Path) -> None:
     assert not mark.exists()
 
 
-TAGS = {
-    "the highest score": (["best-x-0.5-step-10", "best-x-0.75-step-5", "main"], "best-x-0.75-step-5"),
-    "the first of equals, below 0": (["best-a--0.2-step-9", "best-b--0.2-step-2", "best-c--0.9-step-2"], "best-a--0.2-step-9"),
-    "none": (["v1", "best-0.5", "best-a-1-step-2"], None),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("tags", "expected"), TAGS.values(), ids=TAGS)
-def test_the_best_tag(tags: list[str], expected: str | None) -> None:
-    assert best_tag(tags) == expected
-
-
 @pytest.mark.parametrize("source", ["nowhere", "/no/such/folder", "a/b/../c", "a/b@", ""])
 def test_what_is_neither_folder_nor_id_is_refused(source: str) -> None:
     with pytest.raises(CheckpointError, match="expected a folder that exists or a Hugging Face id"):
@@ -556,7 +532,7 @@ def test_what_is_neither_folder_nor_id_is_refused(source: str) -> None:
 
 
 def said(sources: Iterable[str]) -> dict[str, str]:
-    """The configuration in JSON, or the refusal, of each checkpoint."""
+    """Return each checkpoint's configuration as JSON, or the refusal."""
     outcomes = {}
     for source in sources:
         try:
@@ -571,12 +547,12 @@ from __future__ import annotations
 import json, sys
 from dataclasses import asdict
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 
 {inspect.getsource(said)}
 print(json.dumps(said(sys.argv[1:])))
 """
-UNTAGGED, TAGGED, WITHOUT = "org/name", f"org/other@{TAG}", "org/without"  # repositories of their own
+UNTAGGED, TAGGED, WITHOUT = "org/name", f"org/other@{TAG}", "org/without"  # separate repositories
 IN_SUBFOLDER, PICKLED, PICKLED_WITHIN = "org/runs/one/ckpt=5@v1", "org/pickled", "org/runs/pickled@v1"
 LATE, LATE_ABOVE = "org/late/one/ckpt@v1", "org/late/two/ckpt@v1"
 NOT_THERE, ABSENT, OTHER_TAG = "org/runs/none@v1", "org/absent/folder@v1", "org/name@v9"
@@ -588,7 +564,7 @@ OFFLINE = (
 
 @pytest.fixture(scope="module")
 def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What a process of its own says of checkpoints, since huggingface_hub reads its environment once; then this one,
+    """Ask a separate process about checkpoints, since huggingface_hub reads the environment once; then this process,
     which is offline, with the same cache.
 
     They are multi-image ones as upstream uploads them: the tag's commit lacks config.yaml, which main has.
@@ -631,17 +607,6 @@ def test_config_yaml_is_found_on_main_of_the_hub_s_repository(from_hub: dict[str
     expected = asdict(families.load(goldens.config(WITH_IMAGES).checkpoint).config)
     assert expected["multi_image"] and expected["per_frame_progress_token"]
     assert json.loads(from_hub[source]) == json.loads(json.dumps(expected))
-
-
-@pytest.mark.parametrize(("main", "is_found"), [("a" * 40, True), ("a" * 41, False), ("../other", False)])
-def test_main_of_the_hub_s_cache_is_a_commit(tmp_path: Path, main: str, is_found: bool) -> None:
-    snapshots = tmp_path / "snapshots"
-    for folder in (snapshots / "of-the-tag", snapshots / ("a" * 40), tmp_path / "refs"):
-        folder.mkdir(parents=True)
-    (snapshots / ("a" * 40) / "config.yaml").write_text("{}")
-    (tmp_path / "refs" / "main").write_text(main)
-    found = find_run_config(snapshots / "of-the-tag")
-    assert found == ((snapshots / ("a" * 40) / "config.yaml").resolve() if is_found else None)
 
 
 REFUSED_HUB = {
@@ -702,20 +667,19 @@ def test_a_repository_in_the_cache_is_found_offline_and_its_revision_is_said(
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     lines: list[str] = []
     commit = local_hub.commit_of(expected)
-    assert find("org/name", lines.append) == home / "snapshots" / commit
+    assert families.find("org/name", lines.append) == home / "snapshots" / commit
     used = (
         f"org/name@{expected} of the cache is used (commit {commit}), because HF_HUB_OFFLINE is set; the Hub may have a"
     )
     assert [line[: len(used)] for line in lines] == [used]
-    assert find(f"org/name@{expected}", lines.append) == home / "snapshots" / commit
+    assert families.find(f"org/name@{expected}", lines.append) == home / "snapshots" / commit
     assert len(lines) == 1
 
 
 READ_FROM_HUB = """
 import json, sys
 from rfm import families
-from rfm.checkpoint.hub import find
-folder = find("org/asked")
+folder = families.find("org/asked")
 files = sorted(str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file())
 print(json.dumps([files, families.load("org/asked", reward_model="roboreward").collator.example()]))
 """
@@ -780,7 +744,7 @@ def test_a_hub_that_does_not_answer_is_told_in_words(tmp_path: Path) -> None:
 READ_BASE = """
 import json, sys
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 told = []
 for base in ("org/base", "org/other"):
     try:

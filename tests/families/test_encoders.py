@@ -15,7 +15,7 @@ import goldens
 from engines import load_engine
 from rfm import families
 from rfm.checkpoint.content import PREPROCESSOR_CONFIG, CheckpointError
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
 from rfm_client import (
     BatchTiming,
@@ -53,7 +53,7 @@ def encoders_of(name: str) -> Encoders:
 
 
 def encoded(outcome: EncoderSample | RewardError) -> tuple[np.ndarray, np.ndarray]:
-    """The embeddings of all frames, one trajectory after the other, and of the task."""
+    """Return the embeddings of all frames in order, and of the task."""
     assert isinstance(outcome, EncoderSample), outcome
     task = outcome.trajectories[0].text_embedding
     assert task is not None
@@ -117,7 +117,7 @@ def test_a_pair_of_two_frame_sizes_is_scored_from_the_embeddings_of_each_traject
 
 
 def test_a_pair_of_one_frame_size_is_encoded_as_one_video(encoders: Encoders) -> None:
-    """To the bit, also where its frames are those of two forward passes."""
+    """Bit for bit, also where the frames take two forward passes."""
     first, second = video(1, 40, 48, 100), video(2, 40, 48, 100)
     (pair,) = encoders.encode([EncoderSample((first, second))])
     (as_one,) = encoders.encode_frames([np.concatenate([first.positions, second.positions])])
@@ -129,7 +129,7 @@ def test_a_pair_of_one_frame_size_is_encoded_as_one_video(encoders: Encoders) ->
 
 
 def refuse(model: torch.nn.Module, is_too_large: Callable[[Tensor], bool], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The CPU has no memory of a device that could run out: the model refuses what it is given in its place."""
+    """A CPU has no device memory to exhaust, so the model itself refuses large inputs."""
     forward = model.forward
 
     def refusing(*arguments: Tensor, **named: Tensor) -> Any:
@@ -151,8 +151,8 @@ def test_out_of_memory_halves_images_and_tasks_and_is_counted(
     execution.on_forward = lambda: passes.append(None)
     for outcome, other in zip(encoders.encode(videos, execution), expected, strict=True):
         assert_encoded(outcome, encoded(other))
-    assert execution.out_of_memory_count == 3 + 2  # images: 64 and its halves; tasks: all three and the last two
-    assert len(passes) == 3 + 2 + (4 + 1) + 3  # ... and what fitted: four times 16 and 11 images; each task
+    assert execution.out_of_memory_count == 3 + 2  # images: 64, then halves; tasks: all three, then the last two
+    assert len(passes) == 3 + 2 + (4 + 1) + 3  # ... and the fitting ones: four times 16 and 11 images; each task
 
 
 def test_a_video_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,7 +166,7 @@ def test_a_video_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, mon
 
 
 def test_what_the_encoders_take_is_forward_time(encoders: Encoders, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a clock that says that each of their forward passes takes an hour."""
+    """With a clock on which each forward pass takes an hour."""
     hours, seconds, execution = [0], time.perf_counter, Execution()
     monkeypatch.setattr(time, "perf_counter", lambda: seconds() + 3600 * hours[0])
 
@@ -289,7 +289,7 @@ def test_what_an_encoder_s_source_lacks_is_told_with_its_option(encoders: Encode
         checkpoint.encoders()
 
 
-# Of a picture of 4 x 4 pixels: the crop, and where the picture begins in it, or the crop in the picture where it is less.
+# For a 4 x 4 picture: the crop, and the offset of the picture in it, or of a smaller crop in the picture.
 CROPS = {
     "both smaller, evenly": ((6, 8), (1, 2)),
     "both smaller, by odd counts: more zeros behind": ((7, 5), (1, 0)),

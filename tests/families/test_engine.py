@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from paths import ROOT
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.engine.predictor import RowScores
 from rfm_client import (
     FrameScores,
@@ -109,7 +108,7 @@ class Fixed:
 
 
 def scores_of(**changed: float | None) -> FrameScores:
-    """Scores of one frame."""
+    """Return the scores of a frame."""
     values = {"progress": 0.5, "success": 0.5, **changed}
     return FrameScores(**{name: np.full(1, value, np.float32) for name, value in values.items() if value is not None})
 
@@ -128,7 +127,7 @@ NOT_FINITE = {
 
 @pytest.mark.parametrize(("sample", "row"), NOT_FINITE.values(), ids=NOT_FINITE)
 def test_a_score_that_is_not_finite_fails_its_sample_alone(sample: Sample, row: RowScores) -> None:
-    """Whichever family gives it: the engine checks what all families return."""
+    """The engine checks the scores of every family."""
     neighbour = ProgressSample(PAIR[0])
     first, bad, last = Engine(Fixed([RowScores([GOOD]), row, RowScores([GOOD])])).evaluate(
         [neighbour, sample, neighbour]
@@ -152,7 +151,7 @@ import numpy as np, torch
 from small_network import SMALL
 from trajectories import random_trajectory
 from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.rewind.predictor import RewindPredictor
 from rfm.rewind.network import RewindTransformer
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample
@@ -183,7 +182,7 @@ for outcome, other in zip(outcomes, expected, strict=True):
 
 @pytest.mark.slow
 def test_a_cpu_out_of_memory_halves_the_batch_and_fails_a_lone_sample() -> None:
-    """A process of its own, since the limit on its memory is real and lasts; what is freed there is free at once."""
+    """Runs in a separate process, since a memory limit is real and permanent."""
     environment = {**os.environ, "MALLOC_MMAP_THRESHOLD_": str(2**16), "MALLOC_ARENA_MAX": "1"}
     subprocess.run(
         [sys.executable, "-c", IN_LITTLE_MEMORY], cwd=ROOT / "tests" / "support", env=environment, check=True

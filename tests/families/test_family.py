@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Families that the product does not know, and configurations that name none."""
+"""Foreign families, and configurations without a family."""
 
 from __future__ import annotations
 
@@ -19,15 +19,13 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 import rfm_export
 import toy_family
-from one_model import BriefServer
 from paths import ROOT
 from repositories import description_of
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.launch.installation import Installation, find_installation
-from rfm.launch.triton_server import Endpoints
+from rfm.families import CheckpointError
+from rfm.launch.installation import Installation
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -38,6 +36,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
+from servers import find_installation, start_triton
 
 TESTS = ROOT / "tests" / "support"
 DEMO = ROOT / "model_repository"
@@ -53,7 +52,7 @@ def video(red: list[float]) -> Trajectory:
 
 
 def progress(red: list[float]) -> np.ndarray:
-    """What the toy checkpoint says of ``video(red)``."""
+    """Return the toy checkpoint's progress for ``video(red)``."""
     return 1 / (1 + np.exp(2 - 4 * np.round(255 * np.array(red)) / 255))
 
 
@@ -74,7 +73,7 @@ class Running:
 
 
 def with_family(installation: Installation, folder: Path) -> Installation:
-    """The server with a Python environment that has the toy family installed, besides what this one has."""
+    """A server whose Python environment also has the toy family."""
     venv.create(folder)
     (packages,) = folder.glob("lib/python*/site-packages")
     ours = sysconfig.get_path("purelib")
@@ -89,10 +88,7 @@ def running(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
     repository = shutil.copytree(DEMO, folder / "model_repository")
     rfm_export.export(checkpoint, repository, TOY, family=toy_family.__name__)
     installation = with_family(find_installation(), folder / "environment")
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), installation, log=log) as server,
-    ):
+    with start_triton(repository, installation) as server:
         yield Running(repository, server.endpoints.grpc_url)
 
 

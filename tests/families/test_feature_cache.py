@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Embeddings are made once for each frame and task, kept by what these show, and never wrong for it."""
+"""Embeddings are computed once per frame and task, cached by content, and never mixed up."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from engines import load_engine
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.engine.feature_cache import FeatureCache, get_or_make
 from rfm.family import FrameEncoders
-from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, wire
-from rfm_client.contract.samples import EncoderSample, UInt8Array
+from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, UInt8Array
+from rfm_client.contract import wire
+from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import frame_digest
 from vlm import video
 
@@ -37,7 +38,7 @@ def footage(frames: UInt8Array, task: str = TASK) -> EncoderSample:
 
 
 def named(frames: UInt8Array, sent: UInt8Array, cache: FeatureCache[Any]) -> EncoderSample:
-    """A request about frames of which only some are sent, as a model with this cache decodes it."""
+    """Return a request about frames with only some of them sent, as a model with this cache decodes it."""
     (sample,) = wire.decode_trajectories(wire.encode_refs([[*map(frame_digest, frames)]], [TASK], [*sent]), cache.found)
     return sample
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The forms of checkpoints that docs/reference/checkpoints.md lists: files as PEFT writes them, and the test of each row."""
+"""The forms of checkpoints in docs/reference/checkpoints.md: files as PEFT writes them, and a test for each row."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import torch
 
 import goldens
 from paths import GOLDEN
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 from spoilt import copied, settings, weights
 from vlm import load
 
@@ -32,7 +32,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def factors_twice(tensors: dict[str, Any]) -> None:
-    """What PEFT makes of PiSSA: the factors, and beside them those that the run began with; here the latter are 0."""
+    """Write PiSSA factors as PEFT does, beside the initial factors, which are 0 here."""
     for name in [name for name in tensors if ".lora_A." in name]:
         other = name.replace("lora_A", "lora_B")
         tensors[name] = torch.cat([tensors[name], tensors[name]])
@@ -99,7 +99,7 @@ def on_the_embedding(tensors: dict[str, Any]) -> None:
 
 
 def with_the_embedding_twice(tensors: dict[str, Any]) -> None:
-    """What PEFT writes by save_embedding_layers=True if modules_to_save names the embedding."""
+    """Write what PEFT's save_embedding_layers=True gives if modules_to_save names the embedding."""
     copies = {f"{EMBEDDING}.{name}.weight": torch.ones(9, 9) for name in ("original_module", "modules_to_save")}
     tensors.update(copies)
 
@@ -123,7 +123,7 @@ def test_lora_of_other_layers_is_refused(folder: Path, change: Callable[[dict[st
 
 
 def lost(pattern: str) -> Callable[[dict[str, Any]], None]:
-    """Takes the factors of the modules whose names match."""
+    """Remove the factors of modules with matching names."""
 
     def lose(tensors: dict[str, Any]) -> None:
         for name in [*tensors]:

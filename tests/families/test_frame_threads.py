@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frames are prepared in several threads for a GPU, each once, with the same pixels as in one thread."""
+"""Several threads prepare frames for a GPU: each once, with the same pixels as a single thread."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.rewind.encoders import Encoders
 from rfm.roboreward import prompts
 from rfm.vlm.predictor import VlmPredictor
-from rfm_client import ProgressSample
-from rfm_client.contract.samples import EncoderSample, UInt8Array
+from rfm_client import ProgressSample, UInt8Array
+from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import frame_digest
-from rfm_serve import PATIENCE_S
+from servers import PATIENCE_S
 from vlm import PLAIN, assert_close, load, video
 
 THREE = FrameThreads(3)

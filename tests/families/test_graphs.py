@@ -19,8 +19,7 @@ from engines import load_engine
 from pretended import CUDA, pretended
 from reward_models import references
 from rfm import families
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.graphs import IDLE_CALLS, MAX_GRAPHS, STEP_TOKENS, Captured, Function, Graphs
 from rfm_client import PreferenceSample, ProgressSample, Sample

@@ -17,16 +17,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from engines import serve_config
+from in_process import rfm
 from rfm import families
 from rfm.checkpoint.content import MAX_HEADER_BYTES, MAX_JSON_BYTES, CheckpointError
 from rfm.plain_yaml import MAX_YAML_BYTES
-from rfm_client.contract.settings import ConfigError
-from rfm_commands.cli import app
+from rfm_client.options import ConfigError
 from rfm_commands.config import Config
 from spoilt import WEIGHTS, Spoil, copied, files_in, settings, text, text_settings, weights
 
@@ -35,7 +34,7 @@ VLM = goldens.config("q25_mean_l2")
 ADAPTER = goldens.config("q25_peft_adapter_disc10")
 
 LONGEST_S = 30
-MOST_MEMORY_BYTES = 512 * 2**20  # beyond what the process had at its largest
+MOST_MEMORY_BYTES = 512 * 2**20  # above the process's peak
 
 
 @pytest.fixture(autouse=True)
@@ -141,7 +140,7 @@ HOSTILE: dict[str, tuple[Spoil, str]] = {
     # names
     "a shard elsewhere": (shards(a="../secret.safetensors"), r"expected names of files beside it, got '\.\./secret"),
     "a shard with a NUL": (shards(a="a\0.safetensors"), r"expected a file|not there"),
-    # what is no file
+    # not a file
     "a folder as weights": (instead(WEIGHTS, Path.mkdir), rf"{WEIGHTS}: expected a file, got a folder"),
     "a pipe as weights": (instead(WEIGHTS, os.mkfifo), rf"{WEIGHTS}: expected a file, got a pipe"),
     "a pipe as config.yaml": (instead("config.yaml", os.mkfifo), r"config\.yaml: expected a file, got a pipe"),
@@ -158,7 +157,7 @@ def refused(checkpoint: Path, repository: Path, message: str, *options: str) -> 
     """`rfm export` says one line, with exit status 1, soon, in little memory, and the repository stays as it is."""
     before, largest_kib = files_in(repository), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     arguments = ["export", "--checkpoint", str(checkpoint), "--repository", str(repository), *options]
-    result = CliRunner().invoke(app, arguments)
+    result = rfm(*arguments)
     assert result.exit_code == 1, result.output
     assert isinstance(result.exception, SystemExit)
     below_bar = result.stderr.rpartition("\r")[2].partition("\n")[2]  # of transformers 5, which loads a base model

@@ -16,14 +16,13 @@ from safetensors.torch import load_file, save_file
 
 from reward_models import BASE, ROOT, Reference, references
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
-from rfm.vlm.lerobot import LEROBOT_BACKBONE
+from rfm.families import CheckpointError
 from rfm_client import ProgressResult
 
 CASES = references("lerobot_robometer")
 CHECKPOINT = ROOT / "lerobot_robometer" / "tok_disc10" / "checkpoint"
-TOLERANCES = (1e-4, 2e-5)  # of logits and of answers, in float32; seen: 2e-6, 3e-7
+TOLERANCES = (1e-4, 2e-5)  # of logits and answers in float32; seen: 2e-6, 3e-7
 ROUNDED = 0.05  # of answers in bfloat16
 TOKENS = "model.lm_head.weight"
 
@@ -89,7 +88,7 @@ def changed(tmp_path: Path, change: Change) -> Path:
 
 
 def text_config(config: dict[str, Any]) -> dict[str, Any]:
-    text: dict[str, Any] = config[LEROBOT_BACKBONE]["text_config"]
+    text: dict[str, Any] = config["vlm_config"]["text_config"]
     return text
 
 
@@ -132,7 +131,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "half a head": (lambda _, weights: weights.pop("success_head.0.weight"), "missing keys"),
     "no embedding": (lambda _, weights: weights.pop(TOKENS), "embed_tokens"),
     "untied, without the embedding": (
-        lambda config, _: config[LEROBOT_BACKBONE].update(tie_word_embeddings=False),
+        lambda config, _: config["vlm_config"].update(tie_word_embeddings=False),
         "embed_tokens",
     ),
 }
@@ -156,7 +155,7 @@ def test_of_untied_weights_the_embedding_is_read(tmp_path: Path) -> None:
     def untie(config: dict[str, Any], weights: dict[str, torch.Tensor]) -> None:
         weights[name] = weights[TOKENS].clone()
         weights[TOKENS] = torch.zeros_like(weights[TOKENS])
-        config[LEROBOT_BACKBONE]["tie_word_embeddings"] = False
+        config["vlm_config"]["tie_word_embeddings"] = False
 
     case = next(case for case in CASES if case.config == CHECKPOINT.parent)
     engine = Engine.of(families.load(str(changed(tmp_path, untie)), base_model=str(BASE)))

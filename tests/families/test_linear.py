@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Linear layers: oneDNN's products are those of ``nn.Linear``, and training still has its gradients."""
+"""Linear layers: oneDNN's products equal those of ``nn.Linear``, and training keeps gradients."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_parts_of_a_weight_and_of_a_bias_and_views_of_an_input() -> None:
 
 
 class Operators(TorchDispatchMode):
-    """Remembers what was computed by oneDNN's own operator."""
+    """Records the calls of oneDNN's operator."""
 
     by_onednn = False
 

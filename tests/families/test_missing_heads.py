@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Checkpoints without heads, down to the first ReWiND code's, which predicts progress alone: what is there is served."""
+"""Checkpoints without some heads, such as the first ReWiND code's with progress alone, serve the others."""
 
 from __future__ import annotations
 
@@ -21,9 +21,8 @@ import rfm_export
 from engines import serve_config
 from repositories import description_of
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.provenance import Decision
 from rfm.engine import Engine
+from rfm.families import CheckpointError, Decision
 from rfm.family import Checkpoint, Options
 from rfm_client import (
     InvalidSampleError,
@@ -79,7 +78,7 @@ def test_what_is_there_is_scored_as_with_all_heads_and_the_rest_refused_alone(
 
 @pytest.mark.parametrize("name", [REWIND, VLM])
 def test_a_score_that_is_not_finite_is_still_an_error(tmp_path: Path, name: str) -> None:
-    """The value that stands for a missing head hides no fault of one that is there."""
+    """The value for a missing head hides no fault of the other heads."""
     for heads, spoilt in (((), "success_head"), (("success",), "progress_head")):
         folder = without(name, heads, tmp_path / spoilt)
         weights(lambda tensors, head=spoilt: tensors[f"{head}.4.bias"].fill_(torch.nan))(folder)
@@ -113,7 +112,7 @@ def test_a_head_that_is_missing_is_not_said_to_be_untrained(tmp_path: Path) -> N
 
 
 class FirstCode(nn.Module):
-    """The network of the first ReWiND code, as its repository describes it, of a small width."""
+    """A narrow network of the first ReWiND code, as the repository describes it."""
 
     def __init__(self, max_length: int) -> None:
         super().__init__()
@@ -138,7 +137,7 @@ class FirstCode(nn.Module):
 
 @pytest.fixture(scope="module")
 def first_code(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FirstCode]:
-    """A network of it, saved as its training script does, and converted."""
+    """A checkpoint as the first training script saves it, converted."""
     torch.manual_seed(0)
     network = FirstCode(max_length=16)
     for parameter in network.parameters():
@@ -154,7 +153,7 @@ def first_code(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FirstCod
 
 @pytest.fixture
 def run(first_code: tuple[Path, FirstCode], tmp_path: Path) -> Path:
-    """A copy of its folder, to which a test may add."""
+    """A copy of the folder, which a test may change."""
     return shutil.copytree(first_code[0], tmp_path / "run")
 
 
@@ -207,7 +206,7 @@ def test_a_checkpoint_of_the_first_rewind_code_is_exported_and_labels(run: Path,
 
 
 def test_a_checkpoint_of_the_first_rewind_code_is_causal_whatever_upstream_s_older_files_mean(run: Path) -> None:
-    """Upstream's configurations of before causal_mask, when no network of theirs had one, state all of these."""
+    """Upstream's configurations from before causal_mask state all of these."""
     fields = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len")
     config = families.load(run).config
     (run / "config.json").write_text(json.dumps({name: getattr(config, name) for name in fields}))

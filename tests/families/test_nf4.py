@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Weights that bitsandbytes rounded to NF4: the values that it makes of them, or a refusal."""
+"""Weights in bitsandbytes' NF4: the same values, or a refusal."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ import rfm_export
 from engines import load_engine, serve_config
 from few_bits import TOLERANCES, as_bytes, case, change_config, in_both_forms
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
+from rfm.families import CheckpointError
 from rfm.vlm import nf4
 from rfm_client import ProgressSample
 from vlm import PLAIN, assert_close, load, video
@@ -135,7 +135,7 @@ def test_other_types_of_bitsandbytes_are_refused_by_name(both: tuple[Path, Path]
 
 
 def test_config_json_may_say_nothing_of_nf4_but_nothing_wrong(both: tuple[Path, Path]) -> None:
-    """A trainer that saves weights alone leaves the configuration of the base model."""
+    """A trainer that saves weights alone keeps the base model's configuration."""
     few_bits, full = both
     shutil.copyfile(full / "config.json", few_bits / "config.json")
     assert "rounded_weights" in [each.name for each in load(PLAIN, few_bits).decisions()]

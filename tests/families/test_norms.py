@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The RMSNorm of GPUs gives all bits of transformers' norms, which CPUs compute."""
+"""The RMSNorm for GPUs equals transformers' norms bit for bit on the CPU."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def checkpoint(name: str) -> VlmCheckpoint:
 
 
 def with_fused_norms(network: nn.Module) -> int:
-    """Do on the CPU what ``speed_up`` does elsewhere; return the number of norms."""
+    """Apply ``speed_up``'s norms on the CPU. Return the number of norms."""
     found = [
         (module, name, child)
         for module in network.modules()
@@ -62,7 +62,7 @@ def test_the_norms_of_gpus_give_the_bits_of_transformers_norms(name: str, dtype:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 300.0], ids=str)
 def test_a_norm_of_gpus_gives_the_bits_of_transformers_norm(scale: float, dtype: torch.dtype) -> None:
-    """Values as small as epsilon's root, and as large as those of some channels of trained networks."""
+    """Return values from epsilon's root to the largest channels of trained networks."""
     network = Engine.of(checkpoint(PLAIN), dtype=dtype).predictor.network  # type: ignore[attr-defined]  # of this family
     norm = network.model.language_model.norm
     torch.manual_seed(0)

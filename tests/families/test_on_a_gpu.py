@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tests on a GPU of what else is tested with packages that a bare GPU machine lacks."""
+"""GPU tests that need only the packages of a bare GPU machine."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ import torch
 import goldens
 import rfm_export
 from engines import serve_config
-from rfm_client import Trajectory
-from rfm_client.frames.inputs import as_trajectory
+from rfm_client import Trajectory, as_trajectory
 
 CAMERA = "observation.images.top"
 FRAMES = np.random.default_rng(0).integers(0, 256, (4, 6, 8, 3), np.uint8)

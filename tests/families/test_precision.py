@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is computed as float32 is float32."""
+"""float32 products use no lower precision."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rfm.engine.layers import MKL_FUNCTIONS
 
 
 def test_the_first_calls_of_all_functions_of_mkl_are_made_by_one_thread() -> None:
-    """A wrong first call comes once in hundreds of processes, so this looks at the list, which PyTorch's header gives."""
+    """A wrong first call is rare, so this compares the list with PyTorch's header."""
     header = Path(torch.__file__).parent / "include" / "ATen" / "cpu" / "vml.h"
     named = re.findall(r"^ *IMPLEMENT_VML_MKL\((\w+),", header.read_text(), re.MULTILINE)
     assert sorted(named) == sorted(function.__name__ for function in MKL_FUNCTIONS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Settings of a base model's preprocessing: each is applied, without effect, or refused."""
+"""Preprocessing settings of a base model: applied, without effect, or refused."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 import goldens
 import reward_models
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 from spoilt import Spoil, copied, in_json, settings
 from vlm import PLAIN, load
 
@@ -23,7 +23,7 @@ VIDEO = "q25_video_avg_disc10"
 
 
 def loaded(name: str, spoil: Spoil, tmp_path: Path) -> Any:
-    """The collator of a reference checkpoint whose base model is changed."""
+    """Return a reference checkpoint's collator after a change of the base model."""
     sources = goldens.config(name).sources
     base = shutil.copytree(sources["base_model"], tmp_path / "base", copy_function=shutil.copyfile)
     spoil(base)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What holds of any input: made up by hypothesis, and made smaller where it does not hold."""
+"""Properties of any input, which hypothesis makes up and shrinks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hypothesis.extra import numpy as arrays
 
 import goldens
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 from rfm.family import Options
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
@@ -30,7 +30,7 @@ from rfm_client import InvalidSampleError
 from rfm_client.contract import wire
 from small_network import SMALL
 
-# The same examples each time: what fails here fails everywhere.
+# The same examples each time, so a failure repeats everywhere.
 THOROUGH = settings(max_examples=200, deadline=None, derandomize=True, database=None)
 SLOW = settings(
     max_examples=100, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
@@ -69,7 +69,7 @@ def requests(draw: st.DrawFn, *, frames: bool) -> dict[str, Array]:
 
 
 def told(error: InvalidSampleError) -> None:
-    """As all errors of input are told."""
+    """Like all errors of input."""
     assert ": expected " in str(error)
     assert ", got " in str(error)
     assert len(str(error)) < 1000
@@ -85,7 +85,7 @@ def test_any_request_is_samples_or_a_refusal(tensors: dict[str, Array]) -> None:
         return
     assert len(samples) == len(tensors[wire.NUM_FRAMES])
     shapes = {tuple(trajectory.positions.shape[1:] for trajectory in sample.trajectories) for sample in samples}
-    if len(shapes) == 1:  # what was taken was taken whole
+    if len(shapes) == 1:  # accepted values are kept whole
         again = wire.encode_samples(samples)
         np.testing.assert_array_equal(again[wire.NUM_FRAMES], tensors[wire.NUM_FRAMES])
         np.testing.assert_array_equal(again[wire.FRAME_STEPS], tensors[wire.FRAME_STEPS])

@@ -161,7 +161,7 @@ def test_no_mix_of_lengths_and_types_changes_a_result(config: RewindConfig, toke
 
 @pytest.mark.parametrize("lengths", [(32, 33), (33, 32), (32, 32, 32)], ids=str)
 def test_rows_of_as_many_tokens_as_a_batch_has_room_for_are_scored_as_alone(lengths: tuple[int, ...]) -> None:
-    """33 and 34 tokens lie in a batch of 68, as many as in two padded rows."""
+    """33 and 34 tokens lie in a batch of 68 tokens, like two padded rows."""
     engine = engine_of(build(replace(SMALL, use_per_frame_progress_token=False, max_len=40)))
     samples = [ProgressSample(trajectory(seed, length)) for seed, length in enumerate(lengths)]
     for sample, outcome in zip(samples, engine.evaluate(samples), strict=True):
@@ -302,7 +302,7 @@ def test_the_gpu_gives_the_numbers_of_the_cpu(config: RewindConfig) -> None:
 
 
 def test_half_precision_scores_are_near_those_of_float32() -> None:
-    """ReWiND in bfloat16, where somebody asks for it."""
+    """ReWiND in bfloat16, on request."""
     checkpoint = goldens.config("c1_t1_disc10").checkpoint
     in_float32, in_bfloat16 = (Engine.of(families.load(checkpoint), dtype=dtype) for dtype in (None, torch.bfloat16))
     samples = [ProgressSample(random_trajectory(seed, 1 + seed)) for seed in range(8)]

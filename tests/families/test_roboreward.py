@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""RoboReward: the answers of the original code, all at once, and what it refuses."""
+"""RoboReward: the original code's answers, batches, and refusals."""
 
 from __future__ import annotations
 
@@ -18,15 +18,20 @@ from PIL import Image
 
 from reward_models import Reference, references
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
+from rfm.families import CheckpointError
 from rfm.roboreward.predictor import RoboRewardPredictor, WrittenAnswer
 from rfm.roboreward.prompts import as_jpeg, is_unclear, parsed
 from rfm.vlm.qwen import ROOM
 from rfm.vlm.row import VlmRow
-from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Trajectory
-from rfm_client.contract import InferenceFailedError, InvalidSampleError
+from rfm_client import (
+    InferenceFailedError,
+    InvalidSampleError,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    Trajectory,
+)
 
 CASES = references("roboreward")
 CONFIGS = sorted({case.config for case in CASES})
@@ -239,7 +244,7 @@ def written(
 
 
 OTHER = 5  # a token that no answer has
-# The draft, and the number of its tokens that are accepted, for an answer and the token that ends it.
+# The draft, and the number of accepted tokens, for an answer and the end token.
 DRAFTS: dict[str, Callable[[list[int], int], tuple[list[int], int]]] = {
     "beginning": lambda answer, _: (answer[:3], 3),
     "whole answer": lambda answer, _: (answer, len(answer)),
@@ -276,7 +281,7 @@ def test_a_draft_changes_no_answer(settings: dict[str, Any], dtype: torch.dtype)
                 np.testing.assert_allclose(answer.digit_logits, told.digit_logits, rtol=0, atol=atol)
 
 
-NOT_FINITE_AT = {  # for each draft, after how many of its tokens, and whether the answer is lost
+NOT_FINITE_AT = {  # for each draft: number of tokens before, and whether the answer is lost
     "behind an accepted token": ("whole answer", 2, True),
     "behind a rejected token": ("wrong", 2, False),
     "behind the end": ("goes on behind the end", 6, False),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Weights of 8 and 4 bits: what they stand for, and that scores depend on nothing else."""
+"""Weights of 8 and 4 bits: scores depend on the rounded values alone."""
 
 from __future__ import annotations
 
@@ -23,13 +23,12 @@ from few_bits import rounded as in_nf4
 from pretended import CUDA, pretended
 from reward_models import ROOT
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
 from rfm.config import ExportConfig
 from rfm.engine import Engine
+from rfm.families import CheckpointError
 from rfm.vlm import nf4
 from rfm.vlm.rounded import Int8Linear, Nf4Linear, RoundedLinear, fit, rounded
-from rfm_client import ProgressSample
-from rfm_client.contract.model_info import ModelInfo
+from rfm_client import ModelInfo, ProgressSample
 from rfm_commands.engine_scorer import EngineScorer
 from rfm_export.pbtxt import parse
 from rfm_export.verify import device_for
@@ -192,7 +191,7 @@ def test_a_checkpoint_in_nf4_keeps_its_codes_and_is_labelled(tmp_path: Path, nam
 
     rfm_export.export(few_bits, tmp_path / "models", serve_config(goldens.config(name)))
     info = info_of(tmp_path / "models" / "rfm_frames")
-    assert (info.weights, info.weights_difference) == ("nf4", None)  # nobody has the weights before rounding
+    assert (info.weights, info.weights_difference) == ("nf4", None)  # the weights before rounding are unknown
 
 
 def _is_of(key: str, path: str) -> bool:

@@ -16,8 +16,7 @@ import torch
 import goldens
 from rfm import families
 from rfm.engine import Engine
-from rfm_client import ProgressResult, ProgressSample, Sample
-from rfm_client.contract.samples import Float32Array
+from rfm_client import Float32Array, ProgressResult, ProgressSample, Sample
 from vlm import BFLOAT16, video
 
 CLIP = ProgressSample(video(0, 5, 84, 112))
@@ -45,7 +44,7 @@ def progress(engine: Engine, samples: list[Sample]) -> Float32Array:
 
 @pytest.fixture(scope="module")
 def cold() -> dict[str, list[float]]:
-    """Scores of the first pass of another process, by dtype."""
+    """Return the first pass's scores of another process by dtype."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(Path(__file__).parent), *sys.path]))}
     done = subprocess.run([sys.executable, "-c", COLD], env=environment, check=True, capture_output=True, text=True)
     return dict(json.loads(done.stdout))

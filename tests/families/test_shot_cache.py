@@ -1,30 +1,28 @@
 # SPDX-License-Identifier: MIT
-"""What a vision tower makes of a shot is made once, kept by what the shot shows, and never wrong for it."""
+"""Features of a shot are computed once, cached by content, and never mixed up."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 import torch
 
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.vlm.predictor import VlmPredictor
-from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, Trajectory
+from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, Trajectory, UInt8Array
 from rfm_client.contract import wire
-from rfm_client.contract.samples import UInt8Array
 from rfm_client.contract.wire import frame_digest
-from rfm_client.frames.sampling import RULES, Rule, Sampling
+from rfm_client.frames import Rule, Sampling
+from tolerances import TOLERANCE
 from vlm import assert_close, load, video
 
 TASK = "stack the blocks"
-TOLERANCE = 1e-5
 TAKE_A_NUMBER = ("linspace_trunc", "linspace_round", "rint", "rint_pad")
 AS_VIDEO = " as video"  # no reference is a Qwen3-VL that reads videos
 MODELS = ["q3_tok_disc10", f"q3_tok_disc10{AS_VIDEO}", "q25_peft_adapter_disc10", "q25_video_avg_disc10"]
@@ -40,7 +38,7 @@ def engine(name: str, cache: FeatureCache[Any] | None = None) -> Engine:
 
 
 def of_both(name: str, cache: FeatureCache[Any] | None = None) -> tuple[Engine, Engine]:
-    """An engine with a cache, by default one that holds all, and one without."""
+    """Return an engine with a cache, by default large enough for all, and an engine without."""
     return engine(name, FeatureCache(64 * BYTES_PER_MIB) if cache is None else cache), engine(name)
 
 
@@ -60,7 +58,7 @@ def whole(frames: UInt8Array) -> ProgressSample:
 def named(
     served: Engine, frames: Sequence[UInt8Array], sent: Sequence[UInt8Array], frame_steps: int = 0
 ) -> ProgressSample:
-    """A request about frames of which only some are sent, as a model with this engine decodes it."""
+    """Return a request about frames with only some of them sent, as a model with this engine decodes it."""
     tensors = wire.encode_refs([[*map(frame_digest, frames)]], [TASK], [*sent])
     tensors[wire.FRAME_STEPS][:] = frame_steps
     assert served.cache is not None
@@ -81,13 +79,13 @@ def ask(
 
 
 def assert_scored(outcome: Any, plain: Engine, frames: UInt8Array, frame_steps: int = 0) -> None:
-    """As by an engine without a cache that is given the whole video."""
+    """The scores equal those of an engine without a cache."""
     (expected,) = plain.evaluate([ProgressSample(Trajectory(frames=frames, task=TASK), frame_steps=frame_steps)])
     assert_close(outcome, expected, TOLERANCE)
 
 
 @pytest.mark.parametrize(
-    ("name", "rule"), [*((MODELS[0], rule) for rule in RULES), *((name, "rint_pad") for name in MODELS[1:])]
+    ("name", "rule"), [*((MODELS[0], rule) for rule in get_args(Rule)), *((name, "rint_pad") for name in MODELS[1:])]
 )
 def test_an_episode_has_the_scores_of_the_whole_and_each_shot_is_encoded_once(name: str, rule: Rule) -> None:
     cached, plain = of_both(name)
@@ -159,7 +157,7 @@ def test_whole_videos_of_other_callers_fill_the_cache(name: str) -> None:
 
 
 def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames of very long videos are made smaller than those of short ones."""
+    """Frames of very long videos are downscaled more."""
     cached, plain = of_both(MODELS[3])
     frames = frames_of(6, 4, (448, 336))
     monkeypatch.setattr("rfm.vlm.images.VIDEO_TOTAL_TOKENS", 300.0)
@@ -172,7 +170,7 @@ def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> None:
-    """The last tokens of a video may stand behind all that is read."""
+    """The last tokens of a video may follow all positions that are read."""
     cache, frames = FeatureCache[Any](BYTES_PER_MIB), frames_of(12, 4)
     cached = engine(name, cache)
 
@@ -186,7 +184,7 @@ def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_a_frame_that_comes_many_times_is_brought_to_size_once(name: str) -> None:
-    """Or one large frame, named thousands of times, would take all memory."""
+    """Otherwise thousands of references to a large frame would take all memory."""
     cached, plain = of_both(name)
     frames = frames_of(13, 2)[[0, 1, 1, 0, 1, 1]]
     sample = named(cached, frames, frames[:2])
@@ -251,7 +249,7 @@ def test_frames_that_were_evicted_are_kept_again_though_all_their_shots_are_kept
 
 
 def test_what_is_kept_holds_on_to_no_request() -> None:
-    """A frame of a large request would keep all of it."""
+    """A cached view would keep a whole large request in memory."""
     cache, frames = FeatureCache[Any](BYTES_PER_MIB), frames_of(10, 3)
     ask(engine(MODELS[0], cache), frames, frames)
     kept = cache.found([frame_digest(frame) for frame in frames])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""TOPReward: the numbers of LeRobot's code and of Robometer's baseline, and what it refuses."""
+"""TOPReward: the numbers of LeRobot's code and Robometer's baseline, and refusals."""
 
 from __future__ import annotations
 
@@ -16,12 +16,17 @@ from safetensors.torch import load_file, save_file
 from paths import GOLDEN
 from reward_models import ROOT, Reference, references
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
-from rfm_client import PreferenceSample, ProgressResult, ProgressSample, SimilaritySample, Trajectory
-from rfm_client.contract import InvalidSampleError
-from rfm_client.contract.samples import UInt8Array
+from rfm.engine import Engine, Execution
+from rfm.families import CheckpointError
+from rfm_client import (
+    InvalidSampleError,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    SimilaritySample,
+    Trajectory,
+    UInt8Array,
+)
 
 FOLDER = ROOT / "topreward"
 CHECKPOINT = FOLDER / "checkpoints" / "vlm_fp32_untied"
@@ -87,7 +92,7 @@ def test_scores_are_those_of_the_original_code(case: Reference) -> None:
 
 
 def shortened(sample: ProgressSample, most: int) -> ProgressSample:
-    """The sample with the frames that Robometer's baseline picks of a longer video."""
+    """Return the sample with the frames that Robometer's baseline picks."""
     frames = sample.trajectory.positions
     if len(frames) > most:
         frames = frames[np.linspace(0, len(frames) - 1, most, dtype=int)]
@@ -126,7 +131,7 @@ def test_prefixes_share_the_vision_tower_s_work(lerobot: Engine) -> None:
     lerobot.predictor.cache.clear()
     execution, again = Execution(), Execution()
     lerobot.evaluate([progress(noise(8))], execution)
-    assert execution.num_encoded == 16  # 4 pairs, and 4 frames that fill up their pair themselves; not 72
+    assert execution.num_encoded == 16  # 4 pairs, and 4 frames that make up a pair alone; not 72
     lerobot.evaluate([progress(noise(8))], again)
     assert again.num_encoded == 0
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The toy world: clips are what their truth says."""
+"""The toy world: clips show their ground truth."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Prefixes of an episode as one tree: the scores of separate passes, fewer tokens, bounded masks."""
+"""Prefixes of an episode as a tree: scores as in separate passes, fewer tokens, bounded masks."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ import torch
 from pretended import CUDA, Seen, pretended
 from reward_models import ROOT
 from rfm import families
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.vlm import leaves, tree
 from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees
-from rfm_client import ProgressResult, ProgressSample, Trajectory
-from rfm_client.contract import InvalidSampleError, wire
+from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
+from rfm_client.contract import wire
+from tolerances import TOLERANCE
 from vlm import load
 
 CHECKPOINT = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
 TASK = "put the red block in the bowl"
-TOLERANCE, ROUNDED = 1e-5, 0.3  # the second of log-probabilities in bfloat16
+ROUNDED = 0.3  # of log-probabilities in bfloat16
 
 
 def sample(num_frames: int, height: int = 64, width: int = 64, frame_steps: int = 0) -> ProgressSample:
@@ -50,7 +50,7 @@ def values(outcomes: Any) -> list[Any]:
 def assert_as_separate(
     engine: Engine, samples: list[ProgressSample], monkeypatch: pytest.MonkeyPatch, tolerance: float = TOLERANCE
 ) -> None:
-    """The scores of trees are those of prefixes that have a row of their own, and fewer tokens give them."""
+    """A tree gives the scores of separate prefixes with fewer tokens."""
     of_trees, separate = Execution(), Execution()
     found = values(engine.evaluate(samples, of_trees))
     with monkeypatch.context() as changed:
@@ -87,7 +87,7 @@ def test_budget_and_metrics_count_the_tokens_of_a_tree() -> None:
     engine.score([prepared], execution)
     assert execution.num_tokens == prepared.num_tokens <= 7500
     assert execution.num_slots == execution.num_tokens
-    assert execution.num_encoded == 128  # 32 pairs, and 32 frames that fill up their pair themselves
+    assert execution.num_encoded == 128  # 32 pairs, and 32 frames that make up a pair alone
 
 
 MIXED = [sample(1), sample(16), sample(20, 48, 80), sample(24, 96, 64)]

@@ -21,7 +21,7 @@ PREPROCESSOR = "preprocessor_config.json"
 
 
 def published_image_encoder(folder: Path) -> None:
-    """The files of facebook/dinov2-base that decide embeddings, but for its weights."""
+    """The files of facebook/dinov2-base that decide embeddings, except the weights."""
     from transformers import Dinov2Config
 
     Dinov2Config().save_pretrained(folder)
@@ -42,7 +42,7 @@ OTHER_ENCODERS: dict[str, tuple[Any, Spoil, list[str]]] = {
     "registers": (OF_IMAGE, settings("config.json", model_type="dinov2_with_registers"), ["model_type: expected dinov2, got dinov2_with_registers"]),
     "another crop": (OF_IMAGE, settings("preprocessor_config.json", crop_size={"height": 256, "width": 256}), ["crop_px: expected [224, 224], got [256, 256]"]),
     "another brightness": (OF_IMAGE, settings("preprocessor_config.json", image_mean=[0.5, 0.456, 0.406]), ["image_mean: expected [0.485, 0.456, 0.406], got [0.5, 0.456, 0.406]"]),
-    "another width": (OF_IMAGE, settings("config.json", hidden_size=384, num_attention_heads=6), []),  # of which the weights tell
+    "another width": (OF_IMAGE, settings("config.json", hidden_size=384, num_attention_heads=6), []),  # as the weights tell
     "texts as published": (OF_TEXT, lambda _folder: None, []),
     "fewer layers": (OF_TEXT, settings("config.json", num_hidden_layers=6), ["num_hidden_layers: expected 12, got 6"]),
 }  # fmt: skip

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The two forms of a Qwen3-VL's prompt with a video: the ids of transformers' own processor, and what decides the form."""
+"""The two forms of a Qwen3-VL video prompt: token ids as transformers' processor gives them, and the choice."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ import rfm_export
 from paths import GOLDEN
 from reward_models import BASE, ROOT
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.provenance import Decision, assumed
+from rfm.checkpoint.provenance import assumed
 from rfm.config import ExportConfig
 from rfm.engine import Engine
+from rfm.families import CheckpointError, Decision
 from rfm.vlm.video_prompt import WRAPPED_SINCE, decided
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Trajectory
 
@@ -55,7 +55,7 @@ PROGRESS, PAIR = ProgressSample(trajectory(5)), PreferenceSample(trajectory(3), 
 
 @dataclass(frozen=True)
 class Case:
-    """A model, its sample, and the numbers and rate of the frames that the processor is told, of each video."""
+    """A model, a sample, and the frame numbers and rate of each video for the processor."""
 
     source: Path
     shown: tuple[list[int], ...]
@@ -93,7 +93,7 @@ class Metadata:
 
 @dataclass(frozen=True)
 class Videos:
-    """In the place of the video processor, which needs torchvision: the grid and the times of each video."""
+    """Return grid and times of each video in place of the processor, which needs torchvision."""
 
     grids: Sequence[tuple[int, int, int]]
     metadata: Sequence[Metadata]
@@ -156,7 +156,7 @@ def test_the_form_changes_scores(name: str) -> None:
     np.testing.assert_array_equal(default, bare)  # transformers 4.57.6 and 5.5.4 wrote config.json
 
 
-VERSIONS: dict[str, tuple[str | None, str, str, bool]] = {  # form and end of its source by version; True: assumed
+VERSIONS: dict[str, tuple[str | None, str, str, bool]] = {  # form and end of the source by version; True: assumed
     "4.57": ("4.57.6", "bare", "transformers_version 4.57.6", False),
     "the last before": ("5.9.0", "bare", "transformers_version 5.9.0", False),
     "the first": ("5.10.1", "wrapped", "transformers_version 5.10.1", False),
@@ -208,7 +208,7 @@ def test_an_export_keeps_its_form(tmp_path: Path, name: str) -> None:
         (decision,) = (d for d in families.load(tmp_path / form).decisions() if d.name == "video_prompt")
         assert decision == Decision("video_prompt", form, "config.json")
     settings = json.loads((tmp_path / "bare" / "config.json").read_text())["rfm"]
-    assert "video_prompt" not in settings  # as in exports of before the setting, whose digests stay the same
+    assert "video_prompt" not in settings  # as in exports before the setting, which keep the digest
     with pytest.raises(CheckpointError, match="leave it out, or export the checkpoint again"):
         families.load(tmp_path / "bare", video_prompt="wrapped")
 

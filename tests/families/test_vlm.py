@@ -15,10 +15,8 @@ import torch
 
 import goldens
 from engines import TRANSFORMERS, load_engine
-from reference_server import Served
 from rfm import families
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.engine.layers import progress_from_logits
 from rfm.vlm.backbone import QWEN_2_5
 from rfm.vlm.predictor import VlmPredictor
@@ -34,6 +32,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
+from servers import Served
 from vlm import BFLOAT16, PLAIN, assert_close, load, predictor_of, upstream_inputs, video
 
 PIXEL_TOLERANCE = 1e-6  # relative, of a sum over all pixels
@@ -96,7 +95,7 @@ def round_frequencies(network: torch.nn.Module) -> None:
 
 
 def excesses(engine: Engine, case: goldens.Case, *, bfloat16: bool, tolerances: tuple[float, float]) -> list[float]:
-    """How many times its tolerance each sample's largest difference is."""
+    """Return each sample's largest difference divided by the tolerance."""
     results = [outcome for outcome in engine.evaluate(case.samples()) if not isinstance(outcome, Exception)]
     pairs = zip(results, case.expected(bfloat16=bfloat16), strict=True)
     each = (goldens.differences(result, expected) for result, expected in pairs)
@@ -116,7 +115,7 @@ def test_bfloat16_is_the_original_s_bfloat16(case: goldens.Case) -> None:
 @pytest.mark.reference
 @pytest.mark.parametrize("case", [case for case in BFLOAT16_CASES if case.has_float32], ids=str)
 def test_a_network_in_bfloat16_holds_the_original_s_numbers(case: goldens.Case) -> None:
-    """Computed in float32, where a CPU's rounding is a thousandth of what a rounded frequency does."""
+    """In float32, where CPU rounding is a thousand times smaller than a rounded frequency's effect."""
     _, predictor = engine_in_bfloat16()
     engine = Engine(VlmPredictor(predictor.network.float(), predictor.collator, torch.device("cpu")))
     assert max(excesses(engine, case, bfloat16=False, tolerances=case.tolerances)) <= 1
@@ -157,7 +156,7 @@ def test_a_mixture_equals_its_samples_alone(name: str, token_budget: int, step: 
 
 
 def test_an_ordinary_video_over_the_token_budget_is_scored() -> None:
-    """The budget decides which samples share a forward pass, not which are scored."""
+    """The budget decides how samples share forward passes, not whether they are scored."""
     samples = [ProgressSample(video(0, 12, 280, 420)), PreferenceSample(video(1, 6, 280, 420), video(2, 7, 280, 420))]
     samples.append(ProgressSample(video(3, 5, 84, 84), frame_steps=4))
     engine = Engine(load_engine(PLAIN).predictor, token_budget=100)
@@ -186,7 +185,7 @@ TWO_SIZES: dict[str, Callable[[], VlmPredictor]] = {
 
 
 def pooled(network: Any, states: torch.Tensor) -> torch.Tensor:
-    """[D] of the states [N, D] of a frame's tokens."""
+    """Return [D] from the states [N, D] of a frame's tokens."""
     if not network.config.pools_by_attention:
         return states.mean(dim=0)
     weights = (network.frame_pool_attn(states) / network.config.pooling_temperature).softmax(dim=0)
@@ -197,9 +196,9 @@ def pooled(network: Any, states: torch.Tensor) -> torch.Tensor:
 def test_a_pair_of_two_frame_sizes_is_scored_as_transformers_reads_it(
     make: Callable[[], VlmPredictor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its own forward of the backbone, given each image or video as upstream gives it; then the heads.
+    """Run the backbone's forward with each image or video as upstream does; then the heads.
 
-    Patches are embedded by our matrix product, because the order of sums in its convolution is another.
+    Our matrix product embeds the patches, because the convolution sums in another order.
     """
     predictor = make()
     embed = predictor.network.model.visual.patch_embed
@@ -272,7 +271,7 @@ ASKED_AGAIN = {name: TWO_SIZES[name] for name in (PLAIN, "q25_video_last_l2", ON
 
 @pytest.mark.parametrize("make", ASKED_AGAIN.values(), ids=ASKED_AGAIN)
 def test_a_question_is_read_as_if_no_other_had_been_asked_before(make: Callable[[], VlmPredictor]) -> None:
-    """Questions differ in one thing each: the task, how many frames, their size, dense mode, the type, the order."""
+    """Questions differ in one property: task, number of frames, size, dense mode, type, or order."""
     one, other = video(0, 4, 56, 56), video(1, 3, 56, 84)
     questions: list[Sample] = [
         ProgressSample(one),
@@ -303,7 +302,7 @@ def test_both_frames_of_a_group_carry_its_value() -> None:
 
 @pytest.mark.parametrize("config", goldens.VLM, ids=lambda config: config.name)
 def test_a_network_that_reads_images_is_causal_and_one_that_reads_videos_is_not(config: goldens.Config) -> None:
-    """As the documents say: there is no need to score each prefix of a trajectory that is read as images."""
+    """So callers need not score each prefix of a trajectory that is read as images."""
     trajectory = video(0, 5, 56, 56)
     prefix = replace(trajectory, frames=trajectory.positions[:3])
     whole, part = load_engine(config.name).evaluate([ProgressSample(trajectory), ProgressSample(prefix)])
@@ -315,7 +314,7 @@ def test_a_network_that_reads_images_is_causal_and_one_that_reads_videos_is_not(
 
 
 def test_out_of_memory_halves_the_batch_and_fails_what_never_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The CPU has no memory of a device that could run out: the network refuses larger batches in its place."""
+    """A CPU has no device memory to exhaust, so the network itself refuses large batches."""
     engine, execution = Engine(load_engine(PLAIN).predictor), Execution()
     samples = [ProgressSample(video(seed, 2, 56, 56)) for seed in range(4)]
     expected = engine.evaluate(samples)
@@ -332,12 +331,12 @@ def test_out_of_memory_halves_the_batch_and_fails_what_never_fits(monkeypatch: p
         assert_close(result, other, MIXED_TOLERANCE)
     assert isinstance(failed, InferenceFailedError)
     assert str(failed) == "the sample does not fit in the device's memory"
-    assert execution.out_of_memory_count == 4  # 5 rows, the 3 of them, 2 with the large one, that alone
+    assert execution.out_of_memory_count == 4  # 5 rows, then 3, then 2 with the large one, then that alone
 
 
 @pytest.mark.parametrize("name", ["q3_tok_disc10", "q25_video_avg_disc10"])
 def test_dense_mode_encodes_each_shot_once(name: str) -> None:
-    """Of a video a shot is a pair of frames; 5 of its frames, 4 at a time, make the pairs that are counted here."""
+    """A shot of a video is a pair of frames. 5 frames, 4 at a time, make the pairs below."""
     frames = np.random.default_rng(0).integers(0, 256, (5, 56, 84, 3), np.uint8)
     engine, execution = load_engine(name), Execution()
     (result,) = engine.evaluate([ProgressSample(Trajectory(frames=frames, task="stack"), frame_steps=4)], execution)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Vision-language checkpoints: what decides each setting, and what is refused."""
+"""Vision-language checkpoints: the source of each setting, and refusals."""
 
 from __future__ import annotations
 
@@ -21,9 +21,8 @@ import spoilt
 from engines import load_engine, serve_config
 from repositories import description_of
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
-from rfm.vlm.checkpoint import VlmCheckpoint
+from rfm.families import CheckpointError
 from rfm_client import ProgressSample, Result, RewardError
 from spoilt import Spoil, in_json, settings, text, text_settings, weights
 from vlm import PLAIN, assert_close, load, video
@@ -73,7 +72,6 @@ def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
     original = load(LORA_INSIDE)
     original.save(tmp_path / "saved")
     copy = families.load(tmp_path / "saved")
-    assert isinstance(copy, VlmCheckpoint)
     assert copy.config == original.config
     assert original.factors
     for got, wanted in ((copy.weights, original.weights), (copy.factors, original.factors)):
@@ -137,7 +135,7 @@ def rename(
 
 
 def beside_its_adapter(folder: Path) -> None:
-    """What upstream writes of a LoRA run since its pull request 25."""
+    """Write a LoRA run as upstream does since pull request 25."""
     tensors = load_file(folder / "model.safetensors")
     adapter = {
         f"base_model.model.{name.split('.base_model.model.')[1].replace('.default.', '.')}": tensor
@@ -197,7 +195,7 @@ def drop_first(part: str) -> Callable[[dict[str, Any]], object]:
 
 
 def cut_first(part: str) -> Callable[[dict[str, Any]], object]:
-    """Takes the last column of the first tensor whose name has ``part``."""
+    """Remove the last column of the first tensor with ``part`` in the name."""
 
     def cut(weights: dict[str, Any]) -> None:
         name = next(name for name in weights if part in name)

@@ -20,8 +20,7 @@ from transformers.models.qwen2_5_vl.configuration_qwen2_5_vl import Qwen2_5_VLVi
 import goldens
 from engines import TRANSFORMERS, load_engine
 from rfm import families
-from rfm.engine import Engine
-from rfm.engine.execution import Execution
+from rfm.engine import Engine, Execution
 from rfm.engine.pixels import Normalisation
 from rfm.vlm.backbone import QWEN_2_5
 from rfm.vlm.collator import VlmCollator
@@ -71,7 +70,7 @@ def test_shots_of_one_size_are_one_call_of_attention(name: str, monkeypatch: pyt
 
 @pytest.mark.parametrize("name", QWEN)
 def test_patches_are_embedded_without_a_convolution(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some versions of cuDNN compute the tower's Conv3d wrong in bfloat16; a matrix product gives its values."""
+    """Some versions of cuDNN compute the tower's Conv3d wrong in bfloat16; a matrix product is right."""
     predictor = predictor_of(name)
     batch = predictor.collate(predictor.rows(ProgressSample(video(0, 2, 84, 112)))).to(
         torch.device("cpu"), torch.float32
@@ -122,7 +121,7 @@ def test_a_gpu_gives_the_cpu_s_numbers_in_float32(name: str) -> None:
 
 @pytest.mark.gpu
 def test_the_host_waits_for_a_gpu_once_a_batch() -> None:
-    """PyTorch itself tells of each time that the host waits; to read the scores, it must."""
+    """PyTorch reports each wait of the host. Only reading the scores may wait."""
     config = goldens.config(BFLOAT16)
     engine = Engine.of(families.load(config.checkpoint, **config.sources), device="cuda")
     samples: list[Sample] = [ProgressSample(video(seed, 5, 84, 112)) for seed in range(3)]
@@ -139,7 +138,7 @@ def test_the_host_waits_for_a_gpu_once_a_batch() -> None:
 
 
 # Worked out by hand from qwen-vl-utils' rules: longest side 480 px, multiples of 56 px, then multiples of 28 px within
-# 128 to 768 tokens a frame, of which all pairs of frames together have 115,200; at least 1.05 times 128 stay allowed.
+# 128 to 768 tokens a frame, and 115,200 for all pairs of frames; at least 1.05 times 128 stay allowed.
 VIDEO_SIZES = {
     "a short video keeps its size": (2, (448, 336), [], (448, 336)),
     "a long side is scaled down first": (2, (540, 960), [(270, 480), (280, 504)], (280, 504)),

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from gateway_requests import filmed, progress
-from rfm_client import AsyncRewardClient, InferenceFailedError
-from rfm_client.contract.model_info import ModelInfo
-from rfm_gateway.body import Batch, BodyLimits
-from rfm_gateway.config import MIB, GatewayConfig
+from rfm_client import AsyncRewardClient, InferenceFailedError, ModelInfo
+from rfm_gateway import GatewayConfig
+from rfm_gateway.body import Batch
+from rfm_gateway.config import MIB
+from rfm_gateway.mounting import BodyLimits
 from rfm_gateway.schema import SAMPLES
 from rfm_gateway.scoring import Evaluator
 from rfm_gateway.state import TritonState

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the gateway refuses before it asks Triton: keys, origins, and bodies that are no samples. No Triton is needed."""
+"""The gateway refuses wrong keys, origins and bodies before it asks Triton. No Triton is needed."""
 
 from __future__ import annotations
 

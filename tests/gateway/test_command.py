@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The command that runs a gateway: its options, its key, and what it tells when it starts. No Triton is needed."""
+"""The gateway command: options, the key, and the first lines. No Triton is needed."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from gateways import inside, running
-from rfm.launch.triton_server import Endpoints
+from in_process import rfm
 from rfm_client.contract.process_log import LogLines
-from rfm_commands.cli import app
+from rfm_gateway import GatewayConfig
 from rfm_gateway.command import page_link
-from rfm_gateway.config import GatewayConfig
 from rfm_gateway.state import TritonState
+from servers import Endpoints
 
 KEY = "open sesame"
 
@@ -60,7 +59,7 @@ BAD_OPTIONS = {
 @pytest.mark.parametrize(("options", "message"), BAD_OPTIONS.items())
 def test_wrong_options_are_refused(options: str, message: str) -> None:
     given = ["gateway", "--triton", "grpc://localhost:1", *options.split()]
-    result = CliRunner().invoke(app, given, env={"COLUMNS": "200"})
+    result = rfm(*given, env={"COLUMNS": "200"})
     assert result.exit_code == 2
     assert message in result.output
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which hosts and which pages the gateway answers. No Triton is needed."""
+"""The gateway answers known hosts and pages alone. No Triton is needed."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import pytest
 
 from gateway_requests import FIRST, dumped, failure, progress
 from gateways import TestClient, inside, running
-from rfm.launch.triton_server import Endpoints
-from rfm_client.contract.settings import ConfigError
 from rfm_client.episodes import StepScore
-from rfm_gateway.config import GatewayConfig
+from rfm_client.options import ConfigError
+from rfm_gateway import GatewayConfig
 from rfm_rl import LiveView
+from servers import Endpoints
 from shown_datasets import copied
 
 SAMPLE, KEY, LAB = dumped(progress(FIRST)), "open sesame", "http://lab.example"
@@ -137,7 +137,7 @@ def test_refused_evaluations_are_counted_and_have_their_id(reason: str, headers:
 @pytest.mark.parametrize("headers", OF_OURS.values(), ids=OF_OURS)
 def test_the_page_and_programs_are_answered(gateway: TestClient, headers: dict[str, str]) -> None:
     for path in POSTS:
-        assert gateway.post(path, content=b"", headers=headers).status_code in (415, 422)  # as a wrong body is
+        assert gateway.post(path, content=b"", headers=headers).status_code in (415, 422)  # like a wrong body
     for path in GETS:
         assert gateway.get(path, headers=headers).status_code == 200
 

@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Pages of other origins in Chromium, which try to read from a gateway and to use it: by its address, and by a name of
-their own that leads to it. No Triton is needed.
+"""Pages of other origins in Chromium, which try to use a gateway by address and by a rebound name.
+No Triton is needed.
 """
 
 from __future__ import annotations
 
-import functools
-import threading
 from collections.abc import Iterator
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,9 +13,9 @@ import pytest
 from browsers import REBOUND, Browser
 from gateway_requests import Json
 from gateways import Gateway, poll, running
-from rfm.launch.triton_server import Endpoints
 from rfm_client.episodes import StepScore
 from rfm_rl import LiveView
+from servers import Endpoints, folder_server
 from shown_datasets import copied
 
 pytestmark = pytest.mark.slow
@@ -51,11 +47,6 @@ const shown = (element) => new Promise((resolve) => {
 """
 
 
-class _Page(SimpleHTTPRequestHandler):
-    def log_message(self, *_arguments: Any) -> None:
-        """Stay silent."""
-
-
 @pytest.fixture(scope="module")
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     folder = tmp_path_factory.mktemp("gateway")
@@ -65,15 +56,11 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
 
 @pytest.fixture(scope="module")
 def other_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """The port of another server of this machine, which serves a page."""
+    """The port of another local server, which serves a page."""
     folder = tmp_path_factory.mktemp("other")
     (folder / "index.html").write_text("<!doctype html><title>another page</title>")
-    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Page, directory=str(folder))) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield server.server_port
-        server.shutdown()
-        thread.join()
+    with folder_server(folder) as url:
+        yield int(url.rpartition(":")[2])
 
 
 @pytest.fixture
@@ -86,12 +73,12 @@ def loud_browser(browser: Browser) -> Iterator[Browser]:
 
 
 def tried(browser: Browser, base: str) -> Json:
-    """What a script gets in the page that is open."""
+    """Return the results of a script in the open page."""
     return dict(browser.driver.execute_async_script(TRY, base, [DATASETS, VIDEO, LIVE, "/metrics"], VIDEO, REPORT))
 
 
 def passed_on(gateway: Gateway) -> float:
-    """The number of requests that were not refused."""
+    """Return the number of accepted requests."""
     return gateway.metric("requests_total") - sum(
         gateway.metric("requests_total", code=code) for code in ("403", "421")
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies, waiting and callers beyond what the gateway takes."""
+"""Limits of the gateway: bodies, waiting requests, callers."""
 
 from __future__ import annotations
 
@@ -32,15 +32,13 @@ from gateway_requests import (
     progress,
 )
 from gateways import Gateway, metric_at, poll, running
-from one_model import BriefServer
 from rfm.config import ExportConfig
-from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 from rfm_client import AsyncRewardClient, ServerUnavailableError
-from rfm_gateway.config import GatewayConfig
+from rfm_gateway import GatewayConfig
 from rfm_gateway.state import STALL_S, TritonState
+from servers import start_triton
 
 pytestmark = pytest.mark.triton
 
@@ -158,11 +156,7 @@ def test_while_a_model_works_health_is_told_and_callers_who_hang_up_cost_no_forw
     def scored(sample_type: str) -> float:
         return metric("rfm_samples_total", outcome="scored", sample_type=sample_type)
 
-    with (
-        (tmp_path / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-        running(server.endpoints, tmp_path) as gateway,
-    ):
+    with start_triton(repository) as server, running(server.endpoints, tmp_path) as gateway:
         endpoints = server.endpoints
         answers = [expected(gateway, [sample]) for sample in samples]
         poll(lambda: scored("preference") == 1)

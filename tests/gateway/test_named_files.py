@@ -115,7 +115,7 @@ def test_files_that_do_not_fit_are_refused(shelf: tuple[Gateway, Path]) -> None:
 
 
 def test_files_are_refused_before_they_fill_the_memory(triton: Triton, tmp_path: Path) -> None:
-    """Images and embeddings of a mebibyte each, of which some are small as they lie there. Two have room."""
+    """Images and embeddings of a mebibyte, some with small views. The cache has room for two."""
     folder = tmp_path / "shelf"
     folder.mkdir()
     Image.fromarray(np.zeros((512, 682, 3), np.uint8)).save(folder / "black.png")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the gateway refuses, and how it names the field."""
+"""Refusals of the gateway name the field."""
 
 from __future__ import annotations
 

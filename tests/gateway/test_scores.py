@@ -53,7 +53,7 @@ pytestmark = pytest.mark.triton
 
 
 def mixed(make: Callable[..., Json], *dims: Any) -> list[Json]:
-    """Each type twice, out of order, lengths that differ."""
+    """Return two samples of each type, out of order, with different lengths."""
     return [
         similarity(make(1, 2, *dims), make(2, 5, *dims)),
         progress(make(3, 7, *dims)),
@@ -135,7 +135,7 @@ def test_other_names_of_a_similarity_samples_trajectories_are_read(tiny: Gateway
     assert answer == expected(tiny, [similarity(FIRST, SECOND)] * 2)
 
 
-UPSTREAM_FIELDS: Json = {  # what the FastAPI server's clients send besides
+UPSTREAM_FIELDS: Json = {  # further fields of the FastAPI server's clients
     "id": "episode_7",
     "lang_vector": np.zeros(384, np.float32),
     "frames_shape": [3, 32, 32, 3],
@@ -240,7 +240,7 @@ def test_a_model_that_sees_a_video_gives_a_value_for_two_frames(video: Gateway) 
 def test_concurrent_callers_each_get_their_own_answer(encoders: Gateway) -> None:
     asked = [[mixed(embedded, ENCODER_DIMS)[k % 6], progress(embedded(k, 1 + k % 9, ENCODER_DIMS))] for k in range(32)]
     alone = [expected(encoders, samples) for samples in asked]
-    for index in range(0, len(asked), 8):  # what is wrong with some is not the others' concern
+    for index in range(0, len(asked), 8):  # bad samples do not affect the others
         asked[index][1] = progress(embedded(index, 17, ENCODER_DIMS))
     start = threading.Barrier(len(asked))
 
@@ -267,7 +267,7 @@ def test_a_gateway_asks_triton_over_http_and_answers_what_it_has_begun_when_it_i
         assert requests.get(f"{gateway.url}/health").ok
         answer = expected(gateway, [progress(FIRST)])
         connection = begun(gateway, {"Content-Length": str(len(body)), "Expect": "100-continue"}, body[:20])
-        assert connection.sock.recv(1024).startswith(b"HTTP/1.1 100 ")  # it reads the body
+        assert connection.sock.recv(1024).startswith(b"HTTP/1.1 100 ")  # reads the body
         gateway.process.terminate()
         poll(lambda: "Shutting down" in gateway.log)
         connection.send(body[20:])

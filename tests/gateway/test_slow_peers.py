@@ -24,9 +24,9 @@ from uvicorn.server import ServerState
 from gateway_requests import FIRST, TINY, Triton, ask_json, failure, paused, post_body, progress
 from gateways import WITHIN_S, answers, free_port, poll, running
 from rfm_client.contract.descriptors import MOST
+from rfm_gateway import GatewayConfig
 from rfm_gateway.admission import PACE_BYTES, Room, Turn, arriving
 from rfm_gateway.app import create_app
-from rfm_gateway.config import GatewayConfig
 from rfm_gateway.connections import Connection
 
 KEY = "open sesame"
@@ -39,7 +39,7 @@ LONG_S = 10 * WITHIN_S
 
 @contextmanager
 def listening(limit_concurrency: int | None = None, api_key: str | None = None, **bounds_s: float) -> Iterator[int]:
-    """The port of a gateway inside this process, before no Triton. Its bounds are short; one answer is large."""
+    """Run a gateway without a Triton in this process, with short bounds and one large answer. Yields the port."""
     app, port = create_app(SETTINGS, api_key), free_port()
     app.add_api_route("/large", lambda: StreamingResponse([bytes(2**20)] * 32))
     hasty = type("Hasty", (Connection,), {"head_s": 0.2, "rest_s": 0.2, **bounds_s})
@@ -56,7 +56,7 @@ def listening(limit_concurrency: int | None = None, api_key: str | None = None, 
 
 
 def closed_by_peer(connection: socket.socket) -> bool:
-    """Waits for the end of what the gateway sends."""
+    """Wait until the gateway closes the connection."""
     connection.settimeout(WITHIN_S)
     while connection.recv(65536):
         pass
@@ -208,7 +208,7 @@ def test_a_body_that_does_not_keep_the_pace_is_not_waited_for() -> None:
 
 
 def test_bodies_without_a_place_take_bounded_memory() -> None:
-    """Beyond it, a request takes its place before it reads on."""
+    """A request above the bound takes a place before it reads on."""
 
     async def serve() -> None:
         in_flight, waiting = (Gauge(name, "", registry=None) for name in ("in_flight", "waiting"))

@@ -15,16 +15,18 @@ import psutil
 import pytest
 import requests
 import schemathesis
+import torch
 from hypothesis import HealthCheck, given, settings
 
 import goldens
+from commands import own_regions
+from engines import training_run
 from gateway_requests import (
     ENCODER_DIMS,
     ENCODERS,
     FIRST,
     SECOND,
     TINY,
-    TOLERANCE,
     Triton,
     answered,
     ask_json,
@@ -37,12 +39,10 @@ from gateway_requests import (
     progress,
 )
 from gateways import WITHIN_S, Gateway, answers, free_port, poll, running
-from rfm.checkpoint.content import read_run_config
-from rfm.launch.cleanup import SHARED_MEMORY
-from rfm.launch.triton_server import Endpoints
-from rfm.rewind.network import RewindTransformer
 from rfm_client import InvalidSampleError, ModelNotFoundError, Trajectory
-from rfm_client.transport.status import read_status
+from rfm_client.serving import read_status
+from servers import Endpoints
+from tolerances import TOLERANCE
 
 pytestmark = pytest.mark.triton
 
@@ -83,13 +83,13 @@ def test_scoring_is_healthy_without_triton_s_metrics(triton: Triton, tmp_path: P
 
 def test_a_server_that_hangs_is_unhealthy_with_the_reason(triton: Triton, strict: Gateway) -> None:
     assert requests.get(f"{strict.url}/health").ok
-    with paused(triton):  # what was found before is told for a second more
+    with paused(triton):  # the earlier state is reported for another second
         poll(lambda: requests.get(f"{strict.url}/health").status_code == 503)
         assert "no answer within" in failure(requests.get(f"{strict.url}/health"), 503)
     poll(lambda: requests.get(f"{strict.url}/health").ok)
 
 
-def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: RewindTransformer) -> None:
+def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: torch.nn.Module) -> None:
     info = requests.get(f"{tiny.url}/model_info").json()
     total = sum(parameter.numel() for parameter in tiny_network.parameters())
     architecture = info.pop("model_architecture")
@@ -110,7 +110,7 @@ def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: RewindTran
 
 
 def test_model_info_has_the_whole_configuration_of_the_training_run(encoders: Gateway) -> None:
-    run = read_run_config(goldens.config("enc_c1_t1_disc10").checkpoint / "config.yaml")
+    run = training_run(goldens.config("enc_c1_t1_disc10").checkpoint / "config.yaml")
     assert requests.get(f"{encoders.url}/model_info").json()["experiment_config"] == json.loads(json.dumps(run))
 
 
@@ -191,9 +191,9 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_si
         process.wait(WITHIN_S)
     for why in ("killed by SIGKILL", "no answer for 4 s"):
         assert f"]: gateway is started again: {why}\n" in gateway.log
-    assert len(set(started)) >= 5  # Triton, its model process, and three gateways
+    assert len(set(started)) >= 5  # Triton, a model process, and three gateways
     assert not [child for child in started if child.is_running()]
-    assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
+    assert not own_regions(process.pid)
 
 
 def test_the_client_encodes_a_trajectory_once_for_many_questions(encoders: Gateway, tiny: Gateway) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The demo's repository, whose checkpoint knows the toy world of the datasets."""
+"""The demo's checkpoint, which knows the toy world of the datasets."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
+from servers import Endpoints
 
 
 @pytest.fixture

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""One message names the faults of all episodes, and the options to go on with."""
+"""A message names the faults of all episodes and the options to continue."""
 
 from __future__ import annotations
 
 import json
 import re
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +14,21 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from labelling import FEW, LEROBOT, WRIST, BrightnessScorer, Notes
+from labelling import FEW, LEROBOT, WRIST, BrightnessScorer, Notes, command
 from pictures import numbered, write_video
 from rfm_client import RewardError
-from rfm_client.cli.command import ExitCode
-from rfm_labels import DatasetError, LabelOptions, RayOptions, Scorer, label, open_dataset, parse_episodes
-from rfm_labels.commands import EpisodeTexts, LabelCommand, RunOptions
+from rfm_client.command_line import ExitCode
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset, parse_episodes
 
 TASK = "stack the cups"
 
 
 class Asked(BrightnessScorer):
-    """Counts what it scores, also in a run by the command."""
+    """Counts samples, also in a run by the command."""
 
-    def run(self, source: Path, labels: LabelOptions, *, dry_run: bool = False, task: str | None = None) -> ExitCode:
-        @contextmanager
-        def connect() -> Iterator[Scorer]:
-            yield self
-
+    def run(self, source: Path, labels: LabelOptions, *, dry_run: bool = False, task: str | None = None) -> int:
         self.said: list[str] = []
-        options = RunOptions(dry_run=dry_run, picture=False)
-        texts = EpisodeTexts(task=task)
-        return LabelCommand(str(source), texts, labels, options, RayOptions(), connect, self.said.append).run()
+        return command(source, labels, self, self.said.append, dry_run=dry_run, picture=False, task=task)
 
 
 def broken(folder: Path) -> Path:
@@ -51,7 +42,7 @@ def broken(folder: Path) -> Path:
 
 
 def without_tasks(folder: Path, *blank: str) -> Path:
-    """Each of these texts stands in for a task, from the first on."""
+    """Replace the tasks by these texts in order."""
     root = shutil.copytree(LEROBOT / "toy_v21", folder / "toy")
     file = root / "meta" / "tasks.jsonl"
     lines = [json.loads(line) for line in file.read_text().splitlines()]
@@ -71,7 +62,7 @@ def refused(source: Path, output: Path, **more: Any) -> list[str]:
 
 
 def option(lines: list[str], name: str) -> str:
-    """What an option has in the lines, as a shell reads it."""
+    """Return an option's value in the lines, as a shell reads it."""
     (found,) = (match[1] for line in lines if (match := re.search(rf"{name} (\S+)$", line)))
     return str(found)
 
@@ -159,7 +150,7 @@ def test_a_message_names_twenty_faults_and_counts_the_others(tmp_path: Path) -> 
 
 
 def write_demos(file: Path, *lengths: int, task: str | None = TASK) -> None:
-    """A file of demonstrations, each with 5 frames and this number of actions."""
+    """Write demonstrations with 5 frames and these numbers of actions."""
     with h5py.File(file, "w") as opened:
         opened.create_group("data").attrs["env_args"] = json.dumps({"env_name": "Lift", "lang": task})
         for index, length in enumerate(lengths):

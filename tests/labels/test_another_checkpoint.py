@@ -28,7 +28,7 @@ def labelled(output: Path, *shelves: Shelf, **options: Any) -> None:
 
 
 def assert_of_one_checkpoint(output: Path) -> None:
-    """All progress of each episode that has a part is the first checkpoint's."""
+    """Episodes with a part have all progress from the first checkpoint."""
     parts = sorted((output / ".rfm_parts").glob("*.parquet"))
     assert len(parts) < NUM_EPISODES
     for file in parts:

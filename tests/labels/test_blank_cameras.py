@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cameras that show nothing, or no colours: what labelling says of them, and which it leaves out."""
+"""Cameras with black frames or without colours: warnings, and the cameras that labelling leaves out."""
 
 from __future__ import annotations
 
@@ -15,15 +15,13 @@ import h5py
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 from client_commands import invoke
 from encoding import encode
+from in_process import rfm
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
-from rfm_commands.cli import app
-from rfm_labels import DatasetError, LabelOptions, label, open_dataset, parse_episodes
-from rfm_labels.datasets.faults import listed
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 from rfm_labels.plan import plan_labels
 from rfm_labels.ray_engine import EpisodeActor, RayJob
 
@@ -46,7 +44,7 @@ def black(count: int = 12) -> np.ndarray[Any, Any]:
 
 
 def lines_of(source: Path, output: Path, **options: Any) -> list[str]:
-    """The lines of a run about pictures that show nothing."""
+    """Return a run's lines about blank pictures."""
     notes = Notes()
     dataset = open_dataset(source, task=TASK, override_task=True)
     label(dataset, BrightnessScorer(), LabelOptions(output=output, frames=2, **options), notes)
@@ -54,7 +52,7 @@ def lines_of(source: Path, output: Path, **options: Any) -> list[str]:
 
 
 def blackened(video: Path) -> None:
-    """Codes a video anew with as many black frames."""
+    """Replace a video by the same number of black frames."""
     with av.open(str(video)) as container:
         frames = [frame.to_ndarray(format="rgb24") * 0 for frame in container.decode(video=0)]
     encode(video, frames, "libx264", {"g": "2", "bf": "0"})
@@ -122,7 +120,7 @@ def test_a_black_camera_of_a_lerobot_dataset_is_told_in_each_run_also_of_labels_
     expected = f"{WRIST}: black pictures, in 2 of 3 episodes (0:2): {ADVICE}"
     assert lines_of(root, output, limit=3) == [expected]
     assert lines_of(root, output, limit=3) == [expected]
-    shutil.rmtree(output / ".rfm_parts")  # now only the label files tell
+    shutil.rmtree(output / ".rfm_parts")  # now only the label files know
     assert lines_of(root, output, limit=3) == [expected]
     assert lines_of(root, output, limit=4) == [expected.replace("2 of 3 episodes (0:2)", "3 of 4 episodes (0:2,3)")]
 
@@ -145,7 +143,7 @@ def test_a_report_of_labels_tells_it_too(tmp_path: Path, write: Callable[[Path],
 def test_a_dry_run_tells_of_the_episodes_that_it_tries(tmp_path: Path) -> None:
     root = with_black_wrist(tmp_path, 1)
     words = [root, *ENGINE, "--dry-run", "--workers", 2, "--frames", 2]
-    result = CliRunner().invoke(app, ["label", *map(str, words)])
+    result = rfm("label", *words)
     assert result.exit_code == 0, result.output
     assert f"note: {WRIST}: black pictures, in 1 of 2 episodes (1): {ADVICE}" in result.stderr
 
@@ -175,11 +173,6 @@ def test_many_episodes_are_abbreviated(tmp_path: Path) -> None:
     shown = [{"front": noise(3) if index % 2 else black(3)} for index in range(40)]
     (told,) = lines_of(hdf5(tmp_path / "demos.hdf5", shown), tmp_path / "labels")
     assert "in 20 of 40 episodes (0,2,4,6,8,10,12,14,16,18,20,22,...): " in told
-
-
-@pytest.mark.parametrize("numbers", [[0], [0, 1, 2], [3, 4, 9, 11, 12], [1, 3, 5]])
-def test_listed_episodes_can_be_given_to_the_option(numbers: list[int]) -> None:
-    assert parse_episodes(listed(numbers)) == numbers
 
 
 NO_COLOURS = ("agentview_depth", "depth_head", "seg_instance_id", "topDepth", "depth2", "optical-flow", "normals.0")

@@ -39,7 +39,7 @@ def tables_of(root: Path, below: str) -> list[Path]:
 
 
 def changed(below: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
-    """Changes the rows of episode 1 in the tables of a folder."""
+    """Change the rows of episode 1 in a folder's tables."""
 
     def apply(root: Path) -> None:
         for file in tables_of(root, below):
@@ -133,7 +133,7 @@ def demos(folder: Path, break_it: Callable[[Any], object]) -> Path:
 
 
 def test_a_broken_video_lets_the_others_through(tmp_path: Path, output: Path) -> None:
-    """It counts as no frames, since its length is unknown."""
+    """An unknown length counts as no frames."""
     root = videos(tmp_path)
     with pytest.raises(DatasetError, match=r"b\.mp4: expected a whole video file"):
         label(open_dataset(root, task=TASK), BrightnessScorer(), LabelOptions(output=output))

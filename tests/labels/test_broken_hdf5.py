@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 files with links that lead nowhere, odd attributes and names, or damage: a line or an error names each fault."""
+"""HDF5 files with dead links, odd attributes and names, or damage: a line or an error names each fault."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def changed(file: Path, change: Callable[[Any], object]) -> Path:
 
 
 def put(path: str, value: Any) -> Callable[[Any], None]:
-    """Puts something in the place of what is at a path."""
+    """Replace the object at a path."""
 
     def change(opened: Any) -> None:
         opened.pop(path, None)
@@ -52,7 +52,7 @@ def put(path: str, value: Any) -> Callable[[Any], None]:
 
 
 def told(path: str, name: str, value: Any) -> Callable[[Any], None]:
-    """Gives an attribute to what is at a path."""
+    """Set an attribute of the object at a path."""
 
     def change(opened: Any) -> None:
         opened[path].attrs[name] = value

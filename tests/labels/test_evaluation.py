@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which reward model suits a dataset: measures of label files, against slow formulas and known cases."""
+"""Measures of label files, against slow formulas and known cases."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from typer.testing import CliRunner
 
+from in_process import rfm_client
 from labelling import FEW, BrightnessScorer
-from rfm_client.cli.commands import app
 from rfm_labels import DatasetError, LabelOptions, Watch, evaluate_labels, label, open_dataset, read_outcomes
 from rfm_labels.evaluation import kendall, spearman
 from rfm_labels.label_files import read_cost
@@ -59,7 +58,7 @@ def test_rank_correlations_are_those_of_slow_formulas(seed: int) -> None:
 
 
 def test_successes_are_told_from_failures(tmp_path: Path) -> None:
-    final = {0: 0.9, 1: 0.8, 2: 0.8, 3: 0.1}  # the last of each episode; a tie between a success and a failure
+    final = {0: 0.9, 1: 0.8, 2: 0.8, 3: 0.1}  # the last of each episode; a success ties with a failure
     success = {0: [0.0, 0.7], 1: [0.0, 0.4], 2: [0.9, 0.3], 3: [0.0, 0.1]}
     file = labels(tmp_path / "good_progress.parquet", {each: [0.0, value] for each, value in final.items()}, success)
     comparison = evaluate_labels([file], {0: True, 1: True, 2: False, 3: False})
@@ -67,7 +66,7 @@ def test_successes_are_told_from_failures(tmp_path: Path) -> None:
     assert found.name == "good"
     assert found.by_progress is not None
     assert found.by_success is not None
-    assert found.by_progress.auroc == pytest.approx((4 - 0.5) / 4)  # of four pairs one is a tie
+    assert found.by_progress.auroc == pytest.approx((4 - 0.5) / 4)  # one of four pairs is a tie
     assert (found.by_success.auroc, found.by_success.balanced_accuracy) == (1.0, 1.0)
     assert found.by_success.threshold == pytest.approx(0.4)
     assert (found.final_of_successes, found.final_of_failures) == (pytest.approx(0.85), pytest.approx(0.45))
@@ -112,7 +111,7 @@ def test_many_episodes_take_a_moment(tmp_path: Path) -> None:
 
 def test_the_cost_is_that_of_the_frames_that_the_run_scored(tmp_path: Path) -> None:
     dataset, output = open_dataset(copied("toy_v30_many", tmp_path)), tmp_path / "labels"
-    request_s = 0.05  # and each episode is one request
+    request_s = 0.05  # and an episode is a request
 
     def frames_per_s(scorer: BrightnessScorer, watch: Watch = QUIET, **options: Any) -> float | None:
         label(dataset, scorer, LabelOptions(output=output, workers=1, **{**FEW, **options}), watch)
@@ -121,7 +120,7 @@ def test_the_cost_is_that_of_the_frames_that_the_run_scored(tmp_path: Path) -> N
         return rate
 
     def check(episodes: range, watch: Watch = QUIET) -> float | None:
-        """Return the rate that the files tell, which is that of five episodes."""
+        """Return the rate in the files, which covers five episodes."""
         scorer, began_s = BrightnessScorer(request_s), time.monotonic()
         rate = frames_per_s(scorer, watch, episodes=episodes)
         took_s = time.monotonic() - began_s
@@ -154,7 +153,7 @@ def test_a_file_that_does_not_say_its_cost_has_none(tmp_path: Path) -> None:
     file = labels(tmp_path / "a.parquet", {0: RISING})
     (found,) = evaluate_labels([file]).evaluations
     assert found.frames_per_s is None
-    done = CliRunner().invoke(app, ["evaluate", str(tmp_path), "--labels", str(file)])
+    done = rfm_client("evaluate", tmp_path, "--labels", file)
     assert re.search(r"frames/s.*\n.*\n  a .* -\s", done.stdout), done.output
     for told in ("soon", "[]", '{"frames": 3}', '{"frames": 0, "seconds": 1.0}', '{"frames": 3, "seconds": NaN}'):
         assert Cost.parse(told.encode()) is None
@@ -235,18 +234,18 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
     numbers = [episode.index for episode in open_dataset(root).episodes]
     rows = "".join(f"{number},{number % 2}\n" for number in numbers)
     outcomes = written(tmp_path / "outcomes.csv", f"episode,success\n{rows}")
-    done = CliRunner().invoke(app, ["evaluate", str(root), "--outcome", outcomes])
+    done = rfm_client("evaluate", root, "--outcome", outcomes)
     assert done.exit_code == 0, done.output
     assert all(
         word in done.stdout
         for word in ("short", "long", f"{sum(number % 2 for number in numbers)} successes", "agreement", "AUROC")
     )
     json_file, picture = tmp_path / "out.json", tmp_path / "out.png"
-    done = CliRunner().invoke(app, ["evaluate", str(root), "--json", str(json_file), "--plot", str(picture)])
+    done = rfm_client("evaluate", root, "--json", json_file, "--plot", picture)
     assert done.exit_code == 0, done.output
     document = json.loads(json_file.read_text())
     assert [each["name"] for each in document["evaluations"]] == ["long", "short"]
     assert document["is_success"] is None
     assert picture.read_bytes().startswith(b"\x89PNG")
-    empty = CliRunner().invoke(app, ["evaluate", str(tmp_path)])
+    empty = rfm_client("evaluate", tmp_path)
     assert (empty.exit_code, "expected label files, NAME_progress.parquet" in empty.stderr) == (1, True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory of long videos, for a checkpoint that does not encode them first: each frame is held once, and few videos."""
+"""Memory of long videos for a checkpoint without encoders: few videos, and no frame twice."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from labelling import BrightnessScorer, PickyScorer
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 from rfm_labels import Dataset, DatasetEpisode, LabelOptions, Report, label, scoring
 from rfm_labels.scoring import FrameMemory
 
@@ -24,12 +24,12 @@ WORKERS = 4
 
 @pytest.fixture(autouse=True)
 def small_requests(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is sent together is small beside a video, as it is beside a real one."""
+    """Make requests small beside a video, as in reality."""
     monkeypatch.setattr(scoring, "MAX_BYTES", VIDEO_BYTES // 50)
 
 
 class LongVideos(Dataset):
-    """Episodes of one camera, whose frames are made when they are asked for."""
+    """Episodes of a single camera with frames made on demand."""
 
     kind, source, cameras = "made up", "long videos", ("front",)
 

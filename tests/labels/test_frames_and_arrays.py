@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Episodes as folders of frames and as arrays, and folders of HDF5 files."""
+"""Episodes as frame folders and arrays, and folders with HDF5 files."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,13 @@ import pytest
 from PIL import Image
 from pyarrow import parquet
 
-from labelling import BrightnessScorer, brightness
+from labelling import BrightnessScorer, brightness, command
 from pictures import numbered, numbers
-from rfm_client.cli.command import ExitCode
-from rfm_labels import DatasetError, LabelOptions, RayOptions, Scorer, label, open_dataset
-from rfm_labels.commands import EpisodeTexts, LabelCommand, RunOptions
+from rfm_client.command_line import ExitCode
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 TASK = "stack the cups"
-COUNT = 12  # frames of an episode, so that 10.png is there
+COUNT = 12  # frames of an episode; more than 10, so 10.png exists
 
 
 def write_frames(folder: Path, frames: Any, suffix: str = ".png") -> None:
@@ -61,7 +59,7 @@ def test_folders_of_frames_are_read_in_natural_order_by_one_task(tmp_path: Path,
 
 
 def test_labels_of_folders_of_frames_stay_and_new_folders_are_added(folders: Path) -> None:
-    """Also with the labels and their picture in the folder of the dataset."""
+    """Also with labels and picture in the dataset's folder."""
     scorer = BrightnessScorer()
     report = label(open_dataset(folders, task=TASK), scorer, LabelOptions(episodes=[0, 1]))
     (folders / "rfm_summary.png").write_bytes((folders / "0" / "frame_0.png").read_bytes())
@@ -189,24 +187,17 @@ def write_demos(file: Path, task: str, num_demos: int = 1) -> None:
             opened[f"data/demo_{index}/obs/front"] = numbered(5)
 
 
-def command(source: Path, labels: LabelOptions, *, dry_run: bool = False) -> tuple[ExitCode, list[str], set[str]]:
-    """Exit code, what it says, and the tasks that were scored."""
+def asked(source: Path, labels: LabelOptions, *, dry_run: bool = False) -> tuple[int, list[str], set[str]]:
+    """Return the exit code, the output lines, and the scored tasks."""
     scorer, said = BrightnessScorer(), list[str]()
-
-    @contextmanager
-    def connect() -> Iterator[Scorer]:
-        yield scorer
-
-    options = RunOptions(dry_run=dry_run)
-    code = LabelCommand(str(source), EpisodeTexts(), labels, options, RayOptions(), connect, said.append).run()
-    return code, said, scorer.tasks
+    return command(source, labels, scorer, said.append, dry_run=dry_run), said, scorer.tasks
 
 
 def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = tmp_path / "libero"
     for name, task in (("task_2.hdf5", "a"), ("task_10.hdf5", "b"), ("more/task_1.h5", "c")):
         write_demos(root / name, task)
-    code, said, tasks = command(root, LabelOptions())
+    code, said, tasks = asked(root, LabelOptions())
     assert (code, tasks) == (ExitCode.OK, {"a", "b", "c"})
     files = [f"{root}/more/task_1.h5", f"{root}/task_2.hdf5", f"{root}/task_10.hdf5"]
     assert [line for line in said if line in files] == files
@@ -214,7 +205,7 @@ def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys:
         assert (root / folder / f"{stem}.rfm_summary.png").exists()
         with h5py.File(root / folder / f"{stem}.rfm_rewards.hdf5") as opened:
             np.testing.assert_allclose(opened["data/demo_0/rfm_progress"], brightness(numbered(5)), atol=1e-6)
-    assert command(root, LabelOptions())[::2] == (ExitCode.OK, set())  # files of labels are no datasets
+    assert asked(root, LabelOptions())[::2] == (ExitCode.OK, set())  # files of labels are no datasets
     capsys.readouterr()
 
 
@@ -238,5 +229,5 @@ def test_a_folder_of_hdf5_files_is_refused_before_a_score(tmp_path: Path, labels
     with h5py.File(tmp_path / "low_dim.hdf5", "w") as opened:
         opened["data/demo_0/obs/states"] = np.zeros((5, 3))
     with pytest.raises(DatasetError, match=message):
-        command(tmp_path, labels)
+        asked(tmp_path, labels)
     assert not list(tmp_path.rglob("*rewards*"))

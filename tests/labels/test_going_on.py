@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is finished stays finished: after a kill, beside another process, without a server, on a full disk."""
+"""Finished episodes stay finished: after a kill, beside another process, without a server, on a full disk."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def parts_of(output: Path) -> list[str]:
 
 
 def goes_on(output: Path, undisturbed: list[bytes], **options: Any) -> int:
-    """How many frames the same call then scores, after which the labels are those of a run that nothing disturbed."""
+    """Repeat the call and compare with the labels of an undisturbed run. Return the number of scored frames."""
     rest = BrightnessScorer()
     label(open_dataset(ROOT), rest, LabelOptions(output=output, **FEW, **options))
     assert contents(output) == undisturbed

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 files: their demonstrations, which of their pictures are scored and which way up, and their labels."""
+"""HDF5 files: demonstrations, cameras, orientation, and labels."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from PIL import Image
 from pyarrow import parquet
 
 from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, brightness
-from rfm_client import ProgressResult, ProgressSample
+from rfm_client import ProgressResult, ProgressSample, UInt8Array
 from rfm_client.frames import Correction, Orientation
-from rfm_client.frames.orientation import turned
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 LENGTHS = (5, 7, 3)
@@ -128,8 +127,7 @@ def test_a_file_that_contradicts_itself_is_refused(
     assert scorer.num_samples == 0
 
 
-TURNED_BY_PILLOW: dict[Orientation, Image.Transpose | None] = {
-    "none": None,
+TURNED_BY_PILLOW: dict[Orientation, Image.Transpose] = {
     "rotate180": Image.Transpose.ROTATE_180,
     "flip-vertical": Image.Transpose.FLIP_TOP_BOTTOM,
     "flip-horizontal": Image.Transpose.FLIP_LEFT_RIGHT,
@@ -138,14 +136,20 @@ TURNED_BY_PILLOW: dict[Orientation, Image.Transpose | None] = {
 }
 
 
-@pytest.mark.parametrize(("orientation", "transpose"), TURNED_BY_PILLOW.items(), ids=TURNED_BY_PILLOW)
-def test_a_picture_is_turned_as_pillow_turns_it(orientation: Orientation, transpose: Image.Transpose | None) -> None:
-    assert set(TURNED_BY_PILLOW) == set(get_args(Orientation))
-    frames = frames_of(0, "agentview_rgb")
-    image = Image.fromarray(frames[0])
-    upright = np.asarray(image if transpose is None else image.transpose(transpose))
-    np.testing.assert_array_equal(turned(frames[0], orientation), upright)
-    np.testing.assert_array_equal(turned(frames, orientation)[0], upright)
+def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
+    """Return frames [T, H, W, 3] as Pillow turns them."""
+    if orientation == "none":
+        return frames
+    return np.stack([np.asarray(Image.fromarray(frame).transpose(TURNED_BY_PILLOW[orientation])) for frame in frames])
+
+
+@pytest.mark.parametrize("orientation", get_args(Orientation))
+def test_pictures_are_turned_as_pillow_turns_them(tmp_path: Path, orientation: Orientation) -> None:
+    file = write(tmp_path / "demos.hdf5", ROBOMIMIC, pictures())
+    dataset = open_dataset(file, task="lift the cube", orient=orientation)
+    for camera in CAMERAS:
+        read = np.stack(list(dataset.frames(dataset.episodes[0], camera)))
+        np.testing.assert_array_equal(read, turned(pictures()[camera], orientation))
 
 
 BOTH = ", ".join(CAMERAS)
@@ -204,7 +208,7 @@ JPEG = np.frombuffer(b"\xff\xd8\xff\xe0" + bytes(60), np.uint8)
 def virtual(file: Path, *sources: tuple[str, str, int, slice]) -> None:
     """Replaces a camera of the first demonstration by a virtual dataset.
 
-    sources: file and name, the frames that are claimed to be there, and those of the camera that they make up
+    sources: file and name, the claimed frames, and the camera's frames that they make up
     """
     layout = h5py.VirtualLayout(FRAMES.shape, np.uint8)
     for name, dataset, count, part in sources:
@@ -354,7 +358,7 @@ class WithoutSuccess(BrightnessScorer):
 
 
 def rewards_in(file: Path) -> dict[str, list[str]]:
-    """Names of what is in each demonstration besides what was recorded."""
+    """Return the names of the labels in each demonstration."""
     with h5py.File(file) as opened:
         return {name: sorted({*demo} - {"actions", "obs"}) for name, demo in opened["data"].items()}
 
@@ -413,7 +417,7 @@ def test_in_place_the_file_is_whole_whoever_is_killed_and_whatever_is_full(
     assert demos.read_bytes() == before
     assert [file.name for file in demos.parent.iterdir() if "demos" in file.name] == ["demos.hdf5"]
 
-    replace, left = Path.replace, []  # what a kill at the last moment before the new file would leave
+    replace, left = Path.replace, []  # as a kill just before the new file leaves it
 
     def seen(self: Path, target: Path) -> Path:
         left.extend([demos.read_bytes()] if target == demos else [])

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 import rerun
 from pyarrow import parquet
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from client_commands import invoke
 from gateways import free_port
+from in_process import rfm
 from labelling import FRONT, LEROBOT
 from paths import ROOT
-from rfm.launch.triton_server import Endpoints
-from rfm_client.cli.command import ExitCode
-from rfm_commands.cli import app
+from rfm_client.command_line import ExitCode
+from servers import Endpoints
 from toy_world import Task, make_clip
 
 DATASET = LEROBOT / "toy_v30_many"
@@ -38,11 +38,11 @@ ENGINE = (
 
 def own(*words: object) -> Result:
     """rfm label in this process."""
-    return CliRunner().invoke(app, ["label", *map(str, words)])
+    return rfm("label", *words)
 
 
 def cells(output: str) -> dict[str, str]:
-    """The rows of the table of two columns that is shown."""
+    """Return the rows of the printed table with two columns."""
     rows = [re.split(r"\s{2,}", line.strip()) for line in output.splitlines()]
     return {row[0]: row[1] for row in rows if len(row) == 2}
 
@@ -160,7 +160,7 @@ def test_labelled_episodes_are_recorded_with_the_frames_and_scores_of_each_camer
 ) -> None:
     folder = output / "recordings"
     words = ("label", DATASET, "--episodes", "2,3", "--frames", 8, "--rrd", folder, "--output", output)
-    for _ in range(2):  # what is labelled already is recorded, too
+    for _ in range(2):  # earlier labels are recorded, too
         result = invoke(*words, "--url", demo_server.grpc_url)
         assert result.exit_code == 0, result.stderr
         files = [folder / f"episode_{index:06d}.rrd" for index in (2, 3)]
@@ -244,7 +244,7 @@ def test_pictures_that_are_stored_as_bgr_get_the_labels_of_rgb(output: Path) -> 
 
 
 def test_what_the_run_did_not_train_is_told(output: Path) -> None:
-    """Of what is labelled: neither of preference nor of similarity."""
+    """Only of labelled outputs, not of preference or similarity."""
     checkpoint = shutil.copytree(MODELS / "rfm" / "1" / "checkpoint", output / "checkpoint")
     heads = "".join(f"train_{head}_head: false, " for head in ("progress", "preference", "success", "similarity"))
     (checkpoint / "config.yaml").write_text(f"model: {{{heads}}}\nloss: {{predict_last_frame_progress: true}}\n")

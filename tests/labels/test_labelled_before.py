@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Labels that are there are kept: fewer episodes never replace more, and what has grown is labelled where it is new."""
+"""Existing labels are kept: fewer episodes never replace more, and only new episodes are labelled."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +16,17 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, without_cost
-from rfm_labels import DatasetError, LabelOptions, RayOptions, Scorer, label, open_dataset
-from rfm_labels.commands import EpisodeTexts, LabelCommand, RunOptions
+from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, command, without_cost
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 TOY = LEROBOT / "toy_v30_many"
-CAMERAS = (WRIST, FRONT)  # not in the order of their names
+CAMERAS = (WRIST, FRONT)  # not in alphabetical order
 PROGRESS = "rfm_progress.parquet"
 EPISODE_FRAMES = [episode.num_frames for episode in open_dataset(TOY).episodes]
 
 
 def labelled(root: Path, output: Path, **options: Any) -> tuple[int, list[str]]:
-    """How many frames of each camera a run has scored, and what it has said."""
+    """Return the number of scored frames per camera, and the messages of a run."""
     scorer, notes = BrightnessScorer(), Notes()
     label(open_dataset(root), scorer, LabelOptions(output=output, cameras=CAMERAS, frames=2, **options), notes)
     return scorer.num_samples // len(CAMERAS), notes.lines
@@ -226,7 +224,7 @@ def test_labels_of_a_video_hold_until_its_time_changes_or_where_they_are_verifie
 
 
 def shifted_row(root: Path) -> None:
-    """Another time in a row of episode 3, whose video stays as it is."""
+    """Change a time in a row of episode 3 and keep the video."""
     file = root / "data" / "chunk-000" / "episode_000003.parquet"
     table = parquet.read_table(file, partitioning=None)
     times_s = table["timestamp"].to_numpy().copy()
@@ -236,7 +234,7 @@ def shifted_row(root: Path) -> None:
 
 
 def damaged_in_silence(root: Path) -> None:
-    """Zeros in the index of a video of episode 3, whose size and time stay."""
+    """Zero the index of episode 3's video, without a change of size and time."""
     file = root / "videos" / "chunk-000" / WRIST / "episode_000003.mp4"
     status, content = file.stat(), bytearray(file.read_bytes())
     place = content.index(b"stsz")
@@ -279,12 +277,7 @@ def test_a_dry_run_refuses_labels_of_another_recipe(output: Path) -> None:
 
 
 def dry_run(root: Path, options: LabelOptions) -> None:
-    @contextmanager
-    def connect() -> Iterator[Scorer]:
-        yield BrightnessScorer()
-
-    run = RunOptions(dry_run=True)
-    LabelCommand(str(root), EpisodeTexts(), options, run, RayOptions(), connect, lambda line: None).run()
+    command(root, options, BrightnessScorer(), dry_run=True)
 
 
 def test_a_dataset_that_has_grown_is_labelled_where_it_is_new(tmp_path: Path, output: Path) -> None:

@@ -1,36 +1,37 @@
 # SPDX-License-Identifier: MIT
-"""What the labels of a dataset are: each frame's score on its prefix, through Triton, through the engine, by hand."""
+"""Labels are the scores of prefixes: through Triton, through the engine, by hand."""
 
 from __future__ import annotations
 
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import av
 import numpy as np
 import pytest
 from pyarrow import parquet
 
+import engines
 import goldens
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
 from rfm_client import ProgressSample, RewardClient, Trajectory
-from rfm_client.frames.sampling import RULES, Sampling
-from rfm_commands.engine_scorer import EngineScorer
+from rfm_client.frames import Rule, Sampling
 from rfm_labels import (
     ClientScorer,
     DatasetError,
     LabelOptions,
     Report,
+    Scorer,
     iter_episodes,
     label,
     open_dataset,
     parse_episodes,
 )
+from tolerances import TOLERANCE
 
-TOLERANCE = 1e-5
 MODELS = ROOT / "model_repository"
 ELSEWHERE = goldens.ROOT.parent / "lerobot"
 DATASETS = [
@@ -46,9 +47,9 @@ DATASETS = [
 ]
 
 
-def engine_scorer(checkpoint: Path, encoders: Path) -> EngineScorer:
+def engine_scorer(checkpoint: Path, encoders: Path) -> Scorer:
     options = {name: str(encoders / name) for name in ("image_encoder", "text_encoder")}
-    return EngineScorer(str(checkpoint), **options)
+    return engines.scorer(str(checkpoint), **options)
 
 
 def test_a_checkpoint_is_another_with_other_settings(tmp_path: Path) -> None:
@@ -119,7 +120,7 @@ def test_all_of_a_causal_network_in_one_pass_is_what_its_prefixes_give(client: R
     short = [episode.index for episode in dataset.episodes if episode.num_frames <= 32]
     options = LabelOptions(output=output, cameras=(FRONT,), sampling="all", episodes=short)
     told = progress_of(label(dataset, ClientScorer(client), options))
-    assert "progress." + FRONT not in told  # of one camera there is nothing to be fused
+    assert "progress." + FRONT not in told  # a single camera needs no fusion
     start = 0
     for episode, videos in iter_episodes(dataset, [FRONT]):
         if episode.index in short:
@@ -135,9 +136,9 @@ def test_all_of_a_causal_network_in_one_pass_is_what_its_prefixes_give(client: R
             start += len(frames)
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", get_args(Rule))
 def test_any_rule_labels_each_frame_with_the_slot_that_it_reads(rule: Any, output: Path) -> None:
-    """The scorer gives each slot its own frame's brightness: what a rule reads is always frame t, but for K = 1."""
+    """The scorer returns each slot's brightness: rules read frame t, except for K = 1."""
     dataset = open_dataset(LEROBOT / "toy_v21")
     scorer = BrightnessScorer(max_frames=None)
     frames = None if rule == "all" or rule.startswith("rewind") else 4

@@ -27,13 +27,9 @@ from pyarrow import parquet
 import goldens
 import local_hub
 from encoding import encode, encode_here
-from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer
+from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, digest_of
 from pictures import write_video
-from rfm_client.frames import video_file
-from rfm_client.frames.video_decoding import read_packets
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
-from rfm_labels.datasets import lerobot
-from rfm_labels.datasets.stored_files import digest_of
 
 HUB_ID = "org/name"
 ELSEWHERE = goldens.ROOT.parent / "lerobot"  # beside the further reference cases, where there are some
@@ -59,7 +55,7 @@ def videos(root: Path, camera: str) -> list[Path]:
 
 @pytest.mark.parametrize("root", DATASETS)
 def test_every_frame_is_that_of_the_video_in_order_and_every_episode_that_of_the_rows(root: Path) -> None:
-    """LeRobot writes episodes one behind the other: all videos of a camera, decoded whole, are all frames."""
+    """LeRobot writes episodes one after another, so a camera's whole videos hold all frames."""
     dataset = open_dataset(root)
     assert list(dataset.cameras) == [FRONT, WRIST]
     info = json.loads((root / "meta" / "info.json").read_text())
@@ -135,7 +131,7 @@ def test_a_depth_camera_counts_only_where_it_is_named(tmp_path: Path, mark: dict
 
 
 def saved(convert: Callable[[Any], Any] = lambda image: image, form: str = "PNG") -> Callable[[Any], bytes]:
-    """Makes a file of a picture. convert: what Pillow makes of it first"""
+    """Return a function that encodes a picture. convert: applied before, to the Pillow image"""
 
     def save(image: Any) -> bytes:
         written = io.BytesIO()
@@ -194,7 +190,7 @@ def test_pictures_in_tables_are_of_8_bit_colours(
 
 
 def test_exif_data_turn_images_in_tables_and_change_the_identity_of_the_episode(tmp_path: Path) -> None:
-    """As LeRobot reads them, through ``datasets``."""
+    """LeRobot reads them the same way, through ``datasets``."""
     root, exif = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "dataset"), Image.Exif()
     exif[0x0112] = 6
 
@@ -212,7 +208,7 @@ def test_exif_data_turn_images_in_tables_and_change_the_identity_of_the_episode(
 
 
 def store_as_images(root: Path, camera: str, save: Callable[[Any], bytes]) -> list[np.ndarray[Any, Any]]:
-    """Episode 0's video of a camera goes into its table, as images in the rows and as files; gives its frames."""
+    """Replace a camera's video of episode 0 by images, in the table and as files. Return the frames."""
     frames = whole_video(root / "videos" / "chunk-000" / camera / "episode_000000.mp4")
     images = []
     (root / "images").mkdir()
@@ -262,7 +258,7 @@ def cells(file: str, column: str, change: Callable[[list[Any]], list[Any]]) -> B
 
 
 def spans(change: Callable[[list[Any]], list[Any]]) -> Break:
-    """Other times at which episodes lie in the videos of the front camera."""
+    """Change the episodes' times in the front camera's videos."""
 
     def apply(root: Path) -> None:
         for name in ("from_timestamp", "to_timestamp"):
@@ -281,7 +277,7 @@ def told(**more: Any) -> Break:
 
 
 def video(change: Callable[[list[Any]], list[Any]], file: str = V21_VIDEO, fps: Fraction = Fraction(10)) -> Break:
-    """A video of other frames, or of another rate."""
+    """Write a video with other frames or another rate."""
     coded: dict[str, Any] = {"options": {"crf": "1"}, "pixels": "yuv444p", "rate": fps}
     return lambda root: encode_here(root / file, change(whole_video(root / file)), **coded)
 
@@ -460,7 +456,7 @@ def test_a_hub_that_cannot_be_reached_is_told_in_words(tmp_path: Path) -> None:
 
 
 def test_a_dataset_of_the_hub_is_fetched_at_its_revision(tmp_path: Path) -> None:
-    """By a process of its own: the Hub's library reads its settings when it is imported."""
+    """In a separate process, since the Hub's library reads settings at import."""
     old = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "old")
     (old / "meta").rename(old / "meta_data")
     revisions = {"main": LEROBOT / "toy_v30_many", "v1": LEROBOT / "toy_v21", "old": old}
@@ -475,20 +471,3 @@ def test_a_dataset_of_the_hub_is_fetched_at_its_revision(tmp_path: Path) -> None
     expected = f"org/name: expected a local dataset or one of the Hub, got none: {endpoint} has no such revision of it"
     assert missing == expected
     assert "expected a LeRobot dataset's meta/info.json, got a LeRobot dataset of v1: convert it to v2.0 with " in of_v1
-
-
-def test_a_check_reads_the_packets_of_each_video_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also with more cameras than videos that otherwise stay in memory."""
-    read: list[Path] = []
-
-    def counted(file: Any, container: str | None = None) -> Any:
-        read.append(Path(file.name))
-        return read_packets(file, container)
-
-    monkeypatch.setattr(video_file, "read_packets", counted)
-    monkeypatch.setattr(lerobot, "_VIDEOS_AT_A_TIME", 1)
-    dataset = open_dataset(LEROBOT / "toy_v30_many")
-    for episode in dataset.episodes:
-        for camera in dataset.cameras:
-            dataset.check(episode, camera)
-    assert len(read) == len(set(read)) > len(dataset.cameras)

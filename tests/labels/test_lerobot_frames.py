@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rows of LeRobot datasets have the frames at their times, also where a video has frames without a row."""
+"""Rows of LeRobot datasets get the frame at their time, also where a video has frames without a row."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from client_commands import invoke
 from encoding import encode_here
 from labelling import FRONT, LEROBOT, BrightnessScorer, Notes
 from pictures import write_video
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 FPS = 10
@@ -35,7 +35,7 @@ VIDEO = f"videos/{FRONT}/chunk-000/file-000.mp4"
 
 
 def coded(numbers: Sequence[int]) -> UInt8Array:
-    """Frames that show their numbers, up to 255, as black and white fields."""
+    """Frames that show a number up to 255 as black and white fields."""
     bits = np.array(numbers)[:, None] >> np.arange(8) & 1
     fields = np.where(bits.reshape(-1, 2, 4), 220, 30).astype(np.uint8)
     return np.ascontiguousarray(np.repeat(fields.repeat(16, axis=1).repeat(16, axis=2)[..., None], 3, axis=3))
@@ -52,7 +52,7 @@ def regular(length: int) -> list[float]:
 
 
 def by_a_clock(length: int) -> list[float]:
-    """Some milliseconds late, other ones for each row."""
+    """Shift each row's time by some milliseconds."""
     return [t / FPS + t * 7 % 10 / 1000 for t in range(length)]
 
 
@@ -62,10 +62,10 @@ def with_a_late_end(length: int) -> list[float]:
 
 @dataclass(frozen=True)
 class Recording:
-    """What a v3.0 dataset consists of. The frame of row t shows the row's number in the dataset.
+    """The parts of a v3.0 dataset. The frame of row t shows the row number.
 
     film: numbers that the video's frames show
-    starts, lasts: of each episode in the video, in frames
+    starts, lasts: frames of the episodes in the video
     """
 
     film: Sequence[int]
@@ -165,7 +165,7 @@ def test_a_row_that_is_further_from_its_frame_than_lerobot_allows_is_refused_wit
 
 
 def test_other_row_times_are_another_episode(tmp_path: Path, output: Path) -> None:
-    """They decide which frames are labelled, so labels of the rows before them do not count."""
+    """Rows decide the labelled frames, so labels of earlier rows do not count."""
     takes = RECORDINGS["the times of a clock and discarded takes"]
     root = written(tmp_path, takes)
     label(open_dataset(root, **CLOCK), BrightnessScorer(), options(output))
@@ -191,7 +191,7 @@ def test_a_video_of_version_2_1_may_hold_a_discarded_take(tmp_path: Path, output
 
 
 def test_times_late_in_a_long_video_are_those_of_a_float32(tmp_path: Path) -> None:
-    """Where LeRobot's tolerance is less than the rounding of its time stamps."""
+    """LeRobot's tolerance is smaller than the rounding of time stamps."""
     begin = 7 * FPS * 3600 + 1
     root = Path(shutil.copytree(LEROBOT / "toy_v21", tmp_path / "toy"))
     file = root / f"videos/chunk-000/{FRONT}/episode_000000.mp4"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The tables of LeRobot's ``compute_rabc_weights``, which reward-aligned behaviour cloning reads, made by ``rfm label``."""
+"""``rfm label`` writes the tables of LeRobot's ``compute_rabc_weights`` for reward-aligned behaviour cloning."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from pyarrow import parquet
-from typer.testing import CliRunner
 
 from goldens import HAS_AVX512
+from in_process import rfm
 from reward_models import BASE, ROOT
-from rfm_commands.cli import app
 
 FOLDER = ROOT / "lerobot_rabc"
 EXPECTED = json.loads((FOLDER / "expected.json").read_text())
@@ -50,7 +49,7 @@ def test_topreward_s_table_is_that_of_lerobot(tmp_path: Path, run: dict[str, Any
 
 
 def check(file: Path, words: list[Any], run: dict[str, Any], atol: float) -> None:
-    done = CliRunner().invoke(app, [*map(str, words), "--no-picture"])
+    done = rfm(*words, "--no-picture")
     assert done.exit_code == 0, done.output
     table = parquet.read_table(file)
     for name in ("index", "episode_index", "frame_index"):

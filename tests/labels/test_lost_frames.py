@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 from encoding import encode_here
-from rfm_client import InvalidSampleError
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.inputs import load_trajectory
-from rfm_client.frames.video import read_video
+from rfm_client import InvalidSampleError, UInt8Array, load_trajectory
+from rfm_client.frames import read_video
 from rfm_labels import DatasetError, open_dataset
 
 NUM_FRAMES = 40
@@ -24,13 +22,13 @@ LOST = r"\(the decoder loses the others, .* ffmpeg -i IN OUT; or name a part: st
 
 
 def moving() -> UInt8Array:
-    """Frames that the encoder predicts from others: a noisy picture that moves."""
+    """Return a moving noisy picture, so that the encoder predicts frames from others."""
     picture = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
     return np.stack([np.roll(picture, 2 * t, axis=1) for t in range(NUM_FRAMES)])
 
 
 def remux(source: Path, target: Path, change: Callable[[list[Any]], list[Any]], **options: str) -> None:
-    """Write the packets that ``change`` makes of those in a file."""
+    """Write a file's packets after ``change``."""
     with av.open(str(source)) as whole, av.open(str(target), "w", options=options) as part:
         stream = part.add_stream_from_template(whole.streams.video[0])
         for packet in change([packet for packet in whole.demux(video=0) if packet.dts is not None]):
@@ -61,7 +59,7 @@ STREAMS: dict[str, tuple[str, dict[str, str]]] = {
 def test_a_video_without_its_first_key_frame_is_refused_but_a_part_that_needs_none_is_read(
     tmp_path: Path, stream: str, suffix: str
 ) -> None:
-    """As cutting without encoding, or recording amid a stream, leaves it."""
+    """Cut a video without encoding, like a recording that starts amid a stream."""
     file = tmp_path / f"video.{suffix}"
     encode_here(tmp_path / "all.mp4", moving(), *STREAMS[stream])
     remux(tmp_path / "all.mp4", file, lambda packets: packets[13:])
@@ -96,7 +94,7 @@ def test_an_hevc_video_without_its_first_key_frame_is_refused_whatever_the_decod
     assert_label_refuses(file)
 
 
-DROPPED = {  # the kind that is written over the kind of a coded picture, unknown to every decoder
+DROPPED = {  # overwrites the type of a coded picture; unknown to every decoder
     "H.264": (*STREAMS["x264"], 0x1E, r"expected frame 37 to be decoded \(.* ffmpeg -i IN OUT\), got Invalid data"),
     "HEVC": (*X265, 0x7E, f"expected 40 frames, one for each packet, got 37 {LOST}"),
 }
@@ -106,7 +104,7 @@ DROPPED = {  # the kind that is written over the kind of a coded picture, unknow
 def test_frames_that_the_decoder_drops_amid_a_video_are_missed(
     tmp_path: Path, codec: str, options: dict[str, str], kind: int, refused: str
 ) -> None:
-    """As damage in the head of a slice does it."""
+    """Damage the head of a slice."""
     file = tmp_path / "video.mp4"
     encode_here(file, moving(), codec, options)
     assert len(read_video(file)) == NUM_FRAMES
@@ -151,7 +149,7 @@ def test_a_bare_stream_is_scored_but_not_labelled(tmp_path: Path) -> None:
 
 
 def test_a_transport_stream_that_ends_inside_a_packet_is_refused(tmp_path: Path) -> None:
-    """The decoder shows what is there of a still picture, unmarked."""
+    """The decoder returns part of a still picture without an error."""
     file = tmp_path / "video.ts"
     encode_here(file, moving()[:1].repeat(NUM_FRAMES, axis=0))
     assert len(read_video(file)) == NUM_FRAMES

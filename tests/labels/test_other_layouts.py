@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Datasets in layouts that are not read: the message names the layout, and what makes one of it that is."""
+"""Unsupported layouts of datasets: the message names the layout and the conversion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from rfm_labels import DatasetError, open_dataset
 
 JPEGS = np.array([b"\xff\xd8\xff\xe0"] * 3, "S4")
-HDF5: dict[str, tuple[str, Any]] = {  # a dataset in a file of this layout, by a part of the file's name
+HDF5: dict[str, tuple[str, Any]] = {  # datasets by a part of the file name
     "aloha": ("observations/images/cam_high", np.zeros((3, 8, 8, 3), np.uint8)),
     "robomind": ("observations/rgb_images/camera_top", JPEGS),
     "robotwin": ("observation/head_camera/rgb", JPEGS),
@@ -30,7 +30,7 @@ def write_hdf5(file: Path, layout: str) -> None:
 TO_ALOHA = (
     "got ALOHA's layout, one episode per file (observations/images): convert its folder to LeRobot with openpi's "
 )
-UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, what is opened of them, what the message ends in
+UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the end of the message
     "RLDS": (["1.0.0/features.json"], "", "got an RLDS (TensorFlow) dataset: convert it to "),
     "RLDS, a version": (["1.0.0/a.tfrecord-00000-of-00001"], "1.0.0", "got an RLDS (TensorFlow) dataset: convert it"),
     "Zarr": ([".zgroup", "data/.zgroup"], "", "got Zarr arrays: convert them to LeRobot with "),

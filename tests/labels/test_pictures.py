@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Folders of pictures: names tell the order, EXIF data which way is up; and pictures stored as BGR."""
+"""Folders of pictures: order by name, orientation by EXIF data, and pictures stored as BGR."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pyarrow import parquet
 
 from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, redness
 from pictures import numbered, numbers
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 from rfm_labels.datasets.frame_names import in_order_of_numbers
 from rfm_labels.datasets.stored_files import digest_of, file_identity
@@ -31,7 +31,7 @@ BRIGHT[:2, :3], BRIGHT[0, 0] = (200, 60, 20), (20, 200, 60)
 
 
 def stored(folder: Path, names: Sequence[str]) -> Path:
-    """A dataset of one episode, whose frames in order have these names. Returns its folder."""
+    """Write a dataset of one episode with frames of these names. Return the folder."""
     (folder / "0").mkdir(parents=True)
     for frame, name in zip(numbered(len(names)), names, strict=True):
         Image.fromarray(frame).save(folder / "0" / name)
@@ -39,7 +39,7 @@ def stored(folder: Path, names: Sequence[str]) -> Path:
 
 
 def order(root: Path, count: int) -> list[int]:
-    """The frames of the only episode, each by its number."""
+    """Return the numbers of the frames of the only episode."""
     dataset = open_dataset(root, task=TASK)
     (episode,) = dataset.episodes
     return numbers(np.stack(list(dataset.frames(episode, "frames"))), count)
@@ -146,7 +146,7 @@ AS_STORED = {f"JPEG {number}": with_exif(number, "JPEG") for number in (0, 1, 9)
 
 
 def shown(picture: bytes) -> UInt8Array:
-    """What ``datasets.Image`` decodes, and so LeRobot."""
+    """Decode a picture as ``datasets.Image``, and so LeRobot, does."""
     opened = Image.open(io.BytesIO(picture))
     opened.load()
     if opened.getexif().get(ORIENTATION) is not None:

@@ -71,7 +71,7 @@ def test_a_cluster_goes_on_without_a_node_that_is_killed_and_one_machine_with_wh
     support = Path(__file__).parents[1] / "support"
     monkeypatch.setenv("PYTHONPATH", str(support))  # where actors find the scorer
     monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")  # its thread would outlive the test
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")  # the thread would outlive the test
     node = {"num_cpus": 2, "object_store_memory": 10**8}
     cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
     killed = cluster.add_node(**node)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""LeRobot episodes with several tasks: each stretch of frames by its own task, or all by the first."""
+"""LeRobot episodes with several tasks: one task per stretch of frames, or the first for all."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from labelling import LEROBOT, WRIST, BrightnessScorer, Notes
-from rfm_client import ProgressResult, ProgressSample, Trajectory
-from rfm_client.contract.samples import UInt8Array
+from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, tasks_of
+from rfm_client import ProgressResult, ProgressSample, Trajectory, UInt8Array
 from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, label, open_dataset, read_episode_labels
-from rfm_labels.datasets.lerobot_rows import read_sentences
 
 CUTS = (0, 20, 30)  # first frames of the stretches of episode 0
-TASKS = (0, 4, 0)  # and their numbers
+TASKS = (0, 4, 0)  # and numbers
 
 
 class SinceTheFirst(BrightnessScorer):
-    """Progress is by how much the newest frame is brighter than the first that is shown; keeps each sample's task."""
+    """Progress is the gain in brightness since the first visible frame. Keeps the samples' tasks."""
 
     def __init__(self, encodes: bool = False) -> None:
         super().__init__()
@@ -64,7 +62,7 @@ def root(tmp_path: Path) -> Path:
     root = shutil.copytree(LEROBOT / "toy_v30_many", tmp_path / "toy")
     rows = root / "data" / "chunk-000" / "file-000.parquet"
     change(rows, "task_index", lambda values: [*numbers(58), *values[58:]])
-    sentences = read_sentences(root / "meta" / "tasks.parquet")
+    sentences = tasks_of(root)
     episodes = root / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
     change(episodes, "tasks", lambda values: [[sentences[0], sentences[4]], *values[1:]])
     return root
@@ -93,7 +91,7 @@ def test_each_stretch_of_frames_is_scored_as_an_episode_of_its_task(
 ) -> None:
     dataset, notes, scorer = open_dataset(root), Notes(), SinceTheFirst(encodes)
     scorer.max_frames = None
-    sentences = read_sentences(root / "meta" / "tasks.parquet")
+    sentences = tasks_of(root)
     first = dataset.episode(0)
     assert (first.task, first.tasks) == (
         sentences[0],
@@ -110,7 +108,7 @@ def test_each_stretch_of_frames_is_scored_as_an_episode_of_its_task(
 
 
 def gains(table: Any, chunk: int) -> list[float]:
-    """What LeRobot's reward-aligned behaviour cloning reads of each frame: it weights the frame 0 if this is below 0."""
+    """Return the progress per frame that LeRobot's reward-aligned cloning reads; below 0 the weight is 0."""
     progress, episodes = table["progress_sparse"].to_numpy(), table["episode_index"].to_numpy()
     last = {episode: int(np.flatnonzero(episodes == episode)[-1]) for episode in set(episodes.tolist())}
     return [float(progress[min(i + chunk, last[episodes[i]])] - progress[i]) for i in range(len(progress))]
@@ -154,7 +152,7 @@ def test_all_frames_have_the_first_task_by_choice(root: Path, output: Path) -> N
     means = np.array([frame.mean() / 255 for frame in dataset.frames(dataset.episode(0), WRIST)], np.float32)
     progress = parquet.read_table(report.files[0])["progress_sparse"].to_numpy()[: len(means)]
     np.testing.assert_allclose(progress, means - means[0], atol=1e-5)
-    assert read_sentences(root / "meta" / "tasks.parquet")[4] not in scorer.asked
+    assert tasks_of(root)[4] not in scorer.asked
     with pytest.raises(DatasetError, match="episode 0: expected no change since the labels"):
         label(open_dataset(root), scorer, options(output, episodes=[1]))
     with pytest.raises(DatasetError, match="several_tasks: expected one of each, first, got 'last'"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which sentence LeRobot rows have: columns to choose from, gaps in numbers, contradictions, and what is told of it."""
+"""The sentence of a LeRobot row: the column, gaps in numbers, contradictions, and notes."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from labelling import FEW, FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
+from labelling import FEW, FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, tasks_of
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
-from rfm_labels.datasets.lerobot_rows import read_sentences
 
 V21, V30 = LEROBOT / "toy_v21", LEROBOT / "toy_v30_many"
 LENGTH = 58  # of episode 0 of V30
@@ -29,7 +28,7 @@ def rows_of(root: Path) -> list[Path]:
 
 
 def with_columns(folder: Path, source: Path = V30, **columns: Callable[[int, int], Any]) -> Path:
-    """A copy whose rows have further columns, made of the episode and the frame of a row."""
+    """Copy a dataset and add columns computed from the episode and frame of a row."""
     root = Path(shutil.copytree(source, folder / "toy"))
     for file in rows_of(root):
         table = parquet.read_table(file, partitioning=None)
@@ -41,7 +40,7 @@ def with_columns(folder: Path, source: Path = V30, **columns: Callable[[int, int
 
 
 def persistent(*subtasks: tuple[float, str | None], style: str = "subtask") -> list[dict[str, Any]]:
-    """The value of ``language_persistent`` in all rows of an episode, as LeRobot 0.6 writes it."""
+    """Return ``language_persistent`` in an episode's rows, as LeRobot 0.6 writes it."""
     rest = {"role": "assistant", "camera": None, "tool_calls": None}
     plan = {"content": "first this, then that", "style": "plan", "timestamp": 0.0, **rest}
     return [plan, *({"content": text, "style": style, "timestamp": time_s, **rest} for time_s, text in subtasks)]
@@ -56,7 +55,7 @@ def write_subtasks(root: Path, table: pa.Table) -> None:
 
 
 def sentences() -> dict[int, str | None]:
-    return read_sentences(V30 / "meta" / "tasks.parquet")
+    return tasks_of(V30)
 
 
 ANNOTATION = "annotation.human.action.task_description"
@@ -272,23 +271,6 @@ def test_two_sentences_for_one_number_are_refused(tmp_path: Path) -> None:
         DatasetError, match=r"tasks\.jsonl: expected one sentence for the number 0, got 'put .* and 'open"
     ):
         open_dataset(root)
-
-
-TABLES: dict[str, tuple[dict[str, list[Any]], list[str]]] = {
-    "an index without a name": ({"task_index": [0, 1], "__index_level_0__": ["a b", "c d"]}, ["a b", "c d"]),
-    "a column of sentences": ({"task": ["a b", "c d"], "task_index": [0, 1]}, ["a b", "c d"]),
-    "further columns": ({"task_index": [0, 1], "task": ["a b", "c d"], "robot": ["x", "y"]}, ["a b", "c d"]),
-    "another name": ({"task_index": [0, 1], "sentence": ["a b", "c d"]}, ["a b", "c d"]),
-}
-
-
-@pytest.mark.parametrize(("columns", "expected"), TABLES.values(), ids=TABLES)
-def test_a_table_of_tasks_is_read_as_its_writers_name_its_columns(
-    tmp_path: Path, columns: dict[str, list[Any]], expected: list[str]
-) -> None:
-    (tmp_path / "meta").mkdir()
-    parquet.write_table(pa.table(columns), tmp_path / "meta" / "tasks.parquet")
-    assert list(read_sentences(tmp_path / "meta" / "tasks.parquet").values()) == expected
 
 
 def test_a_table_of_tasks_out_of_order_is_told_since_lerobot_counts_its_rows(tmp_path: Path, output: Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The toy dataset and the comparison of two checkpoints on it, with the commands of the guide."""
+"""The guide's comparison of two checkpoints on the toy dataset."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ import typer
 from typer.testing import CliRunner
 
 import toy_dataset
+from in_process import rfm_app, rfm_client_app
 from paths import ROOT
-from rfm_client.cli.commands import app as rfm_client
-from rfm_commands.cli import app as rfm
 from rfm_labels import evaluate_labels, open_dataset, read_outcomes
 from toy_world import TASKS
 
@@ -30,7 +29,7 @@ def run(command: str) -> str:
     program, *words = shlex.split(command.replace("\\\n", " "))
     if program == "python":
         assert words.pop(0) == "examples/toy_dataset.py"
-    done = CliRunner().invoke({"python": example, "rfm": rfm, "rfm-client": rfm_client}[program], words)
+    done = CliRunner().invoke({"python": example, "rfm": rfm_app, "rfm-client": rfm_client_app}[program], words)
     assert done.exit_code == 0, done.output
     return done.stdout
 

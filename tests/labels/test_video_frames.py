@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Videos that are turned, that break off, that are damaged: labels and scores judge them alike."""
+"""Turned, broken and damaged videos: labels and scores judge them alike."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ import pytest
 
 from encoding import encode_here
 from pictures import TURNS, Matrix, numbered, numbers, turn, write_video
-from rfm_client import InvalidSampleError
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.video import frame_times_s, read_video
+from rfm_client import InvalidSampleError, UInt8Array
+from rfm_client.frames import frame_times_s, read_video
 from rfm_labels import DatasetError, open_dataset
 
 NUM_FRAMES = 40
@@ -30,7 +29,7 @@ def noise(count: int = NUM_FRAMES) -> UInt8Array:
 
 
 def labelled(file: Path) -> UInt8Array:
-    """The frames that ``label`` shows of a folder that holds this video."""
+    """Return the frames that ``label`` reads from a folder with this video."""
     (file.parent / "tasks.csv").write_text(f"video,task\n{file.name},stack the cups\n")
     dataset = open_dataset(file.parent)
     episode = dataset.episodes[0]
@@ -74,7 +73,7 @@ def test_packets_that_are_not_shown_are_no_frames(tmp_path: Path) -> None:
     file = tmp_path / "video.mp4"
     write_video(file, numbered(10), shown_from=4)
     with av.open(str(file)) as container:
-        assert container.streams.video[0].frames == 10  # as the container tells, wrongly
+        assert container.streams.video[0].frames == 10  # as the container says, wrongly
     assert numbers(labelled(file), 10) == numbers(read_video(file), 10) == [4, 5, 6, 7, 8, 9]
     assert numbers(read_video(file, 5), 10) == [4, 6, 9]
 
@@ -101,7 +100,7 @@ BLOCK_PX = 16
 
 
 def rgb(levels: np.ndarray[Any, Any], matrix: int, is_full: bool) -> np.ndarray[Any, Any]:
-    """float64 [..., 3], 0..255, of levels Y, Cb, Cr in 8 bits (ITU-T H.273, equations of matrix coefficients)."""
+    """Convert 8-bit Y, Cb, Cr to float64 [..., 3] in 0..255 (ITU-T H.273, matrix coefficients)."""
     kr, kb = WEIGHTS.get(matrix, (0.299, 0.114))
     low, scale, chroma = (0, 255, 255) if is_full else (16, 219, 224)
     y, pb, pr = (levels[..., 0] - low) / scale, (levels[..., 1] - 128) / chroma, (levels[..., 2] - 128) / chroma
@@ -110,7 +109,7 @@ def rgb(levels: np.ndarray[Any, Any], matrix: int, is_full: bool) -> np.ndarray[
 
 
 def write_levels(file: Path, levels: UInt8Array, pixels: str, matrix: int, full: int) -> None:
-    """A video of blocks of one colour each, levels uint8 [rows, columns, 3], without a loss."""
+    """Write a lossless video of coloured blocks. levels: uint8 [rows, columns, 3]"""
     with av.open(str(file), "w") as container:
         stream: Any = container.add_stream("libx264", rate=10, options={"qp": "0"})
         stream.height, stream.width, stream.pix_fmt = *(BLOCK_PX * n for n in levels.shape[:2]), pixels
@@ -132,7 +131,7 @@ def write_levels(file: Path, levels: UInt8Array, pixels: str, matrix: int, full:
 
 @pytest.mark.parametrize(("pixels", "matrix", "full"), COLOURS.values(), ids=COLOURS)
 def test_colours_are_those_of_the_video_s_matrix_and_range(tmp_path: Path, pixels: str, matrix: int, full: int) -> None:
-    """Whatever PyAV is installed: some take each video for one of BT.601, 6 to 29 levels off."""
+    """With any PyAV: some versions decode every video as BT.601, 6 to 29 levels off."""
     levels = np.random.default_rng(0).integers(60, 190, (6, 8, 3), np.uint8)
     write_levels(tmp_path / "video.mp4", levels, pixels, matrix, full)
     read = read_video(tmp_path / "video.mp4")[0]
@@ -156,7 +155,7 @@ def test_videos_of_one_deep_channel_are_refused_as_depth_maps(tmp_path: Path, pi
 
 
 def write_streams(file: Path, *videos: tuple[UInt8Array, bool]) -> None:
-    """Several videos in one file, and whether each is an attached picture."""
+    """Write several videos into a file. Each says whether it is an attached picture."""
     with av.open(str(file), "w") as container:
         streams: list[Any] = []
         for frames, attached in videos:
@@ -204,7 +203,7 @@ def coded(codec: str = "libx264", **more: Any) -> Write:
 
 
 def recorded_live(file: Path, frames: UInt8Array) -> None:
-    """As into a pipe: nothing that is written is corrected afterwards."""
+    """A file that cannot seek, like a pipe."""
     codec, format = ("mpeg4", "avi") if file.suffix == ".avi" else ("libx264", "matroska")
     with file.open("wb") as opened:
         encode_here(SimpleNamespace(write=opened.write), frames, codec, format=format)
@@ -247,7 +246,7 @@ def test_a_whole_video_is_read_and_one_that_breaks_off_refused(tmp_path: Path, n
     with av.open(str(file)) as container:
         begins = sorted(packet.pos for packet in container.demux(video=0) if packet.size)
     whole = file.read_bytes()
-    is_live = write is recorded_live  # whose size is known up to the frame that breaks off
+    is_live = write is recorded_live  # with a known size up to the broken frame
     for num_bytes in [begins[24] + 100] if is_live else [begins[24] + 100, begins[24]]:
         file.write_bytes(whole[:num_bytes])
         size = r"\d+" if is_live else len(whole)
@@ -268,7 +267,7 @@ def test_a_frame_that_breaks_off_is_no_frame_where_the_file_s_size_is_unknown(
 
 
 def test_damage_counts_up_to_the_next_key_frame_and_only_in_frames_that_are_used(tmp_path: Path) -> None:
-    """Each 20th frame needs no other; the others are made from the one before. x264 notices damage in CAVLC."""
+    """Every 20th frame is a key frame; others need the frame before. x264 notices damage in CAVLC."""
     file = tmp_path / "video.mp4"
     options = {"preset": "ultrafast", "bf": "0", "g": "20", "sc_threshold": "0"}
     encode_here(file, noise(), "libx264", options)

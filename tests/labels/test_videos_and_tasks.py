@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Folders of videos with a table of tasks, and the tasks that a caller gives for any dataset."""
+"""Folders of videos with a table of tasks, and tasks given by a caller."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_a_table_of_videos_that_is_wrong_is_refused(videos: Path, name: str | No
 
 
 def lerobot(folder: Path, task: str) -> Path:
-    """A dataset whose tasks are this one."""
+    """Write a dataset with this task everywhere."""
     root = shutil.copytree(LEROBOT / "toy_v21", folder / "toy")
     lines = [json.dumps({"task_index": index, "task": task}) for index in range(6)]
     (root / "meta" / "tasks.jsonl").write_text("\n".join(lines))

@@ -30,10 +30,7 @@ import goldens
 import rfm_export
 from engines import serve_config
 from paths import ROOT
-from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints
-from rfm_commands.config import Config
-from rfm_export.source import MOST_SAMPLES
+from servers import Endpoints, find_installation
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -59,7 +56,7 @@ SYSTEM_PATH = "/usr/local/bin:/usr/bin:/bin"
 
 @dataclass(frozen=True)
 class Image:
-    """What the Dockerfile puts into /opt/rfm, under ``root``, with a Triton in PATH as in NVIDIA's image."""
+    """The Dockerfile's /opt/rfm below ``root``, with a Triton in PATH as in NVIDIA's image."""
 
     root: Path
     environment: dict[str, str]
@@ -80,7 +77,7 @@ class Image:
 
     @contextmanager
     def started(self, *words: object) -> Iterator[subprocess.Popen[bytes]]:
-        """A program that runs until it is told to stop, and then ends well."""
+        """A program that runs until a signal and then exits with 0."""
         log = self.root / f"{words[0]}.log"
         with log.open("ab") as lines:
             process = subprocess.Popen(self.program(words), env=self.environment, stdout=lines, stderr=lines)
@@ -114,7 +111,7 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Image:
 
 
 def copy(source: Path, target: Path) -> None:
-    """As COPY does it, without what .dockerignore leaves out; files are copied into a folder."""
+    """Copy as COPY does, without the files of .dockerignore."""
     if source.is_dir():
         shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info", "build"))
     else:
@@ -123,7 +120,7 @@ def copy(source: Path, target: Path) -> None:
 
 
 def triton_in(root: Path) -> Path:
-    """A folder with the wheel's tritonserver, which brings along its libraries and backends like NVIDIA's."""
+    """Return a folder with the wheel's tritonserver, libraries and backends, laid out like NVIDIA's."""
     triton = find_installation()
     folder = root / "opt" / "tritonserver"
     arguments = triton.lay_out_backends(folder / "backends")
@@ -137,7 +134,7 @@ def triton_in(root: Path) -> Path:
 
 
 def entries(file: Path) -> dict[str, str]:
-    """Each requirement in a file, with the options after it, which pip lets stand on lines of their own."""
+    """Return each requirement of a file with the options on the following lines."""
     lines = re.sub(r" *\\\n *", " ", file.read_text()).splitlines()
     parts = [line.partition(" --") for line in lines if not line.startswith("#")]
     return {requirement: space + options for requirement, space, options in parts}
@@ -155,7 +152,7 @@ def pins(file: Path, python: str | None = None) -> dict[str, SpecifierSet]:
 
 
 def composed(profile: str, **variables: str) -> dict[str, Any]:
-    """What a docker compose of either generation makes of the file."""
+    """Return the file as either generation of docker compose reads it."""
     program = ["docker", "compose"]
     if not shutil.which("docker") or subprocess.run([*program, "version"], capture_output=True).returncode:
         assert shutil.which("docker-compose"), "docker-compose: expected in PATH, got nothing (make ops-tools)"
@@ -168,9 +165,8 @@ def composed(profile: str, **variables: str) -> dict[str, Any]:
 
 
 def test_the_example_configuration_lets_more_wait_than_a_batch() -> None:
-    export = Config.from_yaml(DOCKER / "serve.yaml").export
-    assert export.max_queue_size is not None
-    assert export.max_queue_size > 2 * MOST_SAMPLES
+    export = yaml.safe_load((DOCKER / "serve.yaml").read_text())["export"]
+    assert export["max_queue_size"] > 2 * 64  # the most samples of a batch by default
 
 
 def test_the_dockerfile_is_clean() -> None:
@@ -193,7 +189,7 @@ def test_the_lock_has_the_versions_of_the_constraints(python: str) -> None:
 
 
 def test_the_lock_names_what_the_packages_ask_for_with_hashes_and_without_addresses() -> None:
-    """What those need in turn, ``pip check`` finds as the image is built."""
+    """``pip check`` finds missing dependencies in the build of the image."""
     asked = [Requirement(text) for name in DISTRIBUTIONS for text in importlib.metadata.requires(name) or []]
     extras = ("", "encoders", "vlm", "quantized")
     needed = {
@@ -277,7 +273,7 @@ def test_the_image_alone_exports_and_serves_what_it_exported(image: Image, tmp_p
 
 
 def check_gateway(image: Image, endpoints: Endpoints) -> None:
-    """The compose file's gateway, on this machine's addresses: its health check waits for it, and is true."""
+    """The compose file's gateway on local addresses passes the health check."""
     gateway, port = SERVICES["gateway"], str(Endpoints.free().http_port)
     here = {"grpc://server:8001": endpoints.grpc_url, "http://server:8002/metrics": endpoints.metrics_url}
     here |= {"0.0.0.0": endpoints.host, "8100": port}
@@ -316,7 +312,7 @@ def test_every_service_is_confined(name: str) -> None:
     assert service["deploy"]["resources"]["limits"]["memory"]
     assert all(port.startswith("${RFM_BIND:-127.0.0.1}:") for port in service["ports"])
     assert re.fullmatch(r"[\w/-]+:v?\d+\.\d+\.\d+(-cpu)?", VARIABLE.sub(r"\2", service["image"]))
-    assert "healthcheck" in service or name in OURS  # the image has its own
+    assert "healthcheck" in service or name in OURS  # the image has another
     assert "HEALTHCHECK" in DOCKERFILE
     for volume in service.get("volumes", []):
         source, target, *_ = VARIABLE.sub(r"\2", volume).split(":")
@@ -340,7 +336,7 @@ def test_the_repository_that_the_guide_exports_is_served_unless_another_is_named
 
 
 def test_prometheus_has_the_secrets_that_its_configuration_names() -> None:
-    """Also in what is commented out, which its reader is told to use."""
+    """Also in comments, which the file recommends."""
     text = (DOCKER / "prometheus" / "prometheus.yml").read_text()
     named = re.findall(r"/run/secrets/(\w+)", text)
     assert named == ["gateway_api_key"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The guide "GPU box": its commands make the keys and the certificate, and a real nginx serves with them and its file."""
+"""The guide "GPU box": the commands make keys and a certificate, and a real nginx serves with the guide's file."""
 
 from __future__ import annotations
 
@@ -27,14 +27,13 @@ from typer.main import get_command
 
 import clip
 from commands import RFM
+from in_process import rfm_app
 from paths import ROOT
 from rfm.config import ServeConfig
-from rfm.launch.endpoints import Endpoints
 from rfm_client import AccessDeniedError, RewardClient, ServerUnavailableError, Trajectory
-from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.status import read_status
-from rfm_commands.cli import app
-from rfm_serve import Serving, serving, wait_for
+from rfm_client.serving import Credentials, read_status
+from servers import Endpoints, Serving, serving, wait_for
+from tolerances import TOLERANCE
 
 pytestmark = pytest.mark.slow
 
@@ -43,12 +42,11 @@ UNIT_FILE = ROOT / "docker" / "systemd" / "rfm-serve.service"
 BIN = Path(sys.executable).parent
 NAME, IP = "localhost", "127.0.0.1"  # the box, as clients call it in these tests
 CALLER, LATER = "alice", "bob"
-PORTS = {"grpc": 8001, "http": 8000, "gateway": 8100, "proxy": 8443}  # in the guide and its files
+PORTS = {"grpc": 8001, "http": 8000, "gateway": 8100, "proxy": 8443}  # in the guide and the files
 VIEWER = ROOT / "apps" / "page" / "rfm_page" / "static"
 VENDORED = ROOT / "apps" / "page" / "rfm_page" / "vendored"
 FRAMES = np.random.default_rng(0).integers(0, 256, (16, 256, 256, 3), np.uint8)  # 3 MiB: nginx alone takes 1 MiB
 FILMED = Trajectory(frames=FRAMES, task=clip.TASK)
-TOLERANCE = 1e-5
 
 
 def section(heading: str) -> str:
@@ -57,12 +55,12 @@ def section(heading: str) -> str:
 
 
 def commands(heading: str) -> str:
-    """The shell commands of a section, which are indented."""
+    """Return the indented shell commands of a section."""
     return "\n".join(re.findall(r"^ {4}(.*)$", section(heading), re.MULTILINE))
 
 
 def shell(script: str, box: Path) -> subprocess.CompletedProcess[str]:
-    """Runs commands of the guide in ``box/keys``, without root: what they put into /etc is put into ``box/etc``."""
+    """Run commands of the guide in ``box/keys`` without root, with ``box/etc`` for /etc."""
     script = 'set -eu\nsudo() { "$@"; }\n' + script.replace("/etc/", f"{box}/etc/")
     environment = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}"}
     return subprocess.run(["bash", "-c", script], cwd=box / "keys", env=environment, capture_output=True, text=True)
@@ -75,7 +73,7 @@ def said(script: str, box: Path) -> str:
 
 
 def here(script: str, heading: str) -> str:
-    """A section's commands with the name and the address of this machine in the place of the example's."""
+    """Return a section's commands with this machine's name and address instead of the example's."""
     assert script.count("gpu-box.lan") or script.count("192.0.2.10") or "$name" in script, heading
     return script.replace("gpu-box.lan", NAME).replace("192.0.2.10", IP)
 
@@ -134,7 +132,7 @@ def papers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def nginx(folder: Path, ports: dict[int, int]) -> Iterator[subprocess.Popen[bytes]]:
-    """Debian's nginx with the file of the guide, on other ports of this machine, and its own folders in ``folder``."""
+    """Run Debian's nginx with the guide's file on other ports and with folders in ``folder``."""
     program = shutil.which("nginx", path=f"{BIN}:{os.environ['PATH']}:/usr/sbin")
     assert program, "nginx: expected in PATH, got nothing (make ops-tools)"
     copied = folder / "etc" / "nginx" / "conf.d" / "rfm.conf"
@@ -311,7 +309,7 @@ def test_the_gateway_answers_by_any_name_of_the_box_also_its_page(box: Box) -> N
     with box.http(host=name, origin=f"https://{name}", **{"X-API-Key": box.key()}) as caller:
         caller.headers["Sec-Fetch-Site"] = "same-origin"
         assert [caller.get(path).status_code for path in ("/health", "/", "/model_info")] == [200] * 3
-        assert caller.post("/evaluate_batch", content=b"").status_code == 422  # as a wrong body is
+        assert caller.post("/evaluate_batch", content=b"").status_code == 422  # like a wrong body
 
 
 @pytest.mark.triton
@@ -398,7 +396,7 @@ def unit() -> configparser.SectionProxy:
 def test_the_unit_runs_what_nginx_and_the_guide_expect() -> None:
     program, name, *arguments = shlex.split(unit()["ExecStart"])
     assert (program, name) == ("/opt/rfm/bin/rfm", "serve")
-    given = get_command(app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
+    given = get_command(rfm_app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
     default = ServeConfig()
     assert (default.http_port, default.grpc_port) == (PORTS["http"], PORTS["grpc"])
     assert (given["http_port"], given["grpc_port"], given["gateway_port"]) == (None, None, PORTS["gateway"])
@@ -423,7 +421,7 @@ def test_the_export_with_the_image_alone_is_a_command_of_it() -> None:
     image = next(index for index, word in enumerate(words) if word.startswith("rfm-triton:"))
     assert words[words.index("--entrypoint") + 1] == "rfm"
     name, *arguments = words[image + 1 :]
-    given = get_command(app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
+    given = get_command(rfm_app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
     mounts = [words[index + 1].split(":") for index, word in enumerate(words) if word == "-v"]
     assert {mount[1]: mount[0] for mount in mounts} == {
         str(given["config_file"]): "$PWD/docker/serve.yaml",

@@ -2,7 +2,7 @@
 """The Kubernetes manifests: built by kubectl's kustomize, checked against schemas and policies, and against the programs.
 
 Kubernetes' own schemas come with kubernetes-validate; those of PodMonitor and of KServe's objects are excerpts
-(``custom_resource_schemas.json`` says of what). What only a cluster can tell is not tested here.
+(``custom_resource_schemas.json`` names them). The tests need no cluster.
 """
 
 from __future__ import annotations
@@ -28,14 +28,12 @@ import yaml
 from referencing import Registry, Resource
 from typer.main import get_command
 
+from in_process import rfm_app
 from paths import ROOT
 from repositories import kill_model
-from rfm.launch import admin_key
 from rfm.launch.ending import KILL_AFTER_S
-from rfm.launch.triton_server import Endpoints
-from rfm_commands.cli import app
 from rfm_gateway.command import STOP_WITHIN_S
-from rfm_serve import wait_for
+from servers import Endpoints, wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -75,7 +73,7 @@ def _built(folder: str) -> str:
 
 
 def built(folder: str, *kinds: str) -> list[Object]:
-    """What ``kubectl apply -k`` would send; of the kinds alone, if any are named."""
+    """Return the objects that ``kubectl apply -k`` sends; only those of ``kinds`` if given."""
     return [found for found in yaml.load_all(_built(folder), yaml.CSafeLoader) if not kinds or found["kind"] in kinds]
 
 
@@ -104,9 +102,9 @@ def workloads(*folders: str) -> list[Any]:
 
 
 def parameters(words: list[str]) -> dict[str, Any]:
-    """What ``rfm`` reads its words as; it runs nothing."""
+    """Parse words as ``rfm`` does, without running it."""
     name, *arguments = words
-    return get_command(app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
+    return get_command(rfm_app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
 
 
 def selected(selector: dict[str, str], folder: str) -> list[Object]:
@@ -138,7 +136,7 @@ def test_every_manifest_fits_its_schema(folder: str, release: str) -> None:
 
 @pytest.mark.parametrize("workload", workloads(*SETS))
 def test_pods_are_restricted(workload: Object) -> None:
-    """As the pod security standard "restricted" has it, and with a root file system that cannot be written."""
+    """Pods meet the pod security standard "restricted" and have a read-only root file system."""
     pod, container = pod_of(workload), container_of(workload)
     context = {**pod.get("securityContext", {}), **container["securityContext"]}
     assert {name: context.pop(name) for name in SECURITY} == SECURITY
@@ -208,7 +206,7 @@ def test_keys_are_files_that_others_cannot_read(workload: Object) -> None:
 def test_kserve_s_key_is_a_variable() -> None:
     container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
     assert parameters(container["args"])["admin_key_file"] is None
-    (key,) = (one["valueFrom"]["secretKeyRef"] for one in container["env"] if one["name"] == admin_key.VARIABLE)
+    (key,) = (one["valueFrom"]["secretKeyRef"] for one in container["env"] if one["name"] == "RFM_ADMIN_KEY")
     assert_readme_creates(key["name"], key["key"])
 
 
@@ -276,7 +274,7 @@ def test_the_gateway_reaches_triton(folder: str) -> None:
     triton, metrics = urlsplit(gateway["triton"]), urlsplit(gateway["metrics_url"])
     pods = named(folder, "Service", triton.hostname)["spec"]
     assert triton.scheme == "grpc"
-    assert pods["clusterIP"] == "None"  # its name has the addresses of all pods, also of those that are added
+    assert pods["clusterIP"] == "None"  # the name has the addresses of all pods, also later ones
     assert triton.port in [port["port"] for port in pods["ports"] if port["name"] == "grpc"]
     one = named(folder, "Service", metrics.hostname)["spec"]
     assert metrics.port in [port["port"] for port in one["ports"] if port["name"] == "metrics"]
@@ -291,7 +289,7 @@ def test_the_gateway_reaches_triton(folder: str) -> None:
 
 @pytest.mark.parametrize("folder", OVERLAYS)
 def test_kube_prometheus_stack_finds_monitors_and_rules(folder: str) -> None:
-    """It selects both by the name of its Helm release, and nothing else is labelled so."""
+    """Prometheus selects both by the name of the Helm release, a label that only they have."""
     labelled = [one for one in built(folder) if "release" in one["metadata"].get("labels", {})]
     assert labelled == built(folder, "PodMonitor") != []
     (release,) = {one["metadata"]["labels"]["release"] for one in labelled}
@@ -377,7 +375,7 @@ def test_the_command_that_copies_the_repository_copies_it_and_adds_a_version(tmp
 
 
 def test_the_probes_tell_a_living_model_from_a_dead_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a pod's container runs, on ports of this machine: the demo's ``rfm`` alone."""
+    """Run a pod's container command on local ports with the demo's ``rfm`` alone."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     repository, key, log = tmp_path / "model_repository", tmp_path / "admin-key", tmp_path / "log"
     shutil.copytree(ROOT / "model_repository" / "rfm", repository / "rfm")
@@ -424,7 +422,7 @@ def test_the_probes_tell_a_living_model_from_a_dead_one(tmp_path: Path, monkeypa
 
 
 def run_kserve_s_liveness_probe(status_port: int) -> None:
-    """Raises CalledProcessError if it does not pass. Knative sends an httpGet to no port but that of requests."""
+    """Raise CalledProcessError if the probe fails. Knative sends an httpGet only to the port of requests."""
     container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
     program, *words, script = container["livenessProbe"]["exec"]["command"]
     assert program == "python"

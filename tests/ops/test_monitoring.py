@@ -26,9 +26,8 @@ import yaml
 
 from paths import ROOT
 from repositories import kill_model
-from rfm.launch.triton_server import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
-from rfm_serve import MODEL, serving, wait_for
+from servers import MODEL, Endpoints, serving, wait_for
 from trajectories import random_trajectory
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -37,7 +36,7 @@ PROMETHEUS = ROOT / "docker" / "prometheus"
 GRAFANA = ROOT / "docker" / "grafana"
 RUNBOOKS = ROOT / "docs" / "guides" / "operate.md"
 
-INTERVALS = {"15s": "1s", "1m": "10s"}  # of the files, and what they are here
+INTERVALS = {"15s": "1s", "1m": "10s"}  # in the files, and in the tests
 EMBEDDING_DIMS = (64, 32)  # D and Dt of the demo's checkpoint
 TOO_MANY_FRAMES = 100  # for it
 GATEWAY_CALLERS = 4
@@ -73,7 +72,7 @@ def program(name: str) -> str:
 
 @dataclass(frozen=True)
 class Monitored:
-    """A Prometheus, and what it scrapes."""
+    """A Prometheus with the scraped servers."""
 
     url: str
 
@@ -83,7 +82,7 @@ class Monitored:
         return answer["data"]
 
     def query(self, expression: str) -> list[Json]:
-        """Each series that has a number."""
+        """Return the series with finite values."""
         result = self.get("query", query=expression)["result"]
         return [entry for entry in result if math.isfinite(float(entry["value"][1]))]
 
@@ -138,7 +137,7 @@ def embedded(seed: int, num_frames: int) -> Trajectory:
 
 
 def load_triton(url: str, is_over: threading.Event) -> None:
-    """Samples of all kinds and both models, among them bad ones."""
+    """Send samples of all kinds to both models, also bad ones."""
     frames = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), np.uint8)
     seed = 0
     with RewardClient(url, retry=False) as client:
@@ -151,7 +150,7 @@ def load_triton(url: str, is_over: threading.Event) -> None:
                 client.progress(embedded(seed, TOO_MANY_FRAMES))
             except InvalidSampleError:
                 pass
-            except RewardError:  # of a model whose process was killed
+            except RewardError:  # the model process was killed
                 is_over.wait(0.1)
 
 
@@ -185,7 +184,7 @@ def loaded(endpoints: Endpoints, gateway_url: str) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def monitored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Monitored]:
-    """Once all is scraped, a model's process dies: what was never started again is in no metric."""
+    """After the first scrape a model process dies, since metrics of restarts appear with the first restart."""
     folder = tmp_path_factory.mktemp("monitored")
     repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
     free = Endpoints.free()
@@ -256,7 +255,7 @@ def test_every_query_of_the_dashboard_gives_data(monitored: Monitored, expressio
     for name, value in {"$model": ".*", "$version": ".*", "$__rate_interval": INTERVALS["1m"]}.items():
         expression = expression.replace(name, value)
     assert "$" not in expression
-    if expression.startswith("ALERTS"):  # of the process that the fixture has killed; it may be over by now
+    if expression.startswith("ALERTS"):  # about the killed process; may be over by now
         expression = f"last_over_time({expression}[10m])"
     if NEEDS_GPU in expression and not torch.cuda.is_available():
         assert monitored.query(expression) == []

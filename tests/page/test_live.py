@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Running episodes at the gateway: what is kept of them, what is told, what is refused. No Triton is needed for that."""
+"""Running episodes at the gateway: storage, answers, refusals. No Triton is needed."""
 
 from __future__ import annotations
 
@@ -17,16 +17,10 @@ from PIL import Image
 from gateway_requests import failure
 from gateways import TestClient, inside, running
 from live_reports import Json, episode, identity, jpeg, picture, report, step
-from rfm.launch.triton_server import Endpoints
 from rfm_client.episodes import StepScore
-from rfm_page.live import (
-    FORGOTTEN_AFTER_S,
-    MOST_BODY_BYTES,
-    MOST_EPISODES,
-    LiveEpisodes,
-    LiveReport,
-)
+from rfm_page.live import FORGOTTEN_AFTER_S, MOST_BODY_BYTES, MOST_EPISODES, LiveEpisodes, LiveReport
 from rfm_rl import LiveView, live
+from servers import Endpoints
 
 KEY = "open sesame"
 

@@ -14,11 +14,10 @@ from selenium.webdriver import ActionChains
 
 from browsers import Browser
 from gateways import Gateway, free_port, poll, running
-from rfm.launch.triton_server import Endpoints
-from rfm_client import RewardClient
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import RewardClient, UInt8Array
 from rfm_client.episodes import StepScore
 from rfm_rl import LiveView
+from servers import Endpoints
 from toy_world import Task, make_clip
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -72,7 +71,7 @@ class Page:
         self.browser["live-tab"].click()
 
     def cards(self, run: str) -> list[dict[str, str]]:
-        """What the page shows of the episodes of a run, in its order."""
+        """Return the cards of a run's episodes in the page's order."""
         return list(self.browser.run(CARDS, run))
 
     def shows(self, run: str, *expected: dict[str, str]) -> None:
@@ -87,13 +86,13 @@ class Page:
         poll(is_so)
 
     def has_pictures(self, run: str, *frames: UInt8Array) -> bool:
-        """Whether the page shows these frames of a run, as JPEG keeps them."""
+        """Return True if the page shows these frames of a run, up to JPEG's losses."""
         shown = self.browser.pixels(self.browser.run(PICTURES, run))
         off = [float(np.abs(one.astype(int) - other).mean()) for one, other in zip(shown, frames, strict=False)]
         return len(shown) == len(frames) and max(off) < 2
 
     def drawn(self, name: str) -> dict[str, list[float]]:
-        """The curve that the chart of an episode has drawn last."""
+        """Return the last curve in an episode's chart."""
         return dict(self.browser.run("return window.drawn[arguments[0]]", f"{name}, environment 0"))
 
 
@@ -205,7 +204,7 @@ def test_a_page_that_is_loaded_later_shows_the_same(page: Page) -> None:
 
 @pytest.mark.parametrize("first", [1, 10**9])
 def test_an_episode_that_is_first_heard_of_late_is_shown(page: Page, first: int) -> None:
-    """Its one point leaves the axis of the chart no length of its own."""
+    """A single point leaves the chart's axis without a length."""
     with LiveView(page.url, name=f"late {first}") as view:
         view.episode("wait").add(FRAMES[0], StepScore(0.5, 0.25, False, first, 3.0))
         page.shows(f"late {first}", {"Step": f"{first}", "state": "running"})
@@ -315,27 +314,3 @@ def test_a_page_without_key_asks_for_it_and_goes_on_with_a_gateway_that_comes_ba
             assert "api_key=" in browser.run("return document.getElementById('live-code').textContent")
         told = browser.until("document.getElementById('errors').textContent")
         assert told.startswith("gateway: expected an answer, got none")
-
-
-def test_a_picture_of_the_page(
-    demo_server: Endpoints, client: RewardClient, quiet_browser: Browser, tmp_path: Path
-) -> None:
-    videos = [
-        FRAMES,
-        DROPPED,
-        make_clip("rewound", TASK, 2_000_002).frames,
-        make_clip("success", TASK, 2_000_003).frames,
-    ]
-    with running(demo_server, tmp_path) as gateway, LiveView(gateway.url, name="policy 7") as view:
-        page = Page(gateway.url, quiet_browser)
-        page.open()
-        episodes = client.episodes(len(videos), SENTENCE, live=view)
-        for frames in zip(*videos, strict=True):
-            episodes.add(list(frames))
-        episodes.reset([False, True, False, True])
-        for frame in FRAMES[:9]:
-            episodes.add([videos[3][0], frame, frame, videos[2][0]], [False, True, False, False])
-        poll(lambda: len(page.cards("policy 7")) == 5 and page.cards("policy 7")[1]["Step"] == "8")
-        poll(lambda: len(quiet_browser.run(PICTURES, "policy 7")) == 5)
-        quiet_browser.picture("page_live.png")
-        quiet_browser.driver.get("about:blank")  # before its gateway ends

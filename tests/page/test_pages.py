@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The files of the page and of the endpoints' documentation. No Triton is needed."""
+"""Files of the page and the endpoints' documentation. No Triton is needed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
 
 from gateways import TestClient, inside
 from paths import ROOT
-from rfm_client.frames.video import read_video
+from rfm_client.frames import read_video
 from toy_world import Task, make_clip
 
 GATEWAY, PAGE = ROOT / "apps" / "gateway" / "rfm_gateway", ROOT / "apps" / "page" / "rfm_page"

@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""What the page asks about videos, before a real Triton."""
+"""The page's requests about videos, with a real Triton."""
 
 from __future__ import annotations
 
 import re
 import shlex
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 import requests
 
 import clip
-from gateway_requests import ENCODERS, TINY, TOLERANCE, VLM, Triton, check_refused, failure
+from gateway_requests import ENCODERS, TINY, VLM, Triton, check_refused, failure
 from gateways import Gateway, poll, running
-from rfm_client.frames.sampling import RULES
+from rfm_client.frames import Rule
+from tolerances import TOLERANCE
 from viewer_requests import COMPARE, SCORE, SERVED, by_command_line, curve_of, events, post
 
 pytestmark = pytest.mark.triton
@@ -36,7 +38,9 @@ def test_the_models_that_score_frames_are_offered(tiny: Gateway, encoders: Gatew
     assert [model["name"] for model in served["models"]] == [ENCODERS, VLM]
     assert (served["model"], served["url"], served["fps"]) == (ENCODERS, encoders.triton_url, 3.0)
     frames = {rule["name"]: rule["frames"] for rule in served["rules"]}
-    assert frames == {rule: 16 if rule.startswith("rewind") else None if rule == "all" else "any" for rule in RULES}
+    assert frames == {
+        rule: 16 if rule.startswith("rewind") else None if rule == "all" else "any" for rule in get_args(Rule)
+    }
     assert requests.get(f"{tiny.url}/{SERVED}").json()["model"] == TINY
 
 

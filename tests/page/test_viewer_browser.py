@@ -21,11 +21,11 @@ from selenium.webdriver.support.select import Select
 
 import clip
 from browsers import Browser
-from gateway_requests import TOLERANCE
 from gateways import Gateway, poll, running
 from paths import VIDEOS
-from rfm.launch.triton_server import Endpoints
 from rfm_client.frames import ChannelOrder, Correction, Orientation
+from servers import Endpoints
+from tolerances import SHOWN, TOLERANCE
 from toy_world import Task, make_clip
 from viewer_requests import by_command_line
 
@@ -36,7 +36,6 @@ TASK, OTHER_TASK = Task("red", "bowl").sentence(), Task("green", "plate").senten
 CLIPS = {"success": ("success", 2_000_000), "failure": ("dropped", 2_000_001)}
 FPS = 10
 SIGNALS = ("progress", "success")
-SHOWN = 5e-4  # three decimals
 PLAYERS = "#videos video, #time"  # the videos, then the slider
 
 
@@ -52,7 +51,7 @@ class Page:
         self.browser.drop([self.videos / f"{name}.mp4" for name in names])
 
     def score(self, *names: str) -> None:
-        """Drops videos, and waits for their curves."""
+        """Drop videos and wait for the curves."""
         self.drop(*names)
         self.browser.until_text("status", f"{len(names)} of {len(names)} curves are done.")
 
@@ -63,12 +62,12 @@ class Page:
         return answer
 
     def saved(self) -> Any:
-        """What the page lets a person take along."""
+        """Return the JSON that the page saves."""
         self.browser["json"].click()
         return json.loads(self.browser.saved("curves.json"))
 
     def beside_the_lines(self) -> list[float]:
-        """The numbers at the cursor: progress of each curve, then success of each."""
+        """Return the numbers at the cursor: progress by curve, then success by curve."""
         return [float(text) for signal in SIGNALS for text in self.browser.values("chart", signal).values()]
 
     def is_at(self, time_s: float, abs_s: float = 0.005) -> bool:
@@ -130,7 +129,7 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
 
 
 def picture(page: Page) -> Image.Image:
-    """What the page shows of its one video, without the box around it."""
+    """Return the picture of the only video, without the surrounding box."""
     (player,) = page.browser.all("#videos video")
     page.browser.run("arguments[0].scrollIntoView()", player)
     page.browser.draw()
@@ -421,11 +420,3 @@ def test_axe_finds_nothing_in_either_theme(page: Page) -> None:
 def test_the_documentation_of_endpoints_needs_no_network(gateway: Gateway, quiet_browser: Browser) -> None:
     quiet_browser.driver.get(f"{gateway.url}/docs")
     quiet_browser.until("document.body.textContent.includes('/evaluate_batch_npy')")
-
-
-def test_a_picture_of_the_page(page: Page) -> None:
-    page.score("success", "failure")
-    page.browser["time"].send_keys(*[Keys.ARROW_RIGHT] * 12)
-    poll(lambda: page.is_at(1.2))
-    page.compare()
-    page.browser.picture("page.png")

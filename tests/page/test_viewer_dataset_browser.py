@@ -19,21 +19,20 @@ from selenium.webdriver import ActionChains, Keys
 from selenium.webdriver.support.select import Select
 
 from browsers import Browser
-from gateway_requests import TOLERANCE
 from gateways import poll, running
 from labelling import BrightnessScorer
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset, summarise
-from rfm_labels.datasets.lerobot import LeRobotDataset
+from rfm_labels.datasets import LeRobotDataset
 from rfm_rl import LiveView
+from servers import Endpoints
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, large
+from tolerances import SHOWN, TOLERANCE
 from toy_world import Task, make_clip
 from viewer_requests import run_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
-SHOWN = 5e-4  # three decimals, and a tenth of a per cent
 KEY = "open sesame"
 OTHER = "brightness"  # the second reward of the first dataset
 NUM_LARGE = 10_000
@@ -43,16 +42,16 @@ VIDEOS = "#episode-videos video"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
 BEYOND = """
 return [document.documentElement, ...document.querySelectorAll(".work")].map((each) => each.scrollWidth - each.clientWidth);
-"""  # how far the page and what each tab shows reach to the right of what can be seen
+"""  # pixels by which the page and each tab overflow to the right
 PICTURES_ARE_THERE = """[...document.querySelectorAll("#live-episodes article")]
   .filter((card) => card.getBoundingClientRect().top < innerHeight)
-  .every((card) => card.querySelector("img").naturalWidth)"""  # the page fetches none that is out of sight
+  .every((card) => card.querySelector("img").naturalWidth)"""  # the page fetches only visible pictures
 ARE_THERE = f"[...document.querySelectorAll('{VIDEOS}')].every((video) => !video.seeking && video.readyState >= 2)"
 
 
 @dataclass(frozen=True)
 class Page:
-    """The tab of datasets. folders: of the datasets, by their numbers"""
+    """The tab of datasets. folders: by number of the dataset"""
 
     url: str
     browser: Browser
@@ -68,17 +67,17 @@ class Page:
 
     @property
     def rows(self) -> list[list[str]]:
-        """The cells of the table of episodes."""
+        """Return the cells of the episodes' table."""
         return self.browser.cells("#episodes tr")
 
     @property
     def episodes(self) -> list[int]:
-        """The episodes of the table, in its order."""
+        """Return the episodes in the table's order."""
         return [int(row[1]) for row in self.rows]
 
     @property
     def numbers(self) -> list[list[float]]:
-        """Progress and success of each of the watched episode's curves, beside its lines."""
+        """Return progress and success beside each curve of the watched episode."""
         values = [self.browser.values("episode-chart", signal) for signal in ("progress", "success")]
         return [[float(of_signal[name]) for of_signal in values] for name in values[0]]
 
@@ -91,13 +90,13 @@ class Page:
         return dataset
 
     def watch(self, episode: int) -> None:
-        """Clicks an episode, and waits for its videos."""
+        """Click an episode and wait for the videos."""
         self.browser.run(f"document.querySelector('#episodes tr[data-episode=\"{episode}\"] button').click()")
         self.browser.until_text("episode-title", f"Episode {episode}")
         self.browser.until(f"document.querySelectorAll('{VIDEOS}').length === 2 && {ARE_THERE}")
 
     def at_rest(self, episode: int) -> None:
-        """Watches an episode, stops it, and goes back to its begin."""
+        """Watch an episode, stop it, and go back to the beginning."""
         self.watch(episode)
         self.move_to(0)
         self.browser.until_text("episode-play", "Play")
@@ -110,7 +109,7 @@ class Page:
             time_s,
         )
         poll(lambda: self.is_at(time_s, 0.02))
-        self.browser.until(ARE_THERE)  # a video that still seeks tells where it is going, and shows where it was
+        self.browser.until(ARE_THERE)  # a seeking video reports the target and shows the old frame
 
     def is_at(self, time_s: float, abs_s: float) -> bool:
         return self.browser.times_s(PLAYERS) == pytest.approx([time_s] * 3, abs=abs_s)
@@ -119,7 +118,7 @@ class Page:
         return len({round(time_s, 2) for time_s in self.browser.times_s(PLAYERS)}) == 1
 
     def score_episode(self) -> None:
-        """Puts the episode into the score tab, and waits for its curves."""
+        """Put the episode into the score tab and wait for the curves."""
         self.browser["score-episode"].click()
         assert self.browser["score-panel"].is_displayed()
         self.browser.until_text("status", "2 of 2 curves are done.")
@@ -194,7 +193,7 @@ def test_the_table_has_the_numbers_of_the_labels(page: Page, number: int) -> Non
 
 
 def episodes_by(*keys: np.ndarray[Any, Any]) -> list[int]:
-    """The numbers of the episodes, the lowest of the first key first."""
+    """Return the episodes' numbers, sorted by the keys."""
     return np.lexsort([np.arange(len(keys[0])), *reversed(keys)]).tolist()  # type: ignore[no-any-return]
 
 
@@ -253,7 +252,7 @@ def test_the_threshold_moves_counts_and_histogram_and_is_dragged_in_the_chart(pa
 
 
 def tick(page: Page, name: str, number: float | None = None) -> None:
-    """Sets a filter, and its number."""
+    """Set a filter and a number."""
     if number is not None:
         page.browser.write(f"number-{name}", f"{number}")
     page.browser[f"only-{name}"].click()
@@ -395,7 +394,7 @@ def test_ten_thousand_episodes_are_a_few_rows_of_the_document(
         page.browser.until_text("episode-title", f"Episode {NUM_LARGE - 1}")
         page.browser["episode-before"].click()
         page.browser.until_text("episode-title", f"Episode {NUM_LARGE - 2}")
-        quiet_browser.driver.get("about:blank")  # before its gateway ends
+        quiet_browser.driver.get("about:blank")  # before the gateway ends
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (1024, 700)], ids=str)
@@ -466,7 +465,9 @@ def test_an_episode_is_put_into_the_score_tab_and_scored(page: Page) -> None:
     page.score_episode()
     assert page.browser["tasks"].get_attribute("value") == dataset.episodes[0].task
     columns = columns_of(page.folders[DEMO], 0)
-    names = [each.get_attribute("title") for each in page.browser.all("#curves th[title]")]  # longer than what is shown
+    names = [
+        each.get_attribute("title") for each in page.browser.all("#curves th[title]")
+    ]  # longer than the visible part
     for name, row, camera in zip(names, page.browser.cells("#curves tr"), CAMERAS, strict=True):
         assert name == f"toy_v30_many_episode_000000.{camera.rpartition('.')[2]}.mp4"
         assert row[4] == f"{len(columns['index'])} of {len(columns['index'])}"
@@ -501,7 +502,7 @@ def test_episodes_without_labels_can_be_watched_and_scored(page: Page) -> None:
 
 @pytest.fixture
 def running_episodes(url: str, demo_server: Endpoints) -> Iterator[None]:
-    """Episodes of four environments, of which one has ended and three still run."""
+    """Episodes of four environments; three still run."""
     kinds = ("success", "dropped", "rewound", "success")
     clips = [make_clip(kind, CLIP_TASK, CLIP_SEED + n).frames for n, kind in enumerate(kinds)]
     with RewardClient(demo_server.grpc_url) as client, LiveView(url, name="policy 7") as view:
@@ -518,7 +519,7 @@ def running_episodes(url: str, demo_server: Endpoints) -> Iterator[None]:
 @pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
 @pytest.mark.usefixtures("running_episodes")
 def test_no_tab_is_wider_than_the_window(page: Page, size: tuple[int, int], theme: str) -> None:
-    """It leaves pictures of each tab among the downloads."""
+    """Leaves a picture of each tab among the downloads."""
 
     def fits(name: str) -> None:
         file = page.browser.downloads / f"{name}_{size[0]}x{size[1]}_{theme}.png"
@@ -605,10 +606,3 @@ def test_broken_episodes_are_marked_and_an_hdf5_dataset_is_watched(
         browser.until(f"document.querySelectorAll('{VIDEOS}').length === 1 && {ARE_THERE}")
         assert not browser["score-episode"].is_enabled()
         assert browser["use-words"].text.startswith("# LeRobot does not read HDF5")
-
-
-def test_a_picture_of_the_page(page: Page) -> None:
-    page.choose(DEMO)
-    page.at_rest(3)
-    page.move_to(1.2)
-    page.browser.picture("page_dataset.png")

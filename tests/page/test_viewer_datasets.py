@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the page asks of datasets: episodes, curves and videos, and what it is refused. No Triton is needed for that."""
+"""The page's requests about datasets: episodes, curves, videos, refusals. No Triton is needed."""
 
 from __future__ import annotations
 
@@ -25,15 +25,13 @@ from gateway_requests import failure
 from gateways import free_port, inside
 from labelling import LEROBOT, BrightnessScorer
 from pictures import TURNS, turn
-from rfm_client.contract.settings import ConfigError
+from rfm_client.options import ConfigError
 from rfm_gateway import GatewayConfig, check_gateway
 from rfm_labels import LabelOptions, label, open_dataset
-from rfm_labels.datasets.lerobot import LeRobotDataset
-from rfm_labels.options import Format
-from rfm_page.page import shown_datasets
+from rfm_labels.datasets import LeRobotDataset
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew
 
-V21, V30 = range(2)  # numbers of the datasets with labels; one without follows
+V21, V30 = range(2)  # datasets with labels; one without follows
 VIDEO = "videos/observation.images.front/chunk-000/file-000.mp4"  # of the episodes below
 OF_VIDEO = range(4)
 NEEDS_LATER = {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "3", "b_strategy": "0"}
@@ -42,7 +40,7 @@ Get = Callable[[str], Any]
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Of the datasets, by their numbers."""
+    """Folders by number of the dataset."""
     folder = tmp_path_factory.mktemp("shelf")
     labelled = [copied(name, folder) for name in ("toy_v21", "toy_v30_many")]
     for root in labelled:
@@ -52,7 +50,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @contextmanager
 def serving(*roots: Path, **settings: Any) -> Iterator[Get]:
-    """Gives the answers of a gateway that shows the datasets in these folders."""
+    """Run a gateway that shows the datasets in these folders. Yields a function that asks it."""
     with inside(dataset=tuple(map(str, roots)), **settings) as gateway:
         yield lambda path: gateway.get(f"/viewer/datasets{path}")
 
@@ -89,7 +87,7 @@ def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: 
 
 
 @pytest.mark.parametrize("form", ["progress", "signals"])
-def test_the_table_tells_how_pictures_became_upright_rgb_for_the_labels(tmp_path: Path, form: Format) -> None:
+def test_the_table_tells_how_pictures_became_upright_rgb_for_the_labels(tmp_path: Path, form: Any) -> None:
     root = copied("toy_v21", tmp_path)
     corrected = open_dataset(root, orient={"wrist": "rotate180"}, channels="bgr")
     label(corrected, BrightnessScorer(), LabelOptions(formats=(form,)))
@@ -220,8 +218,8 @@ def test_a_dataset_with_links_that_leave_it_is_refused(folders: list[Path], tmp_
         (root / name).rename(tmp_path / "moved")
     (root / name).symlink_to(folders[V30] / name)
     expected = f"{root / name}: expected a file in the dataset's folder, got a link that leaves it"
-    with pytest.raises(ConfigError, match=expected):
-        shown_datasets(GatewayConfig(dataset=(str(root),)))
+    with pytest.raises(ConfigError, match=expected), inside(dataset=(str(root),)):
+        pass
 
 
 @pytest.mark.parametrize(("name", "path"), [(VIDEO, "/0/episodes/0/videos/0"), ("rfm_progress.parquet", "/0")])
@@ -246,12 +244,15 @@ def test_a_folder_that_hides_its_links_is_refused(tmp_path: Path, monkeypatch: p
         return listed(folder)
 
     monkeypatch.setattr(os, "scandir", scandir)
-    with pytest.raises(ConfigError, match="videos: expected a folder whose files can be listed, got Permission denied"):
-        shown_datasets(GatewayConfig(dataset=(str(root),)))
+    with (
+        pytest.raises(ConfigError, match="videos: expected a folder whose files can be listed, got Permission denied"),
+        inside(dataset=(str(root),)),
+    ):
+        pass
 
 
 def test_a_pipe_in_a_dataset_is_not_read(tmp_path: Path) -> None:
-    """Whoever opened it would wait for somebody to write."""
+    """Opening it would block until a writer comes."""
     root = copied("toy_v30_many", tmp_path)
     with serving(root) as get:
         (root / VIDEO).unlink()
@@ -268,7 +269,7 @@ def test_links_inside_a_dataset_are_followed(tmp_path: Path) -> None:
         check_frames(get, root, 1)
 
 
-BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, its content, the path that is asked, what is told
+BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, the content, the requested path, the message
     "no video": (VIDEO, None, "/0/episodes/0/videos/0", "file-000.mp4: expected a video file, got none"),
     "a play list": (
         VIDEO,
@@ -364,8 +365,8 @@ def test_a_folder_that_is_no_dataset_is_refused_at_start(tmp_path: Path, name: s
     (tmp_path / "v9" / "meta").mkdir(parents=True)
     info = json.loads((LEROBOT / "toy_v21" / "meta" / "info.json").read_text())
     (tmp_path / "v9" / "meta" / "info.json").write_text(json.dumps({**info, "codebase_version": "v9.9"}))
-    with pytest.raises(ConfigError, match=rf"dataset: .*{message}"):
-        shown_datasets(GatewayConfig(dataset=(str(tmp_path / name),)))
+    with pytest.raises(ConfigError, match=rf"dataset: .*{message}"), inside(dataset=(str(tmp_path / name),)):
+        pass
 
 
 def test_a_missing_package_names_the_mend(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from paths import ROOT
 
-# Of a Robometer with 4 billion parameters, for a sample of 8 frames of 224x224; each layer more is 28 to 31.
+# For a Robometer with 4 billion parameters and 8 frames of 224x224; another layer adds 28 to 31.
 MOST_KERNELS = 1_570
 TOKENS, LEAST_TFLOP = 583, 5.3
 

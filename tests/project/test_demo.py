@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The demo, the checkpoint that it shows, and how that is made."""
+"""The demo, the demo's checkpoint, and the training."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-from typer.testing import CliRunner
 
 import clip
 import rfm_export
 from commands import nothing_left_behind
+from in_process import rfm
 from paths import ROOT, VIDEOS
 from rfm.config import ExportConfig
 from rfm_client import load_trajectory
-from rfm_client.frames.video import read_video
-from rfm_commands.cli import app
+from rfm_client.frames import read_video
 from toy_world import Task, make_clip
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -32,7 +31,7 @@ PNG = b"\x89PNG"
 
 
 def example(name: str, *arguments: object) -> str:
-    """What a script of examples/ prints."""
+    """Return the output of a script in examples/."""
     command = [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)]
     environment = {**os.environ, "COLUMNS": "160"}
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, env=environment)
@@ -55,7 +54,7 @@ def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_a_policy_is_paid_by_the_served_checkpoint(tmp_path: Path) -> None:
-    """Two short rounds; ten whole ones, which take minutes, teach it the task."""
+    """Two short rounds; learning the task takes ten whole ones and minutes."""
     few = ("--rounds", 2, "--population", 6, "--scenes", 1, "--tests", 3, "--log", tmp_path / "triton.log")
     with nothing_left_behind():
         shown = example("train_policy.py", *few).splitlines()
@@ -66,7 +65,7 @@ def test_a_policy_is_paid_by_the_served_checkpoint(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_the_served_checkpoint_keeps_its_bounds_on_clips_it_never_saw(tmp_path: Path) -> None:
-    """A part of what the model card tells, which is of 240 tasks."""
+    """A part of the model card's numbers, which cover 240 tasks."""
     output = tmp_path / "evaluation.json"
     with nothing_left_behind():
         shown = example("evaluate_demo_checkpoint.py", "--repository", REPOSITORY, "--clips", 48, "--output", output)
@@ -91,7 +90,7 @@ def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: p
         "--text-encoder": encoders / "text_encoder",
     }
     with nothing_left_behind():
-        result = CliRunner().invoke(app, ["demo", *(str(word) for pair in options.items() for word in pair)])
+        result = rfm("demo", *(str(word) for pair in options.items() for word in pair))
     assert result.exit_code == 0, result.output
     for shown in (clip.TASK, "clip.mp4", "32 frames", "batches"):
         assert shown in result.output
@@ -107,7 +106,7 @@ def test_a_repository_that_cannot_be_served_is_told(tmp_path: Path) -> None:
         (spaced, "a path without spaces, such as a link (ln -s)"),
     ):
         options = {"--video": tmp_path / "clip.mp4", "--task": "x", "--repository": repository, "--output": tmp_path}
-        result = CliRunner().invoke(app, ["demo", *(str(word) for pair in options.items() for word in pair)])
+        result = rfm("demo", *(str(word) for pair in options.items() for word in pair))
         assert result.exit_code == 1
         assert result.stderr.startswith(f"rfm: repository: expected {told}, got {repository}")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The documentation: its examples run as they stand there, and what it must tell it tells."""
+"""The documentation: examples run as they stand, and nothing required is missing."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from typer.main import get_command
 
 import clip
 import toy_dataset
+from in_process import rfm_app, rfm_client_app
 from labelling import LEROBOT
 from paths import ROOT
-from rfm.launch.triton_server import Endpoints
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
-from rfm_client.cli.commands import app
 from rfm_client.contract import FRAME_SCORES, wire
-from rfm_client.contract.settings import Setting, settings_of
-from rfm_commands.cli import app as rfm
+from rfm_client.contract.settings import Setting
+from rfm_client.options import settings_of
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
+from servers import Endpoints
 
 pytestmark = pytest.mark.triton
 
@@ -54,12 +54,12 @@ COMMAND = re.compile(r"^ {4,}(rfm-client [^#\n]*)", re.MULTILINE)
 ANY_COMMAND = re.compile(r"^ {4,}(?:[^#\n`]*[;&|] *)?((?:\.venv/bin/)?rfm(?:-client)? (?:\\\n|[^#\n])*)", re.MULTILINE)
 IN_A_SCRIPT = re.compile(r"^ {0,3}(rfm(?:-client)? (?:-|\w+ -)(?:\\\n|[^#\n])*)", re.MULTILINE)  # not indented: fenced
 VARIABLE = re.compile(r"\$\(\(.*?\)\)|\$\w+")
-ENDS = ("|", "||", "&", "&&", ";", ">")  # what follows is no argument
+ENDS = ("|", "||", "&", "&&", ";", ">")  # no arguments follow
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.*)", re.MULTILINE)
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
 PATH = re.compile(r"[` ](?!\.venv)([\w.-]+/[\w./-]*\w/?)(?=[` ])")
-SERVED_AS = {  # the guides' words, by what this server and this dataset have
+SERVED_AS = {  # placeholders of the guides, and values of this server and dataset
     "--model first": "--model rfm",
     "--model second": "--model rfm",
     "--episodes 0:20": "--episodes 0:8",
@@ -67,7 +67,7 @@ SERVED_AS = {  # the guides' words, by what this server and this dataset have
 
 
 def found(pattern: re.Pattern[str], files: Iterable[Path] = RUN) -> list[Any]:
-    """Each match in each document, named by file and number. What the guides show runs at night."""
+    """Return each match in each document as a parameter. Those of the guides run at night."""
     matches = [
         pytest.param(
             match,
@@ -83,7 +83,7 @@ def found(pattern: re.Pattern[str], files: Iterable[Path] = RUN) -> list[Any]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The files that the documentation speaks of."""
+    """The files named in the documentation."""
     (tmp_path / "demo_output").mkdir()
     for name in (
         "video.mp4", "a.mp4", "b.mp4", "success.mp4", "failure.mp4", "demo_output/success.mp4", "demo_output/failure.mp4",
@@ -106,7 +106,7 @@ def pictures(seed: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 
 def names() -> dict[str, Any]:
-    """What the examples take as given: the demo checkpoint reads embeddings of 64 and 32."""
+    """Names that the examples use; the demo checkpoint reads embeddings of 64 and 32."""
     random = np.random.default_rng(0)
     embeddings, text = random.standard_normal((8, 64), np.float32), random.standard_normal(32, np.float32)
     filmed = Trajectory(frames=pictures(1), task="stack the cups")
@@ -168,7 +168,7 @@ def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: 
 
 
 def check_gateway(endpoints: Endpoints, command: str) -> None:
-    """It runs until it is told to stop."""
+    """Runs until a signal."""
     port = Endpoints.free().http_port
     words = [*shlex.split(command), "--triton", endpoints.grpc_url, "--metrics-url", endpoints.metrics_url]
     program = Path(sys.executable).parent / words[0]
@@ -188,12 +188,12 @@ def check_gateway(endpoints: Endpoints, command: str) -> None:
 
 def test_every_command_of_the_client_is_shown() -> None:
     guide = CLIENT_GUIDE.read_text()
-    for name in get_command(app).commands:  # type: ignore[attr-defined]
+    for name in get_command(rfm_client_app).commands:  # type: ignore[attr-defined]
         assert f"rfm-client {name}" in guide
 
 
 def test_every_exit_code_is_shown() -> None:
-    from rfm_client.cli.command import ExitCode
+    from rfm_client.command_line import ExitCode
 
     guide = CLIENT_GUIDE.read_text()
     for code in ExitCode:
@@ -223,11 +223,11 @@ def test_every_command_line_is_one_that_the_commands_take(command: str) -> None:
     if "..." in words or any("[" in word for word in words):
         return  # a pattern
     program, *arguments = itertools.takewhile(lambda word: word not in ENDS, words)
-    parse(get_command(rfm if Path(program).name == "rfm" else app), arguments)
+    parse(get_command(rfm_app if Path(program).name == "rfm" else rfm_client_app), arguments)
 
 
 def parse(command: Command, arguments: Sequence[str], parent: Context | None = None) -> None:
-    """Raises click's UsageError for what the command does not take."""
+    """Raise click's UsageError for unknown options and wrong values."""
     subcommands: dict[str, Command] = getattr(command, "commands", {})
     end = next((index for index, word in enumerate(arguments, 1) if word in subcommands), len(arguments))
     context = command.make_context(command.name, list(arguments[:end]), parent)
@@ -237,7 +237,7 @@ def parse(command: Command, arguments: Sequence[str], parent: Context | None = N
 
 def test_every_command_and_option_is_documented() -> None:
     configuration = CONFIGURATION.read_text()
-    for name, command in get_command(rfm).commands.items():  # type: ignore[attr-defined]
+    for name, command in get_command(rfm_app).commands.items():  # type: ignore[attr-defined]
         assert command.help, name
         assert f"`rfm {name}`" in configuration
         for parameter in options(command):
@@ -246,7 +246,7 @@ def test_every_command_and_option_is_documented() -> None:
 
 
 def options(command: Command) -> Iterator[Parameter]:
-    """Those of a command and of its subcommands, each of which has a help text."""
+    """Return the options of a command and all subcommands. Check the help texts."""
     for parameter in command.params:
         if parameter.param_type_name == "option" and parameter.name not in COMPLETION:
             assert parameter.help, (command.name, parameter.name)  # type: ignore[attr-defined]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What ``--help`` shows, in the narrowest terminal that is common."""
+"""``--help`` in a narrow terminal."""
 
 from __future__ import annotations
 
@@ -13,22 +13,21 @@ from click import Command
 from click.testing import CliRunner
 from typer.main import get_command
 
+from in_process import rfm_app, rfm_client_app
 from rfm.config import ServeConfig
-from rfm_client.cli.commands import app as rfm_client
-from rfm_commands.cli import app as rfm
-from rfm_gateway.config import GatewayConfig
+from rfm_gateway import GatewayConfig
 
 COMMON = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
 
 
 def commands(name: str, command: Command) -> Iterator[tuple[str, Command]]:
-    """The command and all below it, by what one types."""
+    """Yield the command and all subcommands with the words to type."""
     yield name, command
     for inner, below in getattr(command, "commands", {}).items():
         yield from commands(f"{name} {inner}", below)
 
 
-COMMANDS = {**dict(commands("rfm", get_command(rfm))), **dict(commands("rfm-client", get_command(rfm_client)))}
+COMMANDS = {**dict(commands("rfm", get_command(rfm_app))), **dict(commands("rfm-client", get_command(rfm_client_app)))}
 
 
 def assert_whole(shown: str, command: Command) -> None:

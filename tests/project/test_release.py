@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A release: one version everywhere, and wheels that serve without the source tree."""
+"""A release: the same version everywhere, and wheels that serve without the source tree."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from paths import ROOT
-from rfm.launch.endpoints import Endpoints
+from servers import Endpoints
 
 DISTRIBUTIONS = (ROOT / "client", *(file.parent for file in ROOT.glob("apps/*/pyproject.toml")), ROOT)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What may import what."""
+"""Rules for imports."""
 
 from __future__ import annotations
 
@@ -16,13 +16,18 @@ import pytest
 
 from paths import ROOT
 
-SHARED = {  # what a family may import beside itself
+SHARED = {  # modules that a family may import besides its own
     "rfm.checkpoint",
     "rfm.engine",
     "rfm.family",
     "rfm_client.contract",
 }
-FAMILIES = {"rewind": set(), "vlm": set(), "topreward": {"rfm.vlm"}, "roboreward": {"rfm.vlm"}}  # and what each extends
+FAMILIES = {
+    "rewind": set(),
+    "vlm": set(),
+    "topreward": {"rfm.vlm"},
+    "roboreward": {"rfm.vlm"},
+}  # and the families that each extends
 FOLDERS = {
     "rfm": ".",
     "rfm_client": "client",
@@ -31,13 +36,17 @@ FOLDERS = {
     **{f"rfm_{name}": f"apps/{name}" for name in ("gateway", "labels", "page", "rl")},
 }
 APPLICATIONS = ("rfm_gateway", "rfm_labels", "rfm_page", "rfm_rl")  # which import public names alone
-PUBLIC = {  # modules, each of which lists its names in __all__
+PUBLIC = {  # modules; each lists the names in __all__
     "rfm_client": {"", "command_line", "episodes", "frames", "options", "plot", "recording", "serving"},
     "rfm_gateway": {"", "mounting"},
     "rfm_labels": {"", "commands", "datasets"},
+    "rfm_rl": {"", "sb3"},
+    "rfm_export": {""},
+    "rfm": {"config", "engine", "families"},
 }
 MOST_NAMES = 113  # of the client's public modules together
 MOST_NAMES_OF_LABELS = 36
+MOST_INTERNAL_PERCENT = 45  # of the test lines in files that import internal names
 # Part of the client -> the parts below it, which alone it may import.
 CLIENT: dict[str, set[str]] = {
     "contract": set(),
@@ -53,7 +62,7 @@ CLIENT: dict[str, set[str]] = {
     "recording": {"contract", "transport"},
     "serving": {"contract", "transport"},
 }  # the rest, which all others leave alone: cli and command_line
-# Package, module, or folder of programs -> what of ours it may import besides itself; "!": what of that it may not.
+# Package, module, or folder of programs -> packages of ours that it may import besides itself; "!": exceptions.
 MAY_IMPORT = {
     **{f"rfm_client.{part}": {f"rfm_client.{lower}" for lower in lowers} for part, lowers in CLIENT.items()},
     "rfm_client": set(),
@@ -74,12 +83,12 @@ MAY_IMPORT = {
 }
 EXCEPTIONS = {
     "commands/rfm_commands/cli.py": {"rfm_export"},  # the command, where all packages meet
-    "examples/demo_training/losses.py": {"rfm"},  # what is trained is the network that is served
+    "examples/demo_training/losses.py": {"rfm"},  # trains the served network
     "examples/demo_training/networks.py": {"rfm"},
     "examples/demo.py": {"rfm", "rfm_commands"},  # starts the server
     "examples/evaluate_demo_checkpoint.py": {"rfm"},
     "examples/train_policy.py": {"rfm"},
-    "benchmarks/bench.py": {"rfm", "rfm_export"},  # the engine without a server, and what is served
+    "benchmarks/bench.py": {"rfm", "rfm_export"},  # the engine without a server, and exports
     "benchmarks/client.py": {"rfm", "rfm_export"},
     "benchmarks/contestants.py": {"rfm", "rfm_commands", "rfm_export"},
     "benchmarks/count.py": {"rfm"},
@@ -96,7 +105,7 @@ EXCEPTIONS = {
 }
 FEWEST_WORDS = 4  # of a docstring
 LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last for type checkers only
-# What only an extra brings, and which files need it.
+# Packages that only an extra brings, and the files that need them.
 EXTRAS = {
     "av": {"video_decoding.py"},
     "async_timeout": {"deadline.py"},  # Python 3.10 only
@@ -111,7 +120,7 @@ EXTRAS = {
 
 
 def imports(file: Path) -> set[str]:
-    """Dotted names of everything that a file imports, wherever in it."""
+    """Return the dotted names of all imports in a file."""
     found = set()
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
@@ -123,7 +132,7 @@ def imports(file: Path) -> set[str]:
 
 
 def names_of_others(file: Path, package: str) -> Iterator[tuple[str, str]]:
-    """Module and name of everything of ours that a file imports from another package."""
+    """Yield module and name of each import from another package of ours."""
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in {*FOLDERS} - {package}:
             yield from ((node.module, name.name) for name in node.names)
@@ -147,7 +156,7 @@ def _module(file: Path) -> str:
 
 
 def is_part(name: str, packages: set[str]) -> bool:
-    """Whether the module is one of these packages or in one."""
+    """Return True if the module is, or lies in, one of these packages."""
     return any(name == package or name.startswith(f"{package}.") for package in packages)
 
 
@@ -191,6 +200,12 @@ def test_a_package_has_few_public_names(package: str, most: int) -> None:
     assert len(names) <= most
 
 
+def test_most_tests_use_public_names() -> None:
+    command = [sys.executable, ROOT / "tools" / "internal_imports.py", f"--most={MOST_INTERNAL_PERCENT}"]
+    done = subprocess.run(command, text=True, capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_the_client_needs_only_light_packages() -> None:
     for file in (ROOT / "client" / "rfm_client").rglob("*.py"):
         part = file.relative_to(ROOT / "client" / "rfm_client").parts
@@ -200,12 +215,12 @@ def test_the_client_needs_only_light_packages() -> None:
 
 
 def test_no_extra_of_the_client_names_a_distribution_of_ours() -> None:
-    """A package index may give such a name to somebody else. It names itself, which pip has then."""
+    """A package index may give such a name to a stranger. The client names itself, which pip has by then."""
     named = re.findall(r'"(rfm-[\w-]*)', (ROOT / "client" / "pyproject.toml").read_text())
     assert set(named) == {"rfm-client"}
 
 
-LOADS = {  # modules: what must not be loaded with them
+LOADS = {  # modules: packages that must not be loaded with them
     "rfm.engine": {"transformers", "PIL", "av", "matplotlib"},
     "rfm_labels": {*EXTRAS, "h5py", "pyarrow", "fsspec", "ray", "scipy", "sklearn", "torch"} - {"async_timeout"},
     "rfm_commands.cli, rfm_commands.rollout, rfm.supervise.supervisor": {"torch"},  # two seconds and 200 MB
@@ -225,7 +240,7 @@ def test_the_domain_knows_nothing_of_triton() -> None:
 
 
 def test_only_its_own_folder_knows_a_family() -> None:
-    """Others ask rfm.families, which finds a family by its name."""
+    """Others ask rfm.families, which finds a family by name."""
     own = {ROOT / "rfm" / family for family in FAMILIES}
     for file in (file for part in ("rfm", "export") for file in (ROOT / part).rglob("*.py")):
         if not own & set(file.parents):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rewards for one Gymnasium environment, with steps that wait for their answers and steps that do not."""
+"""Rewards for a Gymnasium environment, with and without waiting for answers."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from environments import (
     scores,
     two_cameras,
 )
-from reference_server import Served
 from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError
 from rfm_rl import RewardModelWrapper, RewardOptions, SuccessRule
+from servers import Served
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_gymnasium_s_own_check_passes_and_close_closes_only_a_client_that_it_mad
     env = RewardModelWrapper(cart_pole(), connect, TASK)
     assert made == []
     with pytest.warns(UserWarning) as warnings:
-        check_env(env, skip_render_check=True, skip_close_check=True)  # which would make it anew, from its name
+        check_env(env, skip_render_check=True, skip_close_check=True)  # which would make it anew from the name
     assert all("different from the unwrapped" in str(w.message) or "infinity" in str(w.message) for w in warnings)
     spec = RecordEpisodeStatistics(env).spec  # outer wrappers may ask for it
     assert spec is not None
@@ -181,7 +181,7 @@ def not_blocking(late: LateClient, **options: Any) -> tuple[RewardModelWrapper, 
     return env, camera
 
 
-# After which step which answers come, and which of them is the newest in use at the next one.
+# Answers that arrive after each step, and the newest in use at the next.
 COMING: list[tuple[tuple[int, ...], int]] = [((), 0), ((), 0), ((2,), 2), ((1,), 2), ((3, 4), 4), ((), 4)]
 
 
@@ -244,7 +244,7 @@ def test_the_last_step_waits_so_that_late_rewards_add_up_unless_it_shall_not(
 def test_an_episode_ends_at_the_step_at_which_success_is_known_and_stays_a_success(
     client: RewardClient, late: LateClient
 ) -> None:
-    """The answer about that step, which is waited for, may say otherwise."""
+    """The awaited answer about that step may differ."""
     camera = Camera(cart_pole())
     play(RewardModelWrapper(camera, client, TASK))
     success = [float(scores(client, camera.videos[0], step, None).success[-1]) for step in range(6)]

@@ -13,20 +13,11 @@ import pytest
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from environments import (
-    MODEL,
-    TASK,
-    TOLERANCE,
-    LateClient,
-    assert_close,
-    cart_pole,
-    cart_pole_with_pixels,
-    progress,
-    two_cameras,
-)
-from reference_server import Served
+from environments import MODEL, TASK, LateClient, assert_close, cart_pole, cart_pole_with_pixels, progress, two_cameras
 from rfm_client import InvalidSampleError, RewardClient
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
+from servers import Served
+from tolerances import TOLERANCE
 
 NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 
@@ -36,7 +27,7 @@ def vector_env(env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], mode: Autores
 
 
 def roll(env: Any, mode: AutoresetMode, steps: int = 24) -> list[tuple[Any, ...]]:
-    """What each step gives, and each reset; both poles fall twice, not at the same time. The first is reset in any mode."""
+    """Yield the results of each step and reset. Both poles fall twice, at different times."""
     told: list[tuple[Any, ...]] = [env.reset(seed=[0, 1])]
     num_ended = 0
     for _ in range(steps):
@@ -50,7 +41,7 @@ def roll(env: Any, mode: AutoresetMode, steps: int = 24) -> list[tuple[Any, ...]
 
 
 def arrays(told: Any, where: str = "") -> dict[str, np.ndarray]:
-    """All arrays in what steps give, by their place: observations, rewards, infos with their masks."""
+    """Return all arrays of step results by path: observations, rewards, infos with masks."""
     if told is None:
         return {}
     if isinstance(told, dict):

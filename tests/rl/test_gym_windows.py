@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which frames the Gymnasium wrappers send: frames that say their environment, episode and step."""
+"""The frames that the Gymnasium wrappers send; each encodes environment, episode and step."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from coded_env import Code, CodedEnv, Recorder, frame_of
 from rfm_client import InvalidSampleError, ServerUnavailableError
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 
-LENGTHS = (3,), (4, 1, 2)  # steps of the episodes of each environment, in turn
+LENGTHS = (3,), (4, 1, 2)  # steps of the episodes by environment, in turn
 TASKS = ["task 0", "task 1"]
 ACTIONS = np.zeros(2, int)
 NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
-ASKED = {  # by environment: the episode and step that each call asks about, first the reset; some ask about two or none
+ASKED = {  # by environment: episode and step of each call, first the reset; some ask about two or none
     NEXT_STEP: ("0.0 0.1 0.2 0.3 1.0 1.1 1.2 1.3 2.0 2.1", "0.0 0.1 0.2 0.3 0.4 1.0 1.1 2.0 2.1 2.2"),
     SAME_STEP: (
         "0.0 0.1 0.2 0.3+1.0 1.1 1.2 1.3+2.0 2.1 2.2 2.3+3.0",
@@ -37,7 +37,7 @@ CANVAS = CodedEnv().canvas
 
 
 def drawn(observation: Any) -> Any:
-    """The frame in an observation; the frames of all environments are drawn into one array."""
+    """Return the frame of an observation; all environments draw into the same array."""
     CANVAS[:] = observation["pixels"]
     return CANVAS
 
@@ -75,7 +75,7 @@ def vector_of(kind: Any, mode: AutoresetMode, client: Recorder, source: Any, reu
 
 
 def up_to(number: int, episode: int, step: int) -> tuple[list[Code], str]:
-    """The question about a step: all frames of its episode so far, and the environment's task."""
+    """Return the question about a step: all frames of the episode so far, and the task."""
     return [(number, episode, each) for each in range(step + 1)], TASKS[number]
 
 
@@ -83,7 +83,7 @@ def up_to(number: int, episode: int, step: int) -> tuple[list[Code], str]:
 def test_a_vector_sends_each_episode_s_own_frames(
     kind: Any, mode: AutoresetMode, source: Any, reuse: bool, failing: int | None
 ) -> None:
-    """Also after a call whose scoring failed: its frame is part of the episode."""
+    """Also after a failed call, whose frame is part of the episode."""
     with Recorder(failing) as client, closing(vector_of(kind, mode, client, source, reuse)) as env:
         expected = []
         for call, asked in enumerate(zip(*map(str.split, ASKED[mode]), strict=True)):
@@ -199,7 +199,7 @@ def test_an_autoreset_above_begins_an_episode_after_a_success(recorder: Recorder
 
 ENDED: dict[str, tuple[Callable[[CodedEnv], gym.Env[Any, Any]], int, SuccessRule | None]] = {
     "terminated": (lambda env: env, 3, None),
-    "truncated above Autoreset": (lambda env: TimeLimit(Autoreset(env), 1), 1, None),  # which is not told of the end
+    "truncated above Autoreset": (lambda env: TimeLimit(Autoreset(env), 1), 1, None),  # which does not learn of the end
     "succeeded": (lambda env: env, 1, SuccessRule(threshold=0.0)),
     "succeeded above Autoreset": (lambda env: Autoreset(env), 1, SuccessRule(threshold=0.0)),
 }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Episodes that are watched: what is reported of them, and that reporting never delays or changes them."""
+"""Live reports of episodes, which never delay or change them."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from coded_env import CodedEnv, Recorder
 from environments import MODEL, TASK, cart_pole, play
 from gateways import poll
 from live_reports import Taker, picture, taking
-from reference_server import Served
 from rfm_client import RewardClient, ServerUnavailableError
 from rfm_client.episodes import StepScore, SuccessRule
 from rfm_rl import LiveView, RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, live
+from servers import Served
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def score(step: int, progress: float = 0.5, success: float = 0.25) -> StepScore:
 
 
 def episodes_of(taker: Taker) -> list[dict[str, Any]]:
-    """What was reported of each episode, in the order in which they began."""
+    """Return the reports by episode, in the order of the first report."""
     found: dict[str, dict[str, Any]] = {}
     for body in taker.bodies:
         for told in body["episodes"]:
@@ -80,7 +80,7 @@ def test_there_are_few_reports_and_the_newest_frame_wins(taker: Taker) -> None:
             for env, episode in enumerate(episodes):
                 episode.add(picture(100 * env + step, (600, 800)), score(step))
     took_s = time.monotonic() - began_s
-    at_the_end = math.ceil(40 / live.MOST_FRAMES) + 1  # when nobody waits any more
+    at_the_end = math.ceil(40 / live.MOST_FRAMES) + 1  # when no caller waits any more
     assert len(taker.bodies) <= took_s / live.REPORT_EVERY_S + 1 + at_the_end
     assert max(len(body["frames"]) for body in taker.bodies) == live.MOST_FRAMES
     newest = {key: frame for body in taker.bodies for key, frame in body["frames"].items()}
@@ -131,7 +131,7 @@ def test_the_last_steps_are_reported_before_the_process_ends_and_a_fork_says_tha
 def test_without_a_gateway_a_warning_is_logged_once_and_steps_are_kept(
     taker: Taker, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """But not the frames of episodes that have ended."""
+    """Frames of ended episodes are dropped."""
     monkeypatch.setattr(live, "TRY_AGAIN_AFTER_S", 0.05)
     monkeypatch.setattr(live, "MOST_STEPS_KEPT", 100)
     taker.status = 503
@@ -150,7 +150,7 @@ def test_without_a_gateway_a_warning_is_logged_once_and_steps_are_kept(
         poll(lambda: len(taker.headers) > refused + 1)  # the last was made when all had ended
         taker.status = 204
         poll(lambda: len(taker.steps()) == 50)
-    assert [each["step"] for each in taker.steps()] == list(range(100, 150))  # of each its end was kept, too
+    assert [each["step"] for each in taker.steps()] == list(range(100, 150))  # the end of each was kept, too
     shown = {key for body in taker.bodies for key in body["frames"]}
     assert shown == {told["id"] for told in episodes_of(taker) if told["task"] == "stack the cups"}
 
@@ -186,7 +186,7 @@ def test_closing_does_not_wait_for_a_gateway_that_hangs(caplog: pytest.LogCaptur
         view.episode("stack the cups").add(picture(), score(0))
         view.close()
     poll(lambda: "expected a gateway" in caplog.text)
-    assert "timed out" not in caplog.text  # what ended the wait for the answer is the end of this test's socket
+    assert "timed out" not in caplog.text  # the end of this test's socket ended the wait
 
 
 def test_a_view_that_nobody_holds_ends_its_thread(taker: Taker) -> None:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""An environment's own reward stays out of what an algorithm learns from and of what it shows."""
+"""The environment's reward stays out of learning and logs."""
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -32,7 +31,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
-from rfm_rl.own_rewards import WritingMonitor
 from rfm_rl.sb3 import RenderedFrame, RewardModelVecEnv
 
 ALL = RewardOptions(sampling="all")
@@ -71,7 +69,7 @@ WRAPPINGS: dict[str, Callable[[RewardClient], Any]] = {
 
 
 class Ledger(VecEnvWrapper):  # type: ignore[misc]
-    """Adds up what the reward model said about each step, whatever reward the step had."""
+    """Add up the reward model's rewards, whatever the environment paid."""
 
     def __init__(self, venv: Any) -> None:
         super().__init__(venv)
@@ -180,7 +178,6 @@ def test_a_file_with_the_environment_s_rewards_is_told(
     told = r"env: expected no Monitor inside that writes a file, .*; write \w+\(RewardModel\w+\(...\), filename\)"
     with pytest.warns(UserWarning, match=told):
         make(recorder, str(tmp_path / "own")).close()
-    assert pickle.loads(pickle.dumps(WritingMonitor)) is WritingMonitor  # a SubprocVecEnv sends it to its processes
 
 
 def test_gymnasium_s_statistics_inside_show_the_reward_model_s_rewards(recorder: Recorder) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the wrappers pay for progress and success, by mode."""
+"""The wrappers' pay for progress and success, by mode."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TASK = "task 0"
 
 
 class Judging(CodeReader):
-    """Scores each frame by its step."""
+    """Scores each frame by the step."""
 
     predicts_success = True
 
@@ -55,7 +55,7 @@ def judge() -> Iterator[Judge]:
 
 
 def rewards(judge: Judge, **options: Any) -> list[float]:
-    """Of an episode."""
+    """The labels of an episode."""
     env = RewardModelWrapper(CodedEnv(0, (LAST,)), judge, TASK, RewardOptions(sampling="all", **options))
     env.reset()
     paid = []
@@ -118,7 +118,7 @@ def test_an_episode_is_paid_by_its_mode(judge: Judge, options: dict[str, Any], e
 
 
 def test_a_policy_that_hovers_earns_nothing_by_shaping(judge: Judge) -> None:
-    """The discounted sum is that of the ends, whichever way the episode went, also where scores are old."""
+    """The discounted sum depends on both ends alone, also with old scores."""
     for every in (1, 2, 3):
         paid = rewards(judge, mode="shaping", gamma=GAMMA, every=every)
         discounted = sum(GAMMA**t * reward for t, reward in enumerate(paid))
@@ -128,7 +128,7 @@ def test_a_policy_that_hovers_earns_nothing_by_shaping(judge: Judge) -> None:
 @pytest.mark.parametrize("number", [0, 1], ids=["terminated", "truncated"])
 @pytest.mark.parametrize("kind", ["one", "vector", "VecEnv"])
 def test_shaping_of_another_reward_leaves_its_best_policies_as_they_are(judge: Judge, kind: str, number: int) -> None:
-    """What shaping adds to an episode that terminates depends on its reset alone; after a time limit, on its last state."""
+    """Shaping adds a sum that depends on the reset alone; after a time limit, also on the last state."""
     options = RewardOptions(
         mode="shaping", gamma=GAMMA, add_to_env_reward=True, sampling="all", frames_from="pixels", scale=2.0
     )
@@ -141,7 +141,7 @@ def test_shaping_of_another_reward_leaves_its_best_policies_as_they_are(judge: J
 
 
 def paid_by(kind: str, make: Any, judge: Judge, options: RewardOptions, length: int) -> list[float]:
-    """Rewards of an episode's steps, by a wrapper of each kind."""
+    """Return an episode's rewards by wrapper."""
     if kind == "one":
         env: Any = RewardModelWrapper(make(), judge, TASK, options)
         env.reset()

@@ -21,7 +21,7 @@ STEPS = 500
 
 @pytest.mark.triton
 def test_cleanrl_s_statistics_are_of_the_reward_model_s_rewards(client: RewardClient) -> None:
-    """Its scripts count the returns of a vector in the outermost wrapper, by ``infos["episode"]``."""
+    """The library's scripts count returns in the outermost wrapper, by ``infos["episode"]``."""
     vector = SyncVectorEnv([cart_pole] * 4, autoreset_mode=AutoresetMode.NEXT_STEP)
     rewarded = RewardModelVectorWrapper(vector, client, TASK, RewardOptions(mode="delta", max_frames=4))
     with closing(RecordEpisodeStatistics(rewarded)) as envs:

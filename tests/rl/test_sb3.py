@@ -15,10 +15,9 @@ from gymnasium.error import ResetNeeded
 
 from coded_env import Code, CodedEnv, Recorder
 from environments import TASK, cart_pole, cart_pole_with_pixels
-from reference_server import Served
-from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError, UInt8Array
 from rfm_rl import RewardModelWrapper, RewardOptions, SuccessRule
+from servers import Served
 
 pytest.importorskip("stable_baselines3", reason="the extra sb3 is not installed")
 
@@ -28,10 +27,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 
 from rfm_rl.sb3 import RenderedFrame, RewardModelVecEnv
 
-LENGTHS = (3,), (4, 1, 2)  # steps of the episodes of each environment, in turn
+LENGTHS = (3,), (4, 1, 2)  # steps of the episodes by environment, in turn
 TASKS = ["task 0", "task 1"]
 ACTIONS = np.zeros(2, int)
-# By environment: the episode and step that each call asks about, first the reset. Each end of an episode is a reset.
+# By environment: episode and step of each call, first the reset. The end of an episode is a reset.
 ASKED = (
     "0.0 0.1 0.2 0.3+1.0 1.1 1.2 1.3+2.0 2.1 2.2 2.3+3.0",
     "0.0 0.1 0.2 0.3 0.4+1.0 1.1+2.0 2.1 2.2+3.0 3.1 3.2",
@@ -55,7 +54,7 @@ def coded(kind: Any = DummyVecEnv, *, rendered: bool = True, reuse: bool = False
 
 
 def up_to(number: int, episode: int, step: int) -> tuple[list[Code], str]:
-    """The question about a step: all frames of its episode so far, and the environment's task."""
+    """Return the question about a step: all frames of the episode so far, and the task."""
     return [(number, episode, each) for each in range(step + 1)], TASKS[number]
 
 
@@ -221,7 +220,7 @@ def test_steps_that_do_not_wait_end_with_the_score_of_the_last_frame(client: Rew
 
 
 class Dim(CodedEnv):
-    """Its pictures are floats in 0..1 that became uint8."""
+    """The pictures are floats in 0..1 that became uint8."""
 
     def _drawn(self) -> UInt8Array:
         return np.random.default_rng(self.t).integers(0, 2, (32, 32, 3), np.uint8)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rewards for vectors whose observations and rewards are torch tensors, and for batches of environments in one."""
+"""Rewards for vectors with torch tensors, and for batches of environments in a single environment."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rfm_client import InvalidSampleError
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 
 TASKS = ["task 0", "task 1"]
-LENGTHS = (3,), (4, 1, 2)  # steps of the episodes of each environment, in turn
+LENGTHS = (3,), (4, 1, 2)  # steps of the episodes by environment, in turn
 NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 
 
@@ -42,7 +42,7 @@ def on_device(array: Any) -> OnDevice:
 
 
 class TensorVector(SyncVectorEnv):
-    """What it returns are tensors; with SAME_STEP as ManiSkillVectorEnv returns them.
+    """Returns tensors; with SAME_STEP as ManiSkillVectorEnv does.
 
     silent: leave out the last observations
     """
@@ -169,7 +169,7 @@ def test_a_partial_reset_that_a_vector_does_not_read_is_refused(recorder: Record
 
 
 class Batch(gym.Env[Any, Any]):
-    """A batch of environments that is one environment, as in ManiSkill and Isaac Lab."""
+    """A batch of environments in a single environment, as in ManiSkill and Isaac Lab."""
 
     single_observation_space = gym.spaces.Dict({"pixels": gym.spaces.Box(0, 255, (SIZE_PX, SIZE_PX, 3), np.uint8)})
 
@@ -180,7 +180,7 @@ class Batch(gym.Env[Any, Any]):
 
 
 class Unbatched(gym.Wrapper[Any, Any, Any, Any]):
-    """The only environment of a batch, as CPUGymWrapper of ManiSkill gives it."""
+    """A batch's only environment, as in ManiSkill's CPUGymWrapper."""
 
     def __init__(self, env: Batch) -> None:
         super().__init__(env)

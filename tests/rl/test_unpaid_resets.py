@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Resets of episodes whose end the wrappers have not seen, so that a reward is never paid."""
+"""Early resets, after which the wrappers never pay a reward."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def recorder() -> Iterator[Recorder]:
 
 @pytest.fixture
 def told(caplog: pytest.LogCaptureFixture) -> Any:
-    """What the client has logged so far."""
+    """Return the client's log so far."""
     return lambda: [record.message for record in caplog.records if record.levelno == logging.WARNING]
 
 

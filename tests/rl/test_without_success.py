@@ -15,11 +15,9 @@ import rfm_export
 from engines import load_engine, serve_config
 from environments import MODEL, TASK, cart_pole, play
 from gateways import running
-from one_model import BriefServer
-from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressResult, ProgressSample, RewardClient, Trajectory
 from rfm_rl import RewardModelWrapper, RewardOptions, SuccessRule
+from servers import Endpoints, start_triton
 from spoilt import without
 
 pytestmark = pytest.mark.triton
@@ -30,7 +28,7 @@ def endpoints(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
     folder = tmp_path_factory.mktemp("without")
     checkpoint = without(MODEL, ["preference", "success"], folder / "checkpoint")
     rfm_export.export(checkpoint, folder / "model_repository", serve_config(goldens.config(MODEL), MODEL))
-    with BriefServer(folder / "model_repository", Endpoints.free(), find_installation()) as server:
+    with start_triton(folder / "model_repository") as server:
         yield server.endpoints
 
 

@@ -20,7 +20,7 @@ def papers(tmp_path_factory: pytest.TempPathFactory) -> Papers:
 
 @pytest.fixture(scope="module")
 def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of a reference checkpoint for embeddings."""
+    """The repository of a reference checkpoint for embeddings."""
     config, folder = goldens.config("c1_t1_disc10"), tmp_path_factory.mktemp("exposed") / "model_repository"
     rfm_export.export(config.checkpoint, folder, serve_config(config))
     return folder

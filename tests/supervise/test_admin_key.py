@@ -12,18 +12,15 @@ import pytest
 import tritonclient.grpc
 import tritonclient.http
 from tritonclient.utils import InferenceServerException
-from typer.testing import CliRunner
 
 from commands import REPOSITORY
-from reference_server import Served
+from in_process import rfm
 from rfm.launch.admin_key import VARIABLE, take_key
-from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import Installation, ServerStartError, find_installation
 from rfm.launch.triton_options import MAX_HTTP_BYTES, size_limits
 from rfm.launch.triton_server import TritonServer
-from rfm_client.contract.errors import InvalidValueError
-from rfm_commands.cli import app
-from rfm_serve import KEY
+from rfm_client.options import InvalidValueError
+from servers import KEY, Endpoints, Served
 
 ADMINISTRATION: dict[str, tuple[Any, ...]] = {
     "get_model_repository_index": (),
@@ -49,7 +46,7 @@ def test_the_server_changes_nothing_without_its_key(served: Served, tmp_path: Pa
     key_file.touch(0o600)
     key_file.write_text(shown or "")
     words = ["--url", url, *(["--admin-key-file", str(key_file)] if shown else [])]
-    done = CliRunner().invoke(app, ["models", "list", *words])
+    done = rfm("models", "list", *words)
     hint = f"(--admin-key-file or {VARIABLE}), got {'another' if shown else 'none'}"
     assert (done.exit_code, done.stderr) == (1, f"rfm: admin key: expected that of the server at {url} {hint}\n")
 
@@ -100,7 +97,7 @@ def owned_by(user: int, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_group_may_read_a_secret_of_root_s_alone(
     tmp_path: Path, user: int, mode: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As Kubernetes mounts it: links to a file of root's, which the pod's group reads."""
+    """Links to a file of root's that the pod's group reads, as Kubernetes mounts it."""
     (tmp_path / "data").write_text(f"{KEY}\n")
     (tmp_path / "data").chmod(mode)
     (tmp_path / "key").symlink_to("data")

@@ -9,17 +9,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from commands import REPOSITORY, nothing_left_behind
+from in_process import rfm
 from repositories import changing
-from rfm.launch.endpoints import Endpoints
-from rfm.launch.installation import ServerStartError, find_installation
+from rfm.launch.installation import ServerStartError
 from rfm.launch.repository_check import fault_in
 from rfm.launch.triton_server import TritonServer
 from rfm.parameters import EXPORT_PARAMETER, PYTHON_PARAMETERS
 from rfm_client.contract.description import DESCRIPTION_PARAMETER
-from rfm_commands.cli import app
+from servers import Endpoints, find_installation
 
 FOREIGN = 'name: "foreign"\nbackend: "python"\nmax_batch_size: 1\na_field_of_a_newer_triton: 1\n'
 
@@ -114,7 +113,7 @@ def test_a_model_with_broken_files_is_refused_before_a_running_server_loads_it(t
     repository = shutil.copytree(REPOSITORY, tmp_path / "models")
     (repository / "rfm" / "1" / "model.py").unlink()
     words = ["models", "load", "rfm", f"--repository={repository}", "--url=grpc://127.0.0.1:1"]
-    done = CliRunner().invoke(app, words)
+    done = rfm(*words)
     assert done.exit_code == 1
     assert done.stderr.startswith(f"rfm: {repository}/rfm/1/model.py: expected the model's program, got none; ")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What ends with ``rfm serve``, however that ends, and with a log that nobody can write."""
+"""All processes end with ``rfm serve``, however it ends, also with a log that cannot be written."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from commands import RFM, is_alive
 from patients import make_repository
 from rfm.launch import cleanup
 from rfm.launch.ending import ProcessGroup, how_it_ended
-from rfm.launch.endpoints import Endpoints
-from rfm_serve import PATIENCE_S, Serving, children, wait_for
+from servers import PATIENCE_S, Endpoints, Serving, children, wait_for
 
 AT_ONCE_S = 10.0  # a model process used to stay for two minutes
 GROUP = """
@@ -30,7 +29,7 @@ group = ProcessGroup(["/bin/sh", "-c", "trap '' HUP; sleep 600 & sleep 601 & wai
 
 
 def of_group(group: int) -> list[int]:
-    """Processes of a group that live."""
+    """Return the live processes of a group."""
     found = []
     for pid in psutil.pids():
         with suppress(ProcessLookupError):  # it has ended
@@ -82,7 +81,7 @@ def test_notes_of_requests_in_dead_processes_come_first_and_empty_notes_hide_non
         assert claim.requests_inside() == ["alive", "too"]
         Path(f"{claim.requests}{2**22 + 2}").write_bytes(b"dead\0\0")
         assert claim.requests_inside() == ["dead"]
-        assert claim.requests.parent.stat().st_mode & 0o077 == 0  # nobody else can write notes
+        assert claim.requests.parent.stat().st_mode & 0o077 == 0  # only the owner can write notes
     finally:
         claim.release()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where a server listens, and what others may reach of it."""
+"""Addresses that a server listens on, and the services that others reach."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import Any
 
 import httpx
 import pytest
-from typer.testing import CliRunner
 
 from commands import REPOSITORY, nothing_left_behind
-from rfm.config import ConfigError, ServeConfig
+from in_process import rfm
+from rfm.config import ServeConfig
 from rfm.launch import endpoints
 from rfm.launch.endpoints import PORTS, Endpoints, GrpcTls, check_version, free_ports
 from rfm.launch.installation import ServerStartError
 from rfm.launch.model_processes import children_of, has_ended
 from rfm.launch.triton_server import TritonServer
 from rfm.supervise.status import NO_REASON, Status, StatusServer
-from rfm_commands.cli import app
-from rfm_serve import wait_for
+from rfm_client.options import ConfigError
 from secured import Papers, other_program
+from servers import wait_for
 
 
 @pytest.mark.parametrize(
@@ -37,14 +37,14 @@ from secured import Papers, other_program
     ids=["open", "half a pair"],
 )  # fmt: skip
 def test_rfm_serve_says_what_others_may_not_reach(words: tuple[str, ...], told: str) -> None:
-    done = CliRunner().invoke(app, ["serve", "--repository", str(REPOSITORY), *words])
+    done = rfm("serve", "--repository", REPOSITORY, *words)
     assert (done.exit_code, done.stderr[: len(told)]) == (1, told)
     assert ("--accept-known-vulnerabilities" in done.stderr) == ("known remote vul" in told)
 
 
 def test_a_triton_with_known_vulnerabilities_is_warned_about(caplog: pytest.LogCaptureFixture) -> None:
     words = ["serve", "/nowhere", "--host", "0.0.0.0", "--accept-known-vulnerabilities"]
-    assert CliRunner().invoke(app, words).exit_code == 1
+    assert rfm(*words).exit_code == 1
     accepted = "0.0.0.0 is no loopback address, and a Triton with known remote vulnerabilities is accepted"
     assert caplog.messages[0].startswith(accepted)
 
@@ -52,11 +52,11 @@ def test_a_triton_with_known_vulnerabilities_is_warned_about(caplog: pytest.LogC
 @pytest.mark.triton
 @pytest.mark.slow
 def test_an_older_triton_that_listens_elsewhere_is_stopped(repository: Path, tmp_path: Path) -> None:
-    """One whose version is known only when it answers: no wheel, as far as ``rfm serve`` can see."""
+    """A Triton that tells the version only when it runs, unlike the wheel's."""
     free = Endpoints.free()
 
     class Open(Endpoints):
-        """Its address counts as open, but it listens on loopback."""
+        """The address counts as open, but the server listens on loopback."""
 
         @property
         def http_host(self) -> str:
@@ -158,7 +158,7 @@ def test_a_silent_connection_to_the_status_port_is_cut() -> None:
 
 
 def told(about: Status) -> dict[str, Any]:
-    """What the metrics tell of models, by their name and labels."""
+    """Return the metrics of models by name and labels."""
     lines = [line for line in about.metrics().decode().splitlines() if line.startswith("rfm_serve_")]
     return {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines) if "ready" in name}
 

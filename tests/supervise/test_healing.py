@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Faults that ``rfm serve`` survives, each by the same cure: Triton is started again."""
+"""Faults that ``rfm serve`` survives by a restart of Triton."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ import httpx
 import numpy as np
 import pytest
 
-from patients import CALLERS, MARK, TOLERANCE, Callers, answering, make_repository, trajectory
+from patients import CALLERS, MARK, answering, calling, make_repository, trajectory
 from rfm.launch import cleanup
 from rfm.launch.cleanup import SHARED_MEMORY
-from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import find_installation
 from rfm.launch.repository_api import RepositoryApiError
 from rfm.launch.triton_server import TritonServer
@@ -29,11 +28,12 @@ from rfm.supervise.status import NO_REASON
 from rfm.supervise.supervisor import MOST, STEADY_S, BackOff, CrashLoopError
 from rfm.triton_model.watchdog import FAILED_BATCHES
 from rfm_client import InferenceFailedError, ServerUnavailableError
-from rfm_serve import (
+from servers import (
     MODEL,
     PATIENCE_S,
     RFM,
     TRUTH_S,
+    Endpoints,
     Serving,
     administered,
     children,
@@ -41,6 +41,7 @@ from rfm_serve import (
     serving,
     wait_for,
 )
+from tolerances import TOLERANCE
 
 pytestmark = pytest.mark.slow
 
@@ -50,7 +51,7 @@ DEADLY, FAILING, SLOW = MARK, MARK + 1, MARK + 2  # marks of samples
 
 
 def once(trigger: Path) -> str:
-    """Code that is true once the file is there, in one process."""
+    """Return an expression that is true once, in a single process, after the file appears."""
     return f"os.path.exists({str(trigger)!r}) and os.unlink({str(trigger)!r}) is None"
 
 
@@ -83,7 +84,7 @@ def test_what_dies_stops_hangs_or_is_silent_is_healed_and_no_call_is_lost_until_
     with administered(repository, hang_s=HANG_S, triton_silent_s=3) as served:
         assert httpx.get(f"{served.status_url}/live").status_code == 200
         assert httpx.get(f"{served.status_url}/other").status_code == 404
-        with served.client() as client, Callers(client, references) as callers:
+        with served.client() as client, calling(client, references) as callers:
             for fault, what in faults.items():
                 callers.wait_for_all()
                 before = served.restarts(what)
@@ -96,7 +97,7 @@ def test_what_dies_stops_hangs_or_is_silent_is_healed_and_no_call_is_lost_until_
                 served.wait_ready()
                 callers.wait_for_all()
                 assert served.restarts(what) == before + 1
-        assert (callers.lost, callers.wrong) == ([], [])
+        assert (callers.lost, callers.wrong) == ([], 0)
         assert served.metric("rfm_serve_probe_seconds_count", model=MODEL) > 3
         assert len(served.said) == len(faults), served.said
         assert served.said[-1] == "rfm: triton is started again: no answer for 3 s"
@@ -157,24 +158,24 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
         config = repository / MODEL / "config.pbtxt"
         one_version = config.read_text()
         config.write_text(one_version.replace("versions: 1", "versions: 1 versions: 2"))
-        with Callers(client, references) as callers:
+        with calling(client, references) as callers:
             with served.api() as api, pytest.raises(RepositoryApiError):
                 api.load(MODEL)
             callers.wait_for_all()
-        assert (callers.lost, callers.wrong) == ([], [])
+        assert (callers.lost, callers.wrong) == ([], 0)
         assert served.said == []
         config.write_text(one_version)
 
         with pytest.raises(ServerUnavailableError, match="ended twice during this request") as ended:
             client.progress(trajectory(99, mark=DEADLY))
-        # A process that dies before the supervisor has seen its command line counts as Triton's.
+        # A process that dies before the supervisor reads the command line counts as Triton's.
         wait_for(lambda: served.restarts(MODEL, "triton") == 2)
         served.wait_ready()
         inside = re.findall(r" request=(\S+): \w+: these requests were inside", served.log.read_text())
         assert [ended.value.request_id in ids.split(",") for ids in inside] == [True, True]
         np.testing.assert_allclose(client.progress(trajectory(0)).progress, references[0], rtol=0, atol=TOLERANCE)
 
-        with Callers(client, references) as callers:
+        with calling(client, references) as callers:
             callers.wait_for_all()
             trigger.touch()
             wait_for(lambda: served.restarts(MODEL, "triton") == 3)
@@ -183,7 +184,7 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
             assert {type(error) for error in callers.lost} == {InferenceFailedError}
             callers.lost.clear()
             callers.wait_for_all()
-        assert (callers.lost, callers.wrong) == ([], [])
+        assert (callers.lost, callers.wrong) == ([], 0)
         assert "instance is broken" in served.log.read_text()
 
         deadly.touch()
@@ -195,7 +196,7 @@ def test_requests_end_their_process_twice_at_most_and_a_model_that_keeps_ending_
         assert np.isfinite(client.progress(trajectory(0)).progress).all()
         deadly.unlink()
         away = (repository / OTHER).rename(tmp_path / OTHER)
-        wait_for(lambda: served.reasons() == {MODEL: NO_REASON})  # without its folder it is forgotten
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON})  # without the folder it is forgotten
         away.rename(repository / OTHER)
         with served.api() as api:
             api.load(OTHER)
@@ -254,7 +255,7 @@ def test_a_start_is_repeated_when_a_model_process_is_killed(tmp_path: Path, impo
 @pytest.mark.triton
 @pytest.mark.alone
 def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the_rest(tmp_path: Path) -> None:
-    """In a container of its own, whose process ids mean nothing here, where this user may make one."""
+    """In a separate container, whose process ids mean nothing here, if this user may make one."""
     apart = ["unshare", "--map-root-user", "--pid", "--fork", "--kill-child", "--mount-proc"]
     if subprocess.run([*apart, "true"], check=False, stderr=subprocess.DEVNULL).returncode != 0:
         apart = []
@@ -286,7 +287,7 @@ def test_the_row_names_what_had_each_fault() -> None:
 
 
 def test_a_crash_loop_is_many_faults_each_soon_after_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What ran for long is no part of it; starts that fail are, however long they take."""
+    """A long run resets the count; failed starts do not, however long they take."""
     now_s = 0.0
     monkeypatch.setattr("time.monotonic", lambda: now_s)
 

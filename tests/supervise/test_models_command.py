@@ -16,21 +16,21 @@ import numpy as np
 import pytest
 import safetensors.torch
 from tritonclient.grpc import model_config_pb2 as pb
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import goldens
 import rfm_export
 import rollout
 from engines import load_engine, serve_config
+from in_process import rfm
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm.supervise.status import NO_REASON
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_commands import rollout as rfm_rollout
-from rfm_commands.cli import app
 from rfm_commands.rollout import Rollout, RolloutError
 from rfm_export.publish import read_config
-from rfm_serve import Serving, administered, wait_for
 from rollout import CALLERS, NAME, WITH_ENCODERS, callers, difference
+from servers import Serving, administered, wait_for
 from trajectories import random_trajectory
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -48,7 +48,7 @@ while not pathlib.Path({may_end!r}).exists():
 
 
 def models(command: str, *words: str) -> Result:
-    return CliRunner().invoke(app, ["models", command, *words])
+    return rfm("models", command, *words)
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,13 @@ class Running:
         return models(command, *words, *options, *([] if command == "list" else [f"--repository={self.repository}"]))
 
     def models(self, command: str, *words: str) -> str:
-        """Output of ``rfm models COMMAND``, which succeeds."""
+        """Return the output of ``rfm models COMMAND``."""
         done = self.ask(command, *words)
         assert done.exit_code == 0, done.output
         return done.stdout
 
     def refused(self, command: str, *words: str) -> str:
-        """What it says where it fails."""
+        """Return the message of a failed command."""
         done = self.ask(command, *words)
         assert done.exit_code == 1, done.output
         (line,) = done.stderr.splitlines()
@@ -122,7 +122,7 @@ def test_a_name_is_loaded_listed_and_unloaded_beside_the_others(running: Running
 
 @contextmanager
 def loading(running: Running, name: str, folder: Path) -> Iterator[None]:
-    """Within it Triton is loading a model: its process waits for a file that comes at the end."""
+    """Keep Triton loading a model, whose process waits for a file that comes at the end."""
     running.export_plain(name)
     begun, may_end = folder / "begun", folder / "may_end"
     model_file = running.repository / name / "1" / "model.py"
@@ -141,7 +141,7 @@ def loading(running: Running, name: str, folder: Path) -> Iterator[None]:
 
 
 def test_callers_are_answered_while_another_model_loads(running: Running, tmp_path: Path) -> None:
-    """All of several connections for each thread that Triton has for HTTP. The load ends after they have been answered."""
+    """Use several connections per HTTP thread of Triton. The load ends after the answers."""
     trajectory = random_trajectory(1, 5, *rollout.WIDTHS)
     endpoints = running.served.endpoints
     urls = (endpoints.http_url, endpoints.grpc_url) * CONNECTIONS
@@ -154,7 +154,7 @@ def test_callers_are_answered_while_another_model_loads(running: Running, tmp_pa
         assert all(threads.map(ask, clients))  # they are connected: new connections would keep away from a busy thread
         with loading(running, "held", tmp_path):
             assert all(threads.map(ask, clients))
-            # What is told over gRPC does not wait either.
+            # Requests over gRPC do not wait either.
             assert ["held", "1", "LOADING"] in running.listed()
     running.models("unload", "held")
 
@@ -194,7 +194,7 @@ def test_a_server_that_cannot_be_reached_is_told(url: str, words: tuple[str, ...
 def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(
     running: Running, other: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that fails at its end, when the ensemble has gone over; one that succeeds, and its rollback."""
+    """A rollout fails after the ensemble's change; another succeeds and is rolled back."""
     samples = rollout.questions()
     expected = {"1": rollout.answers(WITH_ENCODERS.checkpoint, samples), "2": rollout.answers(other, samples)}
     assert min(difference(*pair) for pair in zip(expected["1"], expected["2"], strict=True)) > rollout.CLEARLY
@@ -240,7 +240,7 @@ def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(
 
 @pytest.mark.nightly  # a minute and a half
 def test_what_was_served_is_served_again_and_not_what_was_exported_since(running: Running, other: Path) -> None:
-    """Models that were loaded since, too; those that were unloaded are not."""
+    """Newly loaded models, too, but no unloaded ones."""
     served, samples = running.served, rollout.questions()
     running.export_plain("since")
     running.models("load", "since")
@@ -299,7 +299,7 @@ def test_a_broken_version_is_never_asked_and_the_old_one_stays(running: Running,
         assert (running.served_by_restart(name), running.ready(name)) == ([1], ["1"])
     assert (tally.failed, tally.unlike, set(tally.by_version)) == ([], [], {"1"})
     with running.client(NAME) as client:
-        assert client.is_ready()  # what failed is no reason to ask nobody here
+        assert client.is_ready()  # a failed call is no reason to stop
     running.models("unload", name)
 
 
@@ -330,7 +330,7 @@ class GoingAway:
 
 @pytest.fixture(scope="module")
 def three_models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Encoder, scorer and ensemble, of which version 1 is served and version 2 was exported."""
+    """Encoder, scorer and ensemble with a served version 1 and an exported version 2."""
     repository = tmp_path_factory.mktemp("three") / "repository"
     rollout.export(WITH_ENCODERS.checkpoint, repository)
     rollout.export(WITH_ENCODERS.checkpoint, repository)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm serve``: the process, its signals, and what it leaves behind."""
+"""``rfm serve``: the process, signals, and the remains."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ import httpx
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 import clip
 import rfm_export
 from commands import EXIT_S, REPOSITORY, RFM, command, is_alive, nothing_left_behind, wait_for_http
+from in_process import rfm
 from paths import ROOT
 from rfm.config import ExportConfig
 from rfm.launch import installation
@@ -31,8 +31,7 @@ from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.contract.descriptors import MOST
-from rfm_commands.cli import app
-from rfm_serve import children, model_processes, wait_for
+from servers import children, model_processes, wait_for
 
 VIDEO = ROOT / "tests/videos/jaco_play_pick_up_green_cup.mp4"
 DEMO = ["demo", f"--repository={REPOSITORY}", f"--video={VIDEO}", f"--task={clip.TASK}"]
@@ -59,7 +58,7 @@ def environment(pid: int) -> set[str]:
 @pytest.mark.triton
 @pytest.mark.slow
 def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At an IPv6 address. The gateway alone has its key."""
+    """At an IPv6 address. Only the gateway has the key."""
     keys = {name: f"a-secret-of-{name}" for name in ("RFM_ADMIN_KEY", "RFM_GATEWAY_API_KEY")}
     for name, key in keys.items():
         monkeypatch.setenv(name, key)
@@ -108,7 +107,7 @@ def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(monkey
     ids=["hang up", "kill", "demo"],
 )
 def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], number: signal.Signals) -> None:
-    """A stand-in never gets ready, so that the moment of the signal is known."""
+    """A stand-in never gets ready, so the moment of the signal is certain."""
     started = tmp_path / "started"
     program = executable(
         tmp_path / "tritonserver", f"#!/bin/sh\necho $$ > {tmp_path}/pid\nmv {tmp_path}/pid {started}\nexec sleep 600\n"
@@ -148,7 +147,7 @@ def test_a_signal_while_it_still_loads_ends_it() -> None:
 @pytest.mark.triton
 @pytest.mark.slow
 def test_models_that_cannot_be_loaded_are_named_with_a_remedy(tmp_path: Path) -> None:
-    """A checkpoint that cannot be read, and an export for GPUs that are not here."""
+    """An unreadable checkpoint, and an export for missing GPUs."""
     models = tmp_path / "models"
     shutil.copytree(REPOSITORY / "rfm", models / "rfm")
     settings = ExportConfig(name="gpu", num_gpus=torch.cuda.device_count() + 1)
@@ -173,13 +172,13 @@ def test_a_port_that_is_taken_is_named_with_its_option(option: str, what: str) -
     with nothing_left_behind(), socket.create_server(("::1", 0), family=socket.AF_INET6) as taken:
         port = taken.getsockname()[1]
         words = command(REPOSITORY, Endpoints.free())[1:]
-        done = CliRunner().invoke(app, [*words, "--host=::1", f"--{option}-port={port}"])
+        done = rfm(*words, "--host=::1", f"--{option}-port={port}")
     told = f"rfm: {what}: expected a free port of this machine at [::1]:{port}, got Address already in use; "
     assert done.exit_code == 1
     assert done.stderr.splitlines()[-1] == f"{told}--{option}-port names another port"
 
 
-WRONG_FOLDERS: dict[str, tuple[str, str]] = {  # below a folder, by what it is
+WRONG_FOLDERS: dict[str, tuple[str, str]] = {  # below a folder
     "missing": ("nothing", "which is not there: rfm export --checkpoint CHECKPOINT --repository {folder} writes one"),
     "empty": ("empty", "which has none: rfm export --checkpoint CHECKPOINT --repository {folder} writes them"),
     "a file": ("models/rfm/config.pbtxt", "a file: --repository names the folder"),
@@ -259,7 +258,7 @@ def test_a_program_that_does_not_serve_is_told_and_is_no_crash_loop(
     if program is not None:
         executable(file, program)
     words = [*command(REPOSITORY, Endpoints.free())[1:], f"--status-port={free_ports(1)[0]}"]
-    done = CliRunner().invoke(app, [*words, "--tritonserver", str(file)])
+    done = rfm(*words, "--tritonserver", file)
     assert done.exit_code == 1
     assert re.search(rf"^rfm: tritonserver: {told}", done.stderr.splitlines()[-1])
 

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""TLS and keys: of gRPC, of HTTP behind a proxy, and of the gateway."""
+"""TLS and keys for gRPC, HTTP behind a proxy, and the gateway."""
 
 from __future__ import annotations
 
+import asyncio
 import re
 import socket
 import ssl
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,27 +22,20 @@ import aiohttp.web
 import httpx
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import goldens
 from engines import load_engine
-from one_model import BriefServer
+from in_process import rfm, rfm_client
 from repositories import kill_model
-from rfm.launch.endpoints import Endpoints, GrpcTls
-from rfm.launch.triton_options import MAX_HTTP_BYTES
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
-from rfm_client.cli.commands import app as client_app
-from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.loop_thread import LoopThread
-from rfm_client.transport.status import read_status
-from rfm_commands.cli import app
-from rfm_serve import KEY, PATIENCE_S, Serving, serving, wait_for
+from rfm_client.serving import Credentials, read_status
 from secured import PUBLIC_HOST, Papers, other_program
+from servers import KEY, PATIENCE_S, Endpoints, GrpcTls, Serving, serving, start_triton, wait_for
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
 PLAIN = goldens.config("c1_t1_disc10")
 TRAJECTORY = random_trajectory(0, 5)
-TOLERANCE = 1e-5
 AT_ONCE_S = 20.0  # far less than the client would retry
 GATED = "inference,health,metadata,model-config,statistics"
 TRITON_GATE = "triton-grpc-protocol-gate"  # gRPC metadata that Triton was told to ask for
@@ -72,13 +67,13 @@ def secure(repository: Path, papers: Papers, tmp_path_factory: pytest.TempPathFa
     folder = tmp_path_factory.mktemp("secure")
     endpoints = replace(Endpoints.free(), grpc_tls=GrpcTls(papers.certificate, papers.key))
     program = other_program(folder, f"--grpc-restricted-protocol={GATED}:gate={KEY}")
-    with (folder / "log").open("wb") as log, BriefServer(repository, endpoints, program, log=log):
+    with start_triton(repository, program, endpoints):
         yield endpoints
 
 
 @pytest.fixture(scope="module")
 def gateway_port() -> int:
-    """Of the gateway beside ``mutual``."""
+    """Port of the gateway beside ``mutual``."""
     return Endpoints.free().http_port
 
 
@@ -161,7 +156,7 @@ def test_tls_on_one_side_alone_gives_no_connection(mutual: Endpoints, papers: Pa
 
 
 def test_the_gateway_beside_tls_listens_on_loopback_alone(mutual: Endpoints, gateway_port: int) -> None:
-    """Else whoever has no certificate would be served by it, in the clear."""
+    """Otherwise it would serve callers without a certificate, in the clear."""
     with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as caller:  # it starts after Triton
         assert caller.get(f"http://127.0.0.1:{gateway_port}/health", timeout=AT_ONCE_S).json()["status"] == "healthy"
     with pytest.raises(ConnectionRefusedError):
@@ -173,16 +168,16 @@ def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, key_f
     own = ["--client-certificate", str(papers.client_certificate), "--client-key", str(papers.client_key)]
     trusted = ["--ca-file", str(papers.ca), *own]
     for given in ([*trusted, *list_models], [*list_models, *trusted]):
-        assert CliRunner().invoke(app, ["models", *given]).stdout.split() == ["rfm", "1", "READY"]
+        assert rfm("models", *given).stdout.split() == ["rfm", "1", "READY"]
     for credentials in (["--ca-file", str(papers.other_ca), *own], trusted[:2]):
-        refused = CliRunner().invoke(app, ["models", *credentials, *list_models])
+        refused = rfm("models", *credentials, *list_models)
         assert (refused.exit_code, refused.stdout) == (1, "")
         assert refused.stderr.startswith(f"rfm: {mutual.grpc_url}: failed to connect")
 
 
 @pytest.fixture(scope="module")
 def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
-    """As behind nginx or an ingress, which asks for a certificate and a key."""
+    """An HTTPS proxy like nginx or an ingress that asks for a certificate and a key."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(papers.certificate, papers.key)
     context.verify_mode = ssl.CERT_REQUIRED
@@ -200,7 +195,7 @@ def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
             kept = {name: value for name, value in answer.headers.items() if name != "Content-Length"}
             return aiohttp.web.Response(status=answer.status, body=await answer.read(), headers=kept)
 
-    application = aiohttp.web.Application(client_max_size=MAX_HTTP_BYTES)
+    application = aiohttp.web.Application(client_max_size=2**28)
     application.router.add_route("*", "/{tail:.*}", forward)
     runner = aiohttp.web.AppRunner(application, access_log=None)
     bound = socket.create_server(("127.0.0.1", 0))
@@ -209,12 +204,17 @@ def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
         await runner.setup()
         await aiohttp.web.SockSite(runner, bound, ssl_context=context).start()
 
-    loop = LoopThread("proxy")
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
     try:
-        loop.wait(start())
+        asyncio.run_coroutine_threadsafe(start(), loop).result()
         yield f"https://127.0.0.1:{bound.getsockname()[1]}"
     finally:
-        loop.stop(runner.cleanup)
+        asyncio.run_coroutine_threadsafe(runner.cleanup(), loop).result()
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
 
 
 def test_http_through_a_proxy_with_tls_and_a_key(proxied: str, papers: Papers) -> None:
@@ -245,7 +245,7 @@ def test_a_proxy_denies_who_shows_no_key_or_certificate_and_is_not_trusted_by_st
 
 
 def test_a_closed_client_leaves_no_connection_to_a_server_that_hangs(papers: Papers) -> None:
-    """The server never says the goodbye of TLS, which the cancelled call's connection would wait for."""
+    """The server never closes TLS, for which the cancelled call's connection would wait."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(papers.certificate, papers.key)
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -294,14 +294,14 @@ def test_the_command_has_the_same_options(mutual: Endpoints, proxied: str, paper
     words = [f"--{name.replace('_', '-')}={file}" for name, file in names.items()]
     wrong = f"--ca-file={papers.other_ca}"
     for given in ([*words, "sample"], ["sample", *words], [words[0], "sample", *words[1:]], [wrong, "sample", *words]):
-        done = CliRunner().invoke(client_app, [*given, "--url", mutual.grpc_url])
+        done = rfm_client(*given, "--url", mutual.grpc_url)
         assert done.exit_code == 0, done.output
     in_environment = {f"RFM_{name.upper()}": str(file) for name, file in {**names, "api_key_file": key_file}.items()}
     for name in ("sample", "status", "wait"):
-        done = CliRunner(env=in_environment).invoke(client_app, [name, "--url", proxied])
+        done = rfm_client(name, "--url", proxied, env=in_environment)
         assert done.exit_code == 0, done.output
     for given in ([wrong, "sample"], [*words, "sample", wrong]):
-        refused = CliRunner().invoke(client_app, [*given, "--url", mutual.grpc_url])
+        refused = rfm_client(*given, "--url", mutual.grpc_url)
         assert (refused.exit_code, "access denied" in refused.stderr) == (1, True)
 
 
@@ -353,13 +353,13 @@ def test_the_gateway_s_own_certificate_is_not_the_caller_s_fault(
 
 def test_half_a_certificate_of_the_gateway_is_refused(papers: Papers) -> None:
     words = ["gateway", "--triton", "grpc://127.0.0.1:1", "--certificate", str(papers.certificate)]
-    done = CliRunner().invoke(app, words)
+    done = rfm(*words)
     assert done.exit_code == 2
     assert "Invalid value: --certificate needs --key" in done.stderr
 
 
 def test_a_file_for_triton_that_is_not_there_is_refused_with_the_gateway_s_option() -> None:
-    done = CliRunner().invoke(app, ["gateway", "--triton", "grpcs://127.0.0.1:1", "--triton-ca-file", "/nowhere"])
+    done = rfm("gateway", "--triton", "grpcs://127.0.0.1:1", "--triton-ca-file", "/nowhere")
     assert done.exit_code == 2
     told = (
         "Invalid value for '--triton-ca-file': expected certificates (PEM) at /nowhere, got No such file or directory"
@@ -368,7 +368,7 @@ def test_a_file_for_triton_that_is_not_there_is_refused_with_the_gateway_s_optio
 
 
 def test_rfm_serve_heals_with_tls(mutual: Endpoints, papers: Papers, running: Serving, repository: Path) -> None:
-    """It is told of no certificate for itself."""
+    """The gateway has no server certificate."""
     kill_model(repository)
     with client(mutual.grpc_url, **papers.client) as asked:  # it asks again until the model is back
         scores_right(asked)

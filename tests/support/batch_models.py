@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A model whose scores are plain to see, and requests that stand in for Triton's."""
+"""A model with plain scores, and stand-ins for Triton's requests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client import (
     InferenceFailedError,
@@ -31,7 +31,7 @@ from rfm_client import (
 from rfm_client.contract import wire
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 from rfm_client.contract.process_log import LEVEL_VARIABLE, LogLines
-from rfm_serve import wait_for
+from servers import wait_for
 from trajectories import random_trajectory
 
 WIDTHS = (4, 3)
@@ -47,8 +47,8 @@ CONFIG = {
     "instance_group": [{"count": 1}],
 }
 BARE = Description()
-FINAL = 1  # what Triton wants with the last response to a request
-REFUSED, BREAKS, FAILS = 2, 3, 4  # numbers of frames that the model below cannot bear
+FINAL = 1  # Triton's flag of the last response to a request
+REFUSED, BREAKS, FAILS = 2, 3, 4  # numbers of frames on which the model fails
 
 
 @dataclass
@@ -67,7 +67,7 @@ class Tensor:
 
 @dataclass
 class Request:
-    """As Triton hands it over, and what is sent in answer."""
+    """A request as Triton hands it over, with the responses."""
 
     tensors: wire.Tensors
     id: str = ""
@@ -126,7 +126,7 @@ class Model(BatchModel[Sample, Result]):
         pass
 
     def respond(self, *requests: Request) -> list[Response]:
-        """What becomes of requests of which Triton hands over all at once."""
+        """Hand requests over at once. Return the responses."""
         self.take(*requests)
         wait_for(lambda: all(request.responses for request in requests))
         return [response for request in requests for response in request.responses]
@@ -158,7 +158,7 @@ class Model(BatchModel[Sample, Result]):
         return wire.encode_results(answers, wire.num_positions(tensors), outputs)
 
     def told(self, name: str) -> dict[tuple[str, ...], float]:
-        """What Triton was told of a metric, by the labels that do not name the instance."""
+        """Return a metric's values by the labels that do not name the instance."""
         self.finalize()
         own = {"model", "version", "device", "instance"}
         return {

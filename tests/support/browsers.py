@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Chromium without a window, which reaches this machine alone, and what it has asked for and complained about."""
+"""Headless Chromium that reaches only this machine, with the requests and complaints of a page."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.remote.webelement import WebElement
 
 from gateways import poll
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 
-IMAGES_VARIABLE = "RFM_IMAGES"  # a folder for new pictures of the documents
 AXE = Path(__file__).parents[1] / "page" / "vendored" / "axe-core" / "axe.min.js"
 WINDOW_PX = (1280, 1400)
 PICTURE_PX = (1440, 900)
-REBOUND = "rebound.example"  # a name of elsewhere that leads here, as with DNS rebinding
+REBOUND = "rebound.example"  # a foreign name that leads here, as with DNS rebinding
 QUIET = (  # nothing but the page asks for anything
     "--disable-background-networking", "--disable-component-update", "--disable-default-apps", "--disable-sync",
     "--no-first-run", "--no-default-browser-check", "--disable-features=OptimizationHints,MediaRouter",
@@ -67,7 +66,7 @@ class Browser:
             self.driver.execute_cdp_cmd("Input.dispatchDragEvent", event)
 
     def until(self, script: str) -> Any:
-        """What a script gives, once it gives anything."""
+        """Return a script's result once it is true."""
         found: list[Any] = []
 
         def is_there() -> bool:
@@ -82,7 +81,7 @@ class Browser:
         poll(lambda: self[name].text == text)
 
     def cells(self, rows: str) -> list[list[str]]:
-        """The text of each cell of the table rows that a selector finds."""
+        """Return the cells' text of the table rows that match a selector."""
         script = "[...row.children].map((cell) => cell.textContent)"
         return list(self.run(f"return [...document.querySelectorAll('{rows}')].map((row) => {script})"))
 
@@ -91,7 +90,7 @@ class Browser:
         self.driver.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
 
     def values(self, chart: str, signal: str) -> dict[str, str]:
-        """The numbers of a signal beside the lines of a chart, by the names of its curves."""
+        """Return a signal's numbers beside the lines of a chart by name of the curve."""
         spans = f"document.querySelectorAll('#{chart} .values span[data-signal={signal}]')"
         return dict(self.run(f"return [...{spans}].map((each) => [each.dataset.curve, each.textContent])"))
 
@@ -101,7 +100,7 @@ class Browser:
         return list(self.run(f"return [...document.querySelectorAll('{players}')].map((each) => {script})"))
 
     def pixels(self, pictures: Sequence[WebElement]) -> list[UInt8Array]:
-        """What images and videos show now, each uint8 [H, W, 3]."""
+        """Return the current frames of images and videos, each uint8 [H, W, 3]."""
         found = self.run(
             """
             return arguments[0].map((picture) => {
@@ -126,7 +125,7 @@ class Browser:
 
     @contextmanager
     def theme(self, name: str) -> Iterator[None]:
-        """The page as somebody sees it who prefers light or dark."""
+        """Show the page in the light or dark theme."""
         feature = {"name": "prefers-color-scheme", "value": name}
         self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
         try:
@@ -135,7 +134,7 @@ class Browser:
             self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
     def violations(self) -> list[tuple[str, str, list[str]]]:
-        """What axe finds on the page: each rule, how grave that is, and the elements that break it."""
+        """Return axe's findings: rule, impact, and the elements that break it."""
         self.run(AXE.read_text())
         found = self.driver.execute_async_script(
             "const done = arguments[0]; axe.run().then(({ violations }) => done(violations));"
@@ -152,9 +151,8 @@ class Browser:
         finally:
             self.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
-    def picture(self, name: str) -> None:
-        """Saves a picture of the page for the documents."""
-        file = Path(os.environ.get(IMAGES_VARIABLE, self.downloads)) / name
+    def picture(self, file: Path) -> None:
+        """Save a picture of the page for the documents."""
         self.run("document.activeElement.blur()")
         with self.window(*PICTURE_PX):
             self.run("for (const each of document.querySelectorAll('.work')) each.scrollTo(0, 0)")
@@ -163,7 +161,7 @@ class Browser:
         assert file.read_bytes().startswith(b"\x89PNG\r\n")
 
     def complaints(self) -> list[str]:
-        """What the console has shown since the last time: errors, and what the policy of the page forbids."""
+        """Return new errors in the console, also violations of the page's policy."""
         return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]
 
     def asked(self) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 
 TASK = "put the red block in the bowl"
 NUM_FRAMES = 32
@@ -65,7 +65,7 @@ def _position(time: float) -> tuple[float, float]:
 
 
 def _fill(image: UInt8Array, x: float, y: float, width: float, height: float, colour: tuple[int, int, int]) -> None:
-    """A rectangle given by its centre and size as shares of the image."""
+    """A rectangle given by centre and size as shares of the image."""
     left, top, right, bottom = (
         round(max(share, 0) * SIZE_PX) for share in (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
     )

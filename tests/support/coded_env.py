@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An environment whose frames say which environment, episode and step they are of, and a server that reads that."""
+"""An environment whose frames encode environment, episode and step, and a server that reads the code."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from typing import Any, ClassVar, TypeAlias
 import gymnasium as gym
 import numpy as np
 
-from rfm_client import RewardClient, ServerUnavailableError
+from rfm_client import RewardClient, ServerUnavailableError, UInt8Array
 from rfm_client.contract import wire
-from rfm_client.contract.samples import UInt8Array
 from rfm_client.transport.calls import Answer
 from shelves import Shelf
 
@@ -21,7 +20,7 @@ Code: TypeAlias = tuple[int, int, int]  # environment, episode, step
 
 
 def frame_of(*code: int) -> UInt8Array:
-    """A frame that says what it is of, and looks like no other."""
+    """Return a unique frame that encodes environment, episode and step."""
     frame = np.random.default_rng(code).integers(0, 256, (SIZE_PX, SIZE_PX, 3), np.uint8)
     frame[0, 0] = code
     return frame
@@ -30,9 +29,9 @@ def frame_of(*code: int) -> UInt8Array:
 class CodedEnv(gym.Env[Any, Any]):
     """Odd environments truncate, even ones terminate.
 
-    lengths: steps of its episodes, in turn
+    lengths: steps of the episodes, in turn
     reuse: all frames are drawn into the same array
-    bad: of this code a picture is rendered that is none
+    bad: a code for which rendering gives no picture
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -47,12 +46,12 @@ class CodedEnv(gym.Env[Any, Any]):
 
     @property
     def code(self) -> Code:
-        """Of what it shows now."""
+        """The current frame."""
         return self.number, self.episode, self.t
 
     @property
     def has_ended(self) -> bool:
-        """Whether a step would be one after the episode's end."""
+        """True if the next step would follow the episode's end."""
         return self.t >= self.lengths[self.episode % len(self.lengths)]
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
@@ -77,7 +76,7 @@ class CodedEnv(gym.Env[Any, Any]):
 
 
 class CodeReader(Shelf):
-    """A server that keeps the frames' codes and the task of every question, by request.
+    """A stand-in server. Keeps the frames' codes and the task of every question, by request.
 
     failing: number of the request that fails
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm serve`` of the committed repository as a process, and what such processes leave."""
+"""``rfm serve`` with the committed repository as a process, and its remains."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ import psutil
 
 from paths import ROOT
 from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
+from rfm.launch.endpoints import Endpoints
 from rfm.launch.model_processes import has_ended
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"
@@ -29,7 +29,7 @@ OWNER = re.compile(rf"{REGION_PREFIX}_(\d+)_")
 
 
 def is_alive(pid: int) -> bool:
-    """Whether there is a process of this id that has not ended."""
+    """Return True if the process has not ended."""
     return not has_ended(pid)
 
 
@@ -44,25 +44,30 @@ def in_shared_memory() -> set[str]:
 
 
 def regions() -> set[str]:
-    """Names in shared memory, but for those of servers that others run on this machine."""
+    """Return the names in shared memory, except those of other users' servers."""
     names = in_shared_memory()
     owners = {name: int(match[1]) for name in names if (match := OWNER.search(name))}
     return names - {name for name, pid in owners.items() if is_alive(pid) and not is_ours(pid)}
 
 
+def own_regions(pid: int) -> set[Path]:
+    """Return files in shared memory of servers that a process has started."""
+    return set(SHARED_MEMORY.glob(f"{REGION_PREFIX}_{pid}_*"))
+
+
 def running(words: str, most: int | None = None) -> set[int]:
-    """Ids of processes with these words in their command line, or in its first ``most`` words."""
+    """Return ids of processes with these words in the command line, or in the first ``most`` words."""
     each = psutil.process_iter(["cmdline"])
     return {process.pid for process in each if words in " ".join((process.info["cmdline"] or [])[:most])}
 
 
 def tritons() -> set[int]:
-    """Process ids of every tritonserver that this run of the tests has started."""
+    """Return the ids of all tritonservers of this test run."""
     return {pid for pid in running("tritonserver", 1) if is_ours(pid)}
 
 
 def is_ours(pid: int) -> bool:
-    """Whether it is this process, or inherited what conftest.py wrote into the environment."""
+    """True for this process and those that inherited the mark of conftest.py."""
     if pid == os.getpid():
         return True
     try:
@@ -73,7 +78,7 @@ def is_ours(pid: int) -> bool:
 
 @contextmanager
 def nothing_left_behind() -> Iterator[None]:
-    """Within it, servers may start; behind it, none of this run is there, nor anything of it in shared memory."""
+    """Allow servers to start, and check that no process and no shared memory of this run is left."""
     regions_before, tritons_before = regions(), tritons()
     yield
     ends_s = time.monotonic() + EXIT_S

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Writes videos: ``python encoding.py FILE FRAMES.npy CODEC OPTIONS.json``, frames uint8 [T, H, W, 3] at 10 a second.
 
-A program of its own, since the encoder SVT-AV1, where root runs it, gives the thread that calls it a real-time priority
+A separate program, since the encoder SVT-AV1, where root runs it, gives the calling thread a real-time priority
 for good: whatever that thread did or started later would keep all else from the processors.
 """
 
@@ -41,7 +41,7 @@ def encode_here(
     of_container: Mapping[str, str] | None = None,
     format: str | None = None,
 ) -> None:
-    """Writes a video in this process, for other encoders. target: a path, or what has ``write``"""
+    """Write a video in this process, for other encoders. target: a path, or an object with ``write``"""
     target = str(target) if isinstance(target, Path) else target
     with av.open(target, "w", format=format, options=dict(of_container or {})) as container:
         stream: Any = container.add_stream(codec, rate=rate, options=dict(options or {}))

@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import functools
 import importlib.metadata
+from pathlib import Path
+from typing import Any
 
 import goldens
 from rfm import families
+from rfm.checkpoint.content import read_run_config
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 
@@ -19,9 +22,21 @@ def serve_config(config: goldens.Config, name: str = "rfm") -> ExportConfig:
     return ExportConfig(name=name, num_gpus=0, torch_threads=1, **config.sources)
 
 
+def scorer(checkpoint: str, **options: str) -> Any:
+    """Return a scorer for labels that needs no server, as ``rfm label`` has it."""
+    from rfm_commands.engine_scorer import EngineScorer
+
+    return EngineScorer(checkpoint, **options)
+
+
 @functools.cache
 def load_engine(name: str) -> Engine:
-    """The engine of a reference checkpoint, with its encoders if it has some."""
+    """Return the engine of a reference checkpoint, with encoders if there are any."""
     config = goldens.config(name)
     checkpoint = families.load(config.checkpoint, **config.sources)
     return Engine.of(checkpoint, encoders=checkpoint.encoders())
+
+
+def training_run(file: Path) -> dict[str, Any]:
+    """Return the configuration of a training run, whose file names Python classes."""
+    return read_run_config(file)

@@ -13,25 +13,22 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import AddRenderObservation
 
-from rfm_client import ProgressResult, RewardClient, Trajectory
-from rfm_client.contract import wire
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import ProgressResult, RewardClient, Trajectory, UInt8Array
 from rfm_client.episodes import Episode, StepScore
-from rfm_client.transport.calls import Answer, GrpcTransport
-from rfm_client.transport.credentials import Credentials
+from tolerances import TOLERANCE
+from transports import Answer, Connection, Tensors
 
 MODEL = "enc_c1_t1_disc10"
 MAX_FRAMES = 16  # of that checkpoint
 TASK = "balance the pole"
 PUSH_RIGHT = 1  # the pole falls within ten steps
 SIZE = 240, 160  # pixels; fewer would not show the cart
-TOLERANCE = 1e-5
 
 Video = list[UInt8Array]
 
 
 class Camera(gym.Wrapper[Any, Any, Any, Any]):
-    """Videos each episode for the test: ``videos[-1][t]`` is what was to be seen after step t."""
+    """Records each episode: ``videos[-1][t]`` is the frame after step t."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -59,13 +56,13 @@ def cart_pole_with_pixels() -> gym.Env[Any, Any]:
 
 
 def two_cameras(observation: dict[str, Any]) -> dict[str, UInt8Array]:
-    """A frame of each of two cameras, of different sizes, and what is none."""
+    """Return frames of two cameras with different sizes, and an entry without a frame."""
     front = np.asarray(observation["pixels"], np.uint8)
     return {"front": front, "wrist": 255 - front[::2, ::2], "state": np.zeros(1, np.uint8)}
 
 
 def scores(client: RewardClient, video: Video, step: int, max_frames: int | None = MAX_FRAMES) -> ProgressResult:
-    """Of the frames up to a step as upstream's RL loop sends them, cut or padded to ``max_frames``; None: all frames.
+    """Score the frames up to a step as upstream's RL loop does, cut or padded to ``max_frames``; None: all frames.
 
     Without the padded slots but the last, which is the newest frame's.
     """
@@ -108,15 +105,15 @@ def assert_close(left: Any, right: Any) -> None:
     np.testing.assert_allclose(left, right, rtol=0, atol=TOLERANCE)
 
 
-class SlowConnection(GrpcTransport):
-    """To the real server; a question whose longest trajectory has a length that is held waits until it is let go."""
+class SlowConnection(Connection):
+    """A connection to the real server that holds questions by the length of the longest trajectory."""
 
     def __init__(self, url: str) -> None:
-        super().__init__(url, Credentials(), shared_memory=False)
+        super().__init__(url)
         self.held: dict[int, Future[None]] = {}
 
-    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **_id: str) -> Answer:
-        length = int(inputs[wire.NUM_FRAMES].max())
+    async def infer(self, model: str, inputs: Tensors, outputs: Any, timeout_s: float, **_id: str) -> Answer:
+        length = int(inputs["num_frames"].max())
         if length in self.held:
             await asyncio.shield(asyncio.wrap_future(self.held[length]))  # several questions may wait for it
         return await super().infer(model, inputs, outputs, timeout_s)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Servers that stop, hang and come back, and calls that go on meanwhile."""
+"""Servers that stop, hang and come back during calls."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 import tritonclient.grpc
 
 from commands import in_shared_memory
-from rfm.launch.triton_server import Endpoints
 from rfm_client import (
     Trajectory,
 )
 from rfm_client.transport.shared_memory import MIN_SHARED_BYTES
+from servers import Endpoints
 
 
 def url_of(endpoints: Endpoints, protocol: str) -> str:
@@ -35,7 +35,7 @@ def heavy() -> Trajectory:
 
 
 def regions(endpoints: Endpoints) -> set[str]:
-    """Names of the regions that the server maps."""
+    """Return the names of the server's mapped regions."""
     with tritonclient.grpc.InferenceServerClient(endpoints.grpc_url.removeprefix("grpc://")) as client:
         return set(client.get_system_shared_memory_status().regions)
 

@@ -18,7 +18,7 @@ from vlm import PLAIN
 WEIGHTS = GOLDEN / "nf4" / "weights.safetensors"
 LORA_INSIDE = "q3_lora_full_disc10"
 
-# Of NF4 layers beside their values in full size. LoRA factors stay beside NF4, as in PEFT, and sum in another order
+# For NF4 layers beside the values in full size. LoRA factors stay beside NF4, as in PEFT, and sum in another order
 # than merged ones.
 TOLERANCES = {PLAIN: 1e-6, LORA_INSIDE: goldens.LORA_TOLERANCES[1]}
 
@@ -34,7 +34,7 @@ def as_bytes(text: bytes) -> Tensor:
 
 
 def rounded(name: str, weight: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-    """The parts of the weight in NF4, and the values that these stand for."""
+    """Return a weight's parts in NF4, and the values."""
     codes, blocksize = case("plain")["weight.quant_map"], 64
     blocks = torch.nn.functional.pad(weight.float().flatten(), (0, -weight.numel() % blocksize)).view(-1, blocksize)
     scales = blocks.abs().amax(1)
@@ -48,7 +48,7 @@ def rounded(name: str, weight: Tensor) -> tuple[dict[str, Tensor], Tensor]:
 
 
 def in_both_forms(name: str, folder: Path) -> tuple[Path, Path]:
-    """A reference checkpoint with the linear weights of its backbone and heads in NF4; with these weights' values."""
+    """A reference checkpoint with linear weights in NF4, and the same with the NF4 values in full size."""
     few_bits: dict[str, Tensor] = {}
     full: dict[str, Tensor] = {}
     for key, tensor in load_file(goldens.config(name).checkpoint / "model.safetensors").items():

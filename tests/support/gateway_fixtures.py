@@ -1,78 +1,79 @@
 # SPDX-License-Identifier: MIT
-"""Fixtures of the gateway and its page: a Triton with three small models, a gateway for each, a browser."""
+"""Fixtures of the gateway and the page: a Triton with three small models, a gateway for each, and a browser.
+
+Every test session reads this file, so each fixture imports the packages that it needs.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
 
-import goldens
-import rfm_export
-from browsers import Browser, chromium
-from engines import serve_config
-from gateway_requests import (
-    ENCODERS,
-    TINY,
-    TINY_CONFIG,
-    VLM,
-    Ask,
-    Triton,
-    ask_json,
-    ask_npy,
-    fixture_of,
-)
-from one_model import BriefServer
-from proxies import Proxy
-from rfm.config import ExportConfig
-from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
-from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints
-from rfm.rewind.checkpoint import RewindCheckpoint
-from rfm.rewind.network import RewindTransformer
+if TYPE_CHECKING:
+    from browsers import Browser
+    from gateway_requests import Ask, Triton
+    from gateways import Gateway
+    from rfm.rewind.network import RewindTransformer
+
+TINY, ENCODERS, VLM = "rfm", "encoders", "vlm"  # models: two numbers a frame; encoders; vision-language in video mode
 
 
 @pytest.fixture(scope="session")
 def tiny_network() -> RewindTransformer:
+    from gateway_requests import TINY_CONFIG
+    from rfm.rewind.network import RewindTransformer
+
     torch.manual_seed(0)
     return RewindTransformer(TINY_CONFIG)
 
 
 @pytest.fixture(scope="session")
 def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Triton]:
+    import goldens
+    import rfm_export
+    from commands import own_regions
+    from engines import serve_config
+    from gateway_requests import TINY_CONFIG, Triton
+    from proxies import Proxy
+    from rfm.config import ExportConfig
+    from rfm.rewind.checkpoint import RewindCheckpoint
+    from servers import Endpoints, start_triton
+
     folder = tmp_path_factory.mktemp("gateway_triton")
     repository, checkpoint = folder / "model_repository", folder / "two_wide"
     RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
     rfm_export.export(checkpoint, repository, ExportConfig(name=TINY, num_gpus=0, torch_threads=1))
     for config, name in ((goldens.config("enc_c1_t1_disc10"), ENCODERS), (goldens.config("q25_video_last_l2"), VLM)):
         rfm_export.export(config.checkpoint, repository, serve_config(config, name))
-    ours = f"{REGION_PREFIX}_{os.getpid()}_*"  # others test beside us
-    regions = set(SHARED_MEMORY.glob(ours))
+    regions = own_regions(os.getpid())
     with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        start_triton(repository) as server,
         Proxy(server.endpoints.http_port) as http,
         Proxy(server.endpoints.grpc_port) as grpc,
         Proxy(server.endpoints.metrics_port) as metrics,
     ):
         endpoints = Endpoints(http_port=http.port, grpc_port=grpc.port, metrics_port=metrics.port)
         yield Triton(repository, endpoints, (http, grpc, metrics))
-    assert set(SHARED_MEMORY.glob(ours)) <= regions
+    assert own_regions(os.getpid()) <= regions
 
 
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """The one browser of all tests of the page."""
+    """The shared browser."""
+    from browsers import chromium
+
     with chromium(tmp_path_factory.mktemp("downloads")) as started:
         yield started
 
 
 @pytest.fixture
 def quiet_browser(browser: Browser) -> Iterator[Browser]:
-    """The browser, which asks nothing outside this machine in the test and whose console shows no error."""
-    browser.driver.get("about:blank")  # the page of the test before asks its gateway no more
+    """The browser; fails the test if the page asks another machine or the console shows an error."""
+    browser.driver.get("about:blank")  # the page of the last test asks no more
     browser.complaints()
     yield browser
     asked = browser.asked()
@@ -81,13 +82,25 @@ def quiet_browser(browser: Browser) -> Iterator[Browser]:
     assert [line for line in browser.complaints() if "viewer/score" not in line] == []  # of the files it refuses
 
 
-tiny, encoders, video = fixture_of(TINY), fixture_of(ENCODERS), fixture_of(VLM)
+def gateway_of(model: str, *options: str) -> Any:
+    @pytest.fixture(scope="session")
+    def gateway(triton: Triton, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+        from gateways import running
+
+        with running(triton.endpoints, tmp_path_factory.mktemp("gateway"), model, *options) as started:
+            yield started
+            assert not started.metric("requests_total", code="500")
+
+    return gateway
 
 
-strict = fixture_of(TINY, "--timeout", "1", "--max-in-flight", "1", "--max-waiting", "0", "--max-body-mib", "1")
+tiny, encoders, video = gateway_of(TINY), gateway_of(ENCODERS), gateway_of(VLM)
+strict = gateway_of(TINY, "--timeout", "1", "--max-in-flight", "1", "--max-waiting", "0", "--max-body-mib", "1")
 
 
-@pytest.fixture(params=[ask_json, ask_npy], ids=["json", "npy"])
+@pytest.fixture(params=["json", "npy"])
 def ask(request: pytest.FixtureRequest) -> Ask:
-    function: Ask = request.param
+    import gateway_requests
+
+    function: Ask = getattr(gateway_requests, f"ask_{request.param}")
     return function

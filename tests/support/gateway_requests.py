@@ -19,23 +19,25 @@ import numpy.typing as npt
 import pytest
 import requests
 
-from gateways import Gateway, running
+from gateway_fixtures import ENCODERS as ENCODERS
+from gateway_fixtures import TINY as TINY
+from gateway_fixtures import VLM as VLM
+from gateways import Gateway
 from proxies import Proxy
-from rfm.launch.triton_server import Endpoints
 from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from servers import Endpoints
 from small_network import SMALL
+from tolerances import TOLERANCE
 
 Json: TypeAlias = dict[str, Any]
 Array: TypeAlias = npt.NDArray[Any]
 Ask: TypeAlias = Callable[..., requests.Response]
-TINY, ENCODERS, VLM = "rfm", "encoders", "vlm"  # models: two numbers a frame; encoders; vision-language in video mode
 TINY_CONFIG = replace(
     SMALL, video_feature_dim=2, text_feature_dim=2, hidden_dim=8, num_layers=1, num_attention_heads=2, max_len=16,
     progress_bins=10,
 )  # fmt: skip
 ENCODER_DIMS = (48, 32)  # widths D and Dt of ENCODERS's encoders
 FRAME_STEPS = 4
-TOLERANCE = 1e-5  # where requests may share batches in different ways
 SIDES = {
     "progress": ("trajectory",),
     "preference": ("chosen_trajectory", "rejected_trajectory"),
@@ -48,16 +50,6 @@ class Triton:
     repository: Path
     endpoints: Endpoints
     proxies: Sequence[Proxy]  # in front of its ports
-
-
-def fixture_of(model: str, *options: str) -> Any:
-    @pytest.fixture(scope="package")
-    def gateway(triton: Triton, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
-        with running(triton.endpoints, tmp_path_factory.mktemp("gateway"), model, *options) as started:
-            yield started
-            assert not started.metric("requests_total", code="500")
-
-    return gateway
 
 
 def embedded(seed: int, num_frames: int, dims: tuple[int, int] = (2, 2), **fields: Any) -> Json:
@@ -103,7 +95,7 @@ def post_json(gateway: Gateway, document: Any) -> requests.Response:
 
 
 def ask_npy(gateway: Gateway, samples: Sequence[Json], **fields: Any) -> requests.Response:
-    """As the evaluation server's documentation tells: every array a part, in its place the name of that part."""
+    """Send every array as a part, as the evaluation server's documentation says."""
     files, form = {}, {name: str(value).lower() for name, value in fields.items()}
     for index, sample in enumerate(samples):
         shown: Json = dict(sample)
@@ -224,7 +216,7 @@ NAMED = b'--b\r\nContent-Disposition: form-data; name="sample_0"\r\n\r\n'
 
 
 def begun(gateway: Gateway, headers: Mapping[str, str], *parts: bytes, path: str = "/evaluate_batch") -> Any:
-    """A connection on which the beginning of a request has been sent."""
+    """Open a connection and send the beginning of a request."""
     connection = gateway.connect()
     connection.putrequest("POST", path)
     for name, value in headers.items():
@@ -246,7 +238,7 @@ def post_body(
 
 @contextmanager
 def paused(triton: Triton) -> Iterator[None]:
-    """Within it nothing comes through to Triton, and nothing from it."""
+    """Stop all bytes to and from Triton."""
     with ExitStack() as held:
         for proxy in triton.proxies:
             held.enter_context(proxy.held())

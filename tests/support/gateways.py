@@ -19,10 +19,10 @@ import requests
 from prometheus_client.parser import text_string_to_metric_families
 
 from rfm.launch.endpoints import free_ports
-from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
+from rfm_gateway import GatewayConfig
 from rfm_gateway.app import create_app
-from rfm_gateway.config import GatewayConfig
+from servers import Endpoints
 
 with warnings.catch_warnings():  # it would rather have httpx2
     warnings.simplefilter("ignore")
@@ -56,7 +56,7 @@ class Gateway:
         return requests.get(f"{self.url}{path}", timeout=WITHIN_S, **options)
 
     def metric(self, name: str, **labels: str) -> float:
-        """Of the gateway's own."""
+        """Return the value of a metric of the gateway."""
         return metric_at(f"{self.url}/metrics", f"rfm_gateway_{name}", **labels)
 
 

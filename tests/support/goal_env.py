@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A goal environment with a reward of its own that no reward model would give."""
+"""A goal environment whose reward no reward model would give."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from coded_env import frame_of
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 
 OWN_REWARD = -100.0
 LENGTH = 5  # steps of an episode

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reference cases computed by the original code: a request, and what it must be answered."""
+"""Reference cases of the original code: requests and answers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ROOT = Path(os.environ.get("RFM_GOLDENS") or GOLDEN)
 
 FRAME_STEPS = 4  # of the original's dense mode
 
-# Limits of differences from the original, of raw scores (logits, similarity) and of probabilities. The references come
+# Largest differences from the original for raw scores (logits, similarity) and probabilities. The references come
 # from another machine, so each limit is three times the largest difference with SSE4.1, AVX2 or AVX-512: small enough
 # to see an epsilon of 1e-6 in place of 1e-5 in a LayerNorm.
 REWIND_TOLERANCES = (2e-5, 5e-6)  # seen: 7.6e-6, 1.7e-6
@@ -89,7 +89,7 @@ class Config:
 
     @property
     def sources(self) -> dict[str, str]:
-        """What the checkpoint is loaded with: its base model, or its encoders, if it has some."""
+        """Arguments for loading the checkpoint: the base model or the encoders, if any."""
         names = ("base_model", "image_encoder", "text_encoder")
         return {name: str(source) for name in names if (source := getattr(self, name)) is not None}
 
@@ -108,7 +108,7 @@ class Config:
 
     @property
     def tolerances(self) -> tuple[float, float]:
-        """Of raw scores and of probabilities, in float32."""
+        """Tolerances of raw scores and probabilities in float32."""
         if not self.is_vlm:
             return REWIND_TOLERANCES
         return LORA_TOLERANCES if self.summary["lora"] else VLM_TOLERANCES
@@ -123,7 +123,7 @@ class Config:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Scores of one sample: per trajectory progress [T], its logits [T, K] and success [T]; the answer about a pair."""
+    """Scores of one sample: per trajectory progress [T], logits [T, K] and success [T]; the answer about a pair."""
 
     progress: list[Array]
     progress_logits: list[Array] | None
@@ -133,7 +133,7 @@ class Expected:
 
 @dataclass(frozen=True)
 class Case:
-    """One request and its answer."""
+    """A request and the answer."""
 
     config: Config
     file: Path
@@ -152,18 +152,18 @@ class Case:
 
     @property
     def tolerances(self) -> tuple[float, float]:
-        """Of raw scores and of probabilities, in float32; wide where the reference was computed in bfloat16 alone."""
+        """Tolerances of raw scores and probabilities; wide for references in bfloat16 alone."""
         rounded = self.config.is_bfloat16 and not self.has_float32
         return ROUNDED_TOLERANCES if rounded else self.config.tolerances
 
     @property
     def has_float32(self) -> bool:
-        """Whether a case of a checkpoint in bfloat16 was also computed in float32."""
+        """True if a case of a bfloat16 checkpoint also has float32 references."""
         return any(key.startswith("fp32.") for key in self.content["expected_arrays"])
 
     @property
     def is_refused(self) -> bool:
-        """Whether the request has to be refused."""
+        """True if the request has to be refused."""
         return "expectation" in self.content
 
     def samples(self) -> list[Sample]:
@@ -182,15 +182,15 @@ class Case:
         ]
 
     def expected(self, *, bfloat16: bool = False) -> list[Expected]:
-        """From the raw arrays, which also tell what the original's answer leaves out.
+        """Read the raw arrays, which the original's answer does not contain in full.
 
-        bfloat16: of a checkpoint in bfloat16 its scores in that type; else those in float32
+        bfloat16: True: scores in bfloat16 if the checkpoint has that type; False: in float32
         """
         arrays = self.arrays
         if not bfloat16 and self.has_float32:
             arrays = {key.removeprefix("fp32."): array for key, array in arrays.items() if key.startswith("fp32.")}
         read = _Reader(arrays, self.config)
-        if self.content["kind"] in ("ragg", "ragp", "ragged"):  # evaluated one by one, each with arrays of its own
+        if self.content["kind"] in ("ragg", "ragp", "ragged"):  # evaluated one by one, each with separate arrays
             return [read.expected(sample, 0, f"sample_{index}.") for index, sample in enumerate(self.samples())]
         rows = {"progress": 0, "preference": 0, "similarity": 0}
         expected = []
@@ -202,7 +202,7 @@ class Case:
         return expected
 
     def check_response(self, results: Sequence[Result]) -> None:
-        """Compares with the body that the original server sends, or should have sent."""
+        """Compare with the body that the original server sends, or should have sent."""
         body = self.content.get("response_fixed") or self.content["response"]
         raw_tolerance, tolerance = ROUNDED_TOLERANCES if self.config.is_bfloat16 else self.config.tolerances
         by_kind: dict[str, list[Any]] = {"progress": [], "success": [], "preference": [], "similarity": []}
@@ -248,7 +248,7 @@ def config(name: str) -> Config:
 
 
 # What the shared server serves: ReWiND, ReWiND with encoders, Qwen3-VL on images, Qwen2.5-VL on video. Each reference
-# case runs on the engine; through Triton one of each of these, and one that is refused.
+# case runs on the engine; through Triton one case of each model, and a refused one.
 SERVED = [config(name) for name in ("c1_t1_disc10", "enc_c1_t1_disc10", "q3_tok_disc10", "q25_video_avg_disc10")]
 SERVED_CASES = [next(case for case in each.cases() if case.file.stem.startswith("mixed")) for each in SERVED]
 REFUSED_CASE = next(case for each in SERVED for case in each.cases() if case.is_refused)
@@ -259,7 +259,7 @@ def sample_type(sample: Sample) -> str:
 
 
 def differences(result: Result, expected: Expected) -> tuple[float, float]:
-    """Largest differences from the reference: of raw scores, and of probabilities."""
+    """Return the largest differences of raw scores and probabilities from the reference."""
     frames = frame_scores(result)
     raw, probabilities = [0.0], [0.0]
     for got, progress, success in zip(frames, expected.progress, expected.success, strict=True):
@@ -311,7 +311,7 @@ def _trajectory(trajectory: dict[str, Any], arrays: Any) -> Trajectory:
 
 @dataclass(frozen=True)
 class _Reader:
-    """The raw arrays of one case."""
+    """Return a case's raw arrays."""
 
     arrays: dict[str, Array]
     config: Config
@@ -319,7 +319,7 @@ class _Reader:
     def expected(self, sample: Sample, row: int, prefix: str) -> Expected:
         kind = sample_type(sample)
         lengths = [trajectory.num_frames for trajectory in sample.trajectories]
-        if isinstance(sample, ProgressSample) and sample.frame_steps:  # one row a prefix, of which the last counts
+        if isinstance(sample, ProgressSample) and sample.frame_steps:  # one row per prefix; the last frame counts
             rows = range(row, row + lengths[0])
             progress, success = (
                 [np.stack([self._raw(f"{prefix}{kind}.{name}_logits_A", r)[-1] for r in rows])]
@@ -337,7 +337,7 @@ class _Reader:
         return Expected([_mean_bin(part) for part in progress], progress, success, answer)
 
     def _of_trajectories(self, name: str, row: int, lengths: Sequence[int]) -> list[Array]:
-        """Values of each frame. The original splits a pair's half-way, whatever the lengths; here as they are."""
+        """Split the values by trajectory. The original splits pairs in the middle, whatever the lengths."""
         values = np.concatenate([self._raw(f"{name}_{side}", row) for side, _ in zip("AB", lengths, strict=False)])
         each = self.config.frames_per_value
         counts = [-(-length // each) for length in lengths]
@@ -345,7 +345,7 @@ class _Reader:
         return [part[np.arange(length) // each] for part, length in zip(parts, lengths, strict=True)]
 
     def _raw(self, name: str, row: int) -> Array:
-        """[T] or [T, K]; of one frame the original may leave the axis of time out."""
+        """[T] or [T, K]; for a single frame the original may omit the time axis."""
         discrete = self.config.is_discrete and "progress" in name.rpartition(".")[2]
         return (
             self.arrays[name][row]

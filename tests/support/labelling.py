@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Labelling without a server: a scorer of a few lines, and a process that labels with it and may be killed.
+"""Labelling without a server: a short scorer, and a process for tests to kill.
 
 python tests/support/labelling.py DATASET OUTPUT SECONDS_A_REQUEST
 """
@@ -10,8 +10,8 @@ import io
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from pyarrow import parquet
 
-from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory
-from rfm_client.contract.samples import UInt8Array
-from rfm_labels import CheckpointFacts, DatasetEpisode, LabelOptions, Scorer, Watch, label, open_dataset
+from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory, UInt8Array
+from rfm_labels import CheckpointFacts, DatasetEpisode, LabelOptions, RayOptions, Scorer, Watch, label, open_dataset
+from rfm_labels.datasets.stored_files import digest_of as digest_of
 
 LEROBOT = Path(__file__).parents[1] / "lerobot"
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
@@ -29,7 +29,7 @@ FEW: dict[str, Any] = {"cameras": (WRIST,), "frames": 2}  # options with which a
 
 
 class BrightnessScorer:
-    """Progress is how bright the slot's frame is, success how red: what is read can be recomputed by hand."""
+    """Progress is the brightness of a slot's frame, success the redness, so tests can recompute both."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class PickyScorer(BrightnessScorer):
 
 
 class Notes(Watch):
-    """Keeps what a run says."""
+    """Keeps the messages of a run."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -95,6 +95,33 @@ class Notes(Watch):
 
     def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
         self.failures.append(f"{episode.name}: {error}")
+
+
+def command(
+    source: Path,
+    labels: LabelOptions,
+    scorer: Scorer,
+    say: Callable[[str], None] = print,
+    *,
+    task: str | None = None,
+    **run: bool,
+) -> int:
+    """Run ``rfm-client label`` with a scorer instead of a server. Return the exit code.
+
+    say: gets each line of its output; run: ``dry_run``, ``picture``
+    """
+    from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
+
+    texts, options = EpisodeTexts(task=task), RunOptions(**run)
+    return LabelCommand(str(source), texts, labels, options, RayOptions(), lambda: nullcontext(scorer), say).run()
+
+
+def tasks_of(root: Path) -> dict[int, str]:
+    """Return the sentences of a LeRobot v3.0 dataset by number."""
+    columns = parquet.read_table(root / "meta" / "tasks.parquet").to_pydict()
+    numbers = columns.pop("task_index")
+    (sentences,) = columns.values()
+    return dict(zip(numbers, sentences, strict=True))
 
 
 def without_cost(file: Path) -> bytes:

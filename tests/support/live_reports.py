@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reports of running episodes as clients write them, and a place that takes reports and keeps them."""
+"""Reports of running episodes as clients write them, and a server that keeps reports."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import base64
 import io
 import json
 import ssl
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
+from servers import web_server
 
 Json = dict[str, Any]
 
 
 def picture(seed: int = 0, size: tuple[int, int] = (48, 64)) -> UInt8Array:
-    """A frame of one colour, which survives JPEG."""
+    """Return a frame with a single colour, which survives JPEG."""
     return np.full((*size, 3), np.random.default_rng(seed).integers(0, 256, 3), np.uint8)
 
 
@@ -50,7 +50,7 @@ def jpeg(frame: UInt8Array) -> str:
 
 
 class Taker:
-    """What has come. status: what is answered"""
+    """The received reports. status: of the answers"""
 
     def __init__(self) -> None:
         self.bodies: list[Json] = []
@@ -64,7 +64,7 @@ class Taker:
 
 @contextmanager
 def taking(context: ssl.SSLContext | None = None) -> Iterator[Taker]:
-    """A server that takes every report, or refuses them as the test wants. context: of HTTPS"""
+    """Run a server for reports that answers with ``status``. context: for HTTPS"""
     taker = Taker()
 
     class Handler(BaseHTTPRequestHandler):
@@ -77,16 +77,7 @@ def taking(context: ssl.SSLContext | None = None) -> Iterator[Taker]:
             self.end_headers()
 
         def log_message(self, *_: Any) -> None:
-            """Says nothing of its requests."""
+            """Log nothing."""
 
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        if context is not None:
-            server.socket = context.wrap_socket(server.socket, server_side=True)
-        taker.url = f"{'http' if context is None else 'https'}://127.0.0.1:{server.server_port}"
-        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
-        thread.start()
-        try:
-            yield taker
-        finally:
-            server.shutdown()
-            thread.join()
+    with web_server(Handler, context) as taker.url:
+        yield taker

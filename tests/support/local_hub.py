@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from urllib.parse import unquote
+
+from servers import web_server
 
 
 def commit_of(revision: str) -> str:
@@ -20,7 +21,7 @@ def commit_of(revision: str) -> str:
 
 @contextmanager
 def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") -> Iterator[str]:
-    """Serves repositories by id (``org/name``), each with the files of a folder at each revision. Gives the endpoint.
+    """Serve repositories by id (``org/name``) with a folder per revision. Yields the endpoint.
 
     kind: ``models`` or ``datasets``. All revisions but main are tags
     """
@@ -36,7 +37,7 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
             place = "" if kind == "models" else f"/{kind}"
             words = self.path.removeprefix(f"/api/{kind}" if self.path.startswith("/api/") else place).split("/")
             repository = "/".join(words[1:3])
-            if repository not in repositories:  # what newer clients ask of the Hub itself
+            if repository not in repositories:  # a question of newer clients to the Hub itself
                 self._send(404, b"", with_body)
                 return
             revisions = repositories[repository]
@@ -86,15 +87,8 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
         def log_message(self, format: str, *args: object) -> None:
             """Keeps the test's output clean."""
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_address[1]}"
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    with web_server(Handler) as url:
+        yield url
 
 
 def _told(file: Path, folder: Path) -> dict[str, object]:
@@ -103,5 +97,5 @@ def _told(file: Path, folder: Path) -> dict[str, object]:
 
 
 def _commit(revisions: Mapping[str, Path], revision: str) -> str:
-    """The commit of a revision, which may be one."""
+    """Return the commit of a revision or commit."""
     return commit_of(revision) if revision in revisions else revision

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples of all types for the reference server, and what it is to have done with them."""
+"""Samples of all types for the reference server, and the server's counts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import goldens
 from commands import running
-from reference_server import Served
 from rfm_client import (
     PreferenceSample,
     ProgressSample,
@@ -22,11 +21,11 @@ from rfm_client import (
     Sample,
     SimilaritySample,
 )
-from rfm_serve import wait_for
+from servers import Served, wait_for
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
-TOLERANCE = 1e-5
-TOLD_S = 1.0  # for a model to tell Triton what it has counted
+TOLD_S = 1.0  # until a model has reported its counts to Triton
 MODEL = "c1_t1_disc10"  # tokens, so T <= 16; discrete; all heads
 
 
@@ -54,7 +53,7 @@ def plug() -> list[Sample]:
 
 
 def counts(served: Served, model: str) -> tuple[int, int]:
-    """Requests answered well, and executions of the model's pipeline, so far. Triton's own count is of its calls."""
+    """Return the numbers of good answers and pipeline executions so far. Triton counts only calls."""
     time.sleep(TOLD_S)
     with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as client:
         stats = client.get_inference_statistics(model).model_stats[0]

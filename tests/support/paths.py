@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where tests find what the repository holds."""
+"""Folders of the repository."""
 
 from __future__ import annotations
 

@@ -1,30 +1,29 @@
 # SPDX-License-Identifier: MIT
-"""A small repository whose model breaks when it is told to, and callers that notice."""
+"""A small repository with a model that breaks on demand, and callers that notice."""
 
 from __future__ import annotations
 
 import shutil
-import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from callers import Callers, Exam, progress_of
 from paths import ROOT
 from repositories import configure
 from rfm import families
 from rfm.engine import Engine
 from rfm_client import ProgressSample, RewardClient, Trajectory
-from rfm_serve import MODEL, wait_for
+from servers import MODEL
 
 CALLERS = 16
-TOLERANCE = 1e-5
-MARK = 7.0  # in the text embedding of a sample that a model of this test dies of
+MARK = 7.0  # in the text embedding of a deadly sample
 
 
 def answering(body: str) -> str:
-    """Code for a model.py that does something before it answers. ``marks``: of the questions"""
+    """Return code for a model.py that runs ``body`` before it answers. ``marks``: by question"""
     return f"""
 
 _plain_answer = TritonPythonModel.answer
@@ -46,7 +45,7 @@ DEADLY = answering(f"if {MARK} in marks: os._exit(1)")
 
 
 def answering_after(seconds: float, began: Path | None = None) -> str:
-    """Code for a model.py whose answers take so much longer. began: a file that is there once it works on one"""
+    """Return code for a model.py with slower answers. began: a file that each answer creates first"""
     note = "" if began is None else f"pathlib.Path({str(began)!r}).touch(); "
     return answering(f"{note}time.sleep({seconds})")
 
@@ -72,44 +71,13 @@ def trajectory(seed: int, num_frames: int = 8, mark: float = 0.0) -> Trajectory:
 
 @pytest.fixture(scope="module")
 def references() -> list[np.ndarray[Any, Any]]:
-    """What the engine answers, without Triton."""
+    """The engine's answers, without Triton."""
     engine = Engine.of(families.load(ROOT / "model_repository" / MODEL / "1" / "checkpoint"))
     return [result.progress for result in engine.evaluate([ProgressSample(trajectory(n)) for n in range(CALLERS)])]  # type: ignore[union-attr]
 
 
-class Callers:
-    """16 threads that ask without pause, with the client's default retries, and compare what they get."""
-
-    def __init__(self, client: RewardClient, references: list[np.ndarray[Any, Any]]) -> None:
-        self._client = client
-        self._references = references
-        self._stop = threading.Event()
-        self.answered = [0] * CALLERS
-        self.wrong: list[int] = []
-        self.lost: list[Exception] = []
-        self._threads = [threading.Thread(target=self._ask, args=(number,)) for number in range(CALLERS)]
-
-    def _ask(self, number: int) -> None:
-        while not self._stop.is_set():
-            try:
-                progress = self._client.progress(trajectory(number)).progress
-                if np.abs(progress - self._references[number]).max() > TOLERANCE:
-                    self.wrong.append(number)
-                self.answered[number] += 1
-            except Exception as error:  # noqa: BLE001  whatever it is, it is lost
-                self.lost.append(error)
-
-    def wait_for_all(self) -> None:
-        """Each is answered twice more: the second answer is to a question that was asked from now on."""
-        before = list(self.answered)
-        wait_for(lambda: self.lost or all(now > then + 1 for now, then in zip(self.answered, before, strict=True)))
-
-    def __enter__(self) -> Callers:
-        for thread in self._threads:
-            thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        for thread in self._threads:
-            thread.join()
+def calling(client: RewardClient, references: list[np.ndarray[Any, Any]]) -> Callers:
+    """Return 16 threads that ask without pause and compare each answer with the engine's."""
+    return Callers(
+        progress_of(client), Exam([ProgressSample(trajectory(n)) for n in range(CALLERS)], references), CALLERS
+    )

@@ -11,7 +11,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import UInt8Array
 
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
 
@@ -34,7 +34,7 @@ TURNS: dict[str, tuple[Matrix, Callable[[UInt8Array], UInt8Array]]] = {
 def write_video(
     file: Path, frames: UInt8Array, times: list[int] | None = None, *, shown_from: int = 0, codec: str = "libx264"
 ) -> None:
-    """A video of 10 fps, or of frames at these tenths of a second; frames before ``shown_from`` are not to be shown."""
+    """Write a video at 10 fps, or with frames at these tenths of a second, to be shown from ``shown_from`` on."""
     with av.open(str(file), "w", options={"avoid_negative_ts": "disabled"} if shown_from else {}) as container:
         options = {"bf": "0", "crf": "1"} if codec == "libx264" else {"b": "9M"}
         stream = container.add_stream(codec, rate=Fraction(10), options=options)
@@ -52,19 +52,19 @@ def write_video(
 
 
 def numbered(count: int) -> UInt8Array:
-    """Grey frames [count, 32, 32, 3], each of its own brightness; ``numbers`` reads them back."""
+    """Return grey frames [count, 32, 32, 3] of increasing brightness; ``numbers`` reads them back."""
     grey = (np.arange(count) * 240 // count).astype(np.uint8)
     return np.ascontiguousarray(np.broadcast_to(grey[:, None, None, None], (count, 32, 32, 3)))
 
 
 def numbers(frames: UInt8Array, count: int) -> list[int]:
-    """Which of ``numbered(count)`` the frames are."""
+    """Return the frames' numbers in ``numbered(count)``."""
     means = frames.mean(axis=(1, 2, 3))
     return np.abs(means[:, None] - numbered(count)[:, 0, 0, 0]).argmin(axis=1).tolist()
 
 
 def turn(file: Path, matrix: Matrix) -> None:
-    """Gives the track of an MP4 file one of the matrices of TURNS."""
+    """Set the matrix of an MP4 file's track to an entry of TURNS."""
     content = file.read_bytes()
     a, b, c, d = (value << 16 for value in matrix)
     start = content.index(b"tkhd") + 4 + 40  # version 0: the matrix follows 40 bytes of other fields

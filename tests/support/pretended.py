@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Two GPUs that are not there: tensors that say that they lie on ``cuda:0`` or ``cuda:1``, and are computed on the CPU.
+"""Two pretended GPUs: tensors claim to lie on ``cuda:0`` or ``cuda:1``, and the CPU computes them.
 
-As on GPUs, an operator that is given tensors of two places fails, and ``cuda`` is the thread's current device. What the
+As on GPUs, an operator fails for tensors on two devices, and ``cuda`` is the thread's current device. What the
 host would wait for is counted: values that it asks for, and copies from memory that is not pinned. CUDA's own calls are
 recorded.
 """
@@ -28,7 +28,7 @@ SECOND = torch.device("cuda", 1)
 CPU = torch.device("cpu")
 _ASKS = {"_local_scalar_dense", "item", "is_nonzero", "equal", "nonzero", "masked_select", "_unique2", "unique_dim"}
 _READS = {torch.Tensor.tolist, torch.Tensor.item, torch.Tensor.__int__, torch.Tensor.__float__, torch.Tensor.__bool__}
-_GUARDED = {  # methods that look for the device before their operator is dispatched
+_GUARDED = {  # methods that look for the device before the operator is dispatched
     torch.Tensor.copy_: torch.ops.aten.copy_.default,
     torch.Tensor.__invert__: torch.ops.aten.bitwise_not.default,
 }
@@ -37,7 +37,7 @@ _COPIES = {"to", "_to_copy", "copy_"}
 
 @dataclass
 class Seen:
-    """What was done on the device.
+    """The work done on the device.
 
     asked: by operator, how often the host waited for a value or a size
     awaited: copies to the device for which the host waited
@@ -62,7 +62,7 @@ class Seen:
         self._of_thread.device = device
 
     def placed(self, device: Any) -> torch.device:
-        """The device that is meant: ``cuda`` is the current one."""
+        """Return the device with an index; ``cuda`` is the current one."""
         device = self.current if device is None else torch.device("cuda", device) if type(device) is int else device
         device = torch.device(device)
         if device.type == "cuda" and device.index is None:
@@ -73,7 +73,7 @@ class Seen:
 
 
 class OnDevice(torch.Tensor):
-    """A tensor on a device; ``held``: its values."""
+    """A tensor on a device. held: the values"""
 
     held: torch.Tensor
     seen: Seen
@@ -102,7 +102,7 @@ class OnDevice(torch.Tensor):
         if func in _GUARDED:
             return computed(_GUARDED[func], args, kwargs or {}, cls.seen)
         if func not in (torch.Tensor.__getitem__, torch.Tensor.__setitem__):
-            with torch._C.DisableTorchFunctionSubclass():  # or what comes back from the device would be wrapped
+            with torch._C.DisableTorchFunctionSubclass():  # or results from the device would be wrapped
                 return func(*args, **(kwargs or {}))
         tensors = [each for each in tree_flatten(args)[0] if isinstance(each, torch.Tensor) and each.dim()]
         _check_together("index", tensors)
@@ -128,7 +128,7 @@ class Pretending(TorchDispatchMode):
 
 
 def computed(func: Any, args: Any, kwargs: dict[str, Any], seen: Seen) -> Any:
-    """What an operator gives, on the device if it is told to, or its tensors lie there."""
+    """Return an operator's result, on the device if asked to or if the inputs lie there."""
     name = func._schema.name.removeprefix("aten::")
     named = dict(zip((argument.name for argument in func._schema.arguments), args, strict=False)) | kwargs
     tensors = [each for each in tree_flatten((args, kwargs))[0] if isinstance(each, torch.Tensor)]
@@ -141,7 +141,7 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any], seen: Seen) -> Any:
     if not there and target.type != "cuda":
         return func(*args, **kwargs)
     if name == "_has_compatible_shallow_copy_type":
-        return False  # a parameter that lies here cannot become one that lies there: a new one is made
+        return False  # a parameter cannot move to another device, so a new one is made
     seen.num_operators += 1
     is_copy = (name in _COPIES and told is not None) or name == "copy_"
     if there and not is_copy:
@@ -183,7 +183,7 @@ def _wrapped(made: Any, target: torch.device) -> Any:
 
 
 class _Stream:
-    """A stream of CUDA, which records what it is asked."""
+    """A CUDA stream that records the calls."""
 
     def __init__(self, seen: Seen, device: Any = None) -> None:
         self.seen, self.device = seen, seen.placed(device)
@@ -229,7 +229,7 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
         return made if device is None else made.to(device)
 
     class Threads(ThreadPoolExecutor):
-        """Threads in which PyTorch has the GPU, too: what it dispatches by is a thread's own."""
+        """Threads in which PyTorch also has the GPU, since dispatch keys are per thread."""
 
         def submit(self, work: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
             def pretending() -> Any:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A TCP proxy in front of a server: connections through it fall silent, or are held back for a while.
 
-A server is not stopped by a signal for that: where Triton 2.51's processes stop while one of them has a lock that
+No signal stops the server for that: if Triton 2.51's processes stop while one of them has a lock that
 another waits for, Triton ends as soon as they go on ("boost::interprocess::lock_exception"). It was seen in 1 of 48
 stops.
 """
@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 class Proxy:
     """Forwards TCP connections to a port, until it goes silent: connections stay open, and nothing comes over them.
 
-    It stands in for a network that drops packets, which needs a privilege to be had. ``reads``: what a client sends
+    It stands in for a network that drops packets, which needs a privilege. ``reads``: what a client sends
     over a silent connection is still acknowledged, and dropped; otherwise nothing more is taken from it.
     """
 
@@ -38,13 +38,13 @@ class Proxy:
         return len(self._pairs)
 
     def go_silent(self) -> None:
-        """All connections that there are; a new one is forwarded."""
+        """Silence all present connections, but not new ones."""
         for *_, is_silent in self._pairs:
             is_silent.set()
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Within it nothing comes over any connection, old or new; what was sent comes afterwards."""
+        """Hold all connections, old and new; the held bytes come afterwards."""
         self._flows.clear()
         try:
             yield
@@ -69,7 +69,7 @@ class Proxy:
                 threading.Thread(target=self._forward, args=(source, target, is_silent), daemon=True).start()
 
     def _greet(self, near: socket.socket) -> bool:
-        """Whether the connection goes on to the server after what comes before the server's own bytes."""
+        """Read the bytes before those for the server. Return True if the connection goes on to the server."""
         return True
 
     def _forward(self, source: socket.socket, target: socket.socket, is_silent: threading.Event) -> None:
@@ -102,7 +102,7 @@ class Proxy:
 
 
 class HttpProxy(Proxy):
-    """An HTTP proxy for CONNECT, behind which every host is the port. asked: the ``host:port`` of each CONNECT."""
+    """An HTTP proxy for CONNECT that maps every host to the port. asked: the ``host:port`` of each CONNECT."""
 
     def __init__(self, port: int) -> None:
         self.asked: list[str] = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What tests do to a model repository and its processes."""
+"""Changes of a model repository and its processes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rfm_export.pbtxt import parse, render
 
 @contextmanager
 def changing(model: Path) -> Iterator[ModelConfig]:
-    """What is changed within it is written into an exported model's configuration."""
+    """Change an exported model's configuration in place."""
     file = model / CONFIG_FILE
     config = parse(file.read_text())
     yield config
@@ -52,7 +52,7 @@ def configure(model: Path, *, instances: int = 1, batch_size: int = 64, **parame
 
 
 def bound_queue(model: Path, *, max_queue_size: int = 0, timeout_ms: int = 0) -> None:
-    """Changes an exported model's configuration: so many requests may wait in Triton, and so long; 0: any."""
+    """Bound the queue of an exported model in number and time of requests; 0: unbounded."""
     with changing(model) as config:
         policy = config.dynamic_batching.default_queue_policy
         policy.max_queue_size, policy.default_timeout_microseconds = max_queue_size, 1000 * timeout_ms
@@ -60,7 +60,7 @@ def bound_queue(model: Path, *, max_queue_size: int = 0, timeout_ms: int = 0) ->
 
 
 def kill_model(repository: Path, model: str = "rfm") -> None:
-    """Kills each process of a model that a server of ``repository`` runs."""
+    """Kill all processes of a model in ``repository``."""
     model_file = f"{repository}/{model}/1/model.py"
     killed = running(model_file)
     assert killed

@@ -25,7 +25,7 @@ BASE = ROOT / "bases" / "q3"
 
 @dataclass(frozen=True)
 class Reference:
-    """One request and its answer. file: ``SECTION/CONFIG/cases/CASE.json``"""
+    """A request and the answer. file: ``SECTION/CONFIG/cases/CASE.json``"""
 
     file: Path
 
@@ -49,7 +49,7 @@ class Reference:
         return dict(np.load(self.file.with_suffix("").with_suffix(".expected.npz")))
 
     def samples(self, last: int | None = None) -> list[ProgressSample]:
-        """The request's samples. last: only as many frames, from the end"""
+        """Return the request's samples. last: keep only the last N frames"""
         inputs = self.file.parent / self.content["inputs"]
         arrays = np.load(inputs.with_suffix(".npz"))
         samples = []
@@ -67,7 +67,7 @@ def references(section: str) -> list[Reference]:
 
 
 def as_before_marks(file: Path) -> None:
-    """Take the marks out of a configuration, as in an export without them."""
+    """Remove the marks from a configuration, as in an export without them."""
     config = text_format.Parse(file.read_text(), ModelConfig())
     (index,) = (index for index, output in enumerate(config.output) if output.name == "unclear")
     del config.output[index]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Two versions of a checkpoint on one server, and callers who compare each answer with that of the version it names.
+"""Two versions of a checkpoint on a server, and callers who compare answers with the named version's.
 
-They send embeddings and raw frames, in turn, one request at a time and a few a second each, and retry nothing.
+They send embeddings and raw frames in turn, a few requests a second, without retries.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.client_options import DEFAULT_TIMEOUT_S
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
 NAME = "rfm"
 WITH_ENCODERS = goldens.config("enc_c1_t1_disc10")
 WIDTHS = (48, 32)
 FRAME_PX = 48
-TOLERANCE = 1e-5
-CLEARLY = 1e-2  # versions differ by at least so much
+CLEARLY = 1e-2  # the least difference between versions
 CALLERS = 32
-PAUSE_S = 0.2  # a control loop's step; without it they would take the processor from what is being loaded
+PAUSE_S = 0.2  # a control loop's step; without it they would slow down the loading
 
 
 @dataclass
 class Tally:
-    """What became of requests.
+    """Outcomes of requests.
 
-    unlike: answers that are neither version's, or not that of the version they name
-    failed: requests without an answer; late: those of them that were past their deadline
+    unlike: answers of neither version, or of another version than the named one
+    failed: requests without an answer; late: those past the deadline
     """
 
     asked: int = 0
@@ -75,7 +75,7 @@ class Tally:
 
 
 def other_checkpoint(folder: Path, source: Path = WITH_ENCODERS.checkpoint) -> Path:
-    """A copy of the checkpoint with other weights, in its encoders too."""
+    """Copy a checkpoint with other weights, also in the encoders."""
     folder.mkdir(parents=True)
     for file in source.iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
@@ -108,14 +108,14 @@ def questions() -> list[Sample]:
 
 
 def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
-    """What the checkpoint itself says."""
+    """Return the checkpoint's answers without a server."""
     serve = serve_config(WITH_ENCODERS)
     loaded = families.load(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
     return Engine.of(loaded, encoders=loaded.encoders()).evaluate(samples)
 
 
 def numbers(outcome: object) -> np.ndarray:
-    """Progress of the (first) trajectory, where there is one also its success."""
+    """Return progress and success of the (first) trajectory."""
     scores = getattr(outcome, "first", outcome)
     return np.concatenate([scores.progress, scores.success])  # type: ignore[attr-defined]
 
@@ -134,7 +134,7 @@ def callers(
     count: int = CALLERS,
     timeout_s: float = DEFAULT_TIMEOUT_S,
 ) -> Iterator[Tally]:
-    """So many ask on and on within it. expected: answers by version"""
+    """Run ``count`` callers. expected: answers by version"""
     tally, stop, begun = Tally(), threading.Event(), threading.Event()
 
     async def call(client: AsyncRewardClient, index: int) -> None:

@@ -15,7 +15,7 @@ PUBLIC_HOST = "127.0.0.2"  # stands for an address that others reach
 
 @dataclass(frozen=True)
 class Papers:
-    """Certificates (PEM): of an authority, of a server and a client that it vouches for, and of a stranger's."""
+    """PEM files of an authority, a server and a client with its certificates, and another authority."""
 
     ca: Path
     certificate: Path
@@ -41,7 +41,7 @@ class Papers:
 
     @property
     def client(self) -> dict[str, Path]:
-        """Options of a client that has everything."""
+        """Client options with all files."""
         return {"ca_file": self.ca, "client_certificate": self.client_certificate, "client_key": self.client_key}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Servers that stand in for real ones, whose checkpoint is replaced by another while callers ask."""
+"""Stand-in servers that replace the checkpoint while callers ask."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rfm_client import ModelNotFoundError
-from rfm_client.contract import FrameSize, wire
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.transport.calls import Answer
+from rfm_client import FrameSize, ModelInfo, ModelNotFoundError
+from transports import Answer, Tensors
 
 
 @dataclass(frozen=True)
@@ -33,9 +31,9 @@ V2 = Kept(0.9, "2", "weights-of-v2")
 
 @dataclass
 class Shelf:
-    """A server with a checkpoint, and another one as soon as it has answered so many requests about samples.
+    """A server that changes the checkpoint after ``after`` requests about samples.
 
-    parts: models that then are of the other one
+    parts: models that then belong to the other checkpoint
     """
 
     kept: Kept = V1
@@ -45,22 +43,22 @@ class Shelf:
     has_encoder: bool = True
     url: str = "grpc://shelf:1"
     count: int = 0
-    shapes: list[tuple[int, ...]] = field(default_factory=list)  # of the arrays that it was asked to score
+    shapes: list[tuple[int, ...]] = field(default_factory=list)  # of the arrays in requests
 
     def of(self, model: str) -> Kept:
         return self.other if self.count >= self.after and model in self.parts else self.kept
 
     async def infer(
-        self, model: str, inputs: wire.Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+        self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
         now = self.of(model)
         if model == "rfm_encoder":
-            num_frames = int(inputs[wire.NUM_FRAMES][0, 0])
-            tensors = {wire.VIDEO_EMBEDDINGS: np.ones((1, num_frames, 4)), wire.TEXT_EMBEDDING: np.ones((1, 2))}
+            num_frames = int(inputs["num_frames"][0, 0])
+            tensors = {"video_embeddings": np.ones((1, num_frames, 4)), "text_embedding": np.ones((1, 2))}
             return Answer({name: array.astype(np.float32) for name, array in tensors.items()}, now.version)
         self.count += 1
-        self.shapes.append(inputs[wire.FRAMES if model == "rfm_frames" else wire.VIDEO_EMBEDDINGS].shape)
-        num_frames = inputs[wire.NUM_FRAMES].sum(axis=1)  # of both trajectories, which may lie in two arrays
+        self.shapes.append(inputs["frames" if model == "rfm_frames" else "video_embeddings"].shape)
+        num_frames = inputs["num_frames"].sum(axis=1)  # of both trajectories, perhaps in two arrays
         scores = np.full((len(num_frames), num_frames.max()), now.score)
         return Answer(dict.fromkeys(outputs, scores.astype(np.float32)), now.version)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Datasets for the page: copies of the toy datasets, videos coded otherwise, and what labels say."""
+"""Datasets for the page: copies of the toy datasets, videos coded otherwise, and columns of labels."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def columns_of(root: Path, episode: int, name: str = "rfm_progress.parquet") -> 
 
 
 def encoded_anew(video: Path, codec: str, options: dict[str, str], noise: np.random.Generator | None = None) -> None:
-    """Codes a video in another way, or noise in its place."""
+    """Encode a video, or noise, in another way."""
     with av.open(str(video)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     if noise is not None:
@@ -45,7 +45,7 @@ def encoded_anew(video: Path, codec: str, options: dict[str, str], noise: np.ran
 
 
 def large(root: Path, num_episodes: int, seed: int = 0) -> Path:
-    """A LeRobot v3.0 dataset of so many episodes of two frames, without videos, and labels of it."""
+    """Write a LeRobot v3.0 dataset of N two-frame episodes without videos, and labels."""
     source, numbers = LEROBOT / "toy_v30_many", np.arange(num_episodes)
     (root / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
     (root / "data" / "chunk-000").mkdir(parents=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A ReWiND network that is small, from which tests change what they are about."""
+"""The configuration of a small ReWiND network."""
 
 from __future__ import annotations
 

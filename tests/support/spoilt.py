@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Copies of checkpoints that a test may spoil."""
+"""Copies of checkpoints for a test to spoil."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 from safetensors.torch import load_file, save_file
 
 import goldens
-from rfm.checkpoint.content import CheckpointError
+from rfm.families import CheckpointError
 
 WEIGHTS = "model.safetensors"
 
@@ -61,12 +61,12 @@ def text(name: str, content: str) -> Spoil:
 
 
 def text_settings(**changes: Any) -> Spoil:
-    """Of the language model in a vision-language one."""
+    """Names of the language model's layers in a vision-language model."""
     return in_json("config.json", lambda content: content["text_config"].update(changes))
 
 
 def conversion(load: Callable[[Path], object], folder: Path) -> str:
-    """What the refusal of ``load`` says to type."""
+    """Return the command in the refusal of ``load``."""
     with pytest.raises(CheckpointError) as refusal:
         load(folder)
     (command,) = re.findall(r"python -c .*", str(refusal.value))
@@ -74,14 +74,14 @@ def conversion(load: Callable[[Path], object], folder: Path) -> str:
 
 
 def convert(load: Callable[[Path], object], folder: Path) -> None:
-    """Runs, in this process, the code that the refusal of ``load`` says to type."""
+    """Run the code from the refusal of ``load`` in this process."""
     _, _, code, *arguments = shlex.split(conversion(load, folder))
     with mock.patch.object(sys, "argv", ["-c", *arguments]):
         exec(code, {})
 
 
 def without(name: str, heads: Sequence[str], target: Path) -> Path:
-    """A copy of a reference checkpoint whose heads are cut off."""
+    """A copy of a reference checkpoint without heads."""
     copied(goldens.config(name), target)
     if not (target / "config.yaml").exists():
         shutil.copyfile(goldens.config(name).checkpoint.parent / "config.yaml", target / "config.yaml")

@@ -19,7 +19,7 @@ _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 def on_terminal(*words: object, width: int = WIDTH) -> tuple[int, list[str]]:
-    """The exit code of ``rfm-client`` and the lines that a person sees on a terminal, standard error among them."""
+    """Return the exit code of ``rfm-client`` and the lines on a terminal, with standard error."""
     ours, its = pty.openpty()
     fcntl.ioctl(its, termios.TIOCSWINSZ, struct.pack("HHHH", _LINES, width, 0, 0))
     environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "TERMINAL_WIDTH")}
@@ -29,7 +29,7 @@ def on_terminal(*words: object, width: int = WIDTH) -> tuple[int, list[str]]:
         shown = b"".join(iter(lambda: _read(ours), b""))
         code = process.wait(timeout=60)
     os.close(ours)
-    # What a progress bar writes is written over, from the start of its line.
+    # A progress bar overwrites the line from the start.
     lines = (line.rpartition("\r\x1b[2K")[2].rstrip("\r") for line in shown.decode().split("\n"))
     return code, [_CONTROL.sub("", line).rstrip() for line in lines]
 

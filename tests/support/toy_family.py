@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A family that the product does not know: how red a frame is, is how far the task has come.
 
-Its encoders give each frame's mean colour, and of the task the number of its letters. Its network is one line.
+The encoders return each frame's mean colour and the number of letters of the task. The network is one line.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS
-from rfm.checkpoint.provenance import Decision
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import RowScores, frame_scores, of_rows, prefix_indices
+from rfm.families import Decision
 from rfm.family import NETWORK, Family, Options
-from rfm_client.contract import (
+from rfm_client import (
     FrameScores,
     InvalidSampleError,
     ProgressSample,

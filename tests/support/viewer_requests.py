@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the page asks the gateway, and the answers that the command line gives to the same questions."""
+"""The page's requests to the gateway, and the command line's answers to the same questions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Json = dict[str, Any]
 
 
 def post(url: str, path: str, files: dict[str, Path | bytes], **fields: Any) -> requests.Response:
-    """The response to a form of the page, whose answer is read as it comes."""
+    """Post a form like the page. Return the response as a stream."""
     with ExitStack() as stack:
         parts = {
             name: (f"{name}.mp4", file)
@@ -44,7 +44,7 @@ def events(response: requests.Response) -> list[tuple[str, Json]]:
 
 
 def curve_of(told: Sequence[tuple[str, Json]]) -> Json:
-    """The curve that the events tell, of which none is missing and none comes twice."""
+    """Return the curve from the events, after a check for missing and repeated steps."""
     (first, video), *others, (last, _) = told
     assert (first, last) == ("video", "done"), told
     progress: list[Any] = []
@@ -58,7 +58,7 @@ def curve_of(told: Sequence[tuple[str, Json]]) -> Json:
 
 
 def run_line(folder: Path, command: str) -> list[str]:
-    """Runs a command line of ``rfm-client`` in this folder, as a person does who copies it; gives its words."""
+    """Run a command line of ``rfm-client`` in this folder, as a user who copies it does. Return the words."""
     program, *words = shlex.split(command)
     assert program == "rfm-client"
     here = Path.cwd()
@@ -72,6 +72,6 @@ def run_line(folder: Path, command: str) -> list[str]:
 
 
 def by_command_line(folder: Path, command: str) -> Json:
-    """What a command line of ``rfm-client`` writes to the JSON file that it names, run in this folder."""
+    """Run a command line of ``rfm-client`` in this folder. Return the JSON that it writes."""
     words = run_line(folder, command)
     return dict(json.loads((folder / words[words.index("--json") + 1]).read_text()))

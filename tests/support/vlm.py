@@ -16,9 +16,7 @@ from rfm.vlm.checkpoint import VlmCheckpoint
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.qwen import UNIT
 from rfm.vlm.row import VlmRow
-from rfm_client import (
-    Trajectory,
-)
+from rfm_client import Trajectory
 
 BFLOAT16 = "q3_tok_disc10_bf16"
 
@@ -56,7 +54,7 @@ def load(name: str, folder: Path | None = None, base: str | None = None) -> VlmC
 
 
 def upstream_inputs(predictor: VlmPredictor, rows: Sequence[VlmRow]) -> dict[str, torch.Tensor]:
-    """The arguments that upstream gives to the backbone: each shot as often, and in the order, as it is shown."""
+    """Return upstream's arguments for the backbone: every shot in order, with repetitions."""
     batch = predictor.collate(rows).to(torch.device("cpu"), torch.float32)
     mask = torch.zeros_like(batch.inputs["input_ids"])
     for index, row in enumerate(rows):

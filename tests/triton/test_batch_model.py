@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What becomes of the requests of one batch, with a stand-in for the module that Triton gives to a model."""
+"""The requests of a batch, with a stand-in for Triton's Python module."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from batch_models import BREAKS, CONFIG, FAILS, LOGGED, METRICS, REFUSED, WIDTHS, Model, Request, backend, request  # noqa: F401  a fixture
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm.engine.threads import use_threads
 from rfm.probe_request import probe_request
 from rfm.triton_model import batch_model
@@ -36,7 +36,7 @@ from rfm_client import (
 from rfm_client.contract import wire
 from rfm_client.contract.description import Description
 from rfm_client.contract.names import PROBE_PREFIX
-from rfm_serve import PATIENCE_S
+from servers import PATIENCE_S
 from trajectories import random_trajectory
 
 REASON = "scoring failed; the server's log has the reason"
@@ -58,7 +58,7 @@ def test_requests_are_answered_together_and_each_gets_its_own(tmp_path: Path) ->
 
 
 def test_refused_and_failed_requests_fail_alone(tmp_path: Path) -> None:
-    """As one does whose tensors cannot be had, or read."""
+    """Fail like a request with missing or unreadable tensors."""
     model = Model(tmp_path)
     unreadable = Request(request(1).tensors | {"num_frames": np.zeros((1, 2), np.int32)})
     responses = model.respond(
@@ -77,7 +77,7 @@ def test_refused_and_failed_requests_fail_alone(tmp_path: Path) -> None:
         ("progress", "refused"): 3, ("progress", "scored"): 1, ("progress", "failed"): 1,
         ("unknown", "refused"): 1, ("unknown", "failed"): 1,
     }  # fmt: skip
-    assert model.told("frames_total") == {(): 1}  # of what was scored
+    assert model.told("frames_total") == {(): 1}  # of scored samples
     refused = [line for line in LOGGED if re.search(r" DEBUG rfm/1\[\d+\]: refused \((progress|unknown)\): ", line)]
     failed = [line for line in LOGGED if re.search(r" ERROR rfm/1\[\d+\]: failed \((progress|unknown)\): ", line)]
     assert (len(refused), len(failed)) == (3, 2)
@@ -146,7 +146,7 @@ class Slow(Model):
 
 
 def test_a_cancelled_request_is_not_scored(tmp_path: Path) -> None:
-    """Also if the batch before was split, and its last request alone took no time."""
+    """Also after a split batch whose last request took no time."""
     model = Slow(tmp_path)
     model.seconds = 1.5 * ASKING_S
     model.respond(request(1), request(BREAKS))
@@ -230,7 +230,7 @@ def test_what_an_execution_took_is_told(tmp_path: Path) -> None:
 def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Triton refuses a family whose name another kind of metric has."""
+    """Triton refuses the name of a metric of another kind."""
 
     def refused(*_: Any, **__: Any) -> None:
         raise ValueError("of another kind")
@@ -358,8 +358,8 @@ def test_what_is_loaded_is_computed_in_a_thread_that_ends() -> None:
     ((thread, num_threads),) = seen
     assert not thread.is_alive()
     assert num_threads == 3
-    assert torch.get_num_threads() == 1  # the calling thread starts no team of its own
-    with pytest.raises(RuntimeError, match="positive"):  # PyTorch's own words, not those of a pool of threads
+    assert torch.get_num_threads() == 1  # the calling thread starts no team
+    with pytest.raises(RuntimeError, match="positive"):  # PyTorch's message, not a thread pool's
         Placement(torch.device("cpu"), num_threads=0).run(lambda: None)
 
 

@@ -13,31 +13,27 @@ import numpy as np
 import pytest
 import requests
 from pyarrow import parquet
-from typer.testing import CliRunner
 
 import rfm_export
 from faulty_servers import url_of
 from gateways import metric_at, poll, running
-from one_model import BriefServer
+from in_process import rfm_client
 from paths import VIDEOS
 from reward_models import BASE, ROOT, Reference, as_before_marks, references
 from rfm import families
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints
 from rfm_client import (
     InvalidSampleError,
+    ModelInfo,
     PreferenceSample,
     ProgressResult,
     ProgressSample,
     RewardClient,
     Trajectory,
 )
-from rfm_client.cli.commands import app
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.transport.calls import GrpcTransport
-from rfm_client.transport.credentials import Credentials
+from servers import Endpoints, start_triton
+from transports import Connection
 from viewer_requests import SCORE, curve_of, events, post
 
 pytestmark = pytest.mark.triton
@@ -67,10 +63,7 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     rfm_export.export(LEROBOT, repository, of_lerobot)
     rfm_export.export(ROBO, repository, ExportConfig(name="robo_old", num_gpus=0, reward_model="roboreward"))
     as_before_marks(repository / "robo_old_frames" / "config.pbtxt")
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-    ):
+    with start_triton(repository) as server:
         yield Served(server.endpoints)
 
 
@@ -150,8 +143,8 @@ def test_unclear_answers_are_marked(asked: Served, protocol: str, is_old: bool) 
     assert first.last_progress == 1.0
 
 
-class Newer(GrpcTransport):
-    """Tells of marks that the server's export does not have, as a description of before a rollback does."""
+class Newer(Connection):
+    """Claims marks that the server's export lacks, like a description from before a rollback."""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         info = await super().model_info(model, timeout_s)
@@ -160,7 +153,7 @@ class Newer(GrpcTransport):
 
 def test_a_client_goes_on_when_an_older_export_takes_the_place_of_a_newer(asked: Served) -> None:
     (sample,) = case("roboreward", UNCLEAR).samples()
-    newer = Newer(asked.endpoints.grpc_url, Credentials(), shared_memory=False)
+    newer = Newer(asked.endpoints.grpc_url)
     with RewardClient("", transports=[newer], model="robo_old") as client:
         result = client.progress(sample.trajectory)
         with client.episode(sample.trajectory.task, sampling="all") as episode:
@@ -205,7 +198,7 @@ def test_score_says_how_many_answers_are_unclear(asked: Served, tmp_path: Path) 
         np.save(files[-1], sample.trajectory.positions)
         task = sample.trajectory.task
     words = [*files, "--task", task, "--url", asked.endpoints.grpc_url, "--model", "robo"]
-    done = CliRunner().invoke(app, ["score", *map(str, words), "--json", str(tmp_path / "scores.json")])
+    done = rfm_client("score", *words, "--json", str(tmp_path / "scores.json"))
     assert done.exit_code == 0, done.output
     told = [video["unclear"] for video in json.loads((tmp_path / "scores.json").read_text())["videos"]]
     lines = " ".join(done.stderr.split())
@@ -222,7 +215,7 @@ def test_labels_mark_unclear_answers(asked: Served, tmp_path: Path) -> None:
         np.save(data / f"{name}.npy", sample.trajectory.positions)
     words = ["label", data, "--task", sample.trajectory.task, "--url", asked.endpoints.grpc_url, "--model", "robo"]
     words += ["--sampling", "all", "--no-picture"]
-    done = CliRunner().invoke(app, [*map(str, words)])
+    done = rfm_client(*words)
     assert done.exit_code == 0, done.output + done.stderr
     marks = parquet.read_table(data / "rfm_progress.parquet")["unclear"].to_numpy()
     assert marks.tolist()[1::2] == [1.0, 1.0]
@@ -231,7 +224,7 @@ def test_labels_mark_unclear_answers(asked: Served, tmp_path: Path) -> None:
     np.testing.assert_array_equal(signals["reward.rfm.unclear"].to_numpy(), marks)
     shutil.rmtree(data / ".rfm_parts")  # restored from the file, with all columns
     np.save(data / "c.npy", sample.trajectory.positions)
-    again = CliRunner().invoke(app, [*map(str, words)])
+    again = rfm_client(*words)
     assert again.exit_code == 0, again.output + again.stderr
     assert len(parquet.read_table(data / "rfm_progress.parquet")["unclear"]) == 6
 
@@ -301,7 +294,7 @@ def test_the_gateway_answers_as_robometer_s_baseline_server(asked: Served, tmp_p
 def test_the_page_shows_the_whole_episode_s_curve(asked: Served, tmp_path: Path) -> None:
     video = VIDEOS / "jaco_play_pick_up_green_cup.mp4"
     words = [video, "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "top", "--fps", "0.5"]
-    done = CliRunner().invoke(app, ["score", *map(str, words), "--json", str(tmp_path / "scores.json")])
+    done = rfm_client("score", *words, "--json", str(tmp_path / "scores.json"))
     assert done.exit_code == 0, done.output
     (told,) = json.loads((tmp_path / "scores.json").read_text())["videos"]
     with running(asked.endpoints, tmp_path, "top") as gateway:
@@ -326,14 +319,14 @@ def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path)
         tmp_path,
         "--no-picture",
     ]
-    refused = CliRunner().invoke(app, list(map(str, words)))
+    refused = rfm_client(*words)
     assert refused.exit_code != 0
     expected = "whole of this model, whose scores are relative to the whole episode, got prefix; give --mode whole"
     assert f"mode: expected {expected}" in refused.output + refused.stderr
-    unknown = CliRunner().invoke(app, ["robo" if word == "top" else str(word) for word in words])
+    unknown = rfm_client(*["robo" if word == "top" else str(word) for word in words])
     assert unknown.exit_code != 0
     assert "name them (--frames), or show all (--sampling all)" in " ".join((unknown.output + unknown.stderr).split())
-    done = CliRunner().invoke(app, [*map(str, words), "--mode", "whole"])
+    done = rfm_client(*words, "--mode", "whole")
     assert done.exit_code == 0, done.output
     labels = parquet.read_table(tmp_path / "rfm_progress.parquet")
     expected = parquet.read_table(ROOT / "lerobot_rabc" / "topreward_progress.parquet")

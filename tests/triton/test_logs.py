@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A request's id: in what the client raises, in Triton's log, in traces, and through the gateway."""
+"""The id of a request: in errors, in Triton's log, in traces, and through the gateway."""
 
 from __future__ import annotations
 
 import os
 import pickle
 import re
-import threading
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from functools import partial
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,6 @@ import rfm_export
 from engines import serve_config
 from gateways import answers, poll
 from paths import ROOT
-from rfm.launch.admin_key import VARIABLE
-from rfm.launch.endpoints import Endpoints
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
@@ -35,10 +33,9 @@ from rfm_client import (
     RewardError,
     ServerUnavailableError,
 )
-from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
-from rfm_client.contract.process_log import LEVEL_VARIABLE
-from rfm_serve import Serving, children, serving, wait_for
+from servers import Endpoints, Serving, children, serving, wait_for, web_server
+from tensors import encode_samples
 from trajectories import random_trajectory
 
 CONFIG = goldens.config("c1_t1_disc10")
@@ -48,7 +45,7 @@ RANDOM_ID = re.compile(r"[0-9a-f]{16}")
 KEY = "an-admin-key-that-nothing-logs"
 FAILING_STEPS = 7
 
-# A model with a fault in it, as nobody wants it to be.
+# A model with a fault.
 FAULTY = f"""
 
 class TritonPythonModel(TritonPythonModel):
@@ -63,14 +60,14 @@ class TritonPythonModel(TritonPythonModel):
 class Running:
     served: Serving
     traces: list[bytes]
-    gateway: str  # its URL
+    gateway: str  # URL
 
     def client(self, protocol: str = "grpc") -> RewardClient:
         endpoints = self.served.endpoints
         return RewardClient(endpoints.grpc_url if protocol == "grpc" else endpoints.http_url, retry=False)
 
     def said_of(self, request_id: str, process: str = "rfm/1") -> list[tuple[str, str]]:
-        """Level and message of each line about a request. A process may write it a moment after its answer."""
+        """Return level and message of each line about a request. A process may write it after the answer."""
         head = (
             rf"^\d{{4}}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{{3}}Z ([A-Z]+) {process}\[\d+\] request={re.escape(request_id)}: "
         )
@@ -82,19 +79,15 @@ class Running:
         return found()
 
 
-class Collector(ThreadingHTTPServer):
-    """What an OpenTelemetry collector is to Triton: it takes what comes."""
+class Collector(BaseHTTPRequestHandler):
+    """Takes traces, as an OpenTelemetry collector does."""
 
-    def __init__(self) -> None:
-        self.traces: list[bytes] = []
-        super().__init__(("127.0.0.1", 0), Taker)
-
-
-class Taker(BaseHTTPRequestHandler):
-    server: Collector
+    def __init__(self, traces: list[bytes], *connection: Any) -> None:
+        self.traces = traces
+        super().__init__(*connection)
 
     def do_POST(self) -> None:
-        self.server.traces.append(self.rfile.read(int(self.headers["Content-Length"])))
+        self.traces.append(self.rfile.read(int(self.headers["Content-Length"])))
         self.send_response(200)
         self.end_headers()
 
@@ -103,7 +96,7 @@ class Taker(BaseHTTPRequestHandler):
 
 
 def documented_options(traces_url: str) -> list[str]:
-    """What docs/reference/logs_and_metrics.md tells to give tritonserver, but with this collector, and for every request."""
+    """Return the options for tritonserver from the documents, with this collector and for every request."""
     text = " ".join(
         re.findall(r"--trace-config=[^\s`]+", (ROOT / "docs" / "reference" / "logs_and_metrics.md").read_text())
     )
@@ -115,24 +108,23 @@ def documented_options(traces_url: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """An ``rfm serve`` that has its admin key from the environment, and a gateway beside."""
+    """An ``rfm serve`` with an admin key from the environment, and a gateway beside."""
     folder = tmp_path_factory.mktemp("logs")
     repository = folder / "repository"
     rfm_export.export(CONFIG.checkpoint, repository, serve_config(CONFIG))
     model = repository / "rfm" / "1" / "model.py"
     model.write_text(model.read_text() + FAULTY)
-    with Collector() as collector, pytest.MonkeyPatch.context() as environment:
-        threading.Thread(target=collector.serve_forever).start()
-        environment.setitem(os.environ, VARIABLE, KEY)
-        environment.setitem(os.environ, LEVEL_VARIABLE, "debug")
-        options = documented_options(f"http://127.0.0.1:{collector.server_address[1]}/v1/traces")
+    traces: list[bytes] = []
+    with web_server(partial(Collector, traces)) as collector, pytest.MonkeyPatch.context() as environment:
+        environment.setitem(os.environ, "RFM_ADMIN_KEY", KEY)
+        environment.setitem(os.environ, "RFM_LOG_LEVEL", "debug")
+        options = documented_options(f"{collector}/v1/traces")
         port = Endpoints.free().http_port
         with serving(repository, f"--gateway-port={port}", "--", *options) as served:
             served.wait_ready()
             gateway = f"http://127.0.0.1:{port}"
             poll(lambda: answers(gateway))
-            yield Running(served, collector.traces, gateway)
-        collector.shutdown()
+            yield Running(served, traces, gateway)
 
 
 GOOD = ProgressSample(random_trajectory(0, 3))
@@ -167,7 +159,7 @@ def test_what_failed_is_logged_as_an_error_with_its_traceback(running: Running) 
 
 @pytest.mark.triton
 def test_the_requests_of_a_call_begin_alike(running: Running) -> None:
-    """One of three samples, which is refused, then each sample alone."""
+    """A refused batch of three, then each sample alone."""
     with running.client() as client:
         outcomes = client.evaluate([GOOD, TOO_LONG, GOOD], return_errors=True, request_id="call")
         assert isinstance(outcomes[1], InvalidSampleError)
@@ -205,7 +197,7 @@ def test_an_error_keeps_its_request_where_it_goes() -> None:
 def test_traces_name_the_request_and_continue_a_caller_s(running: Running) -> None:
     trace_id = "4bf92f3577b34da6a3ce929d0e0e4736"
     inputs = []
-    for name, array in wire.encode_samples([GOOD]).items():
+    for name, array in encode_samples([GOOD]).items():
         inputs.append(tritonclient.http.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
         inputs[-1].set_data_from_numpy(array)
     headers = {"traceparent": f"00-{trace_id}-00f067aa0ba902b7-01"}

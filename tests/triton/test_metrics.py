@@ -18,9 +18,7 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from mixtures import TOLD_S, mixed_samples
-from reference_server import Served
-from rfm.engine.execution import Execution
-from rfm.launch.repository_api import RepositoryApi
+from rfm.engine import Execution
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
 from rfm_client import (
@@ -33,8 +31,8 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
-from rfm_client.transport.status import read_status
-from rfm_serve import wait_for
+from rfm_client.serving import read_status
+from servers import RepositoryApi, Served, wait_for
 from tensors import infer
 from trajectories import random_trajectory
 
@@ -65,12 +63,12 @@ class TritonPythonModel(TritonPythonModel):
 
 @dataclass(frozen=True)
 class Scraped:
-    """All of Triton's metrics at one moment."""
+    """Triton's metrics at a moment."""
 
     families: list[Metric]
 
     def value(self, name: str, **labels: str) -> float:
-        """The sum of a metric's series that have these labels."""
+        """Return the sum of a metric's series with these labels."""
         samples = (sample for family in self.families for sample in family.samples)
         return sum(s.value for s in samples if s.name == f"rfm_{name}" and labels.items() <= s.labels.items())
 
@@ -79,7 +77,7 @@ class Scraped:
 
 
 def scrape(served: Served, told_s: float = TOLD_S) -> Scraped:
-    """What Triton has been told ``told_s`` from now, which is all but of requests that are under way."""
+    """Return Triton's metrics ``told_s`` from now, which cover all finished requests."""
     time.sleep(told_s)
     return Scraped(list(text_string_to_metric_families(httpx.get(served.endpoints.metrics_url).text)))
 
@@ -136,7 +134,7 @@ def test_samples_are_counted_by_type_and_by_what_became_of_them(served: Served) 
 
 
 def test_two_instances_count_apart_and_add_up(served_too: Served) -> None:
-    """What fails is counted, too: together with others, then alone, as the client asks again."""
+    """Failures are counted, too: in a batch, then alone, as the client asks again."""
     samples = mixed_samples(60)
     before = scrape(served_too)
     with client(served_too, TWICE) as asked, ThreadPoolExecutor(len(samples)) as pool:
@@ -153,7 +151,7 @@ def test_two_instances_count_apart_and_add_up(served_too: Served) -> None:
 
 
 def test_histograms_add_up_to_what_each_execution_took(served: Served) -> None:
-    """Asked one after the other, each request is an execution, and results tell its times."""
+    """Sequential requests are separate executions with times in the results."""
     engine = load_engine(MODEL)
     requests = [mixed_samples(count) for count in (1, 2, 5, 9)]
     expected_padding = 0.0
@@ -195,7 +193,7 @@ def test_metrics_have_their_kinds_buckets_and_labels(served_too: Served) -> None
     of_one = [s.labels for s in scraped.family("samples").samples if s.labels["instance"] == f"{TWICE}_0_1"]
     assert {(labels["sample_type"], labels["outcome"]) for labels in of_one} == {
         (kind, outcome) for kind in (*TYPES, UNKNOWN_TYPE) for outcome in OUTCOMES
-    }  # before there is one of them, so that the first is an increase
+    }  # before the first, which must count as an increase
 
 
 def test_raw_frames_are_counted_where_they_are_encoded_and_where_they_are_scored(served: Served) -> None:
@@ -248,7 +246,7 @@ def test_the_served_checkpoint_is_told(served: Served) -> None:
 
 
 def test_a_model_that_is_loaded_again_counts_on(served_too: Served) -> None:
-    """Unloaded, its checkpoint is served no more; loaded in place, it is."""
+    """An unloaded checkpoint is served no more; one loaded in place is."""
     sample = ProgressSample(random_trajectory(0, 3))
     before = scrape(served_too)
 

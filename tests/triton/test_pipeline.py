@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A model that works ahead: what is scored together, when ``execute`` returns, and what becomes of what goes wrong."""
+"""A model with work ahead: batches, the return of ``execute``, and faults."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from batch_models import BREAKS, CONFIG, MODELS, REFUSED, Model, Request, backend, request  # noqa: F401  a fixture
-from rfm.engine.execution import Execution
+from rfm.engine import Execution
 from rfm_client import Result, RewardError, Sample
-from rfm_serve import PATIENCE_S, wait_for
+from servers import PATIENCE_S, wait_for
 
 MAX_BATCH = 8
 assert CONFIG["max_batch_size"] == MAX_BATCH
@@ -55,7 +55,7 @@ class Ahead(Model):
         super().finalize()
 
     def begin(self) -> list[Request]:
-        """Has it score one or two requests, which are prepared, and are not answered before ``open``."""
+        """Start to score one or two prepared requests, which ``open`` lets answer."""
         first = [request(1), request(1)]
         self.take(*first)
         wait_for(lambda: self.batches and len(self.prepared) == 2)
@@ -72,7 +72,7 @@ def test_a_lone_request_on_an_idle_model_is_answered_by_execute(tmp_path: Path) 
     lone = request(5)
     model.take(lone)
     assert [response.error for response in lone.responses] == [None]
-    assert model.prepared == []  # what is not prepared ahead is prepared in its turn
+    assert model.prepared == []  # other requests are prepared in turn
 
 
 def test_what_comes_while_a_batch_is_scored_is_prepared_and_makes_up_the_next(tmp_path: Path) -> None:
@@ -113,12 +113,24 @@ def test_execute_returns_when_less_than_a_batch_waits(tmp_path: Path) -> None:
         taken.result(PATIENCE_S)
 
 
+def test_a_batch_has_no_more_samples_than_triton_s_largest_batch(tmp_path: Path) -> None:
+    model = Ahead(tmp_path)
+    first = model.begin()
+    many = [request(5) for _ in range(MAX_BATCH + 1)]
+    with ThreadPoolExecutor(1) as pool:  # the call waits until less than a batch waits
+        pool.submit(model.take, *many)
+        wait_for(lambda: len(model.prepared) == len(first) + len(many))
+        model.open(*first, *many)
+    assert max(model.batches) <= MAX_BATCH
+    assert sum(model.batches) == len(first) + len(many)
+
+
 def test_a_batch_has_no_more_tokens_than_its_budget(tmp_path: Path) -> None:
     model = Ahead(tmp_path, settings={"token_budget": "12"})
     first = model.begin()
     later = [request(5), request(6)]  # two frames more are too many
     more = request(7)
-    with ThreadPoolExecutor(1) as pool:  # the first call waits if its requests and one of the first fill a batch
+    with ThreadPoolExecutor(1) as pool:  # the first call waits if these requests and one of the first fill a batch
         pool.submit(model.take, *later)
         pool.submit(model.take, more)
         wait_for(lambda: 6 in model.prepared)

@@ -16,13 +16,11 @@ from tritonclient.utils import np_to_triton_dtype
 
 import goldens
 import rfm_export
+from commands import own_regions
 from engines import load_engine, serve_config
 from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, mixed_samples, plug, wait_until_at_work
 from patients import answering_after
-from reference_server import Served
 from repositories import bound_queue, configure, forget_input
-from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
-from rfm.launch.repository_api import RepositoryApi
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,
@@ -34,14 +32,15 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract import wire
-from tensors import TOLERANCE, infer
+from servers import RepositoryApi, Served
+from tensors import Tensors, encode_samples, infer
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
 pytestmark = pytest.mark.triton
 
 VLM = "q3_tok_disc10"
-LEAST_REGION_BYTES = 2**20  # of the Python backend, for one model process
+LEAST_REGION_BYTES = 2**20  # of the Python backend, per model process
 
 
 @pytest.mark.reference
@@ -62,7 +61,7 @@ def video(seed: int, num_frames: int, height: int, width: int) -> Trajectory:
 
 
 def filmed_samples(count: int) -> list[Sample]:
-    """Pairs of both types, of one and of two sizes, and single videos; lengths and sizes differ from one to the next."""
+    """Return pairs of both types with equal and different sizes, and single videos, all with different lengths."""
     samples: list[Sample] = []
     for index in range(count):
         size = (48, 100) if index % 2 else (90, 61)
@@ -93,7 +92,7 @@ def test_any_mixture_equals_its_samples_alone(served: Served, protocol: str, mod
         assert_same(result, wanted)
 
 
-BAD = 11  # the place of a sample that is refused
+BAD = 11  # index of the refused sample
 
 
 @pytest.mark.parametrize(("protocol", "model"), [("grpc", MODEL), ("http", MODEL), ("http", FRAMES_MODEL)])
@@ -126,7 +125,7 @@ def test_callers_share_batches_and_a_bad_sample_fails_alone(served: Served, prot
 
 
 def test_a_bad_sample_of_a_call_is_located_and_costs_no_other(served: Served) -> None:
-    """Be it too long, or of a width that Triton itself refuses."""
+    """Too long, or with a width that Triton itself refuses."""
     samples = mixed_samples(9)
     samples[4] = ProgressSample(random_trajectory(0, 17))
     samples[6] = ProgressSample(random_trajectory(1, 3, 768, 7))
@@ -150,89 +149,89 @@ def test_dense_mode_scores_each_frame_on_its_prefix(served: Served) -> None:
         assert len(client.progress(random_trajectory(6, 40), frame_steps=4).progress) == 40  # longer than max_len
 
 
-def embedded() -> wire.Tensors:
+def embedded() -> Tensors:
     pair = PreferenceSample(random_trajectory(1, 3), random_trajectory(2, 2))
-    return {name: array.copy() for name, array in wire.encode_samples([pair]).items()}
+    return {name: array.copy() for name, array in encode_samples([pair]).items()}
 
 
-def with_value(value: float) -> wire.Tensors:
-    embeddings = embedded()[wire.VIDEO_EMBEDDINGS]
+def with_value(value: float) -> Tensors:
+    embeddings = embedded()["video_embeddings"]
     embeddings[0, 1, 7] = value
-    return {wire.VIDEO_EMBEDDINGS: embeddings}
+    return {"video_embeddings": embeddings}
 
 
-def lengths(first: int, second: int) -> wire.Tensors:
-    return {wire.NUM_FRAMES: np.array([[first, second]], np.int32)}
+def lengths(first: int, second: int) -> Tensors:
+    return {"num_frames": np.array([[first, second]], np.int32)}
 
 
-def steps(number: int) -> wire.Tensors:
-    return {wire.FRAME_STEPS: np.array([[number]], np.int32)}
+def steps(number: int) -> Tensors:
+    return {"frame_steps": np.array([[number]], np.int32)}
 
 
 FRAMES = np.ones((1, 5, 8, 6, 3), np.uint8)
-QUESTION: wire.Tensors = {
-    wire.SAMPLE_TYPE: np.array([[1]], np.uint8),
+QUESTION: Tensors = {
+    "sample_type": np.array([[1]], np.uint8),
     **lengths(3, 2),
     **steps(0),
-    wire.FRAMES: FRAMES,
-    wire.TASK: np.array([[b"lift"]], np.object_),
+    "frames": FRAMES,
+    "task": np.array([[b"lift"]], np.object_),
 }
 
 
-def second(**shape: int) -> wire.Tensors:
-    """The second trajectory's frames in an array of their own."""
+def second(**shape: int) -> Tensors:
+    """Return the second trajectory's frames in a separate array."""
     frames = {"num": 2, "height": 8, "width": 6, "channels": 3, **shape}
-    return {wire.FRAMES: FRAMES[:, :3], wire.SECOND_FRAMES: np.ones((1, *frames.values()), np.uint8)}
+    return {"frames": FRAMES[:, :3], "second_frames": np.ones((1, *frames.values()), np.uint8)}
 
 
-BAD_EMBEDDINGS: dict[str, tuple[wire.Tensors, str]] = {
+BAD_EMBEDDINGS: dict[str, tuple[Tensors, str]] = {
     "NaN": (with_value(np.nan), r"^video_embeddings: expected finite values, got nan at \[1, 7\]$"),
     "Inf": (with_value(np.inf), r"^video_embeddings: expected finite values, got inf at \[1, 7\]$"),
     "another width": (
-        {wire.VIDEO_EMBEDDINGS: np.ones((1, 5, 7), np.float32)},
+        {"video_embeddings": np.ones((1, 5, 7), np.float32)},
         "video_embeddings.*[Ee]xpected.*768.*got.*7",
     ),
     "another width of the text": (
-        {wire.TEXT_EMBEDDING: np.ones((1, 7), np.float32)},
+        {"text_embedding": np.ones((1, 7), np.float32)},
         "text_embedding.*[Ee]xpected.*384.*got.*7",
     ),
     "fewer frames told than sent": (lengths(3, 1), "^video_embeddings: expected zeros behind the 4 frames that num_fr"),
     "dense mode beyond max_len": (
-        {wire.SAMPLE_TYPE: np.array([[0]], np.uint8), **lengths(5, 0), **steps(17)},
+        {"sample_type": np.array([[0]], np.uint8), **lengths(5, 0), **steps(17)},
         r"^frame_steps: expected at most 16 \(max_len of this checkpoint.*\), got 17$",
     ),
     "no frames": (
-        {wire.VIDEO_EMBEDDINGS: np.ones((1, 0, 768), np.float32), **lengths(0, 0)},
+        {"video_embeddings": np.ones((1, 0, 768), np.float32), **lengths(0, 0)},
         r"^num_frames: expected at least one frame of each .*, got \[0, 0\]$",
     ),
 }
 
-BAD_FRAMES: dict[str, tuple[wire.Tensors, str]] = {
-    "bytes that are no text": ({wire.TASK: np.array([[b"\xff\xfe"]], np.object_)}, "^task: expected UTF-8 text, got"),
-    "no task": ({wire.TASK: np.array([[b" "]], np.object_)}, "task: expected a task sentence.*, got ' '$"),
+BAD_FRAMES: dict[str, tuple[Tensors, str]] = {
+    "bytes that are no text": ({"task": np.array([[b"\xff\xfe"]], np.object_)}, "^task: expected UTF-8 text, got"),
+    "no task": ({"task": np.array([[b" "]], np.object_)}, "task: expected a task sentence.*, got ' '$"),
     "too long a task": (
-        {wire.TASK: np.array([[b"lift " * 50]], np.object_)},
+        {"task": np.array([[b"lift " * 50]], np.object_)},
         "task: expected at most 32 tokens .*, got",
     ),
     "more frames told than sent": (lengths(3, 3), "^num_frames: expected at most the 5"),
     "fewer frames told than sent": (lengths(2, 2), "^frames: expected zeros behind the 4"),
     "a negative length": (lengths(-1, 6), "^num_frames: expected .*at least 1"),
-    "no pixels": ({wire.FRAMES: FRAMES[:, :, :0]}, "^frames: expected at least one frame of at least one pixel"),
-    "four channels": ({wire.FRAMES: np.ones((1, 5, 8, 6, 4), np.uint8)}, "[Ee]xpected.*3.*got.*4"),
+    "no pixels": ({"frames": FRAMES[:, :, :0]}, "^frames: expected at least one frame of at least one pixel"),
+    "four channels": ({"frames": np.ones((1, 5, 8, 6, 4), np.uint8)}, "[Ee]xpected.*3.*got.*4"),
     "a sliver": (
-        {wire.FRAMES: np.ones((1, 5, 2, 200, 3), np.uint8)},
+        {"frames": np.ones((1, 5, 2, 200, 3), np.uint8)},
         "^frames: expected frames at most 50 times as lo",
     ),
     "more second frames told than sent": (second(num=1), "^num_frames: expected at most the 1 frames in second_frames"),
     "fewer second frames told than sent": (second(num=5), "^second_frames: expected zeros behind the 2"),
-    "first frames behind those told": ({**second(), wire.FRAMES: FRAMES}, "^frames: expected zeros behind the 3"),
+    "first frames behind those told": ({**second(), "frames": FRAMES}, "^frames: expected zeros behind the 3"),
     "a second sliver": (
         second(height=200, width=2),
         "^frames: expected frames at most 50 times as long as wide, got 200 x 2$",
     ),
     "four channels in the second": (second(channels=4), "[Ee]xpected.*3.*got.*4"),
     "too many frames": (
-        {wire.FRAMES: np.ones((1, 19, 8, 6, 3), np.uint8), **lengths(2, 17)},
+        {"frames": np.ones((1, 19, 8, 6, 3), np.uint8), **lengths(2, 17)},
         "^num_frames: expected at most 16 .*, got 17: .*sampling rule$",
     ),
 }
@@ -244,18 +243,18 @@ def test_what_cannot_be_scored_is_refused_with_what_was_expected(served: Served,
     changes, message = BAD_FRAMES[name] if is_video else BAD_EMBEDDINGS[name]
     model, question = (f"{FRAMES_MODEL}_frames", QUESTION) if is_video else (MODEL, embedded())
     with pytest.raises(InvalidSampleError, match=message):
-        infer(served.url("grpc"), model, question | changes, [wire.PROGRESS])
+        infer(served.url("grpc"), model, question | changes, ["progress"])
 
 
 @pytest.mark.parametrize("model", [MODEL, f"{FRAMES_MODEL}_encoder", f"{VLM}_frames"])
 def test_a_batch_of_no_samples_is_refused(served: Served, model: str) -> None:
-    """Triton lets it pass if the bytes are those of one sample. An ensemble answers it as that sample."""
-    question = embedded() if model == MODEL else {**QUESTION, wire.TASK: np.array([[4, 0, 0, 0, *b"lift"]], np.uint8)}
+    """Triton lets the request pass if the bytes fit a single sample, which an ensemble then scores."""
+    question = embedded() if model == MODEL else {**QUESTION, "task": np.array([[4, 0, 0, 0, *b"lift"]], np.uint8)}
     if model.endswith("_encoder"):
-        question = {name: question[name] for name in (wire.NUM_FRAMES, wire.FRAMES, wire.TASK)}
+        question = {name: question[name] for name in ("num_frames", "frames", "task")}
     request = service_pb2.ModelInferRequest(model_name=model)
     for name, array in question.items():
-        is_text, axes = name == wire.TASK, [1] if name == wire.TASK else array.shape[1:]
+        is_text, axes = name == "task", [1] if name == "task" else array.shape[1:]
         datatype = "BYTES" if is_text else np_to_triton_dtype(array.dtype)
         request.inputs.add(name=name, datatype=datatype, shape=[0, *axes])
         request.raw_input_contents.append(array.tobytes())
@@ -266,7 +265,7 @@ def test_a_batch_of_no_samples_is_refused(served: Served, model: str) -> None:
 
 
 def test_a_rewound_trajectory_is_scored(served: Served) -> None:
-    """Its array has negative strides."""
+    """The array has negative strides."""
     forwards = random_trajectory(1, 6)
     backwards = Trajectory(video_embeddings=forwards.positions[::-1], text_embedding=forwards.text_embedding)
     copied = Trajectory(video_embeddings=forwards.positions[::-1].copy(), text_embedding=forwards.text_embedding)
@@ -279,14 +278,14 @@ def test_what_was_not_asked_is_nan_on_the_wire(served: Served) -> None:
         ProgressSample(random_trajectory(1, 2)),
         PreferenceSample(random_trajectory(2, 1), random_trajectory(3, 3)),
     ]
-    outputs = [wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE, wire.SIMILARITY, wire.PROGRESS_LOGITS, wire.TIMING_MS]
-    tensors = infer(served.url("http"), MODEL, wire.encode_samples(samples), outputs)
-    for name in (wire.PROGRESS, wire.SUCCESS):
+    outputs = ["progress", "success", "preference", "similarity", "progress_logits", "timing_ms"]
+    tensors = infer(served.url("http"), MODEL, encode_samples(samples), outputs)
+    for name in ("progress", "success"):
         assert np.isnan(tensors[name]).tolist() == [[False, False, True, True], [False] * 4]
-    assert np.isnan(tensors[wire.PROGRESS_LOGITS][0]).all(axis=-1).tolist() == [False, False, True, True]
-    assert np.isnan(tensors[wire.PREFERENCE]).tolist() == [[True], [False]]
-    assert np.isnan(tensors[wire.SIMILARITY]).all()
-    assert (tensors[wire.TIMING_MS] > 0).all()
+    assert np.isnan(tensors["progress_logits"][0]).all(axis=-1).tolist() == [False, False, True, True]
+    assert np.isnan(tensors["preference"]).tolist() == [[True], [False]]
+    assert np.isnan(tensors["similarity"]).all()
+    assert (tensors["timing_ms"] > 0).all()
     assert {array.dtype for array in tensors.values()} == {np.dtype(np.float32)}
 
 
@@ -301,22 +300,22 @@ def test_a_pair_of_two_frame_sizes_may_be_sent_through_shared_memory(served: Ser
 
 @pytest.mark.usefixtures("served")
 def test_no_other_user_can_read_the_shared_memory_of_a_server() -> None:
-    found = [path.stat() for path in SHARED_MEMORY.glob(f"{REGION_PREFIX}_{os.getpid()}_*")]
+    found = [path.stat() for path in own_regions(os.getpid())]
     assert any(stat.S_ISREG(each.st_mode) and each.st_size >= LEAST_REGION_BYTES for each in found)
     assert {stat.S_IMODE(each.st_mode) & 0o077 for each in found} == {0}
 
 
 @pytest.mark.parametrize("model", [FRAMES_MODEL, VLM])
 def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) -> None:
-    """Whoever writes tensors may use the optional input for any pair, and for a sample without a second trajectory."""
+    """Tensors may use the optional input for any pair, and for a sample without a second trajectory."""
     frames = [np.random.default_rng(seed).integers(0, 256, (2, 56, 56, 3), np.uint8) for seed in (1, 2)]
     videos = [Trajectory(frames=each, task="lift") for each in frames]
-    tensors = wire.encode_samples([PreferenceSample(videos[0], videos[1]), ProgressSample(videos[0])])
+    tensors = encode_samples([PreferenceSample(videos[0], videos[1]), ProgressSample(videos[0])])
     apart = {
-        wire.FRAMES: np.stack([frames[0], frames[0]]),
-        wire.SECOND_FRAMES: np.stack([frames[1], np.zeros_like(frames[1])]),
+        "frames": np.stack([frames[0], frames[0]]),
+        "second_frames": np.stack([frames[1], np.zeros_like(frames[1])]),
     }
-    outputs = [wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE]
+    outputs = ["progress", "success", "preference"]
     url = served.url("http")
     expected, got = (infer(url, f"{model}_frames", t, outputs) for t in (tensors, tensors | apart))
     for name in outputs:
@@ -327,7 +326,7 @@ def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) 
 def test_a_model_from_before_pairs_of_two_frame_sizes_says_so(served: Served) -> None:
     config = goldens.config(VLM)
     rfm_export.export(config.checkpoint, served.repository, serve_config(config, "before"))
-    forget_input(served.repository, "before_frames", wire.SECOND_FRAMES)
+    forget_input(served.repository, "before_frames", "second_frames")
     wide, tall = video(0, 2, 56, 84), video(1, 2, 84, 56)
     pairs = [PreferenceSample(wide, wide), PreferenceSample(wide, tall), PreferenceSample(tall, tall)]
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
@@ -355,7 +354,7 @@ def test_one_model_missing_is_named_and_does_not_cost_the_others(served: Served)
 
 @pytest.mark.slow
 def test_a_full_queue_refuses_at_once_and_patience_is_served(served: Served) -> None:
-    """By Triton's own policy; with one instance, Triton 2.51 notices a free one half a second late."""
+    """By Triton's policy. With a single instance, Triton 2.51 notices it free half a second late."""
     config, name = goldens.config(MODEL), "queued"
     rfm_export.export(config.checkpoint, served.repository, serve_config(config, name))
     file = served.repository / name / "1" / "model.py"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A model process that ends by itself: each in a process of its own."""
+"""A model process that ends by itself. Each test runs in a separate process."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Each phrase by which rfm_client.contract.triton knows what happened, from a real Triton."""
+"""Each phrase that rfm_client.contract.triton recognises, from a real Triton."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ import goldens
 import rfm_export
 from engines import serve_config
 from mixtures import FRAMES_MODEL, MODEL
-from reference_server import Served
 from repositories import kill_model
-from rfm.launch.repository_api import RepositoryApi
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,
@@ -28,6 +26,7 @@ from rfm_client import (
     ServerUnavailableError,
 )
 from rfm_client.contract import triton, wire
+from servers import RepositoryApi, Served
 from trajectories import random_trajectory
 
 pytestmark = pytest.mark.triton
@@ -95,7 +94,7 @@ PHRASES: dict[str, tuple[Callable[[Asker], Any], str, type[RewardError], str]] =
 
 
 def failure(ask: Callable[[], Any]) -> tuple[str, str]:
-    """Status and message of what Triton refuses."""
+    """Return status and message of a refusal by Triton."""
     with pytest.raises(InferenceServerException) as caught:
         ask()
     return str(caught.value.status()), caught.value.message()

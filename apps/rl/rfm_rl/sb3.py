@@ -41,6 +41,8 @@ try:
 except ImportError as error:
     raise ImportError('rfm_rl.sb3 needs stable-baselines3: pip install ./client "./apps/rl[sb3]"') from error
 
+__all__ = ["RenderedFrame", "RewardModelVecEnv", "RewardOptions"]
+
 _FRAME = "rendered_frame"  # key in the infos of RenderedFrame
 _RENDERED = "make_vec_env(..., wrapper_class=RenderedFrame)"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Callers of ``make chaos``: send requests without end, check every answer, count the outcomes of all calls."""
+"""Threads that send requests without end, check every answer, and count outcomes."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from rfm_client import (
     Sample,
     SimilaritySample,
 )
+from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
-TOLERANCE = 1e-5  # absolute up to 1; relative above, where only similarity can be
 PATIENCE_S = 60.0
 PAUSE_S = 0.1  # after a failed call
 WIDTHS = (64, 32)  # of the demo's checkpoint
@@ -77,6 +77,11 @@ def numbers(result: object) -> Numbers:
     return np.concatenate([[result.similarity], result.reference.progress, result.other.progress])  # type: ignore[attr-defined]
 
 
+def progress_of(client: RewardClient) -> Ask:
+    """Return a caller that asks for progress alone."""
+    return lambda sample: client.progress(sample.trajectories[0]).progress
+
+
 def direct(client: RewardClient) -> Ask:
     """Return a caller with the client's default settings."""
     return lambda sample: numbers(client.evaluate([sample])[0])
@@ -102,7 +107,7 @@ def through_gateway(session: httpx.Client) -> Ask:
 
 @dataclass
 class Callers:
-    """A context with ``count`` threads that call, each with one call at a time, and the outcomes of their calls.
+    """A context with ``count`` threads that call without end, and the outcomes of the calls.
 
     pause_s: time between two calls of a thread
     latencies_s: of answered calls only
@@ -117,7 +122,7 @@ class Callers:
     refused: int = 0
     broken_off: int = 0
     wrong: int = 0
-    lost: list[str] = field(default_factory=list)
+    lost: list[Exception] = field(default_factory=list)
     latencies_s: list[float] = field(default_factory=list)
 
     def __enter__(self) -> Callers:
@@ -140,7 +145,8 @@ class Callers:
         number = caller
         while not self._stop.wait(self.pause_s):
             number = (number + self.count + 1) % len(self.exam.samples)
-            began_s, got, error = time.perf_counter(), None, None
+            began_s, got = time.perf_counter(), None
+            error: Exception | None = None
             try:
                 got = self.ask(self.exam.samples[number])
             except Exception as raised:  # noqa: BLE001  every error is counted
@@ -156,8 +162,8 @@ class Callers:
                     self.refused += 1
                 elif isinstance(error, httpx.TransportError):
                     self.broken_off += 1
-                else:
-                    self.lost.append(repr(error))
+                elif error is not None:
+                    self.lost.append(error)
             if error is not None:
                 self._stop.wait(PAUSE_S)
 

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: MIT
+"""The commands ``rfm`` and ``rfm-client`` in this process, which saves seconds of imports."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from typer.testing import CliRunner, Result
+
+from rfm_client.cli.commands import app as rfm_client_app
+from rfm_commands.cli import app as rfm_app
+
+
+def rfm(*words: object, **options: Any) -> Result:
+    """Run ``rfm``. options: of ``CliRunner.invoke``, such as env"""
+    return CliRunner().invoke(rfm_app, [str(word) for word in words], **options)
+
+
+def rfm_client(*words: object, **options: Any) -> Result:
+    """Run ``rfm-client``. options: of ``CliRunner.invoke``, such as env"""
+    return CliRunner().invoke(rfm_client_app, [str(word) for word in words], **options)
