@@ -82,7 +82,7 @@ PHRASES: dict[str, tuple[Callable[[Asker], Any], str, type[RewardError], str]] =
         lambda a: a.infer(MODEL, embedded(), output=wire.UNCLEAR),
         "unexpected inference output",
         InvalidSampleError,
-        f"^{wire.UNCLEAR}: ",
+        "^unclear: ",
     ),
     "an ensemble": (
         lambda a: a.infer(f"{FRAMES_MODEL}_frames", NO_FRAMES),
