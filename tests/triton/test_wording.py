@@ -79,7 +79,7 @@ PHRASES: dict[str, tuple[Callable[[Asker], Any], str, type[RewardError], str]] =
         r"^video_embeddings: expected \[-1,768\], got \[2,65\]$",
     ),
     "an unknown output": (
-        lambda a: a.infer(MODEL, embedded(), output=wire.UNCLEAR),
+        lambda a: a.infer(MODEL, embedded(), output="unclear"),
         "unexpected inference output",
         InvalidSampleError,
         "^unclear: ",
