@@ -150,7 +150,9 @@ def test_a_link_elsewhere_opens_the_page_and_a_form_elsewhere_posts_nothing(gate
 def test_browsers_that_tell_no_site_embed_pictures_and_videos_of_ours_in_our_page_alone(tmp_path: Path) -> None:
     with inside(dataset=(str(copied("toy_v30_many", tmp_path)),)) as client:
         for path in ("/", "/health", "/viewer/live", "/viewer/datasets/0/episodes/0/videos/0"):
-            assert client.get(path).headers["Cross-Origin-Resource-Policy"] == "same-origin"
+            headers = client.get(path).headers
+            assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
+            assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
 
 
 @pytest.mark.parametrize("allowed", [LAB, "*"])

@@ -63,7 +63,11 @@ def closed_by_peer(connection: socket.socket) -> bool:
     return True
 
 
+CHUNKED = b"POST /evaluate_batch HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n2\r\n[]\r\n"
 ENDLESS = {
+    "a trailer": CHUNKED + b"0\r\nx: " + b"a" * 2**21,
+    "trailers": CHUNKED + b"0\r\n" + b"a: b\r\n" * 2**19,
+    "an extension of a chunk": CHUNKED + b"1;" + b"a" * 2**21,
     "a header": b"GET / HTTP/1.1\r\nHost: localhost\r\nx: " + b"a" * 2**20,
     "headers": b"GET / HTTP/1.1\r\nHost: localhost\r\n" + b"a: b\r\n" * 2**17,
     "a head behind a body that is refused": HEAD_OF_BODY[:-2] + b"\r\n" + b"0" * 1000 + b"GET /" + b"a" * 2**20,
@@ -71,7 +75,7 @@ ENDLESS = {
 
 
 @pytest.mark.parametrize("sent", ENDLESS.values(), ids=ENDLESS)
-def test_a_head_without_an_end_is_cut_off(sent: bytes, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_has_no_end_is_cut_off(sent: bytes, caplog: pytest.LogCaptureFixture) -> None:
     with listening(head_s=LONG_S, rest_s=LONG_S) as port, socket.create_connection(("127.0.0.1", port)) as peer:
         with suppress(ConnectionError):
             peer.sendall(sent)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -117,6 +118,9 @@ def test_a_file_that_changes_to_show_another_file_is_not_read(demos: Path, tmp_p
         demos.unlink()
         demos.symlink_to(other)
         assert "got a link that leaves it" in failure(gateway.get(path), 500)
+        demos.unlink()
+        os.mkfifo(demos)  # opening it would block until a writer comes
+        assert "an HDF5 file, got a folder, a pipe, a socket or a device" in failure(gateway.get(path), 500)
 
 
 def test_labels_in_another_folder_are_not_read(demos: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from rfm_gateway.admission import PACE_BYTES, RETRY_AFTER
 
-MAX_HEAD_BYTES = 64 * 2**10  # as of most servers
+MAX_HEAD_BYTES = 64 * 2**10  # as of most servers; also of what comes between two pieces of a body, such as trailers
 
 logger = logging.getLogger("rfm_gateway.connections")
 logger.setLevel(logging.ERROR)  # so that malformed requests cannot fill the log
@@ -31,6 +31,8 @@ def most_connections(num_descriptors: int) -> int:
 class Connection(HttpToolsProtocol):
     """A connection that is closed if the head of its next request is large or does not arrive within ``head_s``.
 
+    It drops the trailers of a chunked body, and is closed if they are large.
+
     The time begins when the connection opens, and later with the first byte after an answer; until then uvicorn's
     timeout_keep_alive counts. The rest of a body that has its answer may take ``rest_s``, since many callers read an
     answer only after it. So may each PACE_BYTES of an answer: the kernel passes on large pieces.
@@ -47,7 +49,7 @@ class Connection(HttpToolsProtocol):
         self._most, self.limit_concurrency = self.limit_concurrency, None
         self._head_due: asyncio.TimerHandle | None = None
         self._read_due: asyncio.TimerHandle | None = None
-        self._is_in_head, self._head_bytes = False, 0
+        self._is_in_head, self._dry_bytes = False, 0  # bytes of a head, or since the last piece of a body
         self.logger, self.ws_protocol_class = logger, None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
@@ -63,15 +65,30 @@ class Connection(HttpToolsProtocol):
         if is_between_requests and self._head_due is None:
             has_rest = self.cycle is not None and self.cycle.more_body
             self._await_head(self.rest_s if has_rest else self.head_s)
+        self._dry_bytes += len(data)
         super().data_received(data)
-        self._head_bytes += len(data)
-        if self._is_in_head and self._head_bytes > MAX_HEAD_BYTES:
+        if self._dry_bytes > MAX_HEAD_BYTES:
             self.transport.abort()
 
     def on_message_begin(self) -> None:
-        """Count the bytes of a head."""
+        """Keep the headers that follow."""
         super().on_message_begin()
-        self._is_in_head, self._head_bytes = True, 0
+        self._is_in_head = True
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        """Keep a header, and drop a trailer."""
+        if self._is_in_head:
+            super().on_header(name, value)
+
+    def on_body(self, body: bytes) -> None:
+        """Count anew."""
+        self._dry_bytes = 0
+        super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        """Count anew."""
+        self._dry_bytes = 0
+        super().on_message_complete()
 
     def on_headers_complete(self) -> None:
         """Hand the request to the application, or refuse it. Raises HttpParserError for a second one at a time."""

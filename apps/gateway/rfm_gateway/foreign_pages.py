@@ -19,6 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from rfm_gateway.config import GatewayConfig
 
 EMBEDDED_HERE_ALONE = {"Cross-Origin-Resource-Policy": "same-origin"}  # without TLS, browsers do not say who asks
+_IN_NO_FRAME = "frame-ancestors 'none'"
 _ANY_ORIGIN = "*"
 _NEVER_PUBLIC = ("local", "internal", "lan", "svc")  # top-level domains that the public DNS does not have
 _MOST_LETTERS = 100  # of a header in an answer
@@ -43,7 +44,9 @@ class ForeignPageMiddleware:
 
         async def send_embedded_here_alone(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(EMBEDDED_HERE_ALONE)
+                headers = MutableHeaders(scope=message)
+                headers.update(EMBEDDED_HERE_ALONE)
+                headers.setdefault("Content-Security-Policy", _IN_NO_FRAME)  # a page has its own, which says so, too
             await send(message)
 
         refusal = None

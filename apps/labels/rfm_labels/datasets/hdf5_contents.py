@@ -55,6 +55,8 @@ def opened_hdf5(file: Path) -> Iterator[Any]:
         import h5py
     except ImportError as error:
         raise ImportError('HDF5 files need h5py: pip install ./client "./apps/labels[hdf5]"') from error
+    if file.exists() and not file.is_file():  # opening a pipe would wait for ever
+        raise DatasetError.at(file, "an HDF5 file", "a folder, a pipe, a socket or a device")
     try:
         opened = h5py.File(file, "r")
     except BlockingIOError as error:
