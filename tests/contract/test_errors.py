@@ -14,7 +14,8 @@ from rfm.launch.installation import ServerStartError
 from rfm_client import InvalidSampleError
 from rfm_client.contract import triton
 from rfm_client.contract.errors import LocatedError
-from rfm_client.options import ConfigError, InvalidValueError, checked_share, require
+from rfm_client.contract.numbers import checked_share
+from rfm_client.options import ConfigError, InvalidValueError, require
 from rfm_export import ExportError
 from rfm_labels import DatasetError
 
