@@ -59,9 +59,8 @@ def video_stream(container: Any) -> Any:
     if len(videos) > 1:
         codecs = {n: stream.codec_context for n, stream in videos.items()}
         told = ", ".join(f"0:v:{n} ({codec.name}, {codec.width}x{codec.height})" for n, codec in codecs.items())
-        raise FrameFileError.at(
-            "", "one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)", f"{len(videos)}: {told}"
-        )
+        expected = "one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)"
+        raise FrameFileError.of(expected, f"{len(videos)}: {told}")
     (stream,) = videos.values()
     _check_colours(stream.codec_context.format)
     return stream
@@ -145,9 +144,8 @@ class Upright:
             image, matrix = self._rgb(frame), frame.side_data.get("DISPLAYMATRIX")
         except ValueError as error:  # PyAV 17.1 and newer fail at the EXIF data of a Motion JPEG video
             remedy = "encode it anew: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
-            raise FrameFileError.of(
-                f"frames without EXIF data, which PyAV cannot read ({remedy})", str(error)
-            ) from error
+            expected = f"frames without EXIF data, which PyAV cannot read ({remedy})"
+            raise FrameFileError.of(expected, error) from error
         return image if matrix is None else np.ascontiguousarray(_shown(image, np.frombuffer(bytes(matrix), np.int32)))
 
     def _rgb(self, frame: Any) -> UInt8Array:
