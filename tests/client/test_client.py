@@ -96,7 +96,7 @@ def test_a_bad_sample_fails_alone_or_is_raised_with_its_place(served: Served, pr
         good = client.evaluate(samples)
         with pytest.raises(
             InvalidSampleError,
-            match=r"^samples\[5\]\.num_frames: expected at most 16 .*, got 20: .*subsample=True.* \(request \S+\)$",
+            match=r"^samples\[5\]\.num_frames: expected at most 16 .*, got 20; .*subsample=True.* \(request \S+\)$",
         ):
             client.evaluate([*samples, too_long])
     for outcome, expected in zip(outcomes[:5], good, strict=True):

@@ -180,8 +180,6 @@ def test_what_is_not_there_is_told_and_nothing_changes(running: Running, words: 
         ("http://127.0.0.1:8000", (), "url: expected grpc://host:port (its gRPC port, 8001) or with TLS grpcs://"),
         ("127.0.0.1:8001", (), "url: expected grpc://host:port or http://host:port"),
         ("grpc://127.0.0.1:1", (), "grpc://127.0.0.1:1: failed to connect to all addresses"),
-        ("grpcs://h:1", ("--ca-file", "/nowhere"), "ca_file: expected certificates (PEM) at /nowhere"),
-        ("grpc://h:1", ("--ca-file", __file__), "ca_file: expected certificates (PEM)"),
     ],
 )
 def test_a_server_that_cannot_be_reached_is_told(url: str, words: tuple[str, ...], message: str) -> None:
@@ -189,6 +187,13 @@ def test_a_server_that_cannot_be_reached_is_told(url: str, words: tuple[str, ...
     assert done.exit_code == 1
     (told,) = done.stderr.splitlines()
     assert told.startswith(f"rfm: {message}")
+
+
+@pytest.mark.parametrize("file", ["/nowhere", __file__])
+def test_an_unusable_certificate_is_told_with_its_option(file: str) -> None:
+    done = rfm("models", "--ca-file", file, "list", "--url", "grpcs://h:1", env={"COLUMNS": "300"})
+    assert done.exit_code == 2
+    assert f"Invalid value for '--ca-file': expected certificates (PEM) at {file}" in done.stderr
 
 
 def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(

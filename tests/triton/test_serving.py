@@ -232,7 +232,7 @@ BAD_FRAMES: dict[str, tuple[Tensors, str]] = {
     "four channels in the second": (second(channels=4), "[Ee]xpected.*3.*got.*4"),
     "too many frames": (
         {"frames": np.ones((1, 19, 8, 6, 3), np.uint8), **lengths(2, 17)},
-        "^num_frames: expected at most 16 .*, got 17: .*sampling rule$",
+        "^num_frames: expected at most 16 .*, got 17; .*sampling rule$",
     ),
 }
 
