@@ -239,8 +239,8 @@ def test_the_description_tells_what_is_given(asked: Served) -> None:
     assert {name: info.needs_whole_episode for name, info in infos.items()} == {
         "top": True, "baseline": True, "robo": False,
     }  # fmt: skip
-    assert infos["top"].scores == ("progress", "success", "log_prob")
-    assert infos["robo"].scores == ("progress", "success", "progress_logits", "unclear")
+    assert infos["top"].scores == ("progress", "log_prob")
+    assert infos["robo"].scores == ("progress", "progress_logits", "unclear")
     assert infos["robo"].progress_bins == 5
     assert infos["baseline"].max_frames == 64
     assert infos["top"].lacks == ("preference", "similarity", "success")
