@@ -35,7 +35,7 @@ export class LiveTab {
   begin() {
     const key = hasKey() ? ', api_key="the key of this gateway"' : "";
     this.#page["live-code"].textContent = [
-      "from rfm_client import LiveView",
+      "from rfm_rl import LiveView",
       `live = LiveView("${new URL(".", location.href).href.replace(/\/$/, "")}"${key})`,
       'episode = client.episode("stack the cups", live=live)',
     ].join("\n");
