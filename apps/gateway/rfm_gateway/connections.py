@@ -81,12 +81,12 @@ class Connection(HttpToolsProtocol):
             super().on_header(name, value)
 
     def on_body(self, body: bytes) -> None:
-        """Count anew."""
+        """Begin to count anew, after data."""
         self._dry_bytes = 0
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """Count anew."""
+        """Begin to count anew, after data."""
         self._dry_bytes = 0
         super().on_message_complete()
 
