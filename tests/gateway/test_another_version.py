@@ -51,7 +51,7 @@ class Baseline(Rollout):
     """A server of RoboReward that takes one sample a request. The gateway shows it each prefix of an episode."""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        return replace(await super().model_info(model, timeout_s), kind="RoboReward", max_batch_size=1)
+        return replace(await super().model_info(model, timeout_s), scores_whole_prefixes=True, max_batch_size=1)
 
 
 def test_prefixes_that_several_versions_scored_are_no_curve() -> None:
@@ -59,8 +59,8 @@ def test_prefixes_that_several_versions_scored_are_no_curve() -> None:
         async with AsyncRewardClient("", transports=[Baseline(after=1)], retry=False) as client:
             batch = Batch(SAMPLES.validate_python([progress(filmed(1, NUM_FRAMES, size_px=8))], context={}), True)
             with pytest.raises(InferenceFailedError, match="model_version: expected one for all frames, got "):
-                await Evaluator(client, 60.0).evaluate(batch, "request")
-            answer = await Evaluator(client, 60.0).evaluate(batch, "request")
+                await Evaluator(client, BodyLimits(MIB, 60.0)).evaluate(batch, "request")
+            answer = await Evaluator(client, BodyLimits(MIB, 60.0)).evaluate(batch, "request")
             assert answer.outputs_progress is not None
             assert len(answer.outputs_progress.progress_pred[0]) == NUM_FRAMES
 

@@ -254,7 +254,7 @@ def test_concurrent_callers_each_get_their_own_answer(encoders: Gateway) -> None
                 assert answered(response) == numbers(alone[index])
             else:
                 check_refused(
-                    response, (["samples", 1, "num_frames"], "expected at most 16 .*, got 17: .*sampling rule")
+                    response, (["samples", 1, "num_frames"], "expected at most 16 .*, got 17; .*sampling rule")
                 )
 
 
