@@ -9,12 +9,16 @@ import re
 import subprocess
 import sys
 from collections.abc import Collection, Iterator
+from dataclasses import fields
 from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 
 from paths import ROOT
+from rfm_client.episodes import EpisodeOptions
+from rfm_client.episodes.options import StepKeywords
 
 SHARED = {  # modules that a family may import besides its own
     "rfm.checkpoint",
@@ -284,3 +288,9 @@ def test_files_say_their_licence() -> None:
     assert files
     for file in files:
         assert re.match(r"# SPDX-License-Identifier: MIT\n", file.read_text()), file
+
+
+def test_the_keywords_of_an_episode_are_its_options() -> None:
+    """A TypedDict cannot be derived from a dataclass."""
+    keywords, options = get_type_hints(StepKeywords), get_type_hints(EpisodeOptions)
+    assert keywords == {field.name: options[field.name] for field in fields(EpisodeOptions)}

@@ -88,7 +88,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
     ) -> None:
         if not isinstance(venv, VecEnv):
             got = f"{type(venv).__module__}.{type(venv).__name__}"
-            remedy = "rfm_rl.gym has wrappers of gymnasium's environments and vectors"
+            remedy = "rfm_rl has wrappers of gymnasium's environments and vectors"
             raise TypeError(f"venv: expected a VecEnv of stable_baselines3, got {got}; {remedy}")
         check_frame_source(options, venv.render_mode, venv.observation_space)
         is_rendered = not options.renders or all(venv.env_is_wrapped(RenderedFrame))
