@@ -138,7 +138,7 @@ class TritonServer:
         self._group.kill()
 
     def start_ready(self, served: Mapping[str, Config] | None = None) -> None:
-        """Start the process and wait until every model is ready. Repeat a spoilt start once.
+        """Start the process and wait until every model is ready. Repeat a spoilt first start once.
 
         served: configurations of the models to serve, which may name other versions than their files do; None: all
             models, as in their files
@@ -149,7 +149,7 @@ class TritonServer:
             try:
                 self._start_ready(served)
             except SpoiltStartError:
-                if self._signal is not None:  # it is to end
+                if self._signal is not None or served is not None:  # it is to end, or the caller repeats restarts
                     raise
                 self.stop()
                 self._start_ready(served)

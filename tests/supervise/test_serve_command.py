@@ -257,9 +257,9 @@ def test_a_program_that_does_not_serve_is_told_and_is_no_crash_loop(
     file = tmp_path / "tritonserver"
     if program is not None:
         executable(file, program)
-    words = [*command(REPOSITORY, Endpoints.free())[1:], f"--status-port={free_ports(1)[0]}"]
-    done = rfm(*words, "--tritonserver", file)
-    assert done.exit_code == 1
+    words = [*command(REPOSITORY, Endpoints.free()), f"--status-port={free_ports(1)[0]}", f"--tritonserver={file}"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 1
     assert re.search(rf"^rfm: tritonserver: {told}", done.stderr.splitlines()[-1])
 
 

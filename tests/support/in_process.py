@@ -13,9 +13,9 @@ from rfm_commands.cli import app as rfm_app
 
 def rfm(*words: object, **options: Any) -> Result:
     """Run ``rfm``. options: of ``CliRunner.invoke``, such as env"""
-    return CliRunner().invoke(rfm_app, [str(word) for word in words], **options)
+    return CliRunner().invoke(rfm_app, [str(word) for word in words], catch_exceptions=False, **options)
 
 
 def rfm_client(*words: object, **options: Any) -> Result:
     """Run ``rfm-client``. options: of ``CliRunner.invoke``, such as env"""
-    return CliRunner().invoke(rfm_client_app, [str(word) for word in words], **options)
+    return CliRunner().invoke(rfm_client_app, [str(word) for word in words], catch_exceptions=False, **options)
