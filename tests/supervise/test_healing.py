@@ -18,12 +18,11 @@ import httpx
 import numpy as np
 import pytest
 
+from commands import running
 from patients import CALLERS, MARK, answering, calling, make_repository, trajectory
 from rfm.launch import cleanup
 from rfm.launch.cleanup import SHARED_MEMORY
-from rfm.launch.installation import find_installation
 from rfm.launch.repository_api import RepositoryApiError
-from rfm.launch.triton_server import TritonServer
 from rfm.supervise.status import NO_REASON
 from rfm.supervise.supervisor import MOST, STEADY_S, BackOff, CrashLoopError
 from rfm.triton_model.watchdog import FAILED_BATCHES
@@ -39,6 +38,7 @@ from servers import (
     children,
     model_processes,
     serving,
+    start_triton,
     wait_for,
 )
 from tolerances import TOLERANCE
@@ -239,17 +239,22 @@ def test_a_start_is_repeated_when_a_model_process_is_killed(tmp_path: Path, impo
     waits = f"if not os.path.exists({str(begun)!r}):\n    open({str(begun)!r}, 'w')\n    time.sleep(3600)"
     repository = make_repository(tmp_path, more_code=f"\n\nimport os, time\n\n{waits}\n" if imports else "")
 
-    def kill_first() -> None:
-        wait_for(lambda: children(os.getpid(), "tritonserver"))
-        (triton,) = children(os.getpid(), "tritonserver")
-        wait_for(lambda: begun.exists() if imports else children(triton, "triton_python"))
-        os.kill(children(triton, "triton_python")[0], signal.SIGKILL)
+    def loading() -> set[int]:  # found by the repository, since this process may have started other servers
+        return running(f"{repository}/{MODEL}/", 2)
 
-    with (tmp_path / "log").open("wb") as log, ThreadPoolExecutor(1) as thread:
+    def kill_first() -> set[int]:
+        wait_for(begun.exists if imports else loading)
+        processes = loading()
+        for pid in processes:
+            os.kill(pid, signal.SIGKILL)
+        return processes
+
+    with ThreadPoolExecutor(1) as thread:
         killed = thread.submit(kill_first)
-        with TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server:
-            killed.result()
+        with start_triton(repository) as server:
+            assert killed.result()
             assert model_processes(server.pid)
+            assert killed.result().isdisjoint(model_processes(server.pid))
 
 
 @pytest.mark.triton

@@ -19,6 +19,7 @@ from rfm_client import ProgressSample, RewardClient, Trajectory
 from servers import MODEL
 
 CALLERS = 16
+PAUSE_S = 0.05  # without it they would take the processors from a server that starts
 MARK = 7.0  # in the text embedding of a deadly sample
 
 
@@ -77,7 +78,6 @@ def references() -> list[np.ndarray[Any, Any]]:
 
 
 def calling(client: RewardClient, references: list[np.ndarray[Any, Any]]) -> Callers:
-    """Return 16 threads that ask without pause and compare each answer with the engine's."""
-    return Callers(
-        progress_of(client), Exam([ProgressSample(trajectory(n)) for n in range(CALLERS)], references), CALLERS
-    )
+    """Return 16 threads that ask again and again and compare each answer with the engine's."""
+    exam = Exam([ProgressSample(trajectory(n)) for n in range(CALLERS)], references)
+    return Callers(progress_of(client), exam, CALLERS, PAUSE_S)

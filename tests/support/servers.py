@@ -47,9 +47,11 @@ class BriefServer(TritonServer):
 
     def start_ready(self, served: Mapping[str, Mapping[str, Any]] | None = None) -> None:
         before = self._num_stops
-        super().start_ready(served)
-        if self._num_stops > before:  # the first start hung for a minute: too long for callers with a deadline
-            CRASHES.append(self.repository)
+        try:
+            super().start_ready(served)
+        finally:
+            if self._num_stops > before:  # Triton spoilt a start, perhaps both, or hung for a minute
+                CRASHES.append(self.repository)
 
     def stop(self) -> None:
         self._num_stops += 1
