@@ -35,12 +35,13 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 
 PATIENCE_S = 60.0
+PAUSE_S = 0.02  # without it they would take the processors from a server that starts
 
 
 def calling(client: RewardClient, scores: list[np.ndarray[Any, Any]]) -> Callers:
-    """Return two threads that ask without pause. scores: of the trajectories 0 and 1"""
+    """Return two threads that ask again and again. scores: of the trajectories 0 and 1"""
     samples = [ProgressSample(trajectory(seed)) for seed in range(2)]
-    return Callers(progress_of(client), Exam(samples, scores), 2)
+    return Callers(progress_of(client), Exam(samples, scores), 2, PAUSE_S)
 
 
 def test_calls_survive_restarts_and_kills_of_servers(tmp_path: Path, repository: Path) -> None:
@@ -169,8 +170,8 @@ def test_memory_of_cancelled_calls_never_mixes_with_that_of_others(demo_server: 
     with RewardClient(demo_server.grpc_url) as client:
         expected = [client.evaluate([sample])[0] for sample in samples]
     with RewardClient(demo_server.grpc_url, shared_memory=True) as client:
-        for round_number in range(10):
-            late = [client.submit(sample, timeout_s=0.001 * (1 + round_number)) for sample in samples]
+        for late_ms in (1, 3, 5, 7, 10):
+            late = [client.submit(sample, timeout_s=0.001 * late_ms) for sample in samples]
             futures = [client.submit(sample) for sample in samples]
             for future, plain in zip(futures, expected, strict=True):
                 assert_same(future.result(), plain)

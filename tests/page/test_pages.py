@@ -6,10 +6,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import subprocess
 import sys
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -113,17 +111,3 @@ def test_vendored_files_are_those_of_the_pinned_packages(folder: Path) -> None:
     del there["vendored.json"]
     assert "LICENSE" in there
     assert there == told["files"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("package", [GATEWAY, PAGE], ids=lambda package: package.name)
-def test_the_page_is_in_the_distribution(package: Path, tmp_path: Path) -> None:
-    ignored = shutil.ignore_patterns("build", "*.egg-info", "__pycache__")
-    source = shutil.copytree(package.parent, tmp_path / "source", ignore=ignored)
-    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    words = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path), str(source)]
-    subprocess.run([*pip, *words], check=True, timeout=120)
-    (wheel,) = tmp_path.glob("*.whl")
-    kinds = ("docs/*", "static/*", "examples/*", "vendored/*/*")
-    expected = {str(file.relative_to(package.parent)) for kind in kinds for file in package.glob(kind)}
-    assert expected <= set(zipfile.ZipFile(wheel).namelist())

@@ -94,8 +94,8 @@ def gateway(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.fixture
 def page(gateway: Gateway, quiet_browser: Browser, videos: Path) -> Page:
-    quiet_browser.driver.get(gateway.url)
-    quiet_browser.run("localStorage.clear()")
+    storage = {"origin": gateway.url, "storageTypes": "local_storage"}
+    quiet_browser.driver.execute_cdp_cmd("Storage.clearDataForOrigin", storage)
     quiet_browser.open(gateway.url)
     quiet_browser.write("tasks", TASK)
     quiet_browser.write("fps", str(FPS))

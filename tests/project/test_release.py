@@ -8,6 +8,7 @@ import subprocess
 import sys
 import sysconfig
 import venv
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ import pytest
 from paths import ROOT
 from servers import Endpoints
 
+GATEWAY, PAGE = (ROOT / "apps" / name / f"rfm_{name}" for name in ("gateway", "page"))
 DISTRIBUTIONS = (ROOT / "client", *(file.parent for file in ROOT.glob("apps/*/pyproject.toml")), ROOT)
 
 
@@ -37,9 +39,11 @@ def test_every_file_names_the_version() -> None:
     assert released[1] == version()
 
 
-@pytest.mark.slow
-def test_wheels_serve_and_score_without_the_source_tree(tmp_path: Path) -> None:
-    copy, wheels, environment = tmp_path / "source", tmp_path / "wheels", tmp_path / "environment"
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A virtual environment with wheels of all distributions, made from a clone. The wheels lie beside it."""
+    folder = tmp_path_factory.mktemp("release")
+    copy, wheels, environment = folder / "source", folder / "wheels", folder / "environment"
     subprocess.run(["git", "clone", "--quiet", ROOT, copy], check=True)
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     for folder in DISTRIBUTIONS:
@@ -51,8 +55,17 @@ def test_wheels_serve_and_score_without_the_source_tree(tmp_path: Path) -> None:
     install = ["--python", python, "install", "--no-deps", "--no-index", *wheels.glob("*.whl")]
     subprocess.run([*pip, *install], check=True, timeout=300)
     # the dependencies are this environment's, whose own editable packages a .pth file does not bring along
-    packages = environment / "lib" / f"python{sysconfig.get_python_version()}" / "site-packages"
-    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    (packages_in(environment) / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    return environment
+
+
+def packages_in(environment: Path) -> Path:
+    return environment / "lib" / f"python{sysconfig.get_python_version()}" / "site-packages"
+
+
+@pytest.mark.slow
+def test_wheels_have_their_packages_types_and_programs(environment: Path, tmp_path: Path) -> None:
+    python, packages = environment / "bin" / "python", packages_in(environment)
     where = "import rfm, rfm_client, rfm_commands, rfm_export, rfm_gateway as g; print(rfm.__file__, g.__file__)"
     told = subprocess.run([python, "-c", where], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
     assert all(path.startswith(str(packages)) for path in told.split())
@@ -61,6 +74,20 @@ def test_wheels_serve_and_score_without_the_source_tree(tmp_path: Path) -> None:
     for program, name in (("rfm", "rfm-triton"), ("rfm-client", "rfm-client")):
         done = subprocess.run([environment / "bin" / program, "--version"], check=True, capture_output=True, text=True)
         assert done.stdout == f"{program} {version()}\n", name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("package", [GATEWAY, PAGE], ids=lambda package: package.name)
+def test_the_page_is_in_its_wheel(environment: Path, package: Path) -> None:
+    (wheel,) = (environment.parent / "wheels").glob(f"{package.name}-*.whl")
+    kinds = ("docs/*", "static/*", "examples/*", "vendored/*/*")
+    expected = {str(file.relative_to(package.parent)) for kind in kinds for file in package.glob(kind)}
+    assert expected
+    assert expected <= set(zipfile.ZipFile(wheel).namelist())
+
+
+@pytest.mark.nightly  # a Triton in the image is another of these at night
+def test_wheels_serve_and_score_without_the_source_tree(environment: Path, tmp_path: Path) -> None:
     ports = Endpoints.free()
     serve = [environment / "bin" / "rfm", "serve", ROOT / "model_repository", "--grpc-port", str(ports.grpc_port)]
     serve += ["--http-port", str(ports.http_port), "--metrics-port", str(ports.metrics_port)]

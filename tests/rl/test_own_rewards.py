@@ -19,7 +19,6 @@ from coded_env import Code, CodedEnv, CodeReader, Recorder
 from environments import TASK
 from goal_env import LENGTH, Reach
 from rfm_client import RewardClient
-from rfm_client.contract import wire
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 
 pytest.importorskip("stable_baselines3", reason="the extra sb3 is not installed")
@@ -145,7 +144,7 @@ class Pleased(CodeReader):
     """Sees a success in each frame."""
 
     def scores(self, codes: list[Code]) -> dict[str, Any]:
-        return {wire.PROGRESS: 1.0, wire.SUCCESS: 1.0}
+        return {"progress": 1.0, "success": 1.0}
 
 
 def test_a_monitor_outside_counts_episodes_that_end_by_success() -> None:

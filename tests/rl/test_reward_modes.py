@@ -13,7 +13,6 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from coded_env import Code, CodedEnv, CodeReader, Recorder
-from rfm_client.contract import wire
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 
 PROGRESS = (0.1, 0.4, 0.3, 0.3, 0.8)  # of an episode's frames
@@ -31,7 +30,7 @@ class Judging(CodeReader):
     def scores(self, codes: list[Code]) -> dict[str, Any]:
         steps = [step for *_, step in codes]
         success = np.array(SUCCESS)[steps] if self.predicts_success else np.nan
-        return {wire.PROGRESS: np.array(PROGRESS)[steps], wire.SUCCESS: success}
+        return {"progress": np.array(PROGRESS)[steps], "success": success}
 
 
 class Judge(Recorder):

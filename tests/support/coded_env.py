@@ -10,9 +10,8 @@ import gymnasium as gym
 import numpy as np
 
 from rfm_client import RewardClient, ServerUnavailableError, UInt8Array
-from rfm_client.contract import wire
-from rfm_client.transport.calls import Answer
 from shelves import Shelf
+from transports import Answer, Tensors
 
 SIZE_PX = 32
 
@@ -88,13 +87,13 @@ class CodeReader(Shelf):
         self.failing = failing
 
     async def infer(
-        self, model: str, inputs: wire.Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+        self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
-        counts = inputs[wire.NUM_FRAMES][:, 0]
-        windows = [list(frames[:count]) for frames, count in zip(inputs[wire.FRAMES], counts, strict=True)]
+        counts = inputs["num_frames"][:, 0]
+        windows = [list(frames[:count]) for frames, count in zip(inputs["frames"], counts, strict=True)]
         self.pixels += windows
         codes: list[list[Code]] = [[tuple(frame[0, 0].tolist()) for frame in window] for window in windows]
-        tasks = [task.decode() for task in inputs[wire.TASK][:, 0]]
+        tasks = [task.decode() for task in inputs["task"][:, 0]]
         self.calls.append(sorted(zip(codes, tasks, strict=True)))
         if len(self.calls) - 1 == self.failing:
             raise ServerUnavailableError("the server is restarting")

@@ -28,7 +28,6 @@ from rfm_client import (
     Trajectory,
     float_frames_to_uint8,
 )
-from rfm_client.contract.results import trajectory_scores
 
 # RFM_GOLDENS names a folder with more cases of the same layout; without it the tests need nothing but this repository.
 ROOT = Path(os.environ.get("RFM_GOLDENS") or GOLDEN)
@@ -286,7 +285,10 @@ def check(result: Result, expected: Expected, tolerances: tuple[float, float]) -
 
 
 def frame_scores(result: Result) -> list[FrameScores]:
-    return [*trajectory_scores(result).values()]
+    """Return the scores of each trajectory of a sample."""
+    if isinstance(result, ProgressResult):
+        return [result]
+    return [scores for scores in vars(result).values() if isinstance(scores, FrameScores)]
 
 
 def sigmoid(logits: Any) -> Any:

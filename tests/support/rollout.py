@@ -33,7 +33,6 @@ from rfm_client import (
     Sample,
     Trajectory,
 )
-from rfm_client.client_options import DEFAULT_TIMEOUT_S
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
@@ -42,8 +41,8 @@ WITH_ENCODERS = goldens.config("enc_c1_t1_disc10")
 WIDTHS = (48, 32)
 FRAME_PX = 48
 CLEARLY = 1e-2  # the least difference between versions
-CALLERS = 32
-PAUSE_S = 0.2  # a control loop's step; without it they would slow down the loading
+CALLERS = 8  # more would slow down the loading
+PAUSE_S = 0.2  # a control loop's step
 
 
 @dataclass
@@ -132,9 +131,9 @@ def callers(
     model: str = NAME,
     *,
     count: int = CALLERS,
-    timeout_s: float = DEFAULT_TIMEOUT_S,
+    timeout_s: float | None = None,
 ) -> Iterator[Tally]:
-    """Run ``count`` callers. expected: answers by version"""
+    """Run ``count`` callers. expected: answers by version; timeout_s: None: the client's default"""
     tally, stop, begun = Tally(), threading.Event(), threading.Event()
 
     async def call(client: AsyncRewardClient, index: int) -> None:

@@ -37,6 +37,7 @@ CRASHES: list[Path] = []  # repositories whose Triton aborted, or started twice
 MODEL = "rfm"
 KEY = "a-key-that-only-tests-know"  # an admin key
 PATIENCE_S = 60.0
+START_S = 240.0  # generous, for slow machines
 TRUTH_S = 5.0  # until readiness shows a change
 
 
@@ -258,7 +259,7 @@ def administered(repository: Path, *more: str, **settings: int) -> Iterator[Serv
     key_file.write_text(KEY)
     config.write_text("serve:\n" + "".join(f"  {name}: {value}\n" for name, value in settings.items()))
     with serving(repository, f"--admin-key-file={key_file}", f"--config={config}", *more) as served:
-        served.wait_ready()
+        served.wait_ready(within_s=START_S)
         yield served
     assert KEY not in served.log.read_text(errors="replace")
 

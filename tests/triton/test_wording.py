@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -121,23 +122,31 @@ def test_a_restricted_api_wants_its_key(asker: Asker) -> None:
 
 
 @pytest.mark.slow
-def test_a_dead_process_and_an_unloaded_model_are_told_apart(served: Served, asker: Asker, protocol: str) -> None:
-    config, model = goldens.config(MODEL), f"mortal_{protocol}"
+def test_a_dead_process_and_an_unloaded_model_are_told_apart(served: Served) -> None:
+    config, model = goldens.config(MODEL), "mortal"
     rfm_export.export(config.checkpoint, served.repository, serve_config(config, model))
+    askers = [Asker(served, protocol) for protocol in ("grpc", "http")]
+
+    def answers() -> None:
+        for asker in askers:
+            asker.infer(model, embedded())
 
     def says(phrase: str, kind: type[RewardError]) -> None:
-        status, message = failure(lambda: asker.infer(model, embedded()))
-        assert phrase in message
-        assert type(triton.error_of(status, message, triton.invalid_sample)) is kind
+        for asker in askers:
+            status, message = failure(lambda asker=asker: asker.infer(model, embedded()))  # type: ignore[misc]
+            assert phrase in message
+            assert type(triton.error_of(status, message, triton.invalid_sample)) is kind
 
-    with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
+    with ExitStack() as clients, RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
+        for asker in askers:
+            clients.enter_context(asker.client)
         api.load(model)
-        asker.infer(model, embedded())
+        answers()
         api.unload(model)
         api.wait_gone(model)
         says(triton.NO_VERSIONS, ServerUnavailableError)
         api.load(model)
-        asker.infer(model, embedded())
+        answers()
         kill_model(served.repository, model)
         says(triton.PROCESS_ENDED, ProcessEndedError)
         api.unload(model)
