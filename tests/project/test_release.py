@@ -86,7 +86,7 @@ def test_the_page_is_in_its_wheel(environment: Path, package: Path) -> None:
     assert expected <= set(zipfile.ZipFile(wheel).namelist())
 
 
-@pytest.mark.nightly  # a Triton in the image is another of these at night
+@pytest.mark.nightly  # half a minute; the image of docker/ serves then, too
 def test_wheels_serve_and_score_without_the_source_tree(environment: Path, tmp_path: Path) -> None:
     ports = Endpoints.free()
     serve = [environment / "bin" / "rfm", "serve", ROOT / "model_repository", "--grpc-port", str(ports.grpc_port)]
