@@ -138,10 +138,10 @@ class TritonServer:
         self._group.kill()
 
     def start_ready(self, served: Mapping[str, Config] | None = None) -> None:
-        """Start the process and wait until every model is ready. Repeat a spoilt first start once.
+        """Start the process and wait until every model is ready. Repeat a spoilt start once, unless it is a restart.
 
-        served: configurations of the models to serve, which may name other versions than their files do; None: all
-            models, as in their files
+        served: in a restart, configurations of the models to serve, which may name other versions than their files do;
+            None: all models, as in their files
 
         Raises ServerStartError.
         """
@@ -149,7 +149,7 @@ class TritonServer:
             try:
                 self._start_ready(served)
             except SpoiltStartError:
-                if self._signal is not None or served is not None:  # it is to end, or the caller repeats restarts
+                if self._signal is not None or served is not None:  # it is to end, or its caller repeats it
                     raise
                 self.stop()
                 self._start_ready(served)

@@ -42,8 +42,8 @@ def test_every_file_names_the_version() -> None:
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A virtual environment with wheels of all distributions, made from a clone. The wheels lie beside it."""
-    folder = tmp_path_factory.mktemp("release")
-    copy, wheels, environment = folder / "source", folder / "wheels", folder / "environment"
+    place = tmp_path_factory.mktemp("release")
+    copy, wheels, environment = place / "source", place / "wheels", place / "environment"
     subprocess.run(["git", "clone", "--quiet", ROOT, copy], check=True)
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     for folder in DISTRIBUTIONS:

@@ -14,7 +14,7 @@ import numpy as np
 from typer.testing import Result
 
 import clip
-from in_process import rfm_client
+from in_process import rfm_client as invoke
 from rfm_client import (
     FrameScores,
 )
@@ -31,9 +31,6 @@ WIDTHS = (48, 32)  # of video and text embeddings
 
 
 TASK = clip.TASK
-
-
-invoke = rfm_client
 
 
 def ask(served: Served, *words: object, protocol: str = "grpc", model: str = MODEL) -> Result:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -133,7 +134,7 @@ def test_a_dead_process_and_an_unloaded_model_are_told_apart(served: Served) -> 
 
     def says(phrase: str, kind: type[RewardError]) -> None:
         for asker in askers:
-            status, message = failure(lambda asker=asker: asker.infer(model, embedded()))  # type: ignore[misc]
+            status, message = failure(partial(asker.infer, model, embedded()))
             assert phrase in message
             assert type(triton.error_of(status, message, triton.invalid_sample)) is kind
 
