@@ -230,8 +230,9 @@ class Case:
 
 
 def configs(family: str) -> list[Config]:
+    """Return a family's reference checkpoints, without those on SmolVLM, which no published checkpoint uses."""
     folders = sorted(path for path in (ROOT / family).iterdir() if (path / "cases").is_dir())
-    return [Config(folder) for folder in folders]
+    return [Config(folder) for folder in folders if not folder.name.startswith("smol_")]
 
 
 REWIND = configs("rewind")
