@@ -70,7 +70,7 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
         "NaN": (BLACK + np.nan, r"expected finite values in 0\.\.255, got NaN, Inf or nothing"),
         "channels first": (
             np.ones((2, 3, 8, 8), np.uint8),
-            r"expected uint8 \[T, H, W, 3\], got uint8 \[2, 3, 8, 8\]; the channels come last: "
+            r"expected uint8 \[T, H, W, 3\], got int64 \[2, 3, 8, 8\]; the channels come last: "
             r"transpose the axes to \(0, 2, 3, 1\)",
         ),
         "one frame, channels first": (
