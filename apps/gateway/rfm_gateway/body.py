@@ -60,12 +60,12 @@ Take: TypeAlias = Callable[[int], object]  # takes bytes from a budget, or raise
 class Batch:
     """The samples of one request, at least one.
 
-    use_frame_steps: True: progress samples are scored frame by frame
+    use_frame_steps: True: progress samples are scored frame by frame; None: the request does not say
     num_bytes: size of the body
     """
 
     samples: list[schema.Sample]
-    use_frame_steps: bool
+    use_frame_steps: bool | None
     num_bytes: int = 0
 
 
@@ -222,10 +222,10 @@ def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
     return array
 
 
-def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool:
-    """Return a boolean from JSON or, with _FORM_FLAGS, from a form. Raises RequestValidationError."""
+def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool | None:
+    """Return a boolean from JSON or, with _FORM_FLAGS, from a form; None: none. Raises RequestValidationError."""
     if value is None:
-        return False
+        return None
     if isinstance(value, (bool, int, str)) and str(value).strip().lower() in flags:
         return flags[str(value).strip().lower()]
     raise invalid((_STEPS_FIELD,), f"expected true or false, got {reprlib.repr(value)}")
@@ -238,9 +238,9 @@ def _parsed(text: bytes | str, loc: tuple[str, ...]) -> Any:
         raise invalid(loc, f"expected JSON, got: {error}", "json_invalid") from None
 
 
-def _unwrapped(document: Any) -> tuple[list[Any], bool]:
+def _unwrapped(document: Any) -> tuple[list[Any], bool | None]:
     """Return samples and use_frame_steps, from every form that the evaluation server takes or documents."""
-    use_frame_steps = False
+    use_frame_steps = None
     if isinstance(document, dict):
         use_frame_steps = _flag(document.get(_STEPS_FIELD))
         others = [value for key, value in document.items() if key != _STEPS_FIELD]
