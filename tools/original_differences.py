@@ -28,6 +28,7 @@ from engines import serve_config
 from field_clients import CHECKPOINT, EVALUATIONS, WITHIN_S, FieldRequest, Scores
 from gateway_requests import multipart
 from gateways import running
+from rfm_gateway.blank_frames import WARNING_HEADER
 from servers import start_triton
 
 TASK = "put the red cup on the plate"
@@ -36,25 +37,25 @@ NOT_ASKED = "not asked"
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer of one server: scores, or the status and the reason."""
+    """The answer of one server: scores with a warning, or the reason of a refusal."""
 
     status: int
     scores: Scores | None = None
-    reason: str = ""
+    told: str = ""
 
     @classmethod
-    def of(cls, status: int, body: bytes) -> Answer:
+    def of(cls, status: int, body: bytes, warning: str | None = None) -> Answer:
         """Read an answer of any status."""
         if status == 200:
-            return cls(status, Scores.of(json.loads(body)))
+            return cls(status, Scores.of(json.loads(body)), warning or "")
         try:
             detail = json.loads(body)["detail"]
         except (ValueError, KeyError):
             return cls(status)
-        return cls(status, reason=detail if isinstance(detail, str) else detail[0]["msg"])
+        return cls(status, told=detail if isinstance(detail, str) else detail[0]["msg"])
 
     def __str__(self) -> str:
-        return f"{self.status}: {self.reason}" if self.reason else str(self.status)
+        return f"{self.status}: {self.told}" if self.told else str(self.status)
 
 
 def frames(seed: int, num_frames: int = 6, channels: int = 3) -> Any:
@@ -105,7 +106,7 @@ CASES: dict[str, tuple[list[dict[str, Any]], dict[str, str]]] = {  # samples, an
 def posted(url: str, samples: list[dict[str, Any]], fields: dict[str, str]) -> Answer:
     files, form = multipart(samples, **fields)
     response = requests.post(f"{url}/evaluate_batch_npy", files=files, data=form, timeout=WITHIN_S)
-    return Answer.of(response.status_code, response.content)
+    return Answer.of(response.status_code, response.content, response.headers.get(WARNING_HEADER))
 
 
 def recorded(request: FieldRequest, original: str | None) -> Answer:
@@ -113,13 +114,12 @@ def recorded(request: FieldRequest, original: str | None) -> Answer:
     if original is not None:
         return asked(request, original)
     status = request.expected["original_server_status"]
-    reason = "" if status == 200 else "each sample alone: 200"
-    return Answer(status, request.original, reason)
+    return Answer(status, request.original, "" if status == 200 else "each sample alone 200")
 
 
 def asked(request: FieldRequest, url: str) -> Answer:
-    status, _, body = request.sent(url)
-    return Answer.of(status, body)
+    status, headers, body = request.sent(url)
+    return Answer.of(status, body, headers.get(WARNING_HEADER.lower()))
 
 
 def rows(gateway: str, original: str | None) -> Iterator[tuple[str, str, str, str]]:
