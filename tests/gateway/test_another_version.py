@@ -42,7 +42,7 @@ def test_values_are_those_of_the_version_that_answers() -> None:
                 False,
             )
             evaluator = Evaluator(client, BodyLimits(MIB, 60.0))
-            first, second = [await evaluator.evaluate(batch, "request") for _ in range(2)]
+            first, second = [(await evaluator.evaluate(batch, "request"))[0] for _ in range(2)]
             assert first.outputs_progress is not None and second.outputs_progress is not None
             np.testing.assert_allclose(first.outputs_progress.progress_pred, [[0.1] * NUM_FRAMES], rtol=1e-6)
             np.testing.assert_allclose(second.outputs_progress.progress_pred, [[0.9] * (NUM_FRAMES // 2)], rtol=1e-6)
@@ -68,7 +68,7 @@ def test_prefixes_that_several_versions_scored_are_no_curve() -> None:
             )
             with pytest.raises(InferenceFailedError, match="model_version: expected one for all frames, got "):
                 await Evaluator(client, BodyLimits(MIB, 60.0)).evaluate(batch, "request")
-            answer = await Evaluator(client, BodyLimits(MIB, 60.0)).evaluate(batch, "request")
+            answer, _ = await Evaluator(client, BodyLimits(MIB, 60.0)).evaluate(batch, "request")
             assert answer.outputs_progress is not None
             assert len(answer.outputs_progress.progress_pred[0]) == NUM_FRAMES
 

@@ -96,6 +96,12 @@ def post_json(gateway: Gateway, document: Any) -> requests.Response:
 
 def ask_npy(gateway: Gateway, samples: Sequence[Json], **fields: Any) -> requests.Response:
     """Send every array as a part, as the evaluation server's documentation says."""
+    files, form = multipart(samples, **fields)
+    return requests.post(f"{gateway.url}/evaluate_batch_npy", files=files, data=form)
+
+
+def multipart(samples: Sequence[Json], **fields: Any) -> tuple[Json, Json]:
+    """Return the files and the fields of a form."""
     files, form = {}, {name: str(value).lower() for name, value in fields.items()}
     for index, sample in enumerate(samples):
         shown: Json = dict(sample)
@@ -109,7 +115,7 @@ def ask_npy(gateway: Gateway, samples: Sequence[Json], **fields: Any) -> request
                     files[key] = (f"{key}.npy", io.BytesIO(npy(value)), "application/octet-stream")
                     shown[side][name] = {"__numpy_file__": key}
         form[f"sample_{index}"] = json.dumps(shown)
-    return requests.post(f"{gateway.url}/evaluate_batch_npy", files=files, data=form)
+    return files, form
 
 
 def of_client(sample: Json, frame_steps: int) -> Sample:

@@ -25,6 +25,7 @@ from rfm_client import (
 )
 from rfm_gateway import pages, schema
 from rfm_gateway.admission import RETRY_AFTER
+from rfm_gateway.blank_frames import WARNING_HEADER
 from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
 from rfm_gateway.config import MIB, GatewayConfig
 from rfm_gateway.foreign_pages import ForeignPageMiddleware
@@ -85,11 +86,14 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
             allow_origins=config.cors_origin,
             allow_methods=["GET", "POST"],
             allow_headers=["*"],
-            expose_headers=[REQUEST_ID_HEADER],
+            expose_headers=[REQUEST_ID_HEADER, WARNING_HEADER],
         )
     guards = [] if api_key is None else [Depends(key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
-    _add_evaluations(guarded, limits, Evaluator(client, limits, folder), metrics)
+    evaluator = Evaluator(
+        client, limits, folder, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
+    )
+    _add_evaluations(guarded, limits, evaluator, metrics)
     _add_reports(guarded, state, metrics)
     app.include_router(guarded)
 
@@ -109,11 +113,12 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
 def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator, metrics: GatewayMetrics) -> None:
     async def answer(request: Request, reading: Awaitable[Batch]) -> Response:
         batch = await reading
-        found = await while_connected(request, evaluator.evaluate(batch, request.state.request_id))
+        found, warning = await while_connected(request, evaluator.evaluate(batch, request.state.request_id))
         for sample in batch.samples:
             metrics.samples.labels(sample.sample_type).inc()
         left_out = {"outputs_success"} if found.outputs_success is None else None  # clients take null for scores
-        return Response(found.model_dump_json(exclude=left_out), media_type="application/json")
+        headers = {WARNING_HEADER: warning} if warning else None
+        return Response(found.model_dump_json(exclude=left_out), headers=headers, media_type="application/json")
 
     @router.post(
         "/evaluate_batch",

@@ -52,13 +52,13 @@ class Batch:
     """The samples of one request, at least one.
 
     paths: of each sample in the body, for errors
-    use_frame_steps: True: progress samples are scored frame by frame
+    use_frame_steps: True: progress samples are scored frame by frame; None: the request does not say
     num_bytes: size of the body
     """
 
     samples: list[schema.Sample]
     paths: Sequence[Path]
-    use_frame_steps: bool
+    use_frame_steps: bool | None
     num_bytes: int = 0
 
 
@@ -207,10 +207,10 @@ def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
     return array
 
 
-def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool:
-    """Return a boolean from JSON or, with _FORM_FLAGS, from a form. Raises RequestValidationError."""
+def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool | None:
+    """Return a boolean from JSON or, with _FORM_FLAGS, from a form; None: none. Raises RequestValidationError."""
     if value is None:
-        return False
+        return None
     if isinstance(value, (bool, int, str)) and str(value).strip().lower() in flags:
         return flags[str(value).strip().lower()]
     raise invalid((STEPS_FIELD,), f"expected true or false, got {reprlib.repr(value)}")
@@ -223,10 +223,10 @@ def _parsed(text: bytes | str, loc: tuple[str, ...]) -> Any:
         raise invalid(loc, f"expected JSON, got: {error}", "json_invalid") from None
 
 
-def _unwrapped(document: Any) -> tuple[dict[Path, Any], bool]:
+def _unwrapped(document: Any) -> tuple[dict[Path, Any], bool | None]:
     """Return samples by path and use_frame_steps, from every form that the evaluation server takes or documents."""
     if not isinstance(document, dict):
-        return _listed((), document), False
+        return _listed((), document), None
     use_frame_steps = _flag(document.get(STEPS_FIELD))
     others = {key: value for key, value in document.items() if key != STEPS_FIELD}
     if "sample_type" in document:

@@ -202,8 +202,10 @@ class EvaluateBatchRequest(BaseModel):
     """At least one sample. A bare list, a single sample, or an object whose only value is the list is also read."""
 
     samples: list[_ByType] = Field(min_length=1)
-    use_frame_steps: bool = Field(
-        False, description="Score each frame of progress samples on its prefix alone, sampled to 4 frames."
+    use_frame_steps: bool | None = Field(
+        None,
+        description="Score each frame of progress samples on its prefix alone, sampled to 4 frames. Without this field "
+        "the gateway's --use-frame-steps decides.",
     )
 
 

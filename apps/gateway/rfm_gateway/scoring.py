@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -33,10 +32,9 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.frames import BlankFrames
-from rfm_client.options import first_names
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
+from rfm_gateway.blank_frames import WarningLog, refuse_blank_frames, warning_of
 from rfm_gateway.body import Batch, BodyLimits
 from rfm_gateway.field_errors import refused
 from rfm_gateway.folder import RequestFiles
@@ -46,7 +44,6 @@ FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
 _BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the embedding of the task
-logger = logging.getLogger("rfm_gateway")
 
 Text: TypeAlias = Float32Array | InvalidSampleError  # the embedding of a task, or the encoder's error
 
@@ -55,15 +52,30 @@ class Evaluator:
     """Scores batches with the server behind ``client``.
 
     folder: folder of files that samples may name, with links resolved; None: no files
+    use_frame_steps: for requests that do not say
+    refuse_blank: True: black and single-colour frames are invalid
     """
 
-    def __init__(self, client: AsyncRewardClient, limits: BodyLimits, folder: Path | None = None) -> None:
+    def __init__(
+        self,
+        client: AsyncRewardClient,
+        limits: BodyLimits,
+        folder: Path | None = None,
+        *,
+        use_frame_steps: bool = False,
+        refuse_blank: bool = False,
+    ) -> None:
         self._client = client
         self._limits = limits
         self._folder = folder
+        self._use_frame_steps = use_frame_steps
+        self._refuse_blank = refuse_blank
+        self._warnings = WarningLog()
 
-    async def evaluate(self, batch: Batch, request_id: str) -> schema.EvaluateBatchAnswer:
-        """Return the answer to a whole batch. A missing sample would shift later scores, or be read as a reward of 0.
+    async def evaluate(self, batch: Batch, request_id: str) -> tuple[schema.EvaluateBatchAnswer, str]:
+        """Return the answer to a whole batch, and a warning of samples that show nothing; empty: there are none.
+
+        A missing sample would shift later scores, or be read as a reward of 0.
 
         Raises RequestValidationError that lists all invalid samples, HTTPException for files that are too large, and
         ServerError.
@@ -76,20 +88,25 @@ class Evaluator:
                 clear_frames(error.__traceback__)  # otherwise errors among their variables keep the arrays in memory
                 raise
 
-    async def _evaluate(self, batch: Batch, files: RequestFiles, request_id: str) -> schema.EvaluateBatchAnswer:
+    async def _evaluate(
+        self, batch: Batch, files: RequestFiles, request_id: str
+    ) -> tuple[schema.EvaluateBatchAnswer, str]:
         embeddings, frames = await self._served(batch.samples)
         texts = await self._texts(batch.samples, request_id) if embeddings is not None else {}
-        by_prefix = batch.use_frame_steps and frames is not None and frames.scores_whole_prefixes
-        frame_steps = FRAME_STEPS if batch.use_frame_steps and not by_prefix else 0
-        conversion = _Conversion(embeddings, frames, texts, files, frame_steps)
+        use_frame_steps = self._use_frame_steps if batch.use_frame_steps is None else batch.use_frame_steps
+        by_prefix = use_frame_steps and frames is not None and frames.scores_whole_prefixes
+        frame_steps = FRAME_STEPS if use_frame_steps and not by_prefix else 0
+        conversion = _Conversion(embeddings, frames, texts, files, frame_steps, self._refuse_blank)
         num_bytes = batch.num_bytes if self._folder is None else None  # files may be large
-        samples = await off_loop(num_bytes, conversion.samples, batch)
+        samples, warning = await off_loop(num_bytes, conversion.samples, batch)
+        if warning:
+            self._warnings.write(warning)
         asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
         flat = chain.from_iterable(asked)
         outcomes = iter(await self._client.evaluate(flat, return_errors=True, request_id=request_id))
         results = _results([list(islice(outcomes, len(of_sample))) for of_sample in asked], batch)
-        group = 1 if frames is None or batch.use_frame_steps else await self._frames_per_value(results)
-        return _answer(batch.samples, results, group)
+        group = 1 if frames is None or use_frame_steps else await self._frames_per_value(results)
+        return _answer(batch.samples, results, group), warning
 
     async def _frames_per_value(self, results: Sequence[Result]) -> int:
         """Return how many frames share a value. Raises ServerUnavailableError while another version is loaded."""
@@ -147,6 +164,7 @@ class _Conversion:
     embedding_model, frame_model: models that score them; None: not served, or unused
     texts: embeddings by task
     frame_steps: frames to which each prefix of a progress sample is sampled; 0: no dense mode
+    refuse_blank: True: black and single-colour frames are invalid
     """
 
     embedding_model: ModelInfo | None
@@ -154,9 +172,10 @@ class _Conversion:
     texts: Mapping[str, Text]
     files: RequestFiles
     frame_steps: int
+    refuse_blank: bool
 
-    def samples(self, batch: Batch) -> list[Sample]:
-        """Return the client's samples, and log those that show nothing.
+    def samples(self, batch: Batch) -> tuple[list[Sample], str]:
+        """Return the client's samples, and the warning of those that show nothing.
 
         Raises RequestValidationError that lists all invalid samples, and HTTPException as ``RequestFiles`` does.
         """
@@ -169,8 +188,7 @@ class _Conversion:
                 errors[index] = error
         if errors:
             raise refused(errors, batch.samples, batch.paths)
-        _log_blank_samples(converted)
-        return converted
+        return converted, warning_of(converted)
 
     def _sample(self, sample: schema.Sample) -> Sample:
         given = sample.named_trajectories
@@ -220,16 +238,10 @@ class _Conversion:
             expected = "embeddings, since no model for raw frames is served"
             raise InvalidSampleError.at("frames", expected, "frames")
         frames = self.files.frames(given.frames) if isinstance(given.frames, list) else given.uint8_frames
-        return Trajectory(frames=frames, task=given.task or "")
-
-
-def _log_blank_samples(samples: Sequence[Sample]) -> None:
-    shown = [(index, t.frames) for index, sample in enumerate(samples) for t in sample.trajectories]
-    blank = [(index, found) for index, t in shown if t is not None and (found := BlankFrames(t)).told]
-    if blank:
-        names = first_names(dict.fromkeys(index for index, _ in blank), 12)
-        told = max((found for _, found in blank), key=lambda found: found.highest or 0).told
-        logger.warning("samples %s: %s: their scores mean nothing", names, told)
+        trajectory = Trajectory(frames=frames, task=given.task or "")
+        if self.refuse_blank:
+            refuse_blank_frames(trajectory)
+        return trajectory
 
 
 def _prefixes(sample: Sample) -> list[Sample]:
