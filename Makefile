@@ -6,7 +6,7 @@ WORKERS := --numprocesses 3 --dist loadgroup --no-loadscope-reorder
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
-.PHONY: help demo test test-all nightly test-newest check parity bench bench-full gpu gpu-packages perf chaos soak format model_repository \
+.PHONY: help demo test test-all nightly test-newest check parity differences bench bench-full gpu gpu-packages perf chaos soak format model_repository \
   clean ops-check ops-tools audit lock mutate docs prose internal-imports pictures version
 
 # What can be made: this list.
@@ -54,6 +54,11 @@ check: $(INSTALLED)
 # How far the scores are from the original's: every reference case, through Triton.
 parity: $(INSTALLED)
 	$(TOOL) tools/parity.py
+
+# How the gateway's answers differ from the original evaluation server's: a table.
+# ORIGINAL=URL names such a server with the same weights; else its recorded answers are shown.
+differences: $(INSTALLED)
+	$(TOOL) tools/original_differences.py $(if $(ORIGINAL),--original $(ORIGINAL))
 
 # Measure this server beside the bare engine, the FastAPI server's design, LitServe and mosec.
 bench: $(INSTALLED)

@@ -14,7 +14,6 @@ from rfm_client.contract.errors import (
     ClientClosedError,
     DeadlineExceededError,
     InferenceFailedError,
-    InvalidSampleError,
     InvalidValueError,
     ModelNotFoundError,
     RewardError,
@@ -30,7 +29,7 @@ from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
 from rfm_client.episodes.scorer import Asked, StepScorer
 from rfm_client.episodes.steps import Steps
 from rfm_client.scoring.call import Call, CallOptions
-from rfm_client.scoring.samples import SampleScorer
+from rfm_client.scoring.samples import SampleScorer, results_of
 from rfm_client.transport.calls import connect
 from rfm_client.transport.concurrency import ConcurrencyLimiter
 from rfm_client.transport.credentials import Credentials
@@ -82,11 +81,8 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         sample = PreferenceSample(first, second)
         if not both_orders:
             return cast(PreferenceResult, await self.score(sample, **options))
-        outcomes = await self.evaluate([sample, sample.swapped], return_errors=True, **options)
-        for outcome in outcomes:
-            if isinstance(outcome, RewardError):
-                raise outcome
-        asked, swapped = cast("list[PreferenceResult]", outcomes)
+        results = results_of(await self.evaluate([sample, sample.swapped], return_errors=True, **options))
+        asked, swapped = cast("list[PreferenceResult]", results)
         return PreferenceResult.of_both_orders(asked, swapped)
 
     async def similarity(
@@ -117,14 +113,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         """
         samples = list(samples)
         outcomes = await self._scorer.outcomes(samples, self._call(options))
-        if return_errors:
-            return outcomes
-        for index, outcome in enumerate(outcomes):
-            if isinstance(outcome, InvalidSampleError) and len(samples) > 1:
-                raise outcome.inside(f"samples[{index}]") from outcome
-            if isinstance(outcome, RewardError):
-                raise outcome
-        return cast("list[Result]", outcomes)
+        return outcomes if return_errors else results_of(outcomes, "samples[{}]" if len(samples) > 1 else "")
 
     def episode(self, task: str, *, env: int | None = None, **options: Unpack[StepKeywords]) -> AsyncEpisode:
         """Return an episode to score step by step. A step sends only its new frame, if the server keeps features.

@@ -23,6 +23,7 @@ FASTAPI_KEYS = {  # keys of the FastAPI server's file, and their settings here
     "max_workers": "serve.http_threads",
     "server_url": "serve.host",
     "server_port": "serve.http_port",
+    "use_frame_steps": "gateway.use_frame_steps",
 }
 
 

@@ -60,11 +60,14 @@ def test_a_file_has_a_section_for_each_lifetime(tmp_path: Path) -> None:
 def test_the_fastapi_servers_file_is_accepted(tmp_path: Path) -> None:
     config = read(
         tmp_path,
-        "model_path: org/name\nnum_gpus: null\nmax_workers: 4\nbatch_size: 16\nserver_url: http://localhost\nserver_port: 8010\n",
+        "model_path: org/name\nnum_gpus: null\nmax_workers: 4\nbatch_size: 16\nserver_url: http://localhost\nserver_port: 8010\n"
+        "use_frame_steps: true\n",
     )
     assert (config.export.checkpoint, config.export.num_gpus, config.serve.http_threads) == ("org/name", None, 4)
     assert (config.export.batch_size, config.export.max_batch_size) == (16, None)  # the original never reads it
     assert (config.serve.host, config.serve.http_port) == ("127.0.0.1", 8010)
+    assert config.gateway.use_frame_steps
+    assert not read(tmp_path, "").gateway.use_frame_steps
 
 
 @pytest.mark.parametrize(
@@ -194,11 +197,13 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path
         "dataset": str(LEROBOT / "toy_v21"),
     }
     files = {"certificate", "key", "triton_ca_file", "triton_certificate", "triton_key"}  # which a gateway would read
-    assert given.keys() | files | {"viewer"} == settings_of(GatewayConfig).keys()
+    switches = {"viewer", "use_frame_steps", "refuse_blank"}
+    assert given.keys() | files | switches == settings_of(GatewayConfig).keys()
     options = {settings_of(GatewayConfig)[name].option: [value] for name, value in given.items()}
     words = [f"--gateway-{option.removeprefix('--')}={value}" for option, (value,) in options.items()]
     for switch in ("viewer", "no-viewer"):
         assert started(*words, f"--gateway-{switch}") == {**options, f"--{switch}": []}
+    assert started(*words, "--gateway-refuse-blank") == {**options, "--viewer": [], "--refuse-blank": []}
 
 
 @pytest.mark.parametrize(
@@ -239,6 +244,8 @@ def test_a_gateway_takes_from_the_server_what_its_section_leaves_open(started: A
     assert (options["--host"], options["--port"], options["--model"]) == (["127.0.0.1"], ["8100"], ["rfm"])
     assert options["--cors-origin"] == ["http://a", "http://b"]
     assert options["--timeout"] == ["120.0"]
+    (tmp_path / "serve.yaml").write_text("use_frame_steps: true\n")
+    assert "--use-frame-steps" in started("--config", str(tmp_path / "serve.yaml"), "--gateway-port=8100")
 
 
 WORDS: dict[str, tuple[list[str], str]] = {

@@ -36,9 +36,13 @@ def test_values_are_those_of_the_version_that_answers() -> None:
         async with AsyncRewardClient("", transports=[Rollout(after=1)], retry=False) as client:
             config = GatewayConfig(triton="grpc://127.0.0.1:1", metrics_url="http://127.0.0.1:1/metrics")
             state = TritonState(client, config)
-            batch = Batch(SAMPLES.validate_python([progress(filmed(1, NUM_FRAMES, size_px=8))], context={}), False)
+            batch = Batch(
+                SAMPLES.validate_python([progress(filmed(1, NUM_FRAMES, size_px=8))], context={}),
+                [("samples", 0)],
+                False,
+            )
             evaluator = Evaluator(client, BodyLimits(MIB, 60.0))
-            first, second = [await evaluator.evaluate(batch, "request") for _ in range(2)]
+            first, second = [(await evaluator.evaluate(batch, "request"))[0] for _ in range(2)]
             assert first.outputs_progress is not None and second.outputs_progress is not None
             np.testing.assert_allclose(first.outputs_progress.progress_pred, [[0.1] * NUM_FRAMES], rtol=1e-6)
             np.testing.assert_allclose(second.outputs_progress.progress_pred, [[0.9] * (NUM_FRAMES // 2)], rtol=1e-6)
@@ -57,10 +61,14 @@ class Baseline(Rollout):
 def test_prefixes_that_several_versions_scored_are_no_curve() -> None:
     async def ask() -> None:
         async with AsyncRewardClient("", transports=[Baseline(after=1)], retry=False) as client:
-            batch = Batch(SAMPLES.validate_python([progress(filmed(1, NUM_FRAMES, size_px=8))], context={}), True)
+            batch = Batch(
+                SAMPLES.validate_python([progress(filmed(1, NUM_FRAMES, size_px=8))], context={}),
+                [("samples", 0)],
+                True,
+            )
             with pytest.raises(InferenceFailedError, match="model_version: expected one for all frames, got "):
                 await Evaluator(client, BodyLimits(MIB, 60.0)).evaluate(batch, "request")
-            answer = await Evaluator(client, BodyLimits(MIB, 60.0)).evaluate(batch, "request")
+            answer, _ = await Evaluator(client, BodyLimits(MIB, 60.0)).evaluate(batch, "request")
             assert answer.outputs_progress is not None
             assert len(answer.outputs_progress.progress_pred[0]) == NUM_FRAMES
 

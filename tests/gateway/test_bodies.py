@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 from collections.abc import Iterator
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
+import requests
 
-from gateway_requests import FIRST, MULTIPART, NAMED, check_refused, dumped, failure, npy, npy_of, progress
+from gateway_requests import FIRST, MULTIPART, NAMED, NO_KEY, check_refused, dumped, failure, npy, npy_of, progress
 from gateways import TestClient, inside
 
 KEY, ORIGIN = "open sesame", "http://lab.example"
@@ -31,10 +35,14 @@ BODIES: dict[str, tuple[bytes, list[Any], str]] = {
     "ten thousand brackets": (b"[" * 10_000, [], "expected JSON, got: recursion limit .*"),
     "an empty list": (b"[]", ["samples"], NO_SAMPLE),
     "an empty object": (b"{}", ["samples"], NO_SAMPLE),
-    "a number": (b"5", ["samples"], "expected a list of samples, got int"),
+    "a number": (b"5", [], "expected a list of samples, got int"),
     "samples as an object": (b'{"samples": {}}', ["samples"], "expected a list of samples, got dict"),
     "too many": (b"[%b5]" % (b"5," * 10_000), ["samples"], "expected at most 10000 samples, got 10001"),
     "very many errors": (b"[%b5]" % (b"5," * 2000), [], "expected no faulty fields, got 2001"),
+    "a list of numbers": (b"[5]", [0], "expected an object, got 5"),
+    "a sample without a type": (b'{"sample_type": null}', ["sample_type"], "expected progress, .*, got None"),
+    "a list by another name": (b'{"batch": [5]}', ["batch", 0], "expected an object, got 5"),
+    "an object of samples": (b'{"a": %b, "b": 6}' % SAMPLE.encode(), ["b"], "expected an object, got 6"),
     "no steps": (b'{"samples": [5], "use_frame_steps": 2}', ["use_frame_steps"], f"{NO_STEPS}2"),
 }
 
@@ -46,7 +54,7 @@ def test_a_body_that_holds_no_samples_is_refused(
     check_refused(gateway.post("/evaluate_batch", content=body), (path, message))
 
 
-VIDEO_AT = ["samples", 0, "trajectory", "video_embeddings"]
+VIDEO_AT = ["sample_0", "trajectory", "video_embeddings"]
 HUGE = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000, 2)}"
 NO_NPY = r"expected a \.npy file, got: .*"
 FILES = {
@@ -78,7 +86,7 @@ FORMS: dict[str, tuple[list[tuple[str, Any]], list[Any], str]] = {
     "another spelling": ([("sample_01", ZERO[1])], ["sample_01"], "expected sample_0, sample_1 and so on, got .*"),
     "other steps": ([ZERO, ("use_frame_steps", (None, "yes"))], ["use_frame_steps"], f"{NO_STEPS}'yes'"),
     "no JSON": ([("sample_0", (None, "{"))], ["sample_0"], "expected JSON, got: .*"),
-    "JSON in JSON": ([("sample_0", (None, '"{}"'))], ["samples", 0], "expected an object, got '{}'"),
+    "JSON in JSON": ([("sample_0", (None, '"{}"'))], ["sample_0"], "expected an object, got '{}'"),
     "no part": ([("sample_0", (None, MISSING))], VIDEO_AT, r"expected a \.npy part named 'other', got none"),
     "one field twice": ([ZERO] * 2, ["sample_0"], TWICE),
     "one file twice": ([ZERO, *[("a", ("a.npy", b""))] * 2], ["a"], TWICE),
@@ -128,7 +136,8 @@ def test_too_large_a_body_is_a_413(gateway: TestClient, path: str, content: Any)
     is_form = path in (NPY, "/viewer/score")
     body = content if isinstance(content, bytes) else iter([NAMED, *content] if is_form else content)
     response = gateway.post(path, content=body, headers={"Content-Type": MULTIPART})
-    assert failure(response, 413) == "body: expected at most 1048576 bytes, got more"
+    remedy = "send less in one request, or start the gateway with --max-body-mib (rfm serve: --gateway-max-body-mib)"
+    assert failure(response, 413) == f"body: expected at most 1048576 bytes, got more; {remedy}"
 
 
 def test_too_many_parts_are_a_413(gateway: TestClient) -> None:
@@ -142,7 +151,16 @@ def test_too_many_parts_are_a_413(gateway: TestClient) -> None:
 def test_json_is_smaller_than_other_bodies() -> None:
     with inside() as client:
         response = client.post("/evaluate_batch", content=b" " * (32 * 2**20 + 1))
-        assert failure(response, 413) == "body: expected at most 33554432 bytes, got more"
+        remedy = "send arrays as .npy files, to /evaluate_batch_npy"
+        assert failure(response, 413) == f"body: expected at most 33554432 bytes, got more; {remedy}"
+
+
+@pytest.mark.parametrize("path", ["/evaluate_batch", NPY])
+def test_a_compressed_body_is_told_from_broken_json(gateway: TestClient, path: str) -> None:
+    headers = {"Content-Type": MULTIPART, "Content-Encoding": "gzip"}
+    response = gateway.post(path, content=gzip.compress(SAMPLE.encode()), headers=headers)
+    expected = "content-encoding: expected none, since the gateway unpacks no body, got 'gzip'; send the body as it is"
+    assert failure(response, 415) == expected
 
 
 @pytest.mark.parametrize("path", ["/health", "/gpu_status", "/model_info", "/viewer/served", "/evaluate_batch"])
@@ -159,12 +177,23 @@ def test_unknown_paths_and_methods_are_told_as_json(gateway: TestClient) -> None
 
 # Who may ask
 
+
+def coded(text: str) -> str:
+    return base64.b64encode(text.encode()).decode()
+
+
 KEYS: dict[str, tuple[dict[str, Any], bool]] = {
     "X-API-Key": ({"X-API-Key": KEY}, True),
     "Bearer": ({"Authorization": f"Bearer {KEY}"}, True),
     "none": ({}, False),
     "another": ({"X-API-Key": "sesame"}, False),
-    "another scheme": ({"Authorization": f"Basic {KEY}"}, False),
+    "Basic": ({"Authorization": f"Basic {coded(f'any:{KEY}')}"}, True),
+    "Basic without a user": ({"Authorization": f"basic {coded(f':{KEY}')}"}, True),
+    "Basic, as the user": ({"Authorization": f"Basic {coded(f'{KEY}:')}"}, False),
+    "Basic, another": ({"Authorization": f"Basic {coded('any:sesame')}"}, False),
+    "Basic, not coded": ({"Authorization": f"Basic {KEY}"}, False),
+    "Basic, no letters": ({"Authorization": b"Basic \xfc\xfc"}, False),
+    "another scheme": ({"Authorization": f"Digest {coded(f'any:{KEY}')}"}, False),
     "no letters": ({"X-API-Key": b"\xfc"}, False),
 }
 EPISODE = "/viewer/datasets/0/episodes/0"
@@ -184,10 +213,19 @@ def test_only_the_key_opens() -> None:
             response = client.request(method, path, headers=headers)
             assert (response.status_code != 401) is is_right, path
             if not is_right:
-                assert failure(response, 401) == "key: expected X-API-Key or Authorization: Bearer, got another or none"
+                assert failure(response, 401) == NO_KEY
+                assert response.headers["WWW-Authenticate"] == "Bearer"  # for Basic, a browser would ask its user
         for path in ("/", "/docs", "/openapi.json", "/viewer/main.js"):
             assert client.get(path).status_code == 200
         assert client.get("/health").status_code == 503  # there is no Triton
+
+
+def test_the_key_may_be_the_password_in_the_url_of_httpx_and_requests() -> None:
+    url = f"http://any:{quote(KEY)}@127.0.0.1/metrics"
+    with inside(KEY) as client:
+        assert client.get(url).status_code == 200
+        assert client.get("/metrics", headers=requests.Request("GET", url).prepare().headers).status_code == 200
+        assert client.get("http://any@127.0.0.1/metrics").status_code == 401
 
 
 def test_browsers_may_ask_from_the_named_origin_alone(gateway: TestClient) -> None:
@@ -209,4 +247,4 @@ def test_the_schemas_are_those_of_the_evaluation_server_and_not_the_pages(gatewa
     names = ("evaluate_batch", "evaluate_batch_npy", "gpu_status", "health", "model_info", "metrics")
     assert document["paths"].keys() == {f"/{name}" for name in names}
     codes = document["paths"]["/evaluate_batch"]["post"]["responses"].keys()
-    assert codes == {"200", "408", "413", "422", "502", "503", "504"}
+    assert codes == {"200", "408", "413", "415", "422", "502", "503", "504"}

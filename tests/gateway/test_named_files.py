@@ -122,7 +122,7 @@ def test_files_are_refused_before_they_fill_the_memory(triton: Triton, tmp_path:
     embeddings = np.zeros((256, 1000), np.float32)
     np.save(folder / "plain.npy", embeddings)
     np.savez_compressed(folder / "packed.npz", video_embeddings=embeddings, text_embedding=embeddings[0])
-    message = "body: expected files of at most 2097152 bytes in one request, when they are decoded, got more"
+    message = "body: expected files of at most 2097152 bytes in one request, when they are decoded, got more; "
     image = of_frames(["black.png"])
     plain, packed = (progress({"embeddings_path": name, "task": "lift"}) for name in ("plain.npy", "packed.npz"))
     with running(triton.endpoints, tmp_path, ENCODERS, "--allow-folder", str(folder), "--max-body-mib", "1") as gateway:
@@ -135,4 +135,4 @@ def test_files_are_refused_before_they_fill_the_memory(triton: Triton, tmp_path:
             [packed] * 3,
             [image, plain, packed],
         ):
-            assert failure(ask_json(gateway, too_many), 413) == message
+            assert failure(ask_json(gateway, too_many), 413).startswith(message)

@@ -15,7 +15,9 @@ from gateway_requests import (
     SECOND,
     Ask,
     Json,
+    as_parts,
     ask_json,
+    ask_npy,
     check_refused,
     embedded,
     failure,
@@ -66,10 +68,19 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
         "values beyond 255": (BLACK.astype(int) + 256, r"expected values in 0\.\.255, got 256\.\.256"),
         "values below 0": (BLACK.astype(int) - 1, r"expected values in 0\.\.255, got -1\.\.-1"),
         "NaN": (BLACK + np.nan, r"expected finite values in 0\.\.255, got NaN, Inf or nothing"),
+        "channels first": (
+            np.ones((2, 3, 8, 8), np.uint8),
+            r"expected uint8 \[T, H, W, 3\], got int64 \[2, 3, 8, 8\]; the channels come last: "
+            r"transpose the axes to \(0, 2, 3, 1\)",
+        ),
+        "one frame, channels first": (
+            np.ones((3, 8, 8), np.uint8),
+            r".*, got .*; .* transpose the axes to \(1, 2, 0\)",
+        ),
         "two channels": (np.ones((2, 8, 8, 2), int), r"expected uint8 \[T, H, W, 3\], got .* \[2, 8, 8, 2\]"),
         "grey levels": (np.ones((8, 8), int), r"expected uint8 \[T, H, W, 3\], got .* \[8, 8\]"),
         "no pixels": (BLACK[:, :0], "expected .*, got .*"),
-        "truths": (BLACK > 0, r"expected uint8 \[T, H, W, 3\].*, got bool .*"),
+        "truths": (BLACK > 0, r"expected uint8 \[T, H, W, 3\], got bool \[2, 8, 8, 3\]"),
         "words and numbers": (["0.png", 1], NUMBERS),
         "null": (None, "expected frames, got neither frames nor video_embeddings"),
     },
@@ -89,10 +100,19 @@ BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
     "no task": (of_frames(BLACK, task=None), "trajectory task", "expected a task sentence with frames, got ''"),
     "too many frames": (
         but(video_embeddings=np.ones((17, 48))),
-        "num_frames",
-        "expected at most 16 .*, got 17; .*sampling rule",
+        "trajectory video_embeddings",
+        "expected at most 16 .*, got 17; send fewer frames, such as some at equal distances, or use_frame_steps",
     ),
-    "a sliver": (of_frames(np.ones((1, 2, 200, 3), int)), "frames", "expected frames at most 50 times as long .*"),
+    "a sliver": (
+        of_frames(np.ones((1, 2, 200, 3), int)),
+        "trajectory frames",
+        "expected frames at most 50 times as long .*",
+    ),
+    "a sliver in a pair": (
+        preference(filmed(1, 2), {**filmed(1, 2), "frames": np.ones((1, 2, 200, 3), int)}),
+        "",
+        "expected frames at most 50 times as long .*",
+    ),
     "names of images": (of_frames(["0.png", "1.png"]), "trajectory frames 0", NO_FILES),
     "the name of a file": (progress({"embeddings_path": "a.npz"}), "trajectory embeddings_path", NO_FILES),
     "no trajectory": ({"sample_type": "progress"}, "trajectory", "expected a value, got none"),
@@ -117,25 +137,26 @@ def test_a_bad_sample_is_refused_at_its_field(encoders: Gateway, sample: Any, pa
 
 
 def test_all_bad_samples_are_told_at_once(encoders: Gateway, ask: Ask) -> None:
+    sent = as_parts if ask is ask_npy else list
     response = ask(encoders, [but(video_embeddings=np.ones((3, 7))), GOOD, TWO_WIDE])
-    first, second = (["samples", 0, "trajectory"], ["samples", 2, "rejected_trajectory"])
-    check_refused(
-        response, ([*first, "video_embeddings"], r".*\[3, 7\]"), ([*second, "video_embeddings"], r".*\[2, 7\]")
-    )
+    first = sent(["samples", 0, "trajectory", "video_embeddings"])
+    second = sent(["samples", 2, "rejected_trajectory", "video_embeddings"])
+    check_refused(response, (first, r".*\[3, 7\]"), (second, r".*\[2, 7\]"))
     task = but(text_embedding=None, task="lift " * 200)
     response = ask(encoders, [task, but(text_embedding=None), task])
-    at = [["samples", index, "trajectory", "task"] for index in (0, 2)]
+    at = [sent(["samples", index, "trajectory", "task"]) for index in (0, 2)]
     check_refused(response, *((path, r"expected at most \d+ tokens.*, got .*") for path in at))
 
 
 NO_FRAMES = "expected embeddings, since no model for raw frames is served, got frames"
+NO_EMBEDDINGS = "expected frames, since no model for embeddings is served, got embeddings"
 NO_ENCODER = "expected an embedding, or a task to encode, got a task, and no encoder is served"
 NO_TOKEN = r"expected text without the model's special tokens, got '<\|prog_token\|>'"
 OF_MODEL: dict[str, tuple[str, Json, str, str]] = {
-    "no frames": ("tiny", progress(filmed(1, 2)), "trajectory video_embeddings", NO_FRAMES),
+    "no frames": ("tiny", progress(filmed(1, 2)), "trajectory frames", NO_FRAMES),
     "no task": ("tiny", progress({**FIRST, "text_embedding": None}), "trajectory text_embedding", NO_ENCODER),
-    "no embeddings": ("video", progress(FIRST), "trajectory frames", "expected frames, got video_embeddings"),
-    "no special token": ("video", progress(filmed(1, 2, task="lift <|prog_token|>")), "task", NO_TOKEN),
+    "no embeddings": ("video", progress(FIRST), "trajectory video_embeddings", NO_EMBEDDINGS),
+    "no special token": ("video", progress(filmed(1, 2, task="lift <|prog_token|>")), "trajectory task", NO_TOKEN),
 }
 
 

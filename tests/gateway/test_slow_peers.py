@@ -21,7 +21,7 @@ from fastapi.responses import StreamingResponse
 from prometheus_client import Gauge
 from uvicorn.server import ServerState
 
-from gateway_requests import FIRST, TINY, Triton, ask_json, failure, paused, post_body, progress
+from gateway_requests import FIRST, NO_KEY, TINY, Triton, ask_json, failure, paused, post_body, progress
 from gateways import WITHIN_S, answers, free_port, poll, running
 from rfm_client.contract.descriptors import MOST
 from rfm_gateway import GatewayConfig
@@ -29,7 +29,7 @@ from rfm_gateway.admission import PACE_BYTES, Room, Turn, arriving
 from rfm_gateway.app import create_app
 from rfm_gateway.connections import Connection
 
-KEY = "open sesame"
+KEY, REFUSALS = "open sesame", "rfm_gateway.refusals"  # the logger whose lines are counted
 SETTINGS = GatewayConfig(triton="grpc://127.0.0.1:1", max_in_flight=1, max_waiting=0)
 
 
@@ -83,7 +83,7 @@ def test_what_has_no_end_is_cut_off(sent: bytes, caplog: pytest.LogCaptureFixtur
         with pytest.raises(ConnectionError):
             for _ in range(100):
                 peer.sendall(sent)
-    assert not caplog.records
+    assert {record.name for record in caplog.records} <= {REFUSALS}
 
 
 @pytest.mark.parametrize("length", [1, 9000])
@@ -93,7 +93,7 @@ def test_a_request_for_a_websocket_is_an_ordinary_request(length: int, caplog: p
         peer.sendall(b"GET /" + b"a" * length + b" HTTP/1.1\r\nHost: localhost\r\n" + upgrade)
         assert peer.recv(12) == b"HTTP/1.1 404"
         assert closed_by_peer(peer)
-    assert not caplog.records
+    assert {record.name for record in caplog.records} <= {REFUSALS}
 
 
 def test_a_peer_that_sends_many_requests_at_a_time_is_cut_off(caplog: pytest.LogCaptureFixture) -> None:
@@ -105,7 +105,7 @@ def test_a_peer_that_sends_many_requests_at_a_time_is_cut_off(caplog: pytest.Log
             while chunk := peer.recv(65536):
                 got += chunk
     assert got.count(b"HTTP/1.1 200") <= 1
-    assert not caplog.records
+    assert {record.name for record in caplog.records} <= {REFUSALS}
 
 
 HEADS = {"nothing": b"", "half a head": b"POST /evaluate_batch HTTP/1.1\r\nHos"}
@@ -264,7 +264,6 @@ def test_callers_without_the_key_wait_for_no_place_and_the_gateway_has_all_descr
         with paused(triton):
             connection = post_body(gateway, progress(FIRST), {"X-API-Key": KEY})
             poll(lambda: "requests_in_flight 1.0" in gateway.get("/metrics", headers={"X-API-Key": KEY}).text)
-            expected = "key: expected X-API-Key or Authorization: Bearer, got another or none"
-            assert failure(ask_json(gateway, [progress(FIRST)]), 401) == expected
+            assert failure(ask_json(gateway, [progress(FIRST)]), 401) == NO_KEY
         assert connection.getresponse().status == 200
         connection.close()

@@ -162,7 +162,7 @@ def test_a_wrong_report_is_refused(gateway: TestClient, body: Any, loc: list[Any
 
 def test_a_large_report_is_refused(gateway: TestClient) -> None:
     response = post(gateway, b" " * (MOST_BODY_BYTES + 1))
-    assert failure(response, 413) == "body: expected at most 4194304 bytes, got more"
+    assert failure(response, 413) == "body: expected at most 4194304 bytes, got more; send less in one request"
 
 
 def test_a_view_reports_with_the_key_and_is_warned_of_a_wrong_one(

@@ -351,7 +351,8 @@ def test_a_video_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
     with serving(root, max_body_mib=1) as get:
         responses = [get(f"/0/episodes/{episode}/videos/0") for episode in OF_VIDEO]
         too_large = [response for response in responses if response.status_code != 200]
-        assert {failure(response, 413) for response in too_large} == {message}
+        assert too_large
+        assert all(failure(response, 413).startswith(message) for response in too_large)
 
 
 REFUSED = {

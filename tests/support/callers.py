@@ -99,7 +99,7 @@ def through_gateway(session: httpx.Client) -> Ask:
         if answer.status_code == 503:
             raise RefusedError
         outputs = answer.raise_for_status().json()
-        progress, success = outputs["outputs_progress"]["progress_pred"], outputs["outputs_success"]
+        progress, success = outputs["outputs_progress"]["progress_pred"], outputs.get("outputs_success")
         return np.array([*progress[0], *success["success_probs"][0]], np.float32)
 
     return ask

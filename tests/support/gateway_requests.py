@@ -96,6 +96,12 @@ def post_json(gateway: Gateway, document: Any) -> requests.Response:
 
 def ask_npy(gateway: Gateway, samples: Sequence[Json], **fields: Any) -> requests.Response:
     """Send every array as a part, as the evaluation server's documentation says."""
+    files, form = multipart(samples, **fields)
+    return requests.post(f"{gateway.url}/evaluate_batch_npy", files=files, data=form)
+
+
+def multipart(samples: Sequence[Json], **fields: Any) -> tuple[Json, Json]:
+    """Return the files and the fields of a form."""
     files, form = {}, {name: str(value).lower() for name, value in fields.items()}
     for index, sample in enumerate(samples):
         shown: Json = dict(sample)
@@ -109,7 +115,7 @@ def ask_npy(gateway: Gateway, samples: Sequence[Json], **fields: Any) -> request
                     files[key] = (f"{key}.npy", io.BytesIO(npy(value)), "application/octet-stream")
                     shown[side][name] = {"__numpy_file__": key}
         form[f"sample_{index}"] = json.dumps(shown)
-    return requests.post(f"{gateway.url}/evaluate_batch_npy", files=files, data=form)
+    return files, form
 
 
 def of_client(sample: Json, frame_steps: int) -> Sample:
@@ -130,7 +136,7 @@ def expected(gateway: Gateway, samples: Sequence[Json], *, frame_steps: int = 0,
         results: list[Any] = client.evaluate([of_client(sample, frame_steps) for sample in samples])
     pairs = list(zip(samples, results, strict=True))
     of = {kind: [(s, r) for s, r in pairs if s["sample_type"] == kind] for kind in SIDES}
-    told: Json = dict.fromkeys(("outputs_preference", "outputs_progress", "outputs_success", "outputs_similarity"))
+    told: Json = dict.fromkeys(("outputs_preference", "outputs_progress", "outputs_similarity"))
     if of["preference"]:
         chances = [float(result.preference) for _, result in of["preference"]]
         told["outputs_preference"] = {
@@ -201,6 +207,11 @@ def of_frames(frames: Any, **fields: Any) -> Json:
 BLACK = np.zeros((2, 8, 8, 3), np.uint8)
 
 
+def as_parts(path: Sequence[Any]) -> list[Any]:
+    """The path of a sample's field in JSON, as it is in a form."""
+    return [f"sample_{path[1]}", *path[2:]]
+
+
 def check_refused(response: requests.Response, *told: tuple[Sequence[Any], str]) -> None:
     """422 with exactly these fields and reasons."""
     assert response.status_code == 422, response.text
@@ -211,6 +222,10 @@ def check_refused(response: requests.Response, *told: tuple[Sequence[Any], str])
         assert re.fullmatch(message, error["msg"], re.DOTALL), error["msg"]
 
 
+NO_KEY = (
+    "key: expected it in X-API-Key, in Authorization: Bearer, or as the password of HTTP Basic (http://any:KEY@HOST), "
+    "got another or none"
+)
 MULTIPART = "multipart/form-data; boundary=b"
 NAMED = b'--b\r\nContent-Disposition: form-data; name="sample_0"\r\n\r\n'
 

@@ -108,7 +108,7 @@ def running(
 
 @contextmanager
 def inside(api_key: str | None = None, **settings: Any) -> Iterator[TestClient]:
-    """A gateway inside this process, before no Triton."""
-    app = create_app(GatewayConfig(triton="grpc://127.0.0.1:1", **settings), api_key)
+    """A gateway inside this process, before no Triton unless ``settings`` name one."""
+    app = create_app(GatewayConfig(**{"triton": "grpc://127.0.0.1:1", **settings}), api_key)
     with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
         yield client

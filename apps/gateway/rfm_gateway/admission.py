@@ -21,17 +21,19 @@ RETRY_AFTER = {"Retry-After": "1"}
 
 
 async def arriving(
-    request: Request, max_bytes: int, timeout_s: float, pace_s: float = PACE_S
+    request: Request, max_bytes: int, timeout_s: float, pace_s: float = PACE_S, *, remedy: str = ""
 ) -> AsyncGenerator[bytes, None]:
     """Yield the chunks of a body as they come. The time that the caller spends on a chunk does not count.
+
+    remedy: against too large a body
 
     Raises HTTPException 413 as soon as the announced or received size is too large; TimeoutError if the body takes
     longer than ``timeout_s``, or PACE_BYTES of it longer than ``pace_s``.
     """
-    too_large = HTTPException(413, f"body: expected at most {max_bytes} bytes, got more")
+    too_large = f"body: expected at most {max_bytes} bytes, got more" + (f"; {remedy}" if remedy else "")
     announced = request.headers.get("content-length", "")
     if announced.isdecimal() and int(announced) > max_bytes:
-        raise too_large
+        raise HTTPException(413, too_large)
     chunks, come_bytes, left_s = request.stream(), 0, timeout_s
     paced_bytes, pace_left_s = 0, pace_s
     while True:
@@ -44,7 +46,7 @@ async def arriving(
         left_s, pace_left_s = left_s - took_s, pace_left_s - took_s
         come_bytes, paced_bytes = come_bytes + len(chunk), paced_bytes + len(chunk)
         if come_bytes > max_bytes:
-            raise too_large
+            raise HTTPException(413, too_large)
         if paced_bytes >= PACE_BYTES:
             paced_bytes, pace_left_s = 0, pace_s
         yield chunk

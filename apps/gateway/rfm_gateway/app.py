@@ -4,16 +4,14 @@
 from __future__ import annotations
 
 import logging
-import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi.middleware.cors import CORSMiddleware
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import JSONResponse
-from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 from pydantic.json_schema import models_json_schema
 from starlette.requests import ClientDisconnect
 
@@ -27,9 +25,11 @@ from rfm_client import (
 )
 from rfm_gateway import pages, schema
 from rfm_gateway.admission import RETRY_AFTER
+from rfm_gateway.blank_frames import WARNING_HEADER
 from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
 from rfm_gateway.config import MIB, GatewayConfig
 from rfm_gateway.foreign_pages import ForeignPageMiddleware
+from rfm_gateway.keys import key_check
 from rfm_gateway.mounting import PageHost, page_of
 from rfm_gateway.observe import (
     CALLER_LEFT,
@@ -39,11 +39,9 @@ from rfm_gateway.observe import (
     RequestMiddleware,
     while_connected,
 )
+from rfm_gateway.refusals import RefusalLog, asked
 from rfm_gateway.scoring import Evaluator
 from rfm_gateway.state import TritonState
-
-_KEY_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # at module level, where FastAPI resolves annotations
-_KEY_BEARER = HTTPBearer(auto_error=False)
 
 _REFERENCE = "#/components/schemas/{model}"
 _MODELS = (schema.EvaluateBatchRequest, schema.InvalidRequest, schema.Failure)
@@ -80,6 +78,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
         title=title, summary=summary, lifespan=lifespan, docs_url=None, redoc_url=None, exception_handlers=_handlers()
     )
     app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # the innermost
+    app.add_middleware(RefusalLog)
     app.add_middleware(RequestMiddleware, metrics=metrics, config=config)
     if config.cors_origin:
         app.add_middleware(
@@ -87,11 +86,14 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
             allow_origins=config.cors_origin,
             allow_methods=["GET", "POST"],
             allow_headers=["*"],
-            expose_headers=[REQUEST_ID_HEADER],
+            expose_headers=[REQUEST_ID_HEADER, WARNING_HEADER],
         )
-    guards = [] if api_key is None else [Depends(_key_check(api_key))]
+    guards = [] if api_key is None else [Depends(key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
-    _add_evaluations(guarded, limits, Evaluator(client, limits, folder), metrics)
+    evaluator = Evaluator(
+        client, limits, folder, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
+    )
+    _add_evaluations(guarded, limits, evaluator, metrics)
     _add_reports(guarded, state, metrics)
     app.include_router(guarded)
 
@@ -111,15 +113,17 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
 def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator, metrics: GatewayMetrics) -> None:
     async def answer(request: Request, reading: Awaitable[Batch]) -> Response:
         batch = await reading
-        found = await while_connected(request, evaluator.evaluate(batch, request.state.request_id))
+        found, warning = await while_connected(request, evaluator.evaluate(batch, request.state.request_id))
         for sample in batch.samples:
             metrics.samples.labels(sample.sample_type).inc()
-        return Response(found.model_dump_json(), media_type="application/json")
+        left_out = {"outputs_success"} if found.outputs_success is None else None  # clients take null for scores
+        headers = {WARNING_HEADER: warning} if warning else None
+        return Response(found.model_dump_json(exclude=left_out), headers=headers, media_type="application/json")
 
     @router.post(
         "/evaluate_batch",
         response_model=schema.EvaluateBatchAnswer,
-        responses={422: {"model": schema.InvalidRequest}, **_failures(408, 413, 502, 503, 504)},
+        responses={422: {"model": schema.InvalidRequest}, **_failures(408, 413, 415, 502, 503, 504)},
         openapi_extra=_body("application/json", {"$ref": _REFERENCE.format(model="EvaluateBatchRequest")}),
     )
     async def evaluate_batch(request: Request) -> Response:
@@ -177,26 +181,6 @@ def _failures(*codes: int) -> dict[int | str, dict[str, Any]]:
     return {code: {"model": schema.Failure} for code in codes}
 
 
-def _key_check(key: str) -> Callable[..., None]:
-    """Return a dependency that refuses requests without the key."""
-    expected = key.encode()
-
-    def check(
-        in_header: Annotated[str | None, Depends(_KEY_HEADER)],
-        in_bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_KEY_BEARER)],
-    ) -> None:
-        given = (in_header or "", in_bearer.credentials if in_bearer is not None else "")
-        matches = [secrets.compare_digest(each.encode(), expected) for each in given]  # both, in constant time
-        if not any(matches):
-            raise HTTPException(
-                401,
-                "key: expected X-API-Key or Authorization: Bearer, got another or none",
-                {"WWW-Authenticate": "Bearer"},
-            )
-
-    return check
-
-
 def _handlers() -> dict[Any, Any]:
     """Return handlers that answer every error as JSON, and never answer bad input with 500."""
 
@@ -210,8 +194,8 @@ def _handlers() -> dict[Any, Any]:
         code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
         return JSONResponse({"detail": str(error)}, code, RETRY_AFTER if code == 503 else None)
 
-    async def unexpected(_request: Request, error: Exception) -> JSONResponse:
-        logger.error("unexpected", exc_info=error)
+    async def unexpected(request: Request, error: Exception) -> JSONResponse:
+        logger.error("500 %s: unexpected", asked(request.scope), exc_info=error)
         return JSONResponse({"detail": "the gateway failed; its log has the reason"}, 500)
 
     return {

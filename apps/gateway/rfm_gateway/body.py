@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 import reprlib
 from collections import Counter
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
@@ -25,33 +25,24 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
 from rfm_gateway.admission import Turn, arriving
+from rfm_gateway.field_errors import STEPS_FIELD, Path, field_errors, invalid
 
 DECODED_PER_BODY = 2  # limit of decoded files, as a multiple of the body's limit
 MAX_PARTS = 2000  # of one multipart request: each takes memory, also if it is empty
 IN_MEMORY_BYTES = 32 * 2**20  # of a file; larger files lie on disk
 MAX_SAMPLES = 10_000  # of one request
 MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files
-MAX_ERRORS = 1000  # listed in an answer
+AS_FILES = "send arrays as .npy files, to /evaluate_batch_npy"
+LESS = "send less in one request"
+LARGER = f"{LESS}, or start the gateway with --max-body-mib (rfm serve: --gateway-max-body-mib)"
 
 _format: Any = np.lib.format  # numpy declares no types for it
 _BROKEN_NPY = (ValueError, TypeError, LookupError, SyntaxError, TokenError, MemoryError, RecursionError)  # its errors
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
-_STEPS_FIELD = "use_frame_steps"
 _CHARSETS = ("utf-8", "utf8", "us-ascii")
 _FLAGS = {"true": True, "1": True, "false": False, "0": False, "": False}
 _FORM_FLAGS = {**_FLAGS, "1": False}  # as the evaluation server reads forms
-_EXPECTED = {  # the expected value, by pydantic's kind of error
-    "string_type": "text",
-    "dict_type": "an object",
-    "model_type": "an object",
-    "model_attributes_type": "an object",
-    "missing": "a value",
-    "extra_forbidden": "no such field",
-    "union_tag_invalid": "progress, preference or similarity",
-    "union_tag_not_found": "progress, preference or similarity",
-}
-_AROUND_EXPECTED = re.compile("^.*?should (be|have|match) | after validation.*|, unable to .*")  # in its messages
 
 Take: TypeAlias = Callable[[int], object]  # takes bytes from a budget, or raises
 
@@ -60,28 +51,15 @@ Take: TypeAlias = Callable[[int], object]  # takes bytes from a budget, or raise
 class Batch:
     """The samples of one request, at least one.
 
-    use_frame_steps: True: progress samples are scored frame by frame
+    paths: of each sample in the body, for errors
+    use_frame_steps: True: progress samples are scored frame by frame; None: the request does not say
     num_bytes: size of the body
     """
 
     samples: list[schema.Sample]
-    use_frame_steps: bool
+    paths: Sequence[Path]
+    use_frame_steps: bool | None
     num_bytes: int = 0
-
-
-def invalid(loc: tuple[str | int, ...], message: str, kind: str = "value_error") -> RequestValidationError:
-    """Return an error at a field of the body, in the form of FastAPI's own errors."""
-    return RequestValidationError([{"type": kind, "loc": ["body", *loc], "msg": message}])
-
-
-def field_errors(error: ValidationError) -> list[dict[str, Any]]:
-    """Return pydantic's errors in the gateway's form, ``expected X, got Y`` at a path.
-
-    Raises RequestValidationError with only their number if there are more than MAX_ERRORS.
-    """
-    if error.error_count() > MAX_ERRORS:
-        raise invalid((), f"expected no faulty fields, got {error.error_count()}")
-    return [_field_error(each) for each in error.errors(include_url=False)]
 
 
 @dataclass(frozen=True)
@@ -96,7 +74,9 @@ class BodyLimits:
 
     async def read(self, request: Request, max_bytes: int = MAX_JSON_BYTES) -> bytes:
         """Return the whole body."""
-        return b"".join([chunk async for chunk in self._chunks(request, min(self.max_bytes, max_bytes))])
+        remedy = AS_FILES if max_bytes == MAX_JSON_BYTES else LESS
+        limit = (self.max_bytes, LARGER) if self.max_bytes <= max_bytes else (max_bytes, remedy)
+        return b"".join([chunk async for chunk in self._chunks(request, *limit)])
 
     @contextmanager
     def decoding(self) -> Iterator[Take]:
@@ -112,7 +92,7 @@ class BodyLimits:
             left_bytes -= num_bytes
             if left_bytes < 0:
                 limit = f"files of at most {most_bytes} bytes in one request, when they are decoded"
-                raise HTTPException(413, f"body: expected {limit}, got more")
+                raise HTTPException(413, f"body: expected {limit}, got more; {LARGER}")
 
         try:
             yield take
@@ -134,7 +114,7 @@ class BodyLimits:
         if charset.lower() not in _CHARSETS:  # some of Python's codecs fail, others change the text
             raise HTTPException(415, f"content-type: expected the charset utf-8, got {reprlib.repr(charset)}")
         most: Any = {"max_files": MAX_PARTS, "max_fields": MAX_PARTS, "max_part_size": MAX_JSON_BYTES}
-        parser = _Form(request.headers, self._chunks(request, self.max_bytes), **most)
+        parser = _Form(request.headers, self._chunks(request, self.max_bytes, LARGER), **most)
         try:
             form = await parser.parse()
         except (MultiPartException, ValueError) as error:  # ValueError: of python_multipart
@@ -150,8 +130,12 @@ class BodyLimits:
         finally:
             await form.close()
 
-    def _chunks(self, request: Request, max_bytes: int) -> AsyncGenerator[bytes, None]:
-        chunks = arriving(request, max_bytes, self.timeout_s)
+    def _chunks(self, request: Request, max_bytes: int, remedy: str) -> AsyncGenerator[bytes, None]:
+        coding = request.headers.get("content-encoding", "identity")
+        if coding.lower() != "identity":
+            expected = "content-encoding: expected none, since the gateway unpacks no body"
+            raise HTTPException(415, f"{expected}, got {reprlib.repr(coding)}; send the body as it is")
+        chunks = arriving(request, max_bytes, self.timeout_s, remedy=remedy)
         turn: Turn | None = request.state.turn
         return chunks if turn is None else turn.admitted(chunks)
 
@@ -187,24 +171,25 @@ async def read_multipart(limits: BodyLimits, request: Request) -> Batch:
     """
     async with limits.form(request) as (fields, uploads):
         for name in uploads:
-            if name == _STEPS_FIELD or _ANY_SAMPLE_FIELD.fullmatch(name):
+            if name == STEPS_FIELD or _ANY_SAMPLE_FIELD.fullmatch(name):
                 raise invalid((name,), "expected a form field, got a file")
         json_bytes = sum(map(len, fields.values()))
         if json_bytes > MAX_JSON_BYTES:
-            raise HTTPException(413, f"body: expected at most {MAX_JSON_BYTES} bytes of JSON, got more")
+            raise HTTPException(413, f"body: expected at most {MAX_JSON_BYTES} bytes of JSON, got more; {AS_FILES}")
         num_bytes = json_bytes + sum(upload.size or 0 for upload in uploads.values())
         return await off_loop(num_bytes, _of_form, fields, uploads, num_bytes)
 
 
 def _of_json(body: bytes) -> Batch:
     samples, use_frame_steps = _unwrapped(_parsed(body, ()))
-    return Batch(_checked(samples, {}), use_frame_steps, len(body))
+    return Batch(_checked(samples, {}), [*samples], use_frame_steps, len(body))
 
 
 def _of_form(fields: Mapping[str, str], uploads: Mapping[str, UploadFile], num_bytes: int) -> Batch:
-    samples = [_parsed(fields[name], (name,)) for name in _sample_fields(fields)]
+    samples: dict[Path, Any] = {(name,): _parsed(fields[name], (name,)) for name in _sample_fields(fields)}
     arrays = {name: cache(partial(_read_npy, upload)) for name, upload in uploads.items()}  # each file is decoded once
-    return Batch(_checked(samples, arrays), _flag(fields.get(_STEPS_FIELD), _FORM_FLAGS), num_bytes)
+    steps = _flag(fields.get(STEPS_FIELD), _FORM_FLAGS)
+    return Batch(_checked(samples, arrays), [*samples], steps, num_bytes)
 
 
 def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
@@ -222,13 +207,13 @@ def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
     return array
 
 
-def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool:
-    """Return a boolean from JSON or, with _FORM_FLAGS, from a form. Raises RequestValidationError."""
+def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool | None:
+    """Return a boolean from JSON or, with _FORM_FLAGS, from a form; None: none. Raises RequestValidationError."""
     if value is None:
-        return False
+        return None
     if isinstance(value, (bool, int, str)) and str(value).strip().lower() in flags:
         return flags[str(value).strip().lower()]
-    raise invalid((_STEPS_FIELD,), f"expected true or false, got {reprlib.repr(value)}")
+    raise invalid((STEPS_FIELD,), f"expected true or false, got {reprlib.repr(value)}")
 
 
 def _parsed(text: bytes | str, loc: tuple[str, ...]) -> Any:
@@ -238,23 +223,27 @@ def _parsed(text: bytes | str, loc: tuple[str, ...]) -> Any:
         raise invalid(loc, f"expected JSON, got: {error}", "json_invalid") from None
 
 
-def _unwrapped(document: Any) -> tuple[list[Any], bool]:
-    """Return samples and use_frame_steps, from every form that the evaluation server takes or documents."""
-    use_frame_steps = False
-    if isinstance(document, dict):
-        use_frame_steps = _flag(document.get(_STEPS_FIELD))
-        others = [value for key, value in document.items() if key != _STEPS_FIELD]
-        if "sample_type" in document:
-            document = [document]
-        elif "samples" in document:
-            document = document["samples"]
-        elif len(others) == 1 and isinstance(others[0], list):
-            document = others[0]
-        else:
-            document = others
-    if isinstance(document, list):
-        return document, use_frame_steps
-    raise invalid(("samples",), f"expected a list of samples, got {type(document).__name__}", "list_type")
+def _unwrapped(document: Any) -> tuple[dict[Path, Any], bool | None]:
+    """Return samples by path and use_frame_steps, from every form that the evaluation server takes or documents."""
+    if not isinstance(document, dict):
+        return _listed((), document), None
+    use_frame_steps = _flag(document.get(STEPS_FIELD))
+    others = {key: value for key, value in document.items() if key != STEPS_FIELD}
+    if "sample_type" in document:
+        return {(): document}, use_frame_steps
+    if "samples" in document:
+        return _listed(("samples",), document["samples"]), use_frame_steps
+    if len(others) == 1:
+        ((key, value),) = others.items()
+        if isinstance(value, list):
+            return _listed((key,), value), use_frame_steps
+    return {(key,): value for key, value in others.items()}, use_frame_steps
+
+
+def _listed(path: Path, samples: Any) -> dict[Path, Any]:
+    if isinstance(samples, list):
+        return {(*path, index): sample for index, sample in enumerate(samples)}
+    raise invalid(path, f"expected a list of samples, got {type(samples).__name__}", "list_type")
 
 
 def _sample_fields(fields: Mapping[str, str]) -> list[str]:
@@ -270,30 +259,19 @@ def _sample_fields(fields: Mapping[str, str]) -> list[str]:
     return [f"sample_{number}" for number in numbers]
 
 
-def _checked(samples: list[Any], arrays: Mapping[str, Callable[[], np.ndarray[Any, Any]]]) -> list[schema.Sample]:
+def _checked(
+    samples: Mapping[Path, Any], arrays: Mapping[str, Callable[[], np.ndarray[Any, Any]]]
+) -> list[schema.Sample]:
+    paths = list(samples)
     if not samples:
         raise invalid(("samples",), "expected at least one sample, got none", "too_short")
     if len(samples) > MAX_SAMPLES:
         raise invalid(("samples",), f"expected at most {MAX_SAMPLES} samples, got {len(samples)}", "too_long")
     try:
-        return schema.SAMPLES.validate_python(samples, context=arrays)
+        return schema.SAMPLES.validate_python(list(samples.values()), context=arrays)
     except ValidationError as error:
         found = field_errors(error)
         for each in found:  # pydantic puts a sample's type behind its index
             (body, index), path = each["loc"][:2], each["loc"][3:]
-            each["loc"] = [body, "samples", index, *(["sample_type"] if "union_tag" in each["type"] else path)]
+            each["loc"] = [body, *paths[index], *(["sample_type"] if "union_tag" in each["type"] else path)]
         raise RequestValidationError(found) from None
-
-
-def _field_error(error: Any) -> dict[str, Any]:
-    kind, message, given = error["type"], error["msg"], error["input"]
-    if kind == "value_error":
-        message = str(error["ctx"]["error"])
-    elif kind == "json_invalid":
-        message = f"expected JSON, got: {error['ctx']['error']}"
-    else:
-        given = given.get("sample_type") if "union_tag" in kind else given
-        expected = _EXPECTED.get(kind) or _AROUND_EXPECTED.sub("", message)
-        got = {"missing": "none", "too_long": "more"}.get(kind) or reprlib.repr(given)
-        message = f"expected {expected}, got {got}"
-    return {"type": kind, "loc": ["body", *(each for each in error["loc"] if each != "[key]")], "msg": message}

@@ -96,7 +96,8 @@ def gateway_command(config: GatewayConfig) -> list[str]:
     for name, each in settings_of(GatewayConfig).items():
         value = getattr(config, name)
         if isinstance(value, bool):
-            words.append(each.option if value else each.option.replace("--", "--no-", 1))
+            if value or each.default:  # a switch that is off by default has no --no-
+                words.append(each.option if value else each.option.replace("--", "--no-", 1))
             continue
         values = value if isinstance(value, tuple) else () if value is None else (value,)
         words += [word for value in values for word in (each.option, str(value))]

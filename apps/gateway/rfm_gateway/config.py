@@ -65,6 +65,8 @@ class GatewayConfig(Settings):
     max_body_mib: int = setting(512, "Largest request.", least=1)
     max_in_flight: int = setting(256, "Evaluations at a time; others wait.", least=1)
     max_waiting: int = setting(1024, "Evaluations that wait for their turn; more are refused with 503.", least=0)
+    use_frame_steps: bool = setting(False, "Score by prefixes where a request has no field use_frame_steps.")
+    refuse_blank: bool = setting(False, "Refuse black and single-colour frames; else they get a warning.")
     viewer: bool = setting(True, "Serve the page in the browser, at /.")
     dataset: Texts = setting((), "LeRobot folder or HDF5 file to show on the page. Repeat for more.")
 

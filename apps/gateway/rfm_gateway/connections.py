@@ -12,14 +12,17 @@ from starlette.responses import JSONResponse
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from rfm_gateway.admission import PACE_BYTES, RETRY_AFTER
+from rfm_gateway.refusals import RefusalLog
 
 MAX_HEAD_BYTES = 64 * 2**10  # as of most servers; also of what comes between two pieces of a body, such as trailers
 
 logger = logging.getLogger("rfm_gateway.connections")
 logger.setLevel(logging.ERROR)  # so that malformed requests cannot fill the log
 
-_refusal = JSONResponse(
-    {"detail": "expected fewer connections at a time, got more"}, 503, {**RETRY_AFTER, "Connection": "close"}
+_refusal = RefusalLog(
+    JSONResponse(
+        {"detail": "expected fewer connections at a time, got more"}, 503, {**RETRY_AFTER, "Connection": "close"}
+    )
 )
 
 

@@ -16,8 +16,9 @@ from fastapi import APIRouter, FastAPI
 from fastapi.params import Depends
 
 from rfm_client.options import ConfigError
-from rfm_gateway.body import BodyLimits, field_errors, invalid
+from rfm_gateway.body import BodyLimits
 from rfm_gateway.config import GatewayConfig
+from rfm_gateway.field_errors import field_errors, invalid
 from rfm_gateway.observe import GatewayMetrics, while_connected
 from rfm_gateway.pages import add_page
 

@@ -134,8 +134,9 @@ class TrajectoryInput(BaseModel):
         """The frames of an array as uint8 [T, H, W, C], converted as the evaluation server does.
 
         Floats are clipped and truncated. A single frame becomes a video of one frame. RGBA loses its alpha channel.
-        Raises InvalidSampleError for integers outside 0..255. ``Trajectory`` refuses all other types and shapes.
+        Raises InvalidSampleError for integers outside 0..255, and for other types and shapes.
         """
+        _check_axes(self.frames)
         array: np.ndarray[Any, Any] = self.frames if self.frames.ndim != 3 else self.frames[np.newaxis]
         if array.ndim == 4 and array.shape[-1] == RGBA_CHANNELS:
             array = array[..., :RGB_CHANNELS]
@@ -146,6 +147,17 @@ class TrajectoryInput(BaseModel):
                 raise InvalidSampleError.at("frames", "values in 0..255", f"{array.min()}..{array.max()}")
             return array.astype(np.uint8)
         return array
+
+
+def _check_axes(frames: np.ndarray[Any, Any]) -> None:
+    """Raise InvalidSampleError unless the frames are numbers [T, H, W, 3 or 4], or one frame [H, W, 3 or 4]."""
+    shape, channels = frames.shape, (RGB_CHANNELS, RGBA_CHANNELS)
+    if frames.dtype.kind != "b" and frames.ndim in (3, MAX_AXES) and shape[-1] in channels and 0 not in shape:
+        return
+    axes = "0, 2, 3, 1" if frames.ndim == MAX_AXES else "1, 2, 0"
+    is_planar = frames.ndim in (3, MAX_AXES) and shape[-3] in channels
+    remedy = f"the channels come last: transpose the axes to ({axes})" if is_planar else ""
+    raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3]", f"{frames.dtype} {list(shape)}", remedy)
 
 
 class _Sample(BaseModel):
@@ -190,8 +202,10 @@ class EvaluateBatchRequest(BaseModel):
     """At least one sample. A bare list, a single sample, or an object whose only value is the list is also read."""
 
     samples: list[_ByType] = Field(min_length=1)
-    use_frame_steps: bool = Field(
-        False, description="Score each frame of progress samples on its prefix alone, sampled to 4 frames."
+    use_frame_steps: bool | None = Field(
+        None,
+        description="Score each frame of progress samples on its prefix alone, sampled to 4 frames. Without this field "
+        "the gateway's --use-frame-steps decides.",
     )
 
 
@@ -226,7 +240,7 @@ class SimilarityOutputs(BaseModel):
 
 
 class EvaluateBatchAnswer(BaseModel):
-    """Scores by type; null without samples of the type, or if the checkpoint does not predict success."""
+    """Scores by type; null without samples of the type. ``outputs_success`` is left out without scores."""
 
     outputs_preference: PreferenceOutputs | None = None
     outputs_progress: ProgressOutputs | None = None

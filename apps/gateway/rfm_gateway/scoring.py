@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from traceback import clear_frames
+from typing import TypeAlias, cast
 
 import numpy as np
-from fastapi.exceptions import RequestValidationError
 
 from rfm_client import (
     AsyncRewardClient,
@@ -33,11 +32,11 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.frames import BlankFrames
-from rfm_client.options import first_names
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
-from rfm_gateway.body import Batch, BodyLimits, invalid
+from rfm_gateway.blank_frames import WarningLog, refuse_blank_frames, warning_of
+from rfm_gateway.body import Batch, BodyLimits
+from rfm_gateway.field_errors import refused
 from rfm_gateway.folder import RequestFiles
 from rfm_gateway.observe import within
 
@@ -45,13 +44,6 @@ FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
 _BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the embedding of the task
-_SIDES = {  # the gateway's fields, by the client's names
-    "first": "chosen_trajectory",
-    "second": "rejected_trajectory",
-    "reference": "ref_trajectory",
-    "other": "sim_trajectory",
-}
-logger = logging.getLogger("rfm_gateway")
 
 Text: TypeAlias = Float32Array | InvalidSampleError  # the embedding of a task, or the encoder's error
 
@@ -60,37 +52,61 @@ class Evaluator:
     """Scores batches with the server behind ``client``.
 
     folder: folder of files that samples may name, with links resolved; None: no files
+    use_frame_steps: for requests that do not say
+    refuse_blank: True: black and single-colour frames are invalid
     """
 
-    def __init__(self, client: AsyncRewardClient, limits: BodyLimits, folder: Path | None = None) -> None:
+    def __init__(
+        self,
+        client: AsyncRewardClient,
+        limits: BodyLimits,
+        folder: Path | None = None,
+        *,
+        use_frame_steps: bool = False,
+        refuse_blank: bool = False,
+    ) -> None:
         self._client = client
         self._limits = limits
         self._folder = folder
+        self._use_frame_steps = use_frame_steps
+        self._refuse_blank = refuse_blank
+        self._warnings = WarningLog()
 
-    async def evaluate(self, batch: Batch, request_id: str) -> schema.EvaluateBatchAnswer:
-        """Return the answer to a whole batch. A missing sample would shift later scores, or be read as a reward of 0.
+    async def evaluate(self, batch: Batch, request_id: str) -> tuple[schema.EvaluateBatchAnswer, str]:
+        """Return the answer to a whole batch, and a warning of samples that show nothing; empty: there are none.
+
+        A missing sample would shift later scores, or be read as a reward of 0.
 
         Raises RequestValidationError that lists all invalid samples, HTTPException for files that are too large, and
         ServerError.
         """
         with self._limits.decoding() as take:
             scoring = self._evaluate(batch, RequestFiles(self._folder, take), request_id)
-            return await within(self._limits.timeout_s, scoring)
+            try:
+                return await within(self._limits.timeout_s, scoring)
+            except Exception as error:
+                clear_frames(error.__traceback__)  # otherwise errors among their variables keep the arrays in memory
+                raise
 
-    async def _evaluate(self, batch: Batch, files: RequestFiles, request_id: str) -> schema.EvaluateBatchAnswer:
+    async def _evaluate(
+        self, batch: Batch, files: RequestFiles, request_id: str
+    ) -> tuple[schema.EvaluateBatchAnswer, str]:
         embeddings, frames = await self._served(batch.samples)
         texts = await self._texts(batch.samples, request_id) if embeddings is not None else {}
-        by_prefix = batch.use_frame_steps and frames is not None and frames.scores_whole_prefixes
-        frame_steps = FRAME_STEPS if batch.use_frame_steps and not by_prefix else 0
-        conversion = _Conversion(embeddings, frames, texts, files, frame_steps)
+        use_frame_steps = self._use_frame_steps if batch.use_frame_steps is None else batch.use_frame_steps
+        by_prefix = use_frame_steps and frames is not None and frames.scores_whole_prefixes
+        frame_steps = FRAME_STEPS if use_frame_steps and not by_prefix else 0
+        conversion = _Conversion(embeddings, frames, texts, files, frame_steps, self._refuse_blank)
         num_bytes = batch.num_bytes if self._folder is None else None  # files may be large
-        samples = await off_loop(num_bytes, conversion.samples, batch.samples)
+        samples, warning = await off_loop(num_bytes, conversion.samples, batch)
+        if warning:
+            self._warnings.write(warning)
         asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
         flat = chain.from_iterable(asked)
         outcomes = iter(await self._client.evaluate(flat, return_errors=True, request_id=request_id))
-        results = _results([list(islice(outcomes, len(of_sample))) for of_sample in asked])
-        group = 1 if frames is None or batch.use_frame_steps else await self._frames_per_value(results)
-        return _answer(batch.samples, results, group)
+        results = _results([list(islice(outcomes, len(of_sample))) for of_sample in asked], batch)
+        group = 1 if frames is None or use_frame_steps else await self._frames_per_value(results)
+        return _answer(batch.samples, results, group), warning
 
     async def _frames_per_value(self, results: Sequence[Result]) -> int:
         """Return how many frames share a value. Raises ServerUnavailableError while another version is loaded."""
@@ -148,6 +164,7 @@ class _Conversion:
     embedding_model, frame_model: models that score them; None: not served, or unused
     texts: embeddings by task
     frame_steps: frames to which each prefix of a progress sample is sampled; 0: no dense mode
+    refuse_blank: True: black and single-colour frames are invalid
     """
 
     embedding_model: ModelInfo | None
@@ -155,23 +172,23 @@ class _Conversion:
     texts: Mapping[str, Text]
     files: RequestFiles
     frame_steps: int
+    refuse_blank: bool
 
-    def samples(self, samples: Sequence[schema.Sample]) -> list[Sample]:
-        """Return the client's samples, and log those that show nothing.
+    def samples(self, batch: Batch) -> tuple[list[Sample], str]:
+        """Return the client's samples, and the warning of those that show nothing.
 
         Raises RequestValidationError that lists all invalid samples, and HTTPException as ``RequestFiles`` does.
         """
         converted: list[Sample] = []
         errors: dict[int, InvalidSampleError] = {}
-        for index, sample in enumerate(samples):
+        for index, sample in enumerate(batch.samples):
             try:
                 converted.append(self._sample(sample))
             except InvalidSampleError as error:
                 errors[index] = error
         if errors:
-            raise _refused(errors)
-        _log_blank_samples(converted)
-        return converted
+            raise refused(errors, batch.samples, batch.paths)
+        return converted, warning_of(converted)
 
     def _sample(self, sample: schema.Sample) -> Sample:
         given = sample.named_trajectories
@@ -213,22 +230,18 @@ class _Conversion:
         if given.frames is None and given.has_embeddings and self.embedding_model is not None:
             raise InvalidSampleError.at("video_embeddings", "them in both trajectories or neither", "one of two")
         if given.frames is None:
-            got = "video_embeddings" if given.has_embeddings else "neither frames nor video_embeddings"
-            raise InvalidSampleError.at("frames", "frames", got)
+            if given.has_embeddings:
+                expected = "frames, since no model for embeddings is served"
+                raise InvalidSampleError.at("video_embeddings", expected, "embeddings")
+            raise InvalidSampleError.at("frames", "frames", "neither frames nor video_embeddings")
         if self.frame_model is None:
             expected = "embeddings, since no model for raw frames is served"
-            raise InvalidSampleError.at("video_embeddings", expected, "frames")
+            raise InvalidSampleError.at("frames", expected, "frames")
         frames = self.files.frames(given.frames) if isinstance(given.frames, list) else given.uint8_frames
-        return Trajectory(frames=frames, task=given.task or "")
-
-
-def _log_blank_samples(samples: Sequence[Sample]) -> None:
-    shown = [(index, t.frames) for index, sample in enumerate(samples) for t in sample.trajectories]
-    blank = [(index, found) for index, t in shown if t is not None and (found := BlankFrames(t)).told]
-    if blank:
-        names = first_names(dict.fromkeys(index for index, _ in blank), 12)
-        told = max((found for _, found in blank), key=lambda found: found.highest or 0).told
-        logger.warning("samples %s: %s: their scores mean nothing", names, told)
+        trajectory = Trajectory(frames=frames, task=given.task or "")
+        if self.refuse_blank:
+            refuse_blank_frames(trajectory)
+        return trajectory
 
 
 def _prefixes(sample: Sample) -> list[Sample]:
@@ -239,7 +252,7 @@ def _prefixes(sample: Sample) -> list[Sample]:
     return [ProgressSample(Trajectory(frames=frames[:end], task=task)) for end in range(1, len(frames) + 1)]
 
 
-def _results(outcomes: Sequence[Sequence[Result | RewardError]]) -> list[Result]:
+def _results(outcomes: Sequence[Sequence[Result | RewardError]], batch: Batch) -> list[Result]:
     """Return the result of each sample from the outcomes of its prefixes, or from its only outcome.
 
     Raises RequestValidationError that lists all invalid samples, else the first error.
@@ -248,7 +261,7 @@ def _results(outcomes: Sequence[Sequence[Result | RewardError]]) -> list[Result]
     failed = {index: error for index, error in outcome_of if isinstance(error, RewardError)}  # each sample's first
     unfit = {index: error for index, error in failed.items() if isinstance(error, InvalidSampleError)}
     if unfit:
-        raise _refused(unfit)
+        raise refused(unfit, batch.samples, batch.paths)
     for error in failed.values():
         raise error
     return [_joined(cast("list[Result]", of_sample)) for of_sample in outcomes]
@@ -260,16 +273,6 @@ def _joined(results: Sequence[Result]) -> Result:
         return results[0]
     newest = slice(-1, None)
     return ProgressResult.of_parts([each.at(newest) for each in results if isinstance(each, ProgressResult)])
-
-
-def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:
-    """Return an error that lists all invalid samples, under the caller's field names."""
-    details: list[Any] = []
-    for index, error in errors.items():
-        words = error.where.split(".")
-        path = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in words]
-        details += invalid(("samples", index, *path), error.problem).errors()
-    return RequestValidationError(details)
 
 
 def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: int) -> schema.EvaluateBatchAnswer:

@@ -17,6 +17,7 @@ An error never becomes a number.
 
 from __future__ import annotations
 
+from traceback import clear_frames
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -61,6 +62,17 @@ class LocatedError(Exception):
     def inside(self, where: object) -> Self:
         """Return the error with the name of the object around its field: ``where.field: ...``."""
         return type(self).like(self, where=f"{where}.{self.where}" if self.where else str(where))
+
+
+def clear_variables(error: BaseException | None) -> None:
+    """Clear the variables of the functions that an error and its causes have left.
+
+    A variable that holds an error from the same function forms a cycle with the error. The arrays of the request would
+    stay in memory until Python's collector of cycles runs.
+    """
+    while error is not None:
+        clear_frames(error.__traceback__)
+        error = error.__cause__
 
 
 class InvalidValueError(LocatedError, ValueError):

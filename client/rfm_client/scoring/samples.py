@@ -9,7 +9,7 @@ import logging
 from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from copy import copy
 from functools import partial
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar, cast
 
 from rfm_client.contract import wire
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, ModelNotFoundError, RewardError
@@ -51,21 +51,19 @@ class SampleScorer:
     async def result(self, sample: Sample, call: Call) -> Result:
         """Return the result of one sample. Raises RewardError."""
         fit = await self._fitted(sample, call)
-        (outcome,) = await self._request(model_of(fit.sample, self._model), [fit.sample], call)
-        if isinstance(outcome, RewardError):
-            raise outcome
+        (result,) = results_of(list(await self._request(model_of(fit.sample, self._model), [fit.sample], call)))
         await self._check_lengths([fit.sample], call.deadline)
-        return with_frame_indices(outcome, fit.frame_indices)
+        return with_frame_indices(result, fit.frame_indices)
 
     async def outcomes(self, samples: Sequence[Sample], call: Call) -> list[Outcome]:
-        """Return the result or error of each sample."""
+        """Return the result or error of each sample. Errors come without a traceback, which would hold the arrays."""
         fits: dict[int, FittedSample] = {}
         outcomes: dict[int, Outcome] = {}
         for index, sample in enumerate(samples):
             try:
                 fits[index] = await self._fitted(sample, call)
             except RewardError as error:
-                outcomes[index] = error
+                outcomes[index] = error.with_traceback(None)
         sent = {index: fit.sample for index, fit in fits.items()}
         scored = await _together([self._scored(*group, sent, call) for group in groups(sent, self._model)])
         for index, outcome in itertools.chain(*scored):
@@ -171,7 +169,7 @@ class SampleScorer:
                 self._infos.pop(model, None)
                 return await self._request(model, samples, call, asks_given=False)
             if len(samples) == 1:
-                return [error]
+                return [error.with_traceback(None)]
         except RewardError as error:
             return for_each(error, len(samples))
         alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))
@@ -223,9 +221,26 @@ async def _together(calls: Sequence[Coroutine[Any, Any, Answered]]) -> Sequence[
     return [await calls[0]] if len(calls) == 1 else await asyncio.gather(*calls)
 
 
+def results_of(outcomes: list[Outcome], where: str = "") -> list[Result]:
+    """Return the outcomes, if all are results. Raises the first error, and takes it out of the list.
+
+    where: name of a sample, such as ``samples[{}]``, for the error of an invalid one; empty: there is only one
+    """
+    for index, outcome in enumerate(outcomes):
+        if isinstance(outcome, RewardError):
+            try:
+                if where and isinstance(outcome, InvalidSampleError):
+                    raise outcome.inside(where.format(index)) from outcome
+                raise outcome
+            finally:
+                del outcomes[index], outcome  # an error that its own traceback holds would stay in memory
+    return cast("list[Result]", outcomes)
+
+
 def for_each(error: RewardError, count: int) -> list[Outcome]:
     """Return ``count`` copies of the error, since callers may raise them separately."""
     copies: list[Outcome] = []
+    error = error.with_traceback(None)
     for _ in range(count):
         one = copy(error)
         one.__cause__ = error

@@ -10,7 +10,7 @@ from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
-from rfm_client.contract.errors import ClientClosedError
+from rfm_client.contract.errors import ClientClosedError, clear_variables
 
 Returned = TypeVar("Returned")
 
@@ -52,8 +52,12 @@ class LoopThread:
         future = self.start(coroutine)
         try:
             return future.result()
+        except Exception as error:
+            clear_variables(error)
+            raise
         finally:
             future.cancel()  # after an interrupt; without effect on a finished future
+            del future  # it holds the error
 
     def stop(self, last: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Cancel all coroutines, run ``last``, and end the thread. Without effect in a fork, which lacks the thread."""

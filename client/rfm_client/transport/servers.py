@@ -32,6 +32,7 @@ from rfm_client.contract.errors import (
     ProcessEndedError,
     RewardError,
     ServerUnavailableError,
+    clear_variables,
 )
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.wire import Tensors
@@ -212,6 +213,7 @@ class Servers:
                 raise ClientClosedError("this client is closed")
             return await self._until_answered(model, request, deadline, first)
         except (asyncio.CancelledError, Exception) as error:
+            clear_variables(error)
             if self._is_closed and not _is_task_cancelled():  # connections that close raise errors of many classes
                 raise ClientClosedError("this client was closed during the call") from error
             if isinstance(error, OF_A_PORT) and not any(server.has_answered for server in self._servers):

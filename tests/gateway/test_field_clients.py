@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: MIT
+"""Public Robometer clients change their URL and nothing else."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+import goldens
+from field_clients import CHECKPOINT, CLIENTS, EVALUATIONS, REPORTS, FieldRequest, Scores
+from gateway_requests import (
+    FRAME_STEPS,
+    Ask,
+    answered,
+    ask_json,
+    check_refused,
+    expected,
+    filmed,
+    numbers,
+    of_frames,
+    preference,
+    progress,
+)
+from gateways import Gateway, running
+from paths import ROOT
+from rfm_gateway.blank_frames import LINE_EVERY_S, WarningLog
+from servers import Served
+from tolerances import TOLERANCE
+
+pytestmark = pytest.mark.triton
+
+PROBABILITY = goldens.config(CHECKPOINT).tolerances[1]
+
+
+@pytest.fixture(scope="module")
+def gateway(served: Served, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    with running(served.endpoints, tmp_path_factory.mktemp("gateway"), CHECKPOINT) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def changed(served: Served, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    """A gateway that scores by prefixes unless a request says otherwise, and refuses frames that show nothing."""
+    options = ("--use-frame-steps", "--refuse-blank", "--no-viewer")
+    with running(served.endpoints, tmp_path_factory.mktemp("changed"), CHECKPOINT, *options) as started:
+        yield started
+
+
+@pytest.mark.parametrize("request_", EVALUATIONS, ids=str)
+def test_a_recorded_request_gets_the_original_servers_numbers_and_those_of_the_python_client(
+    gateway: Gateway, request_: FieldRequest
+) -> None:
+    status, headers, body = request_.sent(gateway.url)
+    assert (status, headers["content-type"]) == (200, "application/json"), body
+    answer = json.loads(body, parse_constant=pytest.fail)
+    for path in request_.expected["keys"]:
+        outputs, key = path.split(".")
+        assert isinstance(answer[outputs][key], list)
+    scores = Scores.of(answer)
+    lengths = request_.expected["lengths"]
+    assert scores.lengths == (lengths, lengths, request_.expected["preferences"])
+    assert scores.difference(request_.original) <= PROBABILITY
+    steps = FRAME_STEPS if request_.expected["use_frame_steps"] else 0
+    alone = [Scores.of(expected(gateway, [sample], frame_steps=steps)) for sample in request_.samples()]
+    assert scores.difference(Scores.joined(alone)) <= TOLERANCE
+
+
+@pytest.mark.parametrize("request_", REPORTS, ids=str)
+def test_the_reports_that_clients_read_have_their_keys(gateway: Gateway, request_: FieldRequest) -> None:
+    status, _, body = request_.sent(gateway.url)
+    assert status == 200, body
+    assert set(request_.expected["keys"]) <= json.loads(body).keys()
+
+
+def test_the_table_of_differences_to_the_original_server_shows_none_between_a_server_and_itself(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    import original_differences
+
+    for name, there, here, difference in original_differences.rows(gateway.url, gateway.url):
+        assert there == here, name
+        assert not difference or float(difference) <= TOLERANCE, name
+    (row, *_) = original_differences.rows(gateway.url, None)
+    assert row[1:3] == ("200", "200")
+    assert float(row[3]) <= PROBABILITY
+
+
+NAMED = {str(request): request for request in EVALUATIONS}
+
+
+def test_a_request_that_does_not_say_is_scored_by_prefixes_where_the_gateway_has_that_default(changed: Gateway) -> None:
+    silent, saying_false = NAMED["rynnvalue_pirl.default"], NAMED["openpi_monitor.default"]
+    samples = silent.samples()
+    steps = Scores.of(expected(changed, samples, frame_steps=FRAME_STEPS))
+    assert steps.difference(silent.original) > 0.1  # as one pass
+    scores = Scores.of(json.loads(silent.sent(changed.url)[2]))
+    assert scores.difference(steps) <= TOLERANCE
+    scores = Scores.of(answered(ask_json(changed, samples, use_frame_steps=None)))
+    assert scores.difference(steps) <= TOLERANCE
+    scores = Scores.of(json.loads(saying_false.sent(changed.url)[2]))
+    assert scores.difference(saying_false.original) <= PROBABILITY
+
+
+FLOATS = (np.random.default_rng(0).random((6, 32, 32, 3)) * 1.2).clip(0, 1)
+CAST = FLOATS.astype(np.uint8)  # 0, and 1 where a float is 1, as some clients cast before they send
+TOLD = "black pictures, no value above 1 (multiply floats in 0..1 by 255 before they become uint8)"
+
+
+def test_floats_that_became_uint8_are_scored_with_a_warning_in_a_header_and_the_log(gateway: Gateway) -> None:
+    assert set(np.unique(CAST)) == {0, 1}
+    response = ask_json(gateway, [of_frames(CAST)])
+    assert answered(response) == numbers(expected(gateway, [of_frames(CAST)]))
+    warning = f"samples 0: {TOLD}: their scores mean nothing"
+    assert response.headers["X-RFM-Warning"] == warning
+    assert re.search(
+        rf" WARNING .* request=\S+: {re.escape(warning)}", gateway.log
+    )  # of this request or one just before
+
+
+def test_frames_that_show_nothing_are_refused_where_the_gateway_is_told_so(changed: Gateway, ask: Ask) -> None:
+    blank = filmed(1, 6) | {"frames": CAST}
+    response = ask(changed, [progress(filmed(1, 6)), preference(filmed(2, 2), blank), progress(blank)])
+    told = f"expected pictures that show something, got {TOLD}"
+    paths = (["samples", 1, "rejected_trajectory", "frames"], ["samples", 2, "trajectory", "frames"])
+    check_refused(response, *((path, re.escape(told)) for path in paths))
+
+
+def test_warnings_of_many_requests_are_one_line_in_ten_seconds(caplog: pytest.LogCaptureFixture) -> None:
+    now_s = 0.0
+    log = WarningLog(lambda: now_s)
+    with caplog.at_level(logging.WARNING, "rfm_gateway"):
+        for number in range(4):
+            log.write(f"black {number}")
+        now_s = LINE_EVERY_S
+        log.write("black 4")
+        now_s = 2 * LINE_EVERY_S
+        log.write("black 5")
+    counted = "black 4; 3 requests before had such samples, too"
+    assert [record.getMessage() for record in caplog.records] == ["black 0", counted, "black 5"]
+
+
+def test_the_guide_names_each_project_whose_requests_are_sent_and_the_longest_that_it_waits() -> None:
+    guide = (ROOT / "docs" / "guides" / "robometer_clients.md").read_text()
+    rows = {row.split(" | ")[0].removeprefix("| "): row for row in guide.splitlines() if row.startswith("| ")}
+    for client in CLIENTS.values():
+        if client["project"] != "unknown":
+            assert f"{client['timeout_s']} s" in rows[client["project"]]

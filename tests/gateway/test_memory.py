@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""What refused requests leave in memory: nothing, also before Python's collector of cycles runs."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from gateway_requests import FIRST, SECOND, TINY, Json, Triton, dumped, filmed, preference, progress
+from gateways import inside, poll
+from rfm_client import (
+    PreferenceSample,
+    ProgressSample,
+    RewardClient,
+    RewardError,
+    Sample,
+    Trajectory,
+)
+from rfm_gateway.schema import TrajectoryInput
+from servers import Endpoints
+
+pytestmark = pytest.mark.triton
+
+
+def held() -> int:
+    """How many objects with arrays there are."""
+    return sum(type(each) in (Trajectory, TrajectoryInput) for each in gc.get_objects())
+
+
+@contextmanager
+def without_collector() -> Iterator[int]:
+    """Yields how many objects with arrays there are at the beginning."""
+    gc.collect()
+    gc.disable()
+    try:
+        yield held()
+    finally:
+        gc.enable()
+
+
+TOO_LONG = {**FIRST, "video_embeddings": np.zeros((3, 2), np.float32) + 3e38}
+REFUSED: dict[str, tuple[list[Json], int]] = {
+    "by the gateway": ([progress(filmed(1, 2)), progress(FIRST)], 422),
+    "with another width": ([progress({**FIRST, "video_embeddings": np.ones((3, 7))}), progress(FIRST)], 422),
+    "at a field": ([progress(FIRST), progress({**FIRST, "text_embedding": [[1.0]]})], 422),
+    "by the model": ([progress(TOO_LONG), progress(FIRST), preference(TOO_LONG, SECOND)], 422),
+    "by the model, alone": ([progress(TOO_LONG)], 422),
+}
+
+
+@pytest.mark.parametrize(("samples", "code"), REFUSED.values(), ids=REFUSED)
+def test_a_refused_request_is_freed_at_once(triton: Triton, samples: list[Json], code: int) -> None:
+    body = dumped(samples)
+    with inside(triton=triton.endpoints.grpc_url, model=TINY) as client:
+        client.post("/evaluate_batch", content=dumped([progress(FIRST)]))
+        with without_collector() as before:
+            for _ in range(3):
+                assert client.post("/evaluate_batch", content=body).status_code == code
+            poll(lambda: held() == before)
+
+
+def test_a_request_that_no_triton_answers_is_freed_at_once() -> None:
+    with inside() as client, without_collector() as before:
+        for _ in range(3):
+            assert client.post("/evaluate_batch", content=dumped([progress(FIRST)])).status_code == 503
+        poll(lambda: held() == before)
+
+
+def questions() -> list[Sample]:
+    bad, good = (
+        Trajectory(video_embeddings=np.full((3, 2), value, np.float32), text_embedding=np.ones(2, np.float32))
+        for value in (3e38, 1.0)
+    )
+    return [ProgressSample(bad), ProgressSample(good), PreferenceSample(good, bad)]
+
+
+def both_orders(client: RewardClient) -> None:
+    *_, pair = questions()
+    client.preference(*pair.trajectories, both_orders=True)
+
+
+CALLS: dict[str, Callable[[RewardClient], object]] = {
+    "one sample": lambda client: client.progress(questions()[0].trajectories[0]),
+    "several samples": lambda client: client.evaluate(questions()),
+    "both orders": both_orders,
+    "fitted": lambda client: client.evaluate(questions(), subsample=True),
+}
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+@pytest.mark.parametrize("is_there", [True, False], ids=["refused", "no Triton"])
+def test_an_error_of_the_client_is_freed_with_its_arrays(
+    triton: Triton, call: Callable[[RewardClient], object], is_there: bool
+) -> None:
+    url = triton.endpoints.grpc_url if is_there else Endpoints.free().grpc_url
+    with RewardClient(url, model=TINY, retry=False, timeout_s=30) as client, without_collector() as before:
+        for _ in range(3):
+            with pytest.raises(RewardError):
+                call(client)
+        poll(lambda: held() == before)
+
+
+def test_errors_that_are_returned_keep_no_arrays(triton: Triton) -> None:
+    with RewardClient(triton.endpoints.grpc_url, model=TINY) as client, without_collector() as before:
+        errors = client.evaluate(questions(), return_errors=True)
+        poll(lambda: held() == before)
+        assert [type(each).__name__ for each in errors] == [
+            "InvalidSampleError",
+            "ProgressResult",
+            "InvalidSampleError",
+        ]
