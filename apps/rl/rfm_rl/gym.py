@@ -12,8 +12,9 @@ requests its own only if fewer than ``max_pending`` steps have open requests. Th
 last step waits, too, and cancels older requests; without ``blocking``, ``await_last=False`` leaves it unscored.
 
 ``info["reward_model"]`` has ``progress`` and ``success`` of the newest known score (success is NaN if the checkpoint
-does not predict it), its ``step``, its ``lag`` in steps, and the steps ``skipped`` in this episode. With
-``terminate_on_success`` or ``success_bonus`` it has ``succeeded``; after a step, ``env_reward``.
+does not predict it), its ``step``, its ``lag`` in steps, the steps ``skipped`` in this episode, and the other scores
+that the checkpoint gives unasked (``StepScore.more_scores``). With ``terminate_on_success`` or ``success_bonus`` it has
+``succeeded``; after a step, ``env_reward``.
 
 ``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
 frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises

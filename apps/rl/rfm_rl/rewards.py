@@ -245,7 +245,7 @@ class RewardedEpisode:
         """Return the newest known scores, and their lag in steps."""
         known = self.known or StepScore(np.nan, np.nan, False, -1, np.nan)
         told = {"progress": known.progress, "success": known.success, "step": known.step}
-        told |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped}
+        told |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped, **known.more_scores}
         return told if self._options.success_rule is None else told | {"succeeded": self._has_succeeded}
 
 

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol, TypedDict
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +29,8 @@ class StepScore:
     succeeded: True if the success rule holds; False where success is NaN
     step: index of the scored frame in the episode, from 0
     ms: milliseconds to the answer, without the wait for an open ``add_nowait`` request
-    unclear: True if a camera's written answer states no single whole score (RoboReward only)
+    more_scores: the frame's other scores that the checkpoint gives unasked, by name in ``FRAME_SCORES``: marks as bool,
+        numbers as float. Of several cameras, numbers are fused, and a mark is True if one camera has it
     """
 
     progress: float
@@ -37,7 +38,12 @@ class StepScore:
     succeeded: bool
     step: int
     ms: float
-    unclear: bool = False
+    more_scores: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+    @property
+    def unclear(self) -> bool:
+        """True if a camera's written answer states no single whole score (RoboReward only)."""
+        return bool(self.more_scores.get("unclear"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +54,7 @@ class StepScores:
     succeeded: bool [N]; False where ``mask`` left an episode out, or success is NaN
     step: int64 [N], number of each newest frame, from 0; -1: none yet
     ms: time to the answer, milliseconds
-    unclear: bool [N], as in StepScore
+    more_scores: by name an array [N], as in StepScore: bool for marks, else float32 with NaN where there is none
     """
 
     progress: Float32Array
@@ -56,13 +62,18 @@ class StepScores:
     succeeded: npt.NDArray[np.bool_]
     step: npt.NDArray[np.int64]
     ms: float
-    unclear: npt.NDArray[np.bool_]
+    more_scores: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+
+    @property
+    def unclear(self) -> npt.NDArray[np.bool_]:
+        """bool [N], as in StepScore."""
+        return self.more_scores.get("unclear", np.zeros(len(self.progress), bool))
 
     def of(self, index: int) -> StepScore:
         """Return the score of one episode."""
         numbers = float(self.progress[index]), float(self.success[index])
-        succeeded, unclear = bool(self.succeeded[index]), bool(self.unclear[index])
-        return StepScore(*numbers, succeeded, int(self.step[index]), self.ms, unclear)
+        more = {name: values[index].item() for name, values in self.more_scores.items()}
+        return StepScore(*numbers, bool(self.succeeded[index]), int(self.step[index]), self.ms, more)
 
 
 @dataclass(frozen=True)
