@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, TypeAlias, get_args
@@ -12,10 +12,8 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from rfm_client import InvalidSampleError, RewardClient, UInt8Array
-from rfm_client.episodes import Episode, EpisodeOptions, StepScore, SuccessRule
-from rfm_client.frames import ChannelOrder, Fuse, Orientation, Rule
+from rfm_client.episodes import Episode, EpisodeOptions, FrameOptions, StepScore, SuccessRule
 from rfm_client.options import checked_count, checked_finite, require
-from rfm_rl.live import LiveView
 
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
@@ -37,7 +35,7 @@ logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RewardOptions:
+class RewardOptions(FrameOptions):
     """How to score an episode, and to make rewards of progress. Raises ValueError for contradictory options.
 
     mode: ``absolute``: the reward is the newest known progress. ``delta``: its change since the step before, so that an
@@ -60,7 +58,7 @@ class RewardOptions:
         observation to its frame; None: ``render()``
     cameras: keys of the frames to score and fuse, in the observation or the result of ``frames_from``; empty: a single
         camera without a name
-    sampling, fuse, orient, channels, resize, live: as in ``rfm_client.episodes.EpisodeOptions``; rendered frames are
+    sampling, fuse, orient, channels, resize, live: as in ``rfm_client.episodes.FrameOptions``; rendered frames are
         changed alike
     max_frames: ``frames`` of EpisodeOptions: the rule's number of frames
     blocking: True: a step waits for its score
@@ -77,17 +75,10 @@ class RewardOptions:
     every: int = 1
     terminate_on_success: SuccessRule | None = None
     frames_from: str | Callable[[Any], UInt8Array | Mapping[str, UInt8Array]] | None = None
-    cameras: Sequence[str] = ()
-    fuse: Fuse = "mean"
-    orient: Orientation | Mapping[str, Orientation] = "none"
-    channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
-    sampling: Rule | None = None
-    resize: bool = False
     max_frames: int | None = None
     blocking: bool = True
     max_pending: int = 4
     await_last: bool = True
-    live: LiveView | None = None
 
     def __post_init__(self) -> None:
         require("mode", self.mode in get_args(Mode), f"one of {', '.join(get_args(Mode))}", repr(self.mode))
@@ -111,13 +102,14 @@ class RewardOptions:
         for name in ("every", "max_pending", "max_frames"):
             if getattr(self, name) is not None:
                 checked_count(name, getattr(self, name))
-        object.__setattr__(self, "cameras", EpisodeOptions(**self.scoring).cameras)
+        super().__post_init__()
+        EpisodeOptions(**self.scoring)  # raises ValueError
 
     @property
     def scoring(self) -> dict[str, Any]:
         """The arguments of ``client.episode`` for its steps."""
-        own = {"frames": self.max_frames, "success": self.success_rule or SuccessRule(), "timeout_s": None}
-        return {each.name: getattr(self, each.name) for each in fields(EpisodeOptions) if each.name not in own} | own
+        of_frames = {each.name: getattr(self, each.name) for each in fields(FrameOptions)}
+        return {**of_frames, "frames": self.max_frames, "success": self.success_rule or SuccessRule()}
 
     @property
     def success_rule(self) -> SuccessRule | None:

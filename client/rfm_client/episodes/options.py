@@ -127,12 +127,10 @@ class StepKeywords(TypedDict, total=False):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EpisodeOptions:
-    """How each step of an episode is scored. Raises ValueError for contradictory options.
+class FrameOptions:
+    """How the frames of an episode are read. Raises ValueError for contradictory options.
 
     sampling: a rule of ``rfm_client.frames.sampling``; None: the rule of the checkpoint's training
-    frames: the rule's number of frames; None: the rule's own if fixed, else ``ModelInfo.max_frames``. If the rule needs
-        a number and the checkpoint has none, the first step raises ValueError
     cameras: names of the cameras with a frame in each step; empty: a single camera without a name
     fuse: how to combine the scores of several cameras
     orient: rotation or flip that makes frames upright, applied first: an Orientation, or a dict by camera; cameras that
@@ -140,21 +138,16 @@ class EpisodeOptions:
     channels: order of the colours in the given frames, ``rgb`` or ``bgr``: one for all cameras, or a dict by camera
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
-    success: rule of a step's success
     live: view to which each step is reported, with the first camera's frame; it delays no step
-    timeout_s: longest time of a step, retries included; None: the client's
     """
 
     sampling: Rule | None = None
-    frames: int | None = None
     cameras: Sequence[str] = ()
     fuse: Fuse = "mean"
     orient: Orientation | Mapping[str, Orientation] = "none"
     channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
     resize: bool = False
-    success: SuccessRule = SuccessRule()
     live: StepView | None = None
-    timeout_s: float | None = None
 
     def __post_init__(self) -> None:
         require("cameras", not isinstance(self.cameras, str), "a sequence of names", repr(self.cameras))
@@ -162,7 +155,6 @@ class EpisodeOptions:
         is_each_once = len(set(self.cameras)) == len(self.cameras)
         require("cameras", is_each_once, "names that differ", list(self.cameras))
         require("fuse", self.fuse in FUSES, f"one of {', '.join(FUSES)}", repr(self.fuse))
-        Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one for all frames, as cameras names none"
         for name, given in (("orient", self.orient), ("channels", self.channels)):
@@ -174,6 +166,25 @@ class EpisodeOptions:
     def corrections(self) -> list[Correction]:
         """Correction of each camera's frames, in the order of the cameras."""
         return [Correction.of(camera, self.orient, self.channels) for camera in self.cameras or ("",)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeOptions(FrameOptions):
+    """How each step of an episode is scored. Raises ValueError for contradictory options.
+
+    frames: the rule's number of frames; None: the rule's own if fixed, else ``ModelInfo.max_frames``. If the rule needs
+        a number and the checkpoint has none, the first step raises ValueError
+    success: rule of a step's success
+    timeout_s: longest time of a step, retries included; None: the client's
+    """
+
+    frames: int | None = None
+    success: SuccessRule = SuccessRule()
+    timeout_s: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
 
     def sampling_for(self, info: ModelInfo) -> Sampling:
         """Return the rule with its number of frames for a checkpoint.
