@@ -38,7 +38,7 @@ import gymnasium
 from gymnasium.error import ResetNeeded
 
 from rfm_client import InvalidSampleError
-from rfm_client.options import require
+from rfm_client.options import InvalidValueError, require
 from rfm_rl.own_rewards import (
     RETURNS,
     WritingMonitor,
@@ -221,9 +221,10 @@ def check_frame_source(options: RewardOptions, render_mode: str | None, space: g
     """Raise ValueError if the options name a source of frames that the environment lacks."""
     if options.renders and render_mode != "rgb_array":
         expected = "'rgb_array', since frames come from render() unless frames_from or cameras say otherwise"
-        raise ValueError(f"render_mode: expected {expected}, got {render_mode!r}")
+        raise InvalidValueError.at("render_mode", expected, repr(render_mode))
     keys = list(space.keys()) if isinstance(space, gymnasium.spaces.Dict) else []
-    if isinstance(options.frames_from, str) and options.frames_from not in keys:
-        raise ValueError(f"frames_from: expected a key of the observation {keys}, got {options.frames_from!r}")
-    if options.frames_from is None and not set(options.cameras) <= set(keys):
-        raise ValueError(f"cameras: expected keys of the observation {keys}, got {list(options.cameras)}")
+    source, cameras = options.frames_from, list(options.cameras)
+    is_key = not isinstance(source, str) or source in keys
+    require("frames_from", is_key, f"a key of the observation {keys}", repr(source))
+    are_keys = source is not None or set(cameras) <= set(keys)
+    require("cameras", are_keys, f"keys of the observation {keys}", cameras)

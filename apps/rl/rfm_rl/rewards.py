@@ -13,7 +13,7 @@ import numpy as np
 
 from rfm_client import InvalidSampleError, RewardClient, UInt8Array
 from rfm_client.episodes import Episode, EpisodeOptions, FrameOptions, StepScore, SuccessRule
-from rfm_client.options import checked_count, checked_finite, require
+from rfm_client.options import InvalidValueError, checked_count, checked_finite, require
 
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
@@ -207,7 +207,7 @@ class RewardedEpisode:
         if rule is not None and np.isnan(score.success):
             name, none = ("success_bonus", "0") if ending is None else ("terminate_on_success", "None")
             expected = f"{none} with a checkpoint that does not predict success"
-            raise ValueError(f"{name}: expected {expected}, got {getattr(self._options, name)}")
+            raise InvalidValueError.at(name, expected, getattr(self._options, name))
         if self.known is None:
             self._paid_progress = score.progress
         score = replace(score, succeeded=score.succeeded and score.step > 0)  # a reset is no success
@@ -269,7 +269,7 @@ class Rewarder:
         self._has_dropped = not self._has_dropped  # a third reset may go on
         if not self._has_dropped and self._options.mode == "final":
             expected = "the end of an episode before it, where mode 'final' pays"
-            raise ValueError(f"{where}: expected {expected}, got {got}, for the second time in a row; {_INSIDE}")
+            raise InvalidValueError.at(where, expected, f"{got}, for the second time in a row", _INSIDE)
         if not self._has_warned:
             self._has_warned = True
             logger.warning("%s: expected the end of the episode before it, got %s; %s", where, got, _INSIDE)
