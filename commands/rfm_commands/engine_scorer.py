@@ -90,17 +90,15 @@ def _facts(
     description = checkpoint.description
     name, _, tag = source.partition("@")
     is_local = Path(source).is_dir()
-    return CheckpointFacts(
+    return CheckpointFacts.of(
+        description,
         source="/".join(Path(source).resolve().parts[-2:]) if is_local else name,
         revision=None if is_local else tag or None,
         weights_digest=weights_digest(folders),
         settings_digest=_settings_digest(checkpoint, encoders, folders, told),
-        max_frames=description.max_frames,
         frame_size=description.frame_size if encoders is None else encoders.description.frame_size,
         encodes=encoders is not None,
         is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
-        trained_padding=description.trained_padding,
-        needs_whole_episode=description.needs_whole_episode,
         weights=getattr(checkpoint.config, "weights", None),
     )
 

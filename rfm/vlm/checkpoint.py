@@ -6,7 +6,6 @@ A table of renames for each form turns the names of weights into those of VlmRew
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from rfm.checkpoint.content import (
@@ -25,13 +23,12 @@ from rfm.checkpoint.content import (
     expecting,
     is_there,
     read_json,
-    shown,
 )
 from rfm.checkpoint.provenance import Decision
 from rfm.checkpoint.run_config import check_progress
-from rfm.checkpoint.weights import check_shapes, has_head, read_weights
+from rfm.checkpoint.weights import has_head, read_weights
 from rfm.engine.feature_cache import FeatureCache
-from rfm.family import NETWORK, Options, config_fields
+from rfm.family import NETWORK, Options
 from rfm.vlm.backbone import (
     BACKBONES,
     LORA_INSIDE,
@@ -52,7 +49,6 @@ from rfm.vlm.lora import (
     changed_by,
     check_inside,
     has_adapter,
-    merged,
     split,
 )
 from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
@@ -65,26 +61,17 @@ from rfm.vlm.processor import (
     is_published,
     load_collator,
     of_processor,
-    save_processor,
 )
 from rfm.vlm.prompts import OF_AN_OLD_RUN
-from rfm.vlm.rounded import fit
+from rfm.vlm.qwen_checkpoint import LORA, SETTINGS, QwenCheckpoint
 from rfm.vlm.rounding import FLAG, decision, kind_of, read_published, read_unrounded_config, round_layers
 from rfm.vlm.run_config import RunConfig, base_of_adapter, decisions_of
 from rfm.vlm.video_prompt import decided
-from rfm.vlm.work import flop
-from rfm_client.contract import Sample
 from rfm_client.contract.description import Description
-
-LORA = "lora"  # key in VlmCheckpoint.parts: the factors that change the network's weights
-SETTINGS = "rfm"  # key in an exported config.json: this project's fields
-
-_LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
-MAX_LAYERS = 1024
 
 
 @dataclass(frozen=True)
-class VlmCheckpoint:
+class VlmCheckpoint(QwenCheckpoint):
     """A vision-language checkpoint in memory.
 
     weights: of VlmRewardModel, without LoRA
@@ -95,7 +82,6 @@ class VlmCheckpoint:
     """
 
     config: VlmConfig
-    weights: dict[str, Tensor]
     factors: dict[str, Tensor]
     processor: Path | None = None
     base_model: str | None = None
@@ -164,59 +150,15 @@ class VlmCheckpoint:
             check_published(collator, self.base_model)
         return collator
 
-    def flop(self, sample: Sample) -> float:
-        """Return the operations of a sample's products. Raises CheckpointError, InvalidSampleError."""
-        return flop(self.config, self.collator, sample)
-
-    def encoders(self) -> None:
-        """Return None: the network reads raw frames and needs no encoders."""
-
-    def predictor(
-        self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
-    ) -> VlmPredictor:
-        """Return a predictor with the network on ``device``. Raises CheckpointError.
-
-        dtype: of the network; None: float32 on the CPU, else the checkpoint's own
-        cache: for features of frames; None: no cache
-        """
-        if dtype is None and device.type == "cpu":
-            dtype = torch.float32
-        collator = self.collator  # first, so that a missing file is reported before the network is built
-        return VlmPredictor(self.build(dtype), collator, device, cache)
-
-    def save(self, folder: Path) -> None:
-        """Write weights and LoRA factors, a config.json with all settings, and the processor."""
-        collator = self.collator  # first, so that a missing file is reported before the weights are written
-        folder.mkdir(parents=True)
-        settings = {name: value for name, value in config_fields(self.config).items() if name != "backbone"}
-        config = {**self.config.backbone, SETTINGS: settings}
-        (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
-        tensors = {name: tensor.contiguous() for name, tensor in (self.weights | self.factors).items()}
-        save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
-        save_processor(collator, folder / PROCESSOR_FOLDER)
-
-    def build(self, dtype: torch.dtype | None = None) -> VlmRewardModel:
-        """Return the network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own).
-
-        Raises CheckpointError.
-        """
-        wanted = dtype or self.config.torch_dtype
-        network = self._network(wanted)
-        fit(network, self.weights, self.factors)
-        # Parameters only: rotary frequencies stay float32, as upstream.
-        network.load_state_dict(merged(self.weights, self.factors, wanted), strict=True, assign=True)
-        return network.eval().requires_grad_(False)
-
-    def check(self) -> None:
-        """Raise CheckpointError unless the weights fit the network, before memory is allocated for it."""
-        _check_layers(self.config.backbone)
-        with expecting("a backbone that transformers can make", NETWORK_CONFIG), torch.device("meta"):
-            network = self._network(self.config.torch_dtype)
-        fit(network, self.weights)
-        check_shapes(network.state_dict(), self.weights)
-
-    def _network(self, dtype: torch.dtype) -> VlmRewardModel:
+    def network(self, dtype: torch.dtype) -> VlmRewardModel:
+        """Return the network, with weights of no use."""
         return VlmRewardModel(self.config, build_backbone(self.config, dtype))
+
+    def make_predictor(
+        self, network: VlmRewardModel, device: torch.device, cache: FeatureCache[Any] | None
+    ) -> VlmPredictor:
+        """Return the predictor with this network."""
+        return VlmPredictor(network, self.collator, device, cache)
 
 
 def reads(folder: Path) -> bool:
@@ -357,13 +299,3 @@ def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tupl
     weights, factors = split(tensors, scaling)
     weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
-
-
-def _check_layers(config: Any) -> None:
-    inner = config.values() if isinstance(config, dict) else config if isinstance(config, list) else ()
-    for part in inner:
-        _check_layers(part)
-    for name in _LAYER_COUNTS if isinstance(config, dict) else ():
-        count = config.get(name)
-        if isinstance(count, (int, float)) and count > MAX_LAYERS:
-            raise CheckpointError.at(f"{NETWORK_CONFIG}: {name}", f"at most {MAX_LAYERS}", shown(count))

@@ -6,7 +6,6 @@ B conversations of L tokens, D width, V rows of the language head, Q queries: to
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -15,17 +14,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS, CheckpointError, expecting
+from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError
 from rfm.checkpoint.provenance import Decision, source_name
-from rfm.checkpoint.weights import check_shapes
-from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.graphs import Graphs
 from rfm.engine.pixels import Normalisation
 from rfm.engine.predictor import check_type
-from rfm.family import NETWORK, config_fields
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import (
     VIDEO_PAD,
@@ -37,19 +32,16 @@ from rfm.vlm.collator import (
     video_of,
 )
 from rfm.vlm.images import MERGE, QwenImages
-from rfm.vlm.lora import merged
 from rfm.vlm.network import BackboneConfig, build_backbone, qwen_states
-from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.preprocessor import SIZED_BY_PROCESSOR, normalisation_of, patch_px
-from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, read_processor, save_processor
+from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, read_processor
 from rfm.vlm.qwen import Box, KeyValues, positions
-from rfm.vlm.rounded import fit
+from rfm.vlm.qwen_checkpoint import QwenCheckpoint
 from rfm.vlm.row import VlmRow
 from rfm.vlm.video import Indices, VlmVideo
-from rfm.vlm.work import flop
 from rfm_client.contract import ProgressSample, Sample
 
-SETTINGS, REWARD_MODEL = "rfm", "reward_model"  # keys in an exported config.json
+REWARD_MODEL = "reward_model"  # key of SETTINGS in an exported config.json
 VIDEO = VISION_START + VIDEO_PAD + VISION_END  # a video, or a temporal patch, in the text of a prompt
 HEAD, EMBEDDING = "lm_head.weight", "model.language_model.embed_tokens.weight"
 MOST_PIECES = 4096  # cached texts of a prompt and of times
@@ -161,7 +153,7 @@ class LanguageCollator(VlmCollator):
 
 
 @dataclass(frozen=True)
-class LanguageCheckpoint:
+class LanguageCheckpoint(QwenCheckpoint):
     """A Qwen3-VL in memory that is asked in words.
 
     weights: of LanguageNetwork; the head's only if it is not tied to the embedding
@@ -169,15 +161,8 @@ class LanguageCheckpoint:
     settings: the source of each setting of the configuration
     """
 
-    config: Any
-    weights: dict[str, Tensor]
     processor: str | Path
     settings: tuple[Decision, ...] = ()
-
-    @property
-    def parts(self) -> dict[str, dict[str, Tensor]]:
-        """All weights of the network."""
-        return {NETWORK: self.weights}
 
     @property
     def notes(self) -> list[str]:
@@ -192,13 +177,6 @@ class LanguageCheckpoint:
         read = [Decision(fact, value, name) for fact, value in images.items() if fact != "patch_size"]
         patch = Decision("patch_size", images["patch_size"], f"{NETWORK_CONFIG}: vision_config")
         return [*self.settings, Decision("prompt", self.collator.example(), name), patch, *read]
-
-    def flop(self, sample: Sample) -> float:
-        """Return the operations of a sample's products. Raises CheckpointError, InvalidSampleError."""
-        return flop(self.config, self.collator, sample)
-
-    def encoders(self) -> None:
-        """Return None: the network reads raw frames and needs no encoders."""
 
     @cached_property
     def collator(self) -> LanguageCollator:
@@ -216,61 +194,29 @@ class LanguageCheckpoint:
         collator.check_template()
         return collator
 
+    def network(self, dtype: torch.dtype) -> LanguageNetwork:
+        """Return the network, with weights of no use."""
+        return LanguageNetwork(self.config, build_backbone(self.config, dtype))
+
+    def loaded(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the weights with the embedding as the language head, if the head is tied to it."""
+        tied = {} if HEAD in weights or EMBEDDING not in weights else {HEAD: weights[EMBEDDING]}
+        return {**weights, **tied}
+
+    def saved_settings(self) -> dict[str, Any]:
+        """Return this project's fields of an exported config.json."""
+        return {REWARD_MODEL: self.config.reward_model, **super().saved_settings()}
+
+    def build(self, dtype: torch.dtype | None = None) -> LanguageNetwork:
+        """Return the network with these weights, on the CPU, in ``dtype`` (None: its own). Raises CheckpointError."""
+        network: LanguageNetwork = super().build(dtype)
+        if HEAD not in self.weights:
+            network.lm_head.weight = network.model.language_model.embed_tokens.weight
+        return network
+
     def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> LanguageCollator:
         """Return the collator with this tokenizer and preprocessing."""
         raise NotImplementedError
-
-    def make_predictor(
-        self, network: LanguageNetwork, device: torch.device, cache: FeatureCache[Any] | None
-    ) -> VlmPredictor:
-        """Return the predictor with this network."""
-        raise NotImplementedError
-
-    def predictor(
-        self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
-    ) -> VlmPredictor:
-        """Return a predictor with the network on ``device``. Raises CheckpointError.
-
-        dtype: of the network; None: float32 on the CPU, else that of the configuration
-        cache: for features of frames; None: no cache
-        """
-        self.collator  # noqa: B018  first, so that a missing file is reported before the network is built
-        if dtype is None:
-            dtype = torch.float32 if device.type == "cpu" else self.config.torch_dtype
-        return self.make_predictor(self.build(dtype), device, cache)
-
-    def save(self, folder: Path) -> None:
-        """Write the weights, a config.json with all settings, and the processor."""
-        collator = self.collator  # first, so that a missing file is reported before the weights are written
-        folder.mkdir(parents=True)
-        settings = {name: value for name, value in config_fields(self.config).items() if name != "backbone"}
-        config = {**self.config.backbone, SETTINGS: {REWARD_MODEL: self.config.reward_model, **settings}}
-        (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
-        save_file({name: t.contiguous() for name, t in self.weights.items()}, folder / WEIGHTS, {"format": "pt"})
-        save_processor(collator, folder / PROCESSOR_FOLDER)
-
-    def build(self, dtype: torch.dtype) -> LanguageNetwork:
-        """Return the network with these weights, on the CPU, in ``dtype``."""
-        network = LanguageNetwork(self.config, build_backbone(self.config, dtype))
-        fit(network, self.weights)
-        weights = merged(self.weights, {}, dtype)
-        network.load_state_dict(_with_head(weights), strict=True, assign=True)
-        if HEAD not in weights:
-            network.lm_head.weight = network.model.language_model.embed_tokens.weight
-        return network.eval().requires_grad_(False)
-
-    def check(self) -> None:
-        """Raise CheckpointError unless the weights fit the network, before memory is allocated for it."""
-        with expecting("a backbone that transformers can make", NETWORK_CONFIG), torch.device("meta"):
-            network = LanguageNetwork(self.config, build_backbone(self.config, torch.float32))
-        fit(network, self.weights)
-        check_shapes(network.state_dict(), _with_head(self.weights))
-
-
-def _with_head(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the weights with the embedding as the language head, if the head is tied to it."""
-    tied = {} if HEAD in weights or EMBEDDING not in weights else {HEAD: weights[EMBEDDING]}
-    return {**weights, **tied}
 
 
 def processor_name(processor: str | Path) -> str:

@@ -17,8 +17,9 @@ from rfm.checkpoint.weights import read_weights
 from rfm.family import Options, Weights
 from rfm.vlm.backbone import QWEN_NAMES, Renames, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
-from rfm.vlm.language import EMBEDDING, HEAD, REWARD_MODEL, SETTINGS, LanguageConfig
+from rfm.vlm.language import EMBEDDING, HEAD, REWARD_MODEL, LanguageConfig
 from rfm.vlm.processor import PROCESSOR_FOLDER
+from rfm.vlm.qwen_checkpoint import SETTINGS
 from rfm.vlm.rounding import FLAG, decision, kind_of, read_published, read_unrounded_config, round_layers
 from rfm.vlm.run_config import DTYPES
 from rfm.vlm.video_prompt import WRAPPED, decided

@@ -18,6 +18,7 @@ import pytest
 from engines import load_engine
 from mixtures import FRAMES_MODEL, MODEL, assert_same, mixed_samples, plug
 from rfm_client import (
+    FRAME_SCORES,
     AsyncRewardClient,
     DeadlineExceededError,
     InvalidSampleError,
@@ -352,6 +353,21 @@ def test_a_model_without_a_description_is_scored() -> None:
     shelf.lacks_description = True
     with RewardClient("", transports=[shelf]) as client:
         assert client.progress(filmed(2)).unclear is None
+
+
+def test_a_step_has_each_score_that_the_checkpoint_gives_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(FRAME_SCORES, "log_prob", replace(FRAME_SCORES["log_prob"], asked="if given"))  # type: ignore[arg-type]
+    names = [name for name, score in FRAME_SCORES.items() if score.asked == "if given"]
+    shelf = Described(has_encoder=False)
+    shelf.more = {"more_scores": tuple(names)}
+    (frame,) = filmed(1).positions
+    with RewardClient("", transports=[shelf]) as client:
+        step = client.episode("stack", cameras=("front", "wrist")).add({"front": frame, "wrist": frame})
+        steps = client.episodes(2, "stack").add([frame, frame], mask=[False, True])
+    assert step.more_scores == steps.of(1).more_scores == {"log_prob": pytest.approx(0.1), "unclear": True}
+    assert names == [*step.more_scores]
+    np.testing.assert_allclose(steps.more_scores["log_prob"], [np.nan, 0.1])
+    assert steps.unclear.tolist() == [False, True]
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ import goldens
 import rfm_export
 from engines import serve_config
 from in_process import rfm
+from reward_models import ROOT
 from rfm import families
 from rfm.checkpoint.content import MAX_HEADER_BYTES, MAX_JSON_BYTES, CheckpointError
 from rfm.plain_yaml import MAX_YAML_BYTES
@@ -32,6 +33,7 @@ from spoilt import WEIGHTS, Spoil, copied, files_in, settings, text, text_settin
 REWIND = goldens.config("legacy_keys_l2")
 VLM = goldens.config("q25_mean_l2")
 ADAPTER = goldens.config("q25_peft_adapter_disc10")
+ROBOREWARD = ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint"
 
 LONGEST_S = 30
 MOST_MEMORY_BYTES = 512 * 2**20  # above the process's peak
@@ -206,6 +208,14 @@ def test_a_hostile_vision_language_checkpoint_is_refused(tmp_path: Path, spoil: 
     spoil(folder)
     (tmp_path / "model_repository").mkdir()
     refused(folder, tmp_path / "model_repository", message, "--base-model", VLM.sources["base_model"])
+
+
+def test_a_language_model_with_layers_without_end_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "checkpoint"
+    shutil.copytree(ROBOREWARD, folder)
+    text_settings(num_hidden_layers=10**9)(folder)
+    with pytest.raises(CheckpointError, match=r"num_hidden_layers: expected at most 1024, got 1000000000"):
+        families.load(str(folder), reward_model="roboreward")
 
 
 def test_lora_factors_whose_product_would_be_huge_are_refused(tmp_path: Path) -> None:

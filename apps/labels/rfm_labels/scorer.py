@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol, cast
 
 from rfm_client import (
@@ -25,19 +25,12 @@ DECISIVE = ("weights_digest", "settings_digest", "computation")  # equal if scor
 
 @dataclass(frozen=True)
 class CheckpointFacts:
-    """A checkpoint's origin, causes of its scores, and limits.
+    """A checkpoint's origin, causes of its scores, and limits. Other fields: as in ``rfm_client.ModelInfo``.
 
-    source, revision: origin; None: unknown
     weights_digest: of the weights
     settings_digest: of all else that decides the scores: configuration, encoders, dtype, device
-    computation: number type, PyTorch version and attention kernel; None: unknown
-    max_frames: most frames of a trajectory, in training or for the network, the smaller number; None: both unknown
-    frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
     encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
     is_causal: True if no frame's score depends on later frames
-    trained_padding: True if training padded shorter trajectories, or if unknown
-    needs_whole_episode: True if scores are relative to the whole episode
-    weights: form of rounded weights, whose scores are not the full checkpoint's; None: not rounded
     """
 
     source: str | None
@@ -52,6 +45,12 @@ class CheckpointFacts:
     needs_whole_episode: bool = False
     computation: str | None = None
     weights: str | None = None
+
+    @classmethod
+    def of(cls, described: object, **own: Any) -> CheckpointFacts:
+        """Return the facts of a description, such as a ModelInfo. own: fields that differ from it, or that it lacks"""
+        names = [each.name for each in fields(cls) if each.name not in own]
+        return cls(**own, **{name: getattr(described, name) for name in names})
 
     def document(self) -> dict[str, Any]:
         """Return the facts for the provenance."""
@@ -93,19 +92,11 @@ class ClientScorer:
             )
         embedded = infos["embeddings"][0] if "embeddings" in infos else None
         network = info.network if embedded is None else embedded.network
-        return CheckpointFacts(
-            source=info.source,
-            revision=info.revision,
-            weights_digest=info.weights_digest,
+        return CheckpointFacts.of(
+            info,
             settings_digest=digest_of(str(each).encode() for each in digests),
-            max_frames=info.max_frames,
-            frame_size=info.frame_size,
             encodes=embedded is not None,
             is_causal=network.get("config", {}).get("causal_mask") is True,
-            trained_padding=info.trained_padding,
-            needs_whole_episode=info.needs_whole_episode,
-            computation=info.computation,
-            weights=info.weights,
         )
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:

@@ -12,8 +12,9 @@ requests its own only if fewer than ``max_pending`` steps have open requests. Th
 last step waits, too, and cancels older requests; without ``blocking``, ``await_last=False`` leaves it unscored.
 
 ``info["reward_model"]`` has ``progress`` and ``success`` of the newest known score (success is NaN if the checkpoint
-does not predict it), its ``step``, its ``lag`` in steps, and the steps ``skipped`` in this episode. With
-``terminate_on_success`` or ``success_bonus`` it has ``succeeded``; after a step, ``env_reward``.
+does not predict it), its ``step``, its ``lag`` in steps, the steps ``skipped`` in this episode, and the other scores
+that the checkpoint gives unasked (``StepScore.more_scores``). With ``terminate_on_success`` or ``success_bonus`` it has
+``succeeded``; after a step, ``env_reward``.
 
 ``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
 frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
@@ -37,7 +38,7 @@ import gymnasium
 from gymnasium.error import ResetNeeded
 
 from rfm_client import InvalidSampleError
-from rfm_client.options import require
+from rfm_client.options import InvalidValueError, require
 from rfm_rl.own_rewards import (
     RETURNS,
     WritingMonitor,
@@ -220,9 +221,10 @@ def check_frame_source(options: RewardOptions, render_mode: str | None, space: g
     """Raise ValueError if the options name a source of frames that the environment lacks."""
     if options.renders and render_mode != "rgb_array":
         expected = "'rgb_array', since frames come from render() unless frames_from or cameras say otherwise"
-        raise ValueError(f"render_mode: expected {expected}, got {render_mode!r}")
+        raise InvalidValueError.at("render_mode", expected, repr(render_mode))
     keys = list(space.keys()) if isinstance(space, gymnasium.spaces.Dict) else []
-    if isinstance(options.frames_from, str) and options.frames_from not in keys:
-        raise ValueError(f"frames_from: expected a key of the observation {keys}, got {options.frames_from!r}")
-    if options.frames_from is None and not set(options.cameras) <= set(keys):
-        raise ValueError(f"cameras: expected keys of the observation {keys}, got {list(options.cameras)}")
+    source, cameras = options.frames_from, list(options.cameras)
+    is_key = not isinstance(source, str) or source in keys
+    require("frames_from", is_key, f"a key of the observation {keys}", repr(source))
+    are_keys = source is not None or set(cameras) <= set(keys)
+    require("cameras", are_keys, f"keys of the observation {keys}", cameras)

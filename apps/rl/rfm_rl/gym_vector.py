@@ -16,7 +16,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from gymnasium.vector.utils import iterate
 
 from rfm_client import InvalidSampleError, as_array
-from rfm_client.options import require
+from rfm_client.options import InvalidValueError, require
 from rfm_rl.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind, tasks_of
 from rfm_rl.own_rewards import RETURNS, correct_statistics, refuse_statistics
 from rfm_rl.rewards import ClientSource, Info, RewardedEpisode, Rewarder, RewardOptions
@@ -154,7 +154,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         if twice.any() and isinstance(vector, AsyncVectorEnv) and not vector.shared_memory:
             got = f"the environments {np.flatnonzero(twice).tolist()}, which would reset once more in the next step"
             remedy = "take a step before it, or make the AsyncVectorEnv with shared_memory=True"
-            raise ValueError(f"reset: expected none whose episode has ended, got {got}; {remedy}")
+            raise InvalidValueError.at("reset", "none whose episode has ended", got, remedy)
 
     def _check_can_step(self) -> None:
         if len(self._episodes) != self.num_envs:
@@ -272,12 +272,12 @@ def _has_statistics(env: VectorEnv) -> bool:
 
 def _checked_autoreset_mode(env: VectorEnv, options: RewardOptions) -> AutoresetMode:
     mode = env.metadata.get("autoreset_mode")
-    instead = "; wrap each environment in RewardModelWrapper instead"
+    instead = "wrap each environment in RewardModelWrapper instead"
     if not isinstance(mode, AutoresetMode):
-        raise ValueError(f"metadata['autoreset_mode']: expected an AutoresetMode, got {mode!r}")
+        raise InvalidValueError.at("metadata['autoreset_mode']", "an AutoresetMode", repr(mode))
     if mode is AutoresetMode.SAME_STEP and options.renders:
         expected = "NEXT_STEP or DISABLED with frames from render(), which never shows an episode's last frame"
-        raise ValueError(f"autoreset_mode: expected {expected}, got SAME_STEP{instead}")
+        raise InvalidValueError.at("autoreset_mode", expected, mode.name, instead)
     if mode is not AutoresetMode.DISABLED and options.terminate_on_success is not None:
-        raise ValueError(f"autoreset_mode: expected DISABLED with terminate_on_success, got {mode.name}{instead}")
+        raise InvalidValueError.at("autoreset_mode", "DISABLED with terminate_on_success", mode.name, instead)
     return mode

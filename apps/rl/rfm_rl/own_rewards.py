@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any, NoReturn
 
 from rfm_client.episodes import SuccessRule
+from rfm_client.options import InvalidValueError
 from rfm_rl.rewards import Info, RewardedEpisode
 
 RELABELS = "compute_reward"  # method of an environment that rewards a step for another goal
@@ -28,7 +29,7 @@ def refuse_statistics(rule: SuccessRule, instead: str) -> NoReturn:
     instead: what to make instead
     """
     expected = "None with a Monitor or RecordEpisodeStatistics inside, which does not see this end"
-    raise ValueError(f"terminate_on_success: expected {expected}, got {rule}; wrap in the other order: {instead}")
+    raise InvalidValueError.at("terminate_on_success", expected, rule, f"wrap in the other order: {instead}")
 
 
 def with_statistics(info: Info, episode: RewardedEpisode) -> Info:

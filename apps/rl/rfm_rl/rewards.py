@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, TypeAlias, get_args
@@ -12,10 +12,8 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from rfm_client import InvalidSampleError, RewardClient, UInt8Array
-from rfm_client.episodes import Episode, EpisodeOptions, StepScore, SuccessRule
-from rfm_client.frames import ChannelOrder, Fuse, Orientation, Rule
-from rfm_client.options import checked_count, checked_finite, require
-from rfm_rl.live import LiveView
+from rfm_client.episodes import Episode, EpisodeOptions, FrameOptions, StepScore, SuccessRule
+from rfm_client.options import InvalidValueError, checked_count, checked_finite, require
 
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
@@ -37,7 +35,7 @@ logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RewardOptions:
+class RewardOptions(FrameOptions):
     """How to score an episode, and to make rewards of progress. Raises ValueError for contradictory options.
 
     mode: ``absolute``: the reward is the newest known progress. ``delta``: its change since the step before, so that an
@@ -60,7 +58,7 @@ class RewardOptions:
         observation to its frame; None: ``render()``
     cameras: keys of the frames to score and fuse, in the observation or the result of ``frames_from``; empty: a single
         camera without a name
-    sampling, fuse, orient, channels, resize, live: as in ``rfm_client.episodes.EpisodeOptions``; rendered frames are
+    sampling, fuse, orient, channels, resize, live: as in ``rfm_client.episodes.FrameOptions``; rendered frames are
         changed alike
     max_frames: ``frames`` of EpisodeOptions: the rule's number of frames
     blocking: True: a step waits for its score
@@ -77,17 +75,10 @@ class RewardOptions:
     every: int = 1
     terminate_on_success: SuccessRule | None = None
     frames_from: str | Callable[[Any], UInt8Array | Mapping[str, UInt8Array]] | None = None
-    cameras: Sequence[str] = ()
-    fuse: Fuse = "mean"
-    orient: Orientation | Mapping[str, Orientation] = "none"
-    channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
-    sampling: Rule | None = None
-    resize: bool = False
     max_frames: int | None = None
     blocking: bool = True
     max_pending: int = 4
     await_last: bool = True
-    live: LiveView | None = None
 
     def __post_init__(self) -> None:
         require("mode", self.mode in get_args(Mode), f"one of {', '.join(get_args(Mode))}", repr(self.mode))
@@ -111,13 +102,14 @@ class RewardOptions:
         for name in ("every", "max_pending", "max_frames"):
             if getattr(self, name) is not None:
                 checked_count(name, getattr(self, name))
-        object.__setattr__(self, "cameras", EpisodeOptions(**self.scoring).cameras)
+        super().__post_init__()
+        EpisodeOptions(**self.scoring)  # raises ValueError
 
     @property
     def scoring(self) -> dict[str, Any]:
         """The arguments of ``client.episode`` for its steps."""
-        own = {"frames": self.max_frames, "success": self.success_rule or SuccessRule(), "timeout_s": None}
-        return {each.name: getattr(self, each.name) for each in fields(EpisodeOptions) if each.name not in own} | own
+        of_frames = {each.name: getattr(self, each.name) for each in fields(FrameOptions)}
+        return {**of_frames, "frames": self.max_frames, "success": self.success_rule or SuccessRule()}
 
     @property
     def success_rule(self) -> SuccessRule | None:
@@ -215,7 +207,7 @@ class RewardedEpisode:
         if rule is not None and np.isnan(score.success):
             name, none = ("success_bonus", "0") if ending is None else ("terminate_on_success", "None")
             expected = f"{none} with a checkpoint that does not predict success"
-            raise ValueError(f"{name}: expected {expected}, got {getattr(self._options, name)}")
+            raise InvalidValueError.at(name, expected, getattr(self._options, name))
         if self.known is None:
             self._paid_progress = score.progress
         score = replace(score, succeeded=score.succeeded and score.step > 0)  # a reset is no success
@@ -245,7 +237,7 @@ class RewardedEpisode:
         """Return the newest known scores, and their lag in steps."""
         known = self.known or StepScore(np.nan, np.nan, False, -1, np.nan)
         told = {"progress": known.progress, "success": known.success, "step": known.step}
-        told |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped}
+        told |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped, **known.more_scores}
         return told if self._options.success_rule is None else told | {"succeeded": self._has_succeeded}
 
 
@@ -277,7 +269,7 @@ class Rewarder:
         self._has_dropped = not self._has_dropped  # a third reset may go on
         if not self._has_dropped and self._options.mode == "final":
             expected = "the end of an episode before it, where mode 'final' pays"
-            raise ValueError(f"{where}: expected {expected}, got {got}, for the second time in a row; {_INSIDE}")
+            raise InvalidValueError.at(where, expected, f"{got}, for the second time in a row", _INSIDE)
         if not self._has_warned:
             self._has_warned = True
             logger.warning("%s: expected the end of the episode before it, got %s; %s", where, got, _INSIDE)

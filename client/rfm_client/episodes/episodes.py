@@ -17,6 +17,7 @@ import numpy.typing as npt
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.samples import checked_mask
 from rfm_client.episodes.options import StepScore, StepScores
 from rfm_client.episodes.scorer import Asked, StepScorer
@@ -124,13 +125,16 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
     def _gathered(self, scores: Mapping[int, StepScore]) -> StepScores:
         """The scores of all episodes; NaN and False where there is none."""
         progress, success = (np.full(len(self), np.nan, np.float32) for _ in range(2))
-        succeeded, unclear = (np.zeros(len(self), bool) for _ in range(2))
+        succeeded = np.zeros(len(self), bool)
+        more: dict[str, npt.NDArray[Any]] = {}
         for index, score in scores.items():
-            progress[index], success[index] = score.progress, score.success
-            succeeded[index], unclear[index] = score.succeeded, score.unclear
+            progress[index], success[index], succeeded[index] = score.progress, score.success, score.succeeded
+            for name, value in score.more_scores.items():
+                missing = np.zeros(len(self), bool) if FRAME_SCORES[name].mark else np.full_like(progress, np.nan)
+                more.setdefault(name, missing)[index] = value
         steps = np.array([steps.newest for steps in self.steps], np.int64)
         ms = max((score.ms for score in scores.values()), default=0.0)
-        return StepScores(progress, success, succeeded, steps, ms, unclear)
+        return StepScores(progress, success, succeeded, steps, ms, more)
 
 
 class AsyncEpisode(AsyncClosing, OneProcess):

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol, TypedDict
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +29,8 @@ class StepScore:
     succeeded: True if the success rule holds; False where success is NaN
     step: index of the scored frame in the episode, from 0
     ms: milliseconds to the answer, without the wait for an open ``add_nowait`` request
-    unclear: True if a camera's written answer states no single whole score (RoboReward only)
+    more_scores: the frame's other scores that the checkpoint gives unasked, by name in ``FRAME_SCORES``: marks as bool,
+        numbers as float. Of several cameras, numbers are fused, and a mark is True if one camera has it
     """
 
     progress: float
@@ -37,7 +38,12 @@ class StepScore:
     succeeded: bool
     step: int
     ms: float
-    unclear: bool = False
+    more_scores: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+    @property
+    def unclear(self) -> bool:
+        """True if a camera's written answer states no single whole score (RoboReward only)."""
+        return bool(self.more_scores.get("unclear"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +54,7 @@ class StepScores:
     succeeded: bool [N]; False where ``mask`` left an episode out, or success is NaN
     step: int64 [N], number of each newest frame, from 0; -1: none yet
     ms: time to the answer, milliseconds
-    unclear: bool [N], as in StepScore
+    more_scores: by name an array [N], as in StepScore: bool for marks, else float32 with NaN where there is none
     """
 
     progress: Float32Array
@@ -56,13 +62,18 @@ class StepScores:
     succeeded: npt.NDArray[np.bool_]
     step: npt.NDArray[np.int64]
     ms: float
-    unclear: npt.NDArray[np.bool_]
+    more_scores: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+
+    @property
+    def unclear(self) -> npt.NDArray[np.bool_]:
+        """bool [N], as in StepScore."""
+        return self.more_scores.get("unclear", np.zeros(len(self.progress), bool))
 
     def of(self, index: int) -> StepScore:
         """Return the score of one episode."""
         numbers = float(self.progress[index]), float(self.success[index])
-        succeeded, unclear = bool(self.succeeded[index]), bool(self.unclear[index])
-        return StepScore(*numbers, succeeded, int(self.step[index]), self.ms, unclear)
+        more = {name: values[index].item() for name, values in self.more_scores.items()}
+        return StepScore(*numbers, bool(self.succeeded[index]), int(self.step[index]), self.ms, more)
 
 
 @dataclass(frozen=True)
@@ -116,12 +127,10 @@ class StepKeywords(TypedDict, total=False):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EpisodeOptions:
-    """How each step of an episode is scored. Raises ValueError for contradictory options.
+class FrameOptions:
+    """How the frames of an episode are read. Raises ValueError for contradictory options.
 
     sampling: a rule of ``rfm_client.frames.sampling``; None: the rule of the checkpoint's training
-    frames: the rule's number of frames; None: the rule's own if fixed, else ``ModelInfo.max_frames``. If the rule needs
-        a number and the checkpoint has none, the first step raises ValueError
     cameras: names of the cameras with a frame in each step; empty: a single camera without a name
     fuse: how to combine the scores of several cameras
     orient: rotation or flip that makes frames upright, applied first: an Orientation, or a dict by camera; cameras that
@@ -129,21 +138,16 @@ class EpisodeOptions:
     channels: order of the colours in the given frames, ``rgb`` or ``bgr``: one for all cameras, or a dict by camera
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
-    success: rule of a step's success
     live: view to which each step is reported, with the first camera's frame; it delays no step
-    timeout_s: longest time of a step, retries included; None: the client's
     """
 
     sampling: Rule | None = None
-    frames: int | None = None
     cameras: Sequence[str] = ()
     fuse: Fuse = "mean"
     orient: Orientation | Mapping[str, Orientation] = "none"
     channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
     resize: bool = False
-    success: SuccessRule = SuccessRule()
     live: StepView | None = None
-    timeout_s: float | None = None
 
     def __post_init__(self) -> None:
         require("cameras", not isinstance(self.cameras, str), "a sequence of names", repr(self.cameras))
@@ -151,7 +155,6 @@ class EpisodeOptions:
         is_each_once = len(set(self.cameras)) == len(self.cameras)
         require("cameras", is_each_once, "names that differ", list(self.cameras))
         require("fuse", self.fuse in FUSES, f"one of {', '.join(FUSES)}", repr(self.fuse))
-        Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one for all frames, as cameras names none"
         for name, given in (("orient", self.orient), ("channels", self.channels)):
@@ -163,6 +166,25 @@ class EpisodeOptions:
     def corrections(self) -> list[Correction]:
         """Correction of each camera's frames, in the order of the cameras."""
         return [Correction.of(camera, self.orient, self.channels) for camera in self.cameras or ("",)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeOptions(FrameOptions):
+    """How each step of an episode is scored. Raises ValueError for contradictory options.
+
+    frames: the rule's number of frames; None: the rule's own if fixed, else ``ModelInfo.max_frames``. If the rule needs
+        a number and the checkpoint has none, the first step raises ValueError
+    success: rule of a step's success
+    timeout_s: longest time of a step, retries included; None: the client's
+    """
+
+    frames: int | None = None
+    success: SuccessRule = SuccessRule()
+    timeout_s: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
 
     def sampling_for(self, info: ModelInfo) -> Sampling:
         """Return the rule with its number of frames for a checkpoint.

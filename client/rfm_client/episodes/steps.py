@@ -16,11 +16,11 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.results import FrameScores, ProgressResult, Result
+from rfm_client.contract.results import FRAME_SCORES, FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, as_array, check_task
 from rfm_client.episodes.options import EpisodeOptions, StepReport, StepScore
 from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW, BlankFrames, is_black, is_blank
-from rfm_client.frames.camera_fusion import FUSES
+from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.resize import resize_frames
 from rfm_client.frames.sampling import Prefix
 
@@ -169,15 +169,12 @@ class Steps:
             if isinstance(outcome, RewardError):
                 raise self._located(outcome)
         shown = [result.at(prefix.frame_slots) for result in cast("Sequence[ProgressResult]", outcomes)]
-        fuse, rule = FUSES[self.options.fuse], self.options.success
-        fused = FrameScores(
-            progress=fuse([each.progress for each in shown], axis=0),
-            success=fuse([each.success for each in shown], axis=0),
-        )
+        fused, rule = _fused(shown, self.options.fuse), self.options.success
         is_predicted = not np.isnan(fused.success).any()
         succeeded = is_predicted and fused.succeeded(last=rule.last, threshold=rule.threshold)
-        unclear = any(each.unclear is not None and bool(each.unclear[-1]) for each in shown)
-        return StepScore(fused.last_progress, float(fused.success[-1]), succeeded, step, ms, unclear)
+        unasked = [name for name in fused.arrays if FRAME_SCORES[name].asked == "if given"]
+        more = {name: fused.arrays[name][-1].item() for name in unasked}
+        return StepScore(fused.last_progress, float(fused.success[-1]), succeeded, step, ms, more)
 
     def report(self, score: StepScore) -> None:
         """Report a score to the live view, unless the episode has ended or a newer score was reported."""
@@ -201,6 +198,16 @@ class Steps:
     def _located(self, error: RewardError) -> RewardError:
         """Return the error, with the episode's name if a sample is at fault."""
         return error.inside(self._where) if self._where and isinstance(error, InvalidSampleError) else error
+
+
+def _fused(of_cameras: Sequence[FrameScores], fuse: Fuse) -> FrameScores:
+    """Return one trajectory's scores from those of each camera. A mark is True where one camera has it."""
+    fused: dict[str, Any] = {}
+    for name, score in FRAME_SCORES.items():
+        arrays = [each.arrays[name] for each in of_cameras if name in each.arrays]
+        if arrays:
+            fused[name] = np.any(arrays, axis=0) if score.mark else FUSES[fuse](arrays, axis=0)
+    return FrameScores(**fused)
 
 
 def _fault_of(pixels: Sequence[UInt8Array]) -> str:

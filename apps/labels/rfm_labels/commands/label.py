@@ -229,11 +229,11 @@ class LabelCommand:
                 unused.append(error)
                 command = replace(command, texts=replace(command.texts, task=None))
             except RewardError as error:
-                told = str(error).split("\n")
+                told = error.lines if isinstance(error, FaultsError) else [str(error)]
                 lines += [line if command.source in line else f"{command.source}: {line}" for line in told]
             checked.append(command)
         if lines:
-            raise FaultsError("\n".join(lines))
+            raise FaultsError.listing(lines)
         if len(unused) == len(commands):
             raise unused[0]
         return checked

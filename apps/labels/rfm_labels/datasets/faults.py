@@ -64,14 +64,23 @@ class UnusedTaskError(DatasetError):
 
 
 class FaultsError(DatasetError):
-    """Several faults, one per line, then the options that help."""
+    """Several faults, one per line, then the options that help. lines: of the message"""
+
+    lines: tuple[str, ...] = ()
+
+    @classmethod
+    def listing(cls, lines: Sequence[str]) -> FaultsError:
+        """Return the error with these lines."""
+        error = cls("\n".join(lines))
+        error.lines = tuple(lines)
+        return error
 
     @classmethod
     def of(cls, faults: Mapping[int, RewardError], numbers: Sequence[int]) -> FaultsError:
         """Return the error of these episodes. numbers: of all chosen episodes"""
         without_task = [fault for fault in faults.values() if isinstance(fault, MissingTaskError)]
         messages = {number: str(fault) for number, fault in faults.items()}
-        return cls("\n".join(fault_lines(messages, numbers, len(without_task))))
+        return cls.listing(fault_lines(messages, numbers, len(without_task)))
 
 
 require = partial(require_that, error=DatasetError)

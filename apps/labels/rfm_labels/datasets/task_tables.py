@@ -55,7 +55,7 @@ def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, Any]:
         else:
             tasks[known] = task
     if faults:
-        raise FaultsError("\n".join(shortened(faults)))
+        raise FaultsError.listing(shortened(faults))
     require(table, bool(tasks), "at least one video", "none")
     return tasks
 

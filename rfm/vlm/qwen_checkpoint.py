@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: MIT
+"""What checkpoints on a Qwen backbone share: from weights in memory to a network, a predictor and files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS, CheckpointError, expecting, shown
+from rfm.checkpoint.weights import check_shapes
+from rfm.engine.feature_cache import FeatureCache
+from rfm.family import NETWORK, config_fields
+from rfm.vlm.collator import VlmCollator
+from rfm.vlm.lora import merged
+from rfm.vlm.predictor import VlmPredictor
+from rfm.vlm.processor import PROCESSOR_FOLDER, save_processor
+from rfm.vlm.rounded import fit
+from rfm.vlm.work import flop
+from rfm_client.contract import Sample
+
+LORA = "lora"  # key in ``parts``: the factors that change the network's weights
+SETTINGS = "rfm"  # key in an exported config.json: this project's fields
+MAX_LAYERS = 1024
+
+_LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
+
+
+@dataclass(frozen=True)
+class QwenCheckpoint:
+    """A checkpoint in memory. weights: of its network, without LoRA"""
+
+    config: Any
+    weights: dict[str, Tensor]
+
+    @property
+    def parts(self) -> dict[str, dict[str, Tensor]]:
+        """All weights of the network."""
+        return {NETWORK: self.weights}
+
+    @property
+    def collator(self) -> VlmCollator:
+        """The collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+        raise NotImplementedError
+
+    def network(self, dtype: torch.dtype) -> nn.Module:
+        """Return the network, with weights of no use."""
+        raise NotImplementedError
+
+    def make_predictor(self, network: Any, device: torch.device, cache: FeatureCache[Any] | None) -> VlmPredictor:
+        """Return the predictor with this network."""
+        raise NotImplementedError
+
+    def loaded(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the weights under all names that the network loads."""
+        return {**weights}
+
+    def saved_settings(self) -> dict[str, Any]:
+        """Return this project's fields of an exported config.json."""
+        return {name: value for name, value in config_fields(self.config).items() if name != "backbone"}
+
+    def flop(self, sample: Sample) -> float:
+        """Return the operations of a sample's products. Raises CheckpointError, InvalidSampleError."""
+        return flop(self.config, self.collator, sample)
+
+    def encoders(self) -> None:
+        """Return None: the network reads raw frames and needs no encoders."""
+
+    def predictor(
+        self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
+    ) -> VlmPredictor:
+        """Return a predictor with the network on ``device``. Raises CheckpointError.
+
+        dtype: of the network; None: float32 on the CPU, else the checkpoint's own
+        cache: for features of frames; None: no cache
+        """
+        self.collator  # noqa: B018  first, so that a missing file is reported before the network is built
+        if dtype is None and device.type == "cpu":
+            dtype = torch.float32
+        return self.make_predictor(self.build(dtype), device, cache)
+
+    def save(self, folder: Path) -> None:
+        """Write all weights, a config.json with all settings, and the processor."""
+        collator = self.collator  # first, so that a missing file is reported before the weights are written
+        folder.mkdir(parents=True)
+        config = {**self.config.backbone, SETTINGS: self.saved_settings()}
+        (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
+        tensors = {name: tensor.contiguous() for part in self.parts.values() for name, tensor in part.items()}
+        save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
+        save_processor(collator, folder / PROCESSOR_FOLDER)
+
+    def build(self, dtype: torch.dtype | None = None) -> Any:
+        """Return the network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own).
+
+        Raises CheckpointError.
+        """
+        wanted, factors = dtype or self.config.torch_dtype, self.parts.get(LORA, {})
+        network = self.network(wanted)
+        fit(network, self.weights, factors)
+        # Parameters only: rotary frequencies stay float32, as upstream.
+        network.load_state_dict(self.loaded(merged(self.weights, factors, wanted)), strict=True, assign=True)
+        return network.eval().requires_grad_(False)
+
+    def check(self) -> None:
+        """Raise CheckpointError unless the weights fit the network, before memory is allocated for it."""
+        _check_layers(self.config.backbone)
+        with expecting("a backbone that transformers can make", NETWORK_CONFIG), torch.device("meta"):
+            network = self.network(self.config.torch_dtype)
+        fit(network, self.weights)
+        check_shapes(network.state_dict(), self.loaded(self.weights))
+
+
+def _check_layers(config: Any) -> None:
+    inner = config.values() if isinstance(config, dict) else config if isinstance(config, list) else ()
+    for part in inner:
+        _check_layers(part)
+    for name in _LAYER_COUNTS if isinstance(config, dict) else ():
+        count = config.get(name)
+        if isinstance(count, (int, float)) and count > MAX_LAYERS:
+            raise CheckpointError.at(f"{NETWORK_CONFIG}: {name}", f"at most {MAX_LAYERS}", shown(count))
