@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,7 @@ WIDTHS = (48, 32)  # of video and text embeddings
 TASK = clip.TASK
 
 
-invoke = partial(rfm_client, catch_exceptions=False)
+invoke = rfm_client
 
 
 def ask(served: Served, *words: object, protocol: str = "grpc", model: str = MODEL) -> Result:
