@@ -4,18 +4,15 @@
 Needs ``rfm-client[cli]``.
 """
 
-from rfm_client.cli.command import Command, ExitCode, OptionsOf, report, with_options
-from rfm_client.cli.options import CredentialsGiven, OutputOptions, ServerOptions, credentials_of
+from rfm_client.cli.command import Command, ExitCode, report, with_options
+from rfm_client.cli.options import JsonOutput, ServerOptions
 from rfm_client.cli.show import number, print_tables, table
 
 __all__ = [
     "Command",
-    "CredentialsGiven",
     "ExitCode",
-    "OptionsOf",
-    "OutputOptions",
+    "JsonOutput",
     "ServerOptions",
-    "credentials_of",
     "number",
     "print_tables",
     "report",

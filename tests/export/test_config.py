@@ -16,11 +16,11 @@ from labelling import LEROBOT
 from paths import ROOT
 from rfm.config import ExportConfig, ServeConfig
 from rfm.supervise.supervisor import GatewayProcess, Supervisor
-from rfm_client.options import ConfigError, settings_of
+from rfm_client.options import ConfigError
 from rfm_commands import cli
 from rfm_commands.config import SECTIONS, Config
 from rfm_gateway import GatewayConfig
-from rfm_gateway.command import OPTIONS
+from rfm_gateway.command import GatewayOptions
 from servers import Endpoints
 
 REPOSITORY = ROOT / "model_repository"
@@ -167,12 +167,11 @@ def invoke(*words: str) -> Result:
 
 def test_every_setting_is_an_option_of_its_command() -> None:
     commands = get_command(cli.app).commands  # type: ignore[attr-defined]
-    for section, kind in SECTIONS.items():
+    for section, kind in {**SECTIONS, "gateway": GatewayOptions}.items():
         options = {option: each for each in commands[section].params for option in each.opts}
-        for name, setting in settings_of(kind).items():
+        for name, setting in kind.settings().items():
             assert (setting.option in options) is setting.has_option, name
-            text = OPTIONS.helps.get(name, setting.help) if section == "gateway" else setting.help
-            assert not setting.has_option or options[setting.option].help.startswith(text), name
+            assert not setting.has_option or options[setting.option].help.startswith(setting.help), name
 
 
 def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path: Path) -> None:
@@ -194,8 +193,8 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path
         "dataset": str(LEROBOT / "toy_v21"),
     }
     files = {"certificate", "key", "triton_ca_file", "triton_certificate", "triton_key"}  # which a gateway would read
-    assert given.keys() | files | {"viewer"} == settings_of(GatewayConfig).keys()
-    options = {settings_of(GatewayConfig)[name].option: [value] for name, value in given.items()}
+    assert given.keys() | files | {"viewer"} == GatewayConfig.settings().keys()
+    options = {GatewayConfig.settings()[name].option: [value] for name, value in given.items()}
     words = [f"--gateway-{option.removeprefix('--')}={value}" for option, (value,) in options.items()]
     for switch in ("viewer", "no-viewer"):
         assert started(*words, f"--gateway-{switch}") == {**options, f"--{switch}": []}

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from rfm_client import AsyncRewardClient
-from rfm_client.options import ConfigError, Settings, Texts, setting
+from rfm_client.options import ConfigError, Settings, setting
 from rfm_client.serving import (
     DEFAULT_MODEL,
     Credentials,
@@ -24,7 +24,7 @@ from rfm_client.serving import (
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
 MIB = 2**20
 KEY_VARIABLE = "RFM_GATEWAY_API_KEY"
-_MAX_PORT = 65535
+MAX_PORT = 65535
 _HOST_NAME = re.compile(r"[\w.-]+", re.ASCII)
 _ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/A-Z]+")  # as browsers send it
 _SHORTEST_S, _LONGEST_S = 0.001, 86_400.0  # a day
@@ -37,9 +37,9 @@ class GatewayConfig(Settings):
     Addresses may be None, because ``rfm serve`` and ``rfm gateway`` have different defaults for them.
     """
 
-    TITLE: ClassVar[str] = "Gateway (section gateway of the file)"
+    TITLE: ClassVar[str] = "Gateway"
 
-    port: int | None = setting(None, "Port to listen on; else there is no gateway.", least=1, most=_MAX_PORT)
+    port: int | None = setting(None, "Port to listen on; else there is no gateway.", least=1, most=MAX_PORT)
     host: str | None = setting(None, "Address to listen on; else that of Triton.")
     triton: str | None = setting(
         None, "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://; else the one beside it."
@@ -52,8 +52,8 @@ class GatewayConfig(Settings):
     triton_ca_file: Path | None = setting(None, "Authorities (PEM) that Triton is trusted by; else the system's.")
     triton_certificate: Path | None = setting(None, "By which Triton knows the gateway (PEM).")
     triton_key: Path | None = setting(None, "That certificate's key (PEM).")
-    cors_origin: Texts = setting((), "Origin from which browsers may ask. Repeat for more.")
-    allow_host: Texts = setting((), "Host name by which callers may ask without a key. Repeat for more.")
+    cors_origin: tuple[str, ...] = setting((), "Origin from which browsers may ask. Repeat for more.")
+    allow_host: tuple[str, ...] = setting((), "Host name by which callers may ask without a key. Repeat for more.")
     allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
     timeout_s: float = setting(
         120.0,
@@ -66,7 +66,7 @@ class GatewayConfig(Settings):
     max_in_flight: int = setting(256, "Evaluations at a time; others wait.", least=1)
     max_waiting: int = setting(1024, "Evaluations that wait for their turn; more are refused with 503.", least=0)
     viewer: bool = setting(True, "Serve the page in the browser, at /.")
-    dataset: Texts = setting((), "LeRobot folder or HDF5 file to show on the page. Repeat for more.")
+    dataset: tuple[str, ...] = setting((), "LeRobot folder or HDF5 file to show on the page. Repeat for more.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

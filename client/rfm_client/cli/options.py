@@ -7,12 +7,13 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import typer
 
-from rfm_client.cli.command import STANDARD_OUTPUT, Given, OptionsOf, usage_errors
+from rfm_client.cli.command import STANDARD_OUTPUT, usage_errors
 from rfm_client.client import RewardClient
 from rfm_client.client_options import DEFAULT_TIMEOUT_S
 from rfm_client.contract import errors
@@ -33,46 +34,14 @@ _PICTURES = (".png", ".pdf", ".svg")
 _ENDINGS = {"json": (".json",), "plot": _PICTURES, "strips": _PICTURES, "rrd": (".rrd",)}
 
 
-@dataclass(frozen=True)
-class CredentialFiles(Settings):
-    """Credentials for a protected server, as files: CAs, client certificate, API key."""
-
-    TITLE: ClassVar[str] = "TLS and key"
-
-    ca_file: Path | None = setting(None, "Authorities (PEM) to trust; else the system's.", variable="RFM_CA_FILE")
-    client_certificate: Path | None = setting(
-        None, "Certificate that this client shows to the server (PEM).", variable="RFM_CLIENT_CERTIFICATE"
-    )
-    client_key: Path | None = setting(None, "The certificate's key (PEM).", variable="RFM_CLIENT_KEY")
-    api_key_file: Path | None = setting(
-        None, "File with the key that requests show as Bearer.", variable="RFM_API_KEY_FILE"
-    )
-
-    def read(self) -> Credentials:
-        """Return the credentials in the files. Raises ConfigError for an unusable file."""
-        try:
-            api_key = None if self.api_key_file is None else self.api_key_file.read_text().strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError.at("api_key_file", "a text file", error) from None
-        try:
-            return Credentials(self.ca_file, self.client_certificate, self.client_key, api_key=api_key)
-        except ConfigError as error:
-            raise error.named(lambda name: "api_key_file" if name == "api_key" else name) from None
-
-
-# Options after a subcommand, which win over those before it and over variables.
-CredentialsGiven: TypeAlias = Annotated[Given, OptionsOf(CredentialFiles, reads_variables=False)]
-
-
-def credentials_of(context: typer.Context, given: Given) -> Credentials:
-    """Return the credentials of a subcommand: the given files, else those before it. Raises ConfigError."""
-    before: CredentialFiles = context.obj
-    return replace(before, **given).read()
+def timeout_setting(default_s: float, help: str = "Seconds that a request may take.") -> Any:
+    """Return a field for the option ``--timeout``."""
+    return setting(default_s, help, flag="--timeout", least=MIN_TIMEOUT_S, most=MAX_TIMEOUT_S)
 
 
 @dataclass(frozen=True)
-class ServerOptions(Settings):
-    """Servers, model and timeout of a command."""
+class ServerUrls(Settings):
+    """Servers and timeout of a command."""
 
     TITLE: ClassVar[str] = "Server"
 
@@ -83,39 +52,93 @@ class ServerOptions(Settings):
         flag="--url",
         variable="RFM_URL",
     )
-    model: str = setting(DEFAULT_MODEL, "Name under which the checkpoint was exported.")
-    timeout_s: float = setting(
-        DEFAULT_TIMEOUT_S,
-        "Seconds that a request may take.",
-        flag="--timeout",
-        least=MIN_TIMEOUT_S,
-        most=MAX_TIMEOUT_S,
+    timeout_s: float = timeout_setting(DEFAULT_TIMEOUT_S)
+
+
+@dataclass(frozen=True)
+class TlsFiles(Settings):
+    """CAs and client certificate for a server with TLS, as files. Raises ConfigError for an unusable file."""
+
+    TITLE: ClassVar[str] = "Credentials"
+
+    ca_file: Path | None = setting(None, "Authorities (PEM) to trust; else the system's.", variable="RFM_CA_FILE")
+    client_certificate: Path | None = setting(
+        None, "Certificate that this client shows to the server (PEM).", variable="RFM_CLIENT_CERTIFICATE"
     )
+    client_key: Path | None = setting(None, "The certificate's key (PEM).", variable="RFM_CLIENT_KEY")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.credentials  # noqa: B018  # reports an unreadable file now, and may go to a machine without the files
+
+    @cached_property
+    def credentials(self) -> Credentials:
+        """The credentials in the files."""
+        return Credentials(self.ca_file, self.client_certificate, self.client_key)
+
+
+@dataclass(frozen=True)
+class CredentialFiles(TlsFiles):
+    """Credentials for a protected server, as files: CAs, client certificate, API key. Raises ConfigError."""
+
+    api_key_file: Path | None = setting(
+        None, "File with the key that requests show as Bearer.", variable="RFM_API_KEY_FILE"
+    )
+
+    @cached_property
+    def credentials(self) -> Credentials:
+        """The credentials in the files."""
+        try:
+            api_key = None if self.api_key_file is None else self.api_key_file.read_text().strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError.at("api_key_file", "a text file", error) from None
+        try:
+            return replace(super().credentials, api_key=api_key)
+        except ConfigError as error:
+            raise error.named(lambda name: "api_key_file" if name == "api_key" else name) from None
+
+
+@dataclass(frozen=True)
+class StatusOptions(CredentialFiles, ServerUrls):
+    """Servers whose state is shown, and credentials."""
+
+    TITLE: ClassVar[str] = "Server"
+
+    timeout_s: float = timeout_setting(10.0)
+
+
+@dataclass(frozen=True)
+class ServerOptions(CredentialFiles, ServerUrls):
+    """Servers, model, timeout and credentials of a command."""
+
+    TITLE: ClassVar[str] = "Server"
+
+    model: str = setting(DEFAULT_MODEL, "Name under which the checkpoint was exported.")
 
     @property
     def origin(self) -> dict[str, Any]:
         """The servers and the model, for JSON documents."""
         return {"servers": list(self.urls), "model": self.model}
 
-    def client(self, credentials: Credentials, **options: Any) -> RewardClient:
+    def client(self, **options: Any) -> RewardClient:
         """Return a client. Raises typer.BadParameter for an invalid URL."""
         with usage_errors("--url"):
             return RewardClient(
-                self.urls, model=self.model, **{"timeout_s": self.timeout_s, **credentials.options, **options}
+                self.urls, model=self.model, **{"timeout_s": self.timeout_s, **self.credentials.options, **options}
             )
 
     @contextmanager
-    def connected(self, credentials: Credentials) -> Iterator[RewardClient]:
+    def connected(self) -> Iterator[RewardClient]:
         """Yield a client if a server answers and serves the model. Otherwise raise RewardError at once."""
-        with self.client(credentials) as client:
-            self._check(credentials)
+        with self.client() as client:
+            self._check()
             yield client
 
-    def _check(self, credentials: Credentials) -> None:
+    def _check(self) -> None:
         problems = []
         for url in self.urls:
             with RewardClient(
-                url, model=self.model, timeout_s=self.timeout_s, retry=False, **credentials.options
+                url, model=self.model, timeout_s=self.timeout_s, retry=False, **self.credentials.options
             ) as one:
                 try:
                     try:
@@ -129,24 +152,43 @@ class ServerOptions(Settings):
 
 
 @dataclass(frozen=True)
-class VideoOptions(Settings):
-    """Task of the videos, and choice and size of the frames to send."""
+class WaitOptions(ServerOptions):
+    """Servers and model to wait for."""
+
+    timeout_s: float = timeout_setting(120.0, "Seconds to wait.")
+
+
+@dataclass(frozen=True)
+class VideoFiles(Settings):
+    """Task of the videos, and size, orientation and colours of the frames."""
 
     TITLE: ClassVar[str] = "Videos"
 
     task: str = setting("", "The task, as a sentence.")
-    fps: float = setting(3.0, "Take so many frames a second of a video.", least=0.001, group=FRAMES)
-    max_frames: int | None = setting(
-        None, "Score at most so many of these frames, evenly spaced.", least=1, group=FRAMES
-    )
-    subsample: bool = setting(
-        True, "Score at most as many frames in one pass as the checkpoint was trained on, evenly spaced.", group=FRAMES
-    )
     resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
     orient: Orientation = setting(
         "none", "Turn frames upright before they are scored (see docs/guides/label_a_dataset.md)."
     )
     channels: ChannelOrder = setting("rgb", "Channel order in the file; bgr swaps red and blue.")
+
+
+@dataclass(frozen=True)
+class FrameRate(Settings):
+    """Frames to take of a video."""
+
+    TITLE: ClassVar[str] = FRAMES
+
+    fps: float = setting(3.0, "Take so many frames a second of a video.", least=0.001)
+
+
+@dataclass(frozen=True)
+class VideoOptions(FrameRate, VideoFiles):
+    """Task of the videos, and choice and size of the frames to send."""
+
+    max_frames: int | None = setting(None, "Score at most so many of these frames, evenly spaced.", least=1)
+    subsample: bool = setting(
+        True, "Score at most as many frames in one pass as the checkpoint was trained on, evenly spaced."
+    )
 
 
 @dataclass(frozen=True)
@@ -198,17 +240,84 @@ class PrefixOptions(Settings):
 
 
 @dataclass(frozen=True)
-class OutputOptions(Settings):
-    """Files of the results. Raises ConfigError, before the first request, for an unusable file."""
+class JsonOutput(Settings):
+    """A file with the results as JSON. Raises ConfigError, before the first request, for an unusable file."""
 
     TITLE: ClassVar[str] = "Outputs"
 
     json: str | None = setting(
         None, "Write JSON to a .json file; alone or -: print it, and no table.", metavar="[FILE|-]"
     )
+
+    def __post_init__(self) -> None:
+        for name, file in self._files.items():
+            if file.suffix not in _ENDINGS[name]:
+                instead = " or -" if name == "json" else ""
+                raise ConfigError.at(name, f"a file that ends in {', '.join(_ENDINGS[name])}{instead}", file)
+
+    @property
+    def prints_tables(self) -> bool:
+        """True if tables go to standard output."""
+        return self.json != STANDARD_OUTPUT
+
+    def make_folders(self) -> None:
+        """Make the files' folders where they are missing. Raises ConfigError if that fails."""
+        for name, folder in self._folders.items():
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigError.at(name, f"a folder at {folder}", error.strerror) from None
+
+    @property
+    def _files(self) -> dict[str, Path]:
+        """The files of a single type, by the name of their setting; subclasses have more settings."""
+        given = {name: getattr(self, name, None) for name in _ENDINGS}
+        return {name: Path(file) for name, file in given.items() if file not in (None, STANDARD_OUTPUT)}
+
+    @property
+    def _folders(self) -> dict[str, Path]:
+        return {name: file.parent for name, file in self._files.items()}
+
+    def write_json(self, document: Mapping[str, Any]) -> None:
+        """Write the document to the file or standard output, if --json is given."""
+        if self.json is None:
+            return
+        text = json.dumps(document, indent=2, allow_nan=False)
+        if self.json == STANDARD_OUTPUT:
+            typer.echo(text)
+        else:
+            Path(self.json).write_text(f"{text}\n")
+
+
+@dataclass(frozen=True)
+class PlotOutput(JsonOutput):
+    """Files with the results of several videos."""
+
     plot: Path | None = setting(
         None, "Draw the curves of all videos in one figure, sized for a paper: .png, .pdf or .svg.", metavar="FILE"
     )
+
+    def begin(self, videos: Sequence[str]) -> None:
+        """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
+        for name in ("plot", "strips"):
+            if name in self._files and len(videos) > MAX_PICTURED:
+                raise ConfigError.at(name, f"at most {MAX_PICTURED} videos", len(videos))
+        self.make_folders()
+
+
+@dataclass(frozen=True)
+class ComparisonOutput(PlotOutput):
+    """Files with a comparison."""
+
+    plot: Path | None = setting(
+        None, "Draw frames of each video above its scores, the best first: .png, .pdf or .svg.", metavar="FILE"
+    )
+
+
+@dataclass(frozen=True)
+class ScoreOutput(PlotOutput):
+    """Files with the scores of videos."""
+
     strips: Path | None = setting(
         None, "Draw frames of each video above its scores: .png, .pdf or .svg.", metavar="FILE"
     )
@@ -222,40 +331,25 @@ class OutputOptions(Settings):
     )
 
     def __post_init__(self) -> None:
-        for name, endings in _ENDINGS.items():
-            value = getattr(self, name)
-            if value is None or value == STANDARD_OUTPUT:
-                continue
-            if Path(value).suffix not in endings:
-                instead = " or -" if name == "json" else ""
-                raise ConfigError.at(name, f"a file that ends in {', '.join(endings)}{instead}", value)
+        super().__post_init__()
         if self.npy is not None and not self.npy.is_dir() and self.npy.suffix not in ("", ".npy"):
             raise ConfigError.at("npy", "a .npy file or a folder", self.npy)
 
     @property
-    def prints_tables(self) -> bool:
-        """True if tables go to standard output."""
-        return self.json != STANDARD_OUTPUT
+    def _folders(self) -> dict[str, Path]:
+        if self.npy is None:
+            return super()._folders
+        return {**super()._folders, "npy": self.npy.parent if self._is_one_array else self.npy}
 
-    def make_folders(self) -> None:
-        """Make the files' folders where they are missing. Raises ConfigError if that fails."""
-        folders = {name: Path(value).parent for name in _ENDINGS if (value := getattr(self, name)) is not None}
-        if self.npy is not None:
-            folders["npy"] = self.npy.parent if self.npy.suffix == ".npy" and not self.npy.is_dir() else self.npy
-        for name, folder in folders.items():
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ConfigError.at(name, f"a folder at {folder}", error.strerror) from None
+    @property
+    def _is_one_array(self) -> bool:
+        return self.npy is not None and self.npy.suffix == ".npy" and not self.npy.is_dir()
 
     def begin(self, videos: Sequence[str]) -> None:
         """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
-        for name in ("plot", "strips"):
-            if getattr(self, name) is not None and len(videos) > MAX_PICTURED:
-                raise ConfigError.at(name, f"at most {MAX_PICTURED} videos", len(videos))
         if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
             raise ConfigError.at("npy", f"a folder for {len(videos)} videos", self.npy)
-        self.make_folders()
+        super().begin(videos)
 
     def array_files(self, stems: Sequence[str]) -> list[Path]:
         """Return the .npy file of each video; empty without --npy."""
@@ -264,13 +358,3 @@ class OutputOptions(Settings):
         if self.npy.suffix == ".npy":
             return [self.npy]
         return [self.npy / f"{stem}.npy" for stem in stems]
-
-    def write_json(self, document: Mapping[str, Any]) -> None:
-        """Write the document to the file or standard output, if --json is given."""
-        if self.json is None:
-            return
-        text = json.dumps(document, indent=2, allow_nan=False)
-        if self.json == STANDARD_OUTPUT:
-            typer.echo(text)
-        else:
-            Path(self.json).write_text(f"{text}\n")

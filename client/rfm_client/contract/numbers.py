@@ -11,18 +11,22 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidValueError, LocatedError
 
 
-def checked_count(where: str, value: Any, *, least: int = 1, error: type[LocatedError] = InvalidValueError) -> int:
+def checked_count(
+    where: str, value: Any, *, least: int | None = 1, error: type[LocatedError] = InvalidValueError
+) -> int:
     """Return a whole number of at least ``least``. Raises ``error``."""
     is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     require(where, is_whole, "a whole number", repr(value), error)
-    require(where, value >= least, f"at least {least}", value, error)
+    require(where, least is None or value >= least, f"at least {least}", value, error)
     return int(value)
 
 
-def checked_finite(where: str, value: Any, expected: str = "a number") -> float:
-    """Return a finite number. Raises InvalidValueError, whose message says ``expected``."""
+def checked_finite(
+    where: str, value: Any, expected: str = "a number", *, error: type[LocatedError] = InvalidValueError
+) -> float:
+    """Return a finite number. Raises ``error``, whose message says ``expected``."""
     is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    require(where, is_number and math.isfinite(value), expected, value if is_number else repr(value))
+    require(where, is_number and math.isfinite(value), expected, value if is_number else repr(value), error)
     return float(value)
 
 

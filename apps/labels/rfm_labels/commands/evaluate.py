@@ -3,20 +3,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rfm_client.command_line import OptionsOf, OutputOptions, number, print_tables, table, with_options
+from rfm_client.command_line import JsonOutput, number, print_tables, table, with_options
+from rfm_client.options import setting
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from rfm_labels import LabelComparison
 
-HELPS = {"plot": "Draw histograms of progress at the last frame: .png, .pdf or .svg."}
 LEGEND = (
     "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, and of progress, at the last frame; "
     "0.5 is chance. Threshold: of success at the last frame, with the best balanced accuracy. Falls: steps on which "
@@ -24,10 +24,19 @@ LEGEND = (
 )
 
 
+@dataclass(frozen=True)
+class EvaluationOutput(JsonOutput):
+    """Files with an evaluation."""
+
+    plot: Path | None = setting(
+        None, "Draw histograms of progress at the last frame: .png, .pdf or .svg.", metavar="FILE"
+    )
+
+
 @with_options
 def evaluate(
     dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder or HDF5 file of the labelled dataset.")],
-    output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json", "plot"), helps=HELPS)],
+    output: EvaluationOutput,
     labels: Annotated[
         list[Path] | None,
         typer.Option(
