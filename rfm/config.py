@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
@@ -86,6 +87,7 @@ class ExportConfig(CheckpointConfig):
     """The settings that ``rfm export`` writes into a repository. To change them, export again."""
 
     TITLE: ClassVar[str] = "Export"
+    NO_OPTION: ClassVar[Collection[str]] = {"batch_size"}
 
     name: str = setting(DEFAULT_MODEL, "Model name in the repository; raw frames are scored by NAME_frames.")
     num_gpus: int | None = setting(
@@ -127,7 +129,7 @@ class ExportConfig(CheckpointConfig):
         "RoboReward's expected score.",
     )
     batch_size: int | None = setting(
-        None, "Of no effect, as in the FastAPI server; max_batch_size bounds a batch.", least=1, has_option=False
+        None, "Of no effect, as in the FastAPI server; max_batch_size bounds a batch.", least=1
     )
 
     def __post_init__(self) -> None:

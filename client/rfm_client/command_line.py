@@ -5,13 +5,13 @@ Needs ``rfm-client[cli]``.
 """
 
 from rfm_client.cli.command import Command, ExitCode, report, with_options
-from rfm_client.cli.options import JsonOutput, ServerOptions
+from rfm_client.cli.options import PlotOutput, ServerOptions
 from rfm_client.cli.show import number, print_tables, table
 
 __all__ = [
     "Command",
     "ExitCode",
-    "JsonOutput",
+    "PlotOutput",
     "ServerOptions",
     "number",
     "print_tables",

@@ -8,7 +8,7 @@ over HTTP makes the server's other callers wait.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +19,8 @@ import typer
 from rfm.launch.admin_key import take_key
 from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
 from rfm_client.cli.command import Given, with_options
-from rfm_client.cli.options import TlsFiles
-from rfm_client.contract.settings import Settings, setting
+from rfm_client.cli.options import CredentialFiles
+from rfm_client.contract.settings import setting
 from rfm_commands.command import RfmCommand
 from rfm_commands.rollout import Rollout, check_files, models_of, previous_version
 
@@ -30,18 +30,20 @@ app = typer.Typer(no_args_is_help=True)
 
 
 @dataclass(frozen=True)
-class ServerAddress(Settings):
-    """Where a running server is, and the key to it."""
+class TlsFiles(CredentialFiles):
+    """CAs and client certificate for a server with TLS."""
+
+    NO_OPTION: ClassVar[Collection[str]] = {"api_key_file"}
+
+
+@dataclass(frozen=True)
+class AdministeredServer(TlsFiles):
+    """A running server whose models are listed or change."""
 
     TITLE: ClassVar[str] = "Server"
 
     url: str = setting("grpc://127.0.0.1:8001", "grpc://host:port of the server, with TLS grpcs://host:port.")
     admin_key_file: Path | None = setting(None, "File with the server's admin key; else RFM_ADMIN_KEY.")
-
-
-@dataclass(frozen=True)
-class AdministeredServer(TlsFiles, ServerAddress):
-    """A running server whose models are listed or change."""
 
     @contextmanager
     def connected(self) -> Iterator[RepositoryApi]:
@@ -56,8 +58,6 @@ class AdministeredServer(TlsFiles, ServerAddress):
 @dataclass(frozen=True)
 class AdministeredRepository(AdministeredServer):
     """A running server whose models change, and the repository that it reads."""
-
-    TITLE: ClassVar[str] = "Repository"
 
     repository: Path = setting(..., "The repository that the server reads.")
 

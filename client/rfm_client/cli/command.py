@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import inspect
 import sys
@@ -67,8 +66,8 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         if each.name in options:
             parameters += map(_parameter, options[each.name])
         else:
-            annotation = _with_placeholder(each.annotation)
-            parameters.append(each.replace(annotation=annotation, kind=inspect.Parameter.KEYWORD_ONLY))
+            _set_placeholder(each.annotation)
+            parameters.append(each.replace(kind=inspect.Parameter.KEYWORD_ONLY))
     are_given = {each.name for each in own if get_origin(each.annotation) is Given}
 
     @functools.wraps(command)
@@ -255,14 +254,11 @@ def _given(options: Sequence[Setting], context: typer.Context, values: dict[str,
     return given
 
 
-def _with_placeholder(hint: Any) -> Any:
-    """The type of a parameter; its option gets a placeholder, unless it has one."""
-    kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    marks = [copy.copy(mark) for mark in marks]
-    for mark in marks:
+def _set_placeholder(hint: Any) -> None:
+    """Give an option its placeholder, unless it has one."""
+    for mark in get_args(hint)[1:]:
         if isinstance(mark, OptionInfo) and mark.metavar is None:
-            mark.metavar = placeholder_of(kind)
-    return Annotated[(kind, *marks)] if marks else hint
+            mark.metavar = placeholder_of(get_args(hint)[0])
 
 
 def _argument(parameter: Any) -> str:

@@ -25,11 +25,11 @@ from rfm_client.cli.command import (
     with_options,
 )
 from rfm_client.cli.options import (
-    ComparisonOutput,
     CredentialFiles,
     JsonOutput,
+    OutputOptions,
+    PlotOutput,
     PrefixOptions,
-    ScoreOutput,
     ServerOptions,
     StatusOptions,
     VideoOptions,
@@ -85,7 +85,7 @@ def score(
     videos: Annotated[list[str], typer.Argument(metavar="VIDEO...", help=VIDEOS)],
     video: VideoOptions,
     prefix: PrefixOptions,
-    output: ScoreOutput,
+    output: OutputOptions,
     server: ServerOptions,
 ) -> None:
     """Score each frame of one or more videos: progress and success. A failed video does not stop the others."""
@@ -128,7 +128,7 @@ def score(
 def compare(
     videos: Annotated[list[str], typer.Argument(metavar="VIDEO VIDEO...", help=VIDEOS)],
     video: VideoOptions,
-    output: ComparisonOutput,
+    output: PlotOutput,
     server: ServerOptions,
 ) -> None:
     """Rank several videos by how well they do the task.

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -40,8 +40,40 @@ def timeout_setting(default_s: float, help: str = "Seconds that a request may ta
 
 
 @dataclass(frozen=True)
-class ServerUrls(Settings):
-    """Servers and timeout of a command."""
+class CredentialFiles(Settings):
+    """Credentials for a protected server, as files: CAs, client certificate, API key. Raises ConfigError."""
+
+    TITLE: ClassVar[str] = "Credentials"
+
+    ca_file: Path | None = setting(None, "Authorities (PEM) to trust; else the system's.", variable="RFM_CA_FILE")
+    client_certificate: Path | None = setting(
+        None, "Certificate that this client shows to the server (PEM).", variable="RFM_CLIENT_CERTIFICATE"
+    )
+    client_key: Path | None = setting(None, "The certificate's key (PEM).", variable="RFM_CLIENT_KEY")
+    api_key_file: Path | None = setting(
+        None, "File with the key that requests show as Bearer.", variable="RFM_API_KEY_FILE"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.credentials  # noqa: B018  # reports an unreadable file now, and may go to a machine without the files
+
+    @cached_property
+    def credentials(self) -> Credentials:
+        """The credentials in the files."""
+        try:
+            api_key = None if self.api_key_file is None else self.api_key_file.read_text().strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError.at("api_key_file", "a text file", error) from None
+        try:
+            return Credentials(self.ca_file, self.client_certificate, self.client_key, api_key=api_key)
+        except ConfigError as error:
+            raise error.named(lambda name: "api_key_file" if name == "api_key" else name) from None
+
+
+@dataclass(frozen=True)
+class ServerOptions(CredentialFiles):
+    """Servers, model, timeout and credentials of a command."""
 
     TITLE: ClassVar[str] = "Server"
 
@@ -52,68 +84,8 @@ class ServerUrls(Settings):
         flag="--url",
         variable="RFM_URL",
     )
-    timeout_s: float = timeout_setting(DEFAULT_TIMEOUT_S)
-
-
-@dataclass(frozen=True)
-class TlsFiles(Settings):
-    """CAs and client certificate for a server with TLS, as files. Raises ConfigError for an unusable file."""
-
-    TITLE: ClassVar[str] = "Credentials"
-
-    ca_file: Path | None = setting(None, "Authorities (PEM) to trust; else the system's.", variable="RFM_CA_FILE")
-    client_certificate: Path | None = setting(
-        None, "Certificate that this client shows to the server (PEM).", variable="RFM_CLIENT_CERTIFICATE"
-    )
-    client_key: Path | None = setting(None, "The certificate's key (PEM).", variable="RFM_CLIENT_KEY")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.credentials  # noqa: B018  # reports an unreadable file now, and may go to a machine without the files
-
-    @cached_property
-    def credentials(self) -> Credentials:
-        """The credentials in the files."""
-        return Credentials(self.ca_file, self.client_certificate, self.client_key)
-
-
-@dataclass(frozen=True)
-class CredentialFiles(TlsFiles):
-    """Credentials for a protected server, as files: CAs, client certificate, API key. Raises ConfigError."""
-
-    api_key_file: Path | None = setting(
-        None, "File with the key that requests show as Bearer.", variable="RFM_API_KEY_FILE"
-    )
-
-    @cached_property
-    def credentials(self) -> Credentials:
-        """The credentials in the files."""
-        try:
-            api_key = None if self.api_key_file is None else self.api_key_file.read_text().strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError.at("api_key_file", "a text file", error) from None
-        try:
-            return replace(super().credentials, api_key=api_key)
-        except ConfigError as error:
-            raise error.named(lambda name: "api_key_file" if name == "api_key" else name) from None
-
-
-@dataclass(frozen=True)
-class StatusOptions(CredentialFiles, ServerUrls):
-    """Servers whose state is shown, and credentials."""
-
-    TITLE: ClassVar[str] = "Server"
-
-    timeout_s: float = timeout_setting(10.0)
-
-
-@dataclass(frozen=True)
-class ServerOptions(CredentialFiles, ServerUrls):
-    """Servers, model, timeout and credentials of a command."""
-
-    TITLE: ClassVar[str] = "Server"
-
     model: str = setting(DEFAULT_MODEL, "Name under which the checkpoint was exported.")
+    timeout_s: float = timeout_setting(DEFAULT_TIMEOUT_S)
 
     @property
     def origin(self) -> dict[str, Any]:
@@ -149,6 +121,15 @@ class ServerOptions(CredentialFiles, ServerUrls):
                 except errors.RewardError as error:
                     problems.append(error)
         raise problems[0]
+
+
+@dataclass(frozen=True)
+class StatusOptions(ServerOptions):
+    """Servers whose state is shown."""
+
+    NO_OPTION: ClassVar[Collection[str]] = {"model"}
+
+    timeout_s: float = timeout_setting(10.0)
 
 
 @dataclass(frozen=True)
@@ -240,84 +221,17 @@ class PrefixOptions(Settings):
 
 
 @dataclass(frozen=True)
-class JsonOutput(Settings):
-    """A file with the results as JSON. Raises ConfigError, before the first request, for an unusable file."""
+class OutputOptions(Settings):
+    """Files of the results. Raises ConfigError, before the first request, for an unusable file."""
 
     TITLE: ClassVar[str] = "Outputs"
 
     json: str | None = setting(
         None, "Write JSON to a .json file; alone or -: print it, and no table.", metavar="[FILE|-]"
     )
-
-    def __post_init__(self) -> None:
-        for name, file in self._files.items():
-            if file.suffix not in _ENDINGS[name]:
-                instead = " or -" if name == "json" else ""
-                raise ConfigError.at(name, f"a file that ends in {', '.join(_ENDINGS[name])}{instead}", file)
-
-    @property
-    def prints_tables(self) -> bool:
-        """True if tables go to standard output."""
-        return self.json != STANDARD_OUTPUT
-
-    def make_folders(self) -> None:
-        """Make the files' folders where they are missing. Raises ConfigError if that fails."""
-        for name, folder in self._folders.items():
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ConfigError.at(name, f"a folder at {folder}", error.strerror) from None
-
-    @property
-    def _files(self) -> dict[str, Path]:
-        """The files of a single type, by the name of their setting; subclasses have more settings."""
-        given = {name: getattr(self, name, None) for name in _ENDINGS}
-        return {name: Path(file) for name, file in given.items() if file not in (None, STANDARD_OUTPUT)}
-
-    @property
-    def _folders(self) -> dict[str, Path]:
-        return {name: file.parent for name, file in self._files.items()}
-
-    def write_json(self, document: Mapping[str, Any]) -> None:
-        """Write the document to the file or standard output, if --json is given."""
-        if self.json is None:
-            return
-        text = json.dumps(document, indent=2, allow_nan=False)
-        if self.json == STANDARD_OUTPUT:
-            typer.echo(text)
-        else:
-            Path(self.json).write_text(f"{text}\n")
-
-
-@dataclass(frozen=True)
-class PlotOutput(JsonOutput):
-    """Files with the results of several videos."""
-
     plot: Path | None = setting(
         None, "Draw the curves of all videos in one figure, sized for a paper: .png, .pdf or .svg.", metavar="FILE"
     )
-
-    def begin(self, videos: Sequence[str]) -> None:
-        """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
-        for name in ("plot", "strips"):
-            if name in self._files and len(videos) > MAX_PICTURED:
-                raise ConfigError.at(name, f"at most {MAX_PICTURED} videos", len(videos))
-        self.make_folders()
-
-
-@dataclass(frozen=True)
-class ComparisonOutput(PlotOutput):
-    """Files with a comparison."""
-
-    plot: Path | None = setting(
-        None, "Draw frames of each video above its scores, the best first: .png, .pdf or .svg.", metavar="FILE"
-    )
-
-
-@dataclass(frozen=True)
-class ScoreOutput(PlotOutput):
-    """Files with the scores of videos."""
-
     strips: Path | None = setting(
         None, "Draw frames of each video above its scores: .png, .pdf or .svg.", metavar="FILE"
     )
@@ -331,25 +245,40 @@ class ScoreOutput(PlotOutput):
     )
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        for name, endings in _ENDINGS.items():
+            value = getattr(self, name)
+            if value is None or value == STANDARD_OUTPUT:
+                continue
+            if Path(value).suffix not in endings:
+                instead = " or -" if name == "json" else ""
+                raise ConfigError.at(name, f"a file that ends in {', '.join(endings)}{instead}", value)
         if self.npy is not None and not self.npy.is_dir() and self.npy.suffix not in ("", ".npy"):
             raise ConfigError.at("npy", "a .npy file or a folder", self.npy)
 
     @property
-    def _folders(self) -> dict[str, Path]:
-        if self.npy is None:
-            return super()._folders
-        return {**super()._folders, "npy": self.npy.parent if self._is_one_array else self.npy}
+    def prints_tables(self) -> bool:
+        """True if tables go to standard output."""
+        return self.json != STANDARD_OUTPUT
 
-    @property
-    def _is_one_array(self) -> bool:
-        return self.npy is not None and self.npy.suffix == ".npy" and not self.npy.is_dir()
+    def make_folders(self) -> None:
+        """Make the files' folders where they are missing. Raises ConfigError if that fails."""
+        folders = {name: Path(value).parent for name in _ENDINGS if (value := getattr(self, name)) is not None}
+        if self.npy is not None:
+            folders["npy"] = self.npy.parent if self.npy.suffix == ".npy" and not self.npy.is_dir() else self.npy
+        for name, folder in folders.items():
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigError.at(name, f"a folder at {folder}", error.strerror) from None
 
     def begin(self, videos: Sequence[str]) -> None:
         """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
+        for name in ("plot", "strips"):
+            if getattr(self, name) is not None and len(videos) > MAX_PICTURED:
+                raise ConfigError.at(name, f"at most {MAX_PICTURED} videos", len(videos))
         if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
             raise ConfigError.at("npy", f"a folder for {len(videos)} videos", self.npy)
-        super().begin(videos)
+        self.make_folders()
 
     def array_files(self, stems: Sequence[str]) -> list[Path]:
         """Return the .npy file of each video; empty without --npy."""
@@ -358,3 +287,31 @@ class ScoreOutput(PlotOutput):
         if self.npy.suffix == ".npy":
             return [self.npy]
         return [self.npy / f"{stem}.npy" for stem in stems]
+
+    def write_json(self, document: Mapping[str, Any]) -> None:
+        """Write the document to the file or standard output, if --json is given."""
+        if self.json is None:
+            return
+        text = json.dumps(document, indent=2, allow_nan=False)
+        if self.json == STANDARD_OUTPUT:
+            typer.echo(text)
+        else:
+            Path(self.json).write_text(f"{text}\n")
+
+
+@dataclass(frozen=True)
+class JsonOutput(OutputOptions):
+    """A file with the results as JSON."""
+
+    NO_OPTION: ClassVar[Collection[str]] = {"plot", "strips", "rrd", "npy"}
+
+
+@dataclass(frozen=True)
+class PlotOutput(OutputOptions):
+    """Files with a comparison."""
+
+    NO_OPTION: ClassVar[Collection[str]] = {"strips", "rrd", "npy"}
+
+    plot: Path | None = setting(
+        None, "Draw frames of each video above its scores, the best first: .png, .pdf or .svg.", metavar="FILE"
+    )

@@ -6,7 +6,7 @@ from __future__ import annotations
 import inspect
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
@@ -71,6 +71,7 @@ class Setting:
     default: Any
     title: str
     prefix: str
+    has_option: bool
     help: str
     least: float | None = None
     most: float | None = None
@@ -78,7 +79,6 @@ class Setting:
     metavar: str | None = None
     variable: str | None = None
     parse: Callable[[str], Any] | None = None
-    has_option: bool = True
 
     @property
     def option(self) -> str:
@@ -119,9 +119,9 @@ class Setting:
     @property
     def bounds(self) -> str:
         """Bounds of a number in words; empty without bounds."""
-        has_most = self.most is not None and self.most < _UNBOUNDED
         if self.least is None:
-            return f"at most {self.most:g}" if has_most else ""
+            return ""
+        has_most = self.most is not None and self.most < _UNBOUNDED
         return f"{self.least:g} to {self.most:g}" if has_most else f"at least {self.least:g}"
 
     @property
@@ -155,10 +155,12 @@ class Settings:
 
     TITLE: heading of the options in a command's help; options of a base class stand under the base's heading
     PREFIX: before the name of each option
+    NO_OPTION: settings without an option, which only files and programs set
     """
 
     TITLE: ClassVar[str] = "Options"
     PREFIX: ClassVar[str] = ""
+    NO_OPTION: ClassVar[Collection[str]] = ()
 
     def __post_init__(self) -> None:
         for each in self.settings().values():
@@ -171,7 +173,8 @@ class Settings:
         hints, found = typing.get_type_hints(kind), {}
         for each in fields(kind):
             title = next(base.TITLE for base in kind.__mro__ if each.name in inspect.get_annotations(base))
-            found[each.name] = Setting(each.name, hints[each.name], each.default, title, cls.PREFIX, **each.metadata)
+            own = hints[each.name], each.default, title, cls.PREFIX, each.name not in cls.NO_OPTION
+            found[each.name] = Setting(each.name, *own, **each.metadata)
         return found
 
 

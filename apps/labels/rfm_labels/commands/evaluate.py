@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rfm_client.command_line import JsonOutput, number, print_tables, table, with_options
+from rfm_client.command_line import PlotOutput, number, print_tables, table, with_options
 from rfm_client.options import setting
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ LEGEND = (
 
 
 @dataclass(frozen=True)
-class EvaluationOutput(JsonOutput):
+class EvaluationOutput(PlotOutput):
     """Files with an evaluation."""
 
     plot: Path | None = setting(
