@@ -6,7 +6,7 @@ Needs ``rfm-client[cli]``.
 
 from rfm_client.cli.command import Command, ExitCode, report, with_options
 from rfm_client.cli.options import PlotOutput, ServerOptions
-from rfm_client.cli.show import number, print_tables, table
+from rfm_client.cli.show import number, print_table
 
 __all__ = [
     "Command",
@@ -14,8 +14,7 @@ __all__ = [
     "PlotOutput",
     "ServerOptions",
     "number",
-    "print_tables",
+    "print_table",
     "report",
-    "table",
     "with_options",
 ]

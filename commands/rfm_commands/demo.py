@@ -18,7 +18,7 @@ from rfm_client.cli.options import FrameRate
 from rfm_client.cli.show import scores_table, status_tables
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.transport.status import read_status
+from rfm_client.transport.status import ServerStatus
 from rfm_commands.command import TritonPath, fail
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def score_video(
 
 def show_metrics(endpoints: Endpoints, console: Console) -> None:
     """Print Triton's counts of the demo's requests."""
-    status = read_status(endpoints.http_url, metrics_url=endpoints.metrics_url)
+    status = ServerStatus.read(endpoints.http_url, metrics_url=endpoints.metrics_url)
     console.print(*status_tables(status), sep="\n", markup=False, highlight=False)
 
 

@@ -273,5 +273,5 @@ def test_a_checkpoint_is_named_once() -> None:
 
 @pytest.mark.parametrize("value", [True, math.nan, math.inf, -math.inf, "5"], ids=str)
 def test_a_program_gives_numbers_too(value: Any) -> None:
-    with pytest.raises(ConfigError, match=f"^num_gpus: expected a finite number, got {re.escape(repr(value))}$"):
+    with pytest.raises(ConfigError, match=f"^num_gpus: expected a whole number, got {re.escape(repr(value))}$"):
         ExportConfig(num_gpus=value)

@@ -18,7 +18,6 @@ from rfm_client.serving import (
     ListenAddress,
     ServerStatus,
     check_certificate,
-    read_status,
 )
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
@@ -121,7 +120,7 @@ class GatewayConfig(Settings):
     async def status(self, timeout_s: float) -> ServerStatus:
         """Read the state of Triton and of its devices. Raises ServerError."""
         return await asyncio.to_thread(
-            read_status,
+            ServerStatus.read,
             self.triton_url,
             metrics_url=self.metrics_url,
             timeout_s=timeout_s,

@@ -163,14 +163,14 @@ def status(
     ] = None,
 ) -> None:
     """Show the server's models, requests, batches, GPUs and memory."""
-    from rfm_client.transport.status import read_status
+    from rfm_client.transport.status import ServerStatus
 
     if metrics_url is not None and len(server.urls) > 1:
         raise typer.BadParameter("--metrics-url needs a single --url")
     output.make_folders()
     with usage_errors("--url"):
         statuses = [
-            read_status(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=server.credentials)
+            ServerStatus.read(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=server.credentials)
             for url in server.urls
         ]
     if output.prints_tables:

@@ -21,12 +21,10 @@ def checked_count(
     return int(value)
 
 
-def checked_finite(
-    where: str, value: Any, expected: str = "a number", *, error: type[LocatedError] = InvalidValueError
-) -> float:
-    """Return a finite number. Raises ``error``, whose message says ``expected``."""
+def checked_finite(where: str, value: Any, expected: str = "a number") -> float:
+    """Return a finite number. Raises InvalidValueError, whose message says ``expected``."""
     is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    require(where, is_number and math.isfinite(value), expected, value if is_number else repr(value), error)
+    require(where, is_number and math.isfinite(value), expected, value if is_number else repr(value))
     return float(value)
 
 

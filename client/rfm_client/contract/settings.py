@@ -98,18 +98,17 @@ class Setting:
         raise ConfigError.at(self.name, self._expected, f"{value!r:.200}")
 
     def checked(self, value: Any) -> Any:
-        """Return the value, a number as Python's own. Raises ConfigError for a value out of bounds or no choice."""
+        """Return the value, a number as Python's own. Raises InvalidValueError: out of bounds, or no choice."""
         if value is None:
             return None
-        if self._choices:
-            require(self.name, value in self._choices, self._expected, f"{value!r:.200}", ConfigError)
-        if not {int, float} & {*self._kinds}:
-            return value
-        number = checked_finite(self.name, value, "a finite number", error=ConfigError)
-        number = checked_count(self.name, value, least=None, error=ConfigError) if int in self._kinds else number
-        require(self.name, self.least is None or number >= self.least, f"at least {self.least}", value, ConfigError)
-        require(self.name, self.most is None or number <= self.most, f"at most {self.most}", value, ConfigError)
-        return number
+        require(self.name, not self._choices or value in self._choices, self._expected, f"{value!r:.200}")
+        if int in self._kinds:
+            value = checked_count(self.name, value, least=None)
+        elif float in self._kinds:
+            value = checked_finite(self.name, value, "a finite number")
+        require(self.name, self.least is None or value >= self.least, f"at least {self.least}", value)
+        require(self.name, self.most is None or value <= self.most, f"at most {self.most}", value)
+        return value
 
     @property
     def placeholder(self) -> str | None:
@@ -163,8 +162,11 @@ class Settings:
     NO_OPTION: ClassVar[Collection[str]] = ()
 
     def __post_init__(self) -> None:
-        for each in self.settings().values():
-            object.__setattr__(self, each.name, each.checked(getattr(self, each.name)))
+        try:
+            for each in self.settings().values():
+                object.__setattr__(self, each.name, each.checked(getattr(self, each.name)))
+        except InvalidValueError as error:
+            raise ConfigError.like(error) from None
 
     @classmethod
     def settings(cls) -> dict[str, Setting]:

@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 import typer
 
 from rfm_client import RewardError
-from rfm_client.command_line import ExitCode, ServerOptions, print_tables, report, table, with_options
+from rfm_client.command_line import ExitCode, ServerOptions, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import Settings, setting
 from rfm_labels.commands.progress_bar import ProgressBar, Say
@@ -353,5 +353,5 @@ def _plan_rows(plan: Plan, dataset: Dataset, num_bytes: int, took_s: float) -> l
 
 
 def _print(rows: Sequence[tuple[str, str]]) -> None:
-    print_tables(table("", ("labels", ""), rows))
+    print_table("", ("labels", ""), rows)
     sys.stdout.flush()
