@@ -56,7 +56,7 @@ class CredentialFiles(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.credentials  # noqa: B018  # reports an unreadable file now, and may go to a machine without the files
+        self.credentials  # noqa: B018  # reports an unreadable file now, and Ray's other machines may lack the key
 
     @cached_property
     def credentials(self) -> Credentials:
