@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
@@ -21,7 +22,7 @@ from rfm_client.contract.settings import ConfigError, Settings, setting
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["ExportConfig", "ServeConfig"]
+__all__ = ["CheckpointConfig", "ExportConfig", "ServeConfig"]
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
@@ -40,12 +41,54 @@ _OF_A_MACHINE = {"most": MAX_OF_A_MACHINE}
 
 
 @dataclass(frozen=True)
-class ExportConfig(Settings):
-    """The settings that ``rfm export`` writes into a repository. To change them, export again."""
+class CheckpointConfig(Settings):
+    """A checkpoint, how it is asked, and its numbers."""
 
-    TITLE: ClassVar[str] = "Export (section export of the file)"
+    TITLE: ClassVar[str] = "Checkpoint"
 
     checkpoint: str | None = setting(None, "Folder, or Hugging Face id org/name[/subfolder][@tag].")
+    image_encoder: str | None = setting(None, "Folder or id of ReWiND's image encoder.")
+    text_encoder: str | None = setting(None, "Folder or id of ReWiND's text encoder.")
+    base_model: str | None = setting(
+        None, "Folder or id of a vision-language checkpoint's base model; else the one that it names."
+    )
+    reward_model: str | None = setting(
+        None,
+        "Reward model that an ordinary Qwen3-VL is asked as: topreward, topreward-robometer, roboreward or "
+        "roboreward-expected; settings follow: topreward,num_prefixes=15.",
+        flag="--as",
+        metavar="NAME",
+    )
+    video_prompt: VideoPrompt | None = setting(
+        None,
+        "Video prompt of a Qwen3-VL: as in transformers before 5.10 (bare), or since, with one more vision start and "
+        "end around the video (wrapped). Default: by the checkpoint's transformers_version.",
+    )
+    strict_answers: bool = setting(
+        False, "Refuse samples with an unclear RoboReward answer (1.5, 3/5, two scores) instead of marking them."
+    )
+    weights: Weights | None = setting(
+        None,
+        "Round the weights of a vision-language model to 8 bits (int8) or 4 bits (nf4), for GPUs of 8 or 12 GB. Scores "
+        "are then not the full checkpoint's. Default: as in the checkpoint.",
+    )
+    dtype: Dtype | None = setting(None, "Number type of the network; else as checkpoint and device decide.")
+
+    @property
+    def torch_dtype(self) -> torch.dtype | None:
+        """The torch type that ``dtype`` names; None: ``dtype`` is not set."""
+        import torch  # imported here: few readers of a configuration need it
+
+        return getattr(torch, self.dtype) if self.dtype else None
+
+
+@dataclass(frozen=True)
+class ExportConfig(CheckpointConfig):
+    """The settings that ``rfm export`` writes into a repository. To change them, export again."""
+
+    TITLE: ClassVar[str] = "Export"
+    NO_OPTION: ClassVar[Collection[str]] = {"batch_size"}
+
     name: str = setting(DEFAULT_MODEL, "Model name in the repository; raw frames are scored by NAME_frames.")
     num_gpus: int | None = setting(
         None, "GPUs, with as many instances on each; else all, or the CPU. 0: the CPU.", least=0, **_OF_A_MACHINE
@@ -68,32 +111,6 @@ class ExportConfig(Settings):
     max_sample_tokens: int = setting(
         DEFAULT_SAMPLE_TOKENS, "Most tokens of one sample, or of the longest prefix; bounds memory.", **_COUNT
     )
-    dtype: Dtype | None = setting(None, "Number type of the network; else as checkpoint and device decide.")
-    weights: Weights | None = setting(
-        None,
-        "Round the weights of a vision-language model to 8 bits (int8) or 4 bits (nf4), for GPUs of 8 or 12 GB. Scores "
-        "are then not the full checkpoint's. Default: as in the checkpoint.",
-    )
-    image_encoder: str | None = setting(None, "Folder or id of ReWiND's image encoder.")
-    text_encoder: str | None = setting(None, "Folder or id of ReWiND's text encoder.")
-    base_model: str | None = setting(
-        None, "Folder or id of a vision-language checkpoint's base model; else the one that it names."
-    )
-    reward_model: str | None = setting(
-        None,
-        "Reward model that an ordinary Qwen3-VL is asked as: topreward, topreward-robometer, roboreward or "
-        "roboreward-expected; settings follow: topreward,num_prefixes=15.",
-        flag="--as",
-        metavar="NAME",
-    )
-    video_prompt: VideoPrompt | None = setting(
-        None,
-        "Video prompt of a Qwen3-VL: as in transformers before 5.10 (bare), or since, with one more vision start and "
-        "end around the video (wrapped). Default: by the checkpoint's transformers_version.",
-    )
-    strict_answers: bool = setting(
-        False, "Refuse samples with an unclear RoboReward answer (1.5, 3/5, two scores) instead of marking them."
-    )
     max_queue_size: int | None = setting(
         None, "Requests that may wait for a model; more are rejected at once. Else any number.", **_COUNT
     )
@@ -112,7 +129,7 @@ class ExportConfig(Settings):
         "RoboReward's expected score.",
     )
     batch_size: int | None = setting(
-        None, "Of no effect, as in the FastAPI server; max_batch_size bounds a batch.", least=1, has_option=False
+        None, "Of no effect, as in the FastAPI server; max_batch_size bounds a batch.", least=1
     )
 
     def __post_init__(self) -> None:
@@ -120,13 +137,6 @@ class ExportConfig(Settings):
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", self.name):
             raise ConfigError.at("name", "letters, digits, _ and -", f"{self.name!r:.200}")
         require("name", len(self.name) <= MAX_NAME, f"at most {MAX_NAME} characters", len(self.name), ConfigError)
-
-    @property
-    def torch_dtype(self) -> torch.dtype | None:
-        """The torch type that ``dtype`` names; None: ``dtype`` is not set."""
-        import torch  # imported here: few readers of a configuration need it
-
-        return getattr(torch, self.dtype) if self.dtype else None
 
 
 @dataclass(frozen=True)
@@ -136,7 +146,7 @@ class ServeConfig(Settings):
     ``host`` may be a URL, as in the FastAPI server's file; only its address is kept.
     """
 
-    TITLE: ClassVar[str] = "Triton and its watch (section serve of the file)"
+    TITLE: ClassVar[str] = "Triton and its watch"
 
     host: str = setting(DEFAULT_HOST, "IP address to listen on, 0.0.0.0 or :: for all of IPv4 or IPv6.")
     http_port: int = setting(8000, "Triton's HTTP port.", **_PORT)

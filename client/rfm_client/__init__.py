@@ -13,7 +13,6 @@ from rfm_client.client import RewardClient
 from rfm_client.contract import (
     FRAME_SCORES,
     AccessDeniedError,
-    BatchTiming,
     ClientClosedError,
     DeadlineExceededError,
     FrameScores,
@@ -37,16 +36,13 @@ from rfm_client.contract import (
     Trajectory,
     float_frames_to_uint8,
 )
-from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
 from rfm_client.frames.inputs import as_trajectory, load_trajectory
 
 __all__ = [
     "FRAME_SCORES",
-    "SUCCESS_THRESHOLD",
     "AccessDeniedError",
     "AsyncRewardClient",
-    "BatchTiming",
     "ClientClosedError",
     "DeadlineExceededError",
     "Float32Array",

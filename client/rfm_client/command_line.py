@@ -4,21 +4,17 @@
 Needs ``rfm-client[cli]``.
 """
 
-from rfm_client.cli.command import Command, ExitCode, OptionsOf, report, with_options
-from rfm_client.cli.options import CredentialsGiven, OutputOptions, ServerOptions, credentials_of
-from rfm_client.cli.show import number, print_tables, table
+from rfm_client.cli.command import Command, ExitCode, report, with_options
+from rfm_client.cli.options import PlotOutput, ServerOptions
+from rfm_client.cli.show import number, print_table
 
 __all__ = [
     "Command",
-    "CredentialsGiven",
     "ExitCode",
-    "OptionsOf",
-    "OutputOptions",
+    "PlotOutput",
     "ServerOptions",
-    "credentials_of",
     "number",
-    "print_tables",
+    "print_table",
     "report",
-    "table",
     "with_options",
 ]

@@ -4,19 +4,17 @@
 from rfm_client.contract.checks import first_names, require
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.numbers import checked_count, checked_finite
-from rfm_client.contract.settings import ConfigError, Settings, Texts, setting, settings_of
+from rfm_client.contract.settings import ConfigError, Settings, setting
 from rfm_client.contract.tasks import is_blank
 
 __all__ = [
     "ConfigError",
     "InvalidValueError",
     "Settings",
-    "Texts",
     "checked_count",
     "checked_finite",
     "first_names",
     "is_blank",
     "require",
     "setting",
-    "settings_of",
 ]

@@ -8,7 +8,7 @@ from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.process_log import begin_request, write_log
 from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.off_loop import off_loop
-from rfm_client.transport.status import ServerStatus, read_status
+from rfm_client.transport.status import ServerStatus
 
 __all__ = [
     "DEFAULT_MODEL",
@@ -19,6 +19,5 @@ __all__ = [
     "check_certificate",
     "off_loop",
     "raise_limit",
-    "read_status",
     "write_log",
 ]

@@ -7,9 +7,9 @@ import importlib.metadata
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 import typer
 
@@ -20,7 +20,7 @@ from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import find_installation
 from rfm.launch.triton_server import TritonServer, short_spin
 from rfm.supervise.supervisor import CrashLoopError, GatewayProcess, Supervisor
-from rfm_client.cli.command import Given, OptionsOf, add_missing, with_options
+from rfm_client.cli.command import Given, add_missing, with_options
 from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import from_here
 from rfm_client.contract.process_log import write_log
@@ -78,7 +78,7 @@ def rfm(
 @app.command(cls=RfmCommand, epilog=EXPORT_EXAMPLE)
 @with_options
 def export(
-    given: Annotated[Given, OptionsOf(ExportConfig)],
+    given: Given[ExportConfig],
     repository: Annotated[Path, typer.Option(help="Triton model repository.")],
     source: Annotated[
         str | None, typer.Argument(metavar="CHECKPOINT", help="As --checkpoint.", show_default=False)
@@ -129,11 +129,18 @@ def export(
     typer.echo(f"{repository}: {settings.name} version {version}, scores equal to {whose}")
 
 
+@dataclass(frozen=True)
+class GatewayBeside(GatewayConfig):
+    """Settings of a gateway that ``rfm serve`` runs."""
+
+    PREFIX: ClassVar[str] = "gateway-"
+
+
 @app.command(cls=RfmCommand, epilog=SERVE_EXAMPLE)
 @with_options
 def serve(
-    given: Annotated[Given, OptionsOf(ServeConfig)],
-    gateway_given: Annotated[Given, OptionsOf(GatewayConfig, prefix="gateway-")],
+    given: Given[ServeConfig],
+    gateway_given: Given[GatewayBeside],
     words: Annotated[
         list[str] | None,
         typer.Argument(
@@ -237,7 +244,7 @@ def _beside(server: TritonServer, config: Config) -> GatewayConfig:
     return filled
 
 
-def _config(file: Path | None, **options: Given) -> Config:
+def _config(file: Path | None, **options: Given[Any]) -> Config:
     """The file's configuration with the given options of each section."""
     return (Config() if file is None else Config.from_yaml(file)).with_options(**options)
 

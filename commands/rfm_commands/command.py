@@ -10,10 +10,6 @@ import typer
 
 from rfm_client.cli import command
 
-OF_A_CHECKPOINT = ("checkpoint", "image_encoder", "text_encoder", "base_model", "reward_model")  # settings that name it
-ASKED_BY = ("video_prompt", "strict_answers", "weights")  # settings that change how it is asked, or its weights
-CHECKPOINT_TITLE = "Checkpoint"  # heading of their options in commands without --config
-
 AdminKeyFile = Annotated[
     Path | None, typer.Option(help="File with the server's admin key; else RFM_ADMIN_KEY.", show_default=False)
 ]

@@ -11,7 +11,7 @@ from typing import Any
 
 from rfm.config import ExportConfig, ServeConfig
 from rfm.plain_yaml import read_yaml
-from rfm_client.contract.settings import ConfigError, Settings, settings_of
+from rfm_client.contract.settings import ConfigError, Settings
 from rfm_gateway import GatewayConfig
 
 SECTIONS: dict[str, type[Settings]] = {"export": ExportConfig, "serve": ServeConfig, "gateway": GatewayConfig}
@@ -40,7 +40,7 @@ class Config:
 
     def __post_init__(self) -> None:
         serve = self.serve
-        ports = {f"serve.{name}": getattr(serve, name) for name in settings_of(ServeConfig) if name.endswith("_port")}
+        ports = {f"serve.{name}": getattr(serve, name) for name in ServeConfig.settings() if name.endswith("_port")}
         ports["gateway.port"] = self.gateway.port
         taken = {name: port for name, port in ports.items() if port is not None}
         if len(set(taken.values())) < len(taken):
@@ -84,8 +84,8 @@ def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:
             yield key, FASTAPI_KEYS[key], value
         elif key in SECTIONS:
             for inner, each in _items(value, key):
-                if inner not in settings_of(SECTIONS[key]):
-                    raise _unknown(f"{key}.{inner!s:.100}", (f"{key}.{name}" for name in settings_of(SECTIONS[key])))
+                if inner not in SECTIONS[key].settings():
+                    raise _unknown(f"{key}.{inner!s:.100}", (f"{key}.{name}" for name in SECTIONS[key].settings()))
                 yield f"{key}.{inner}", f"{key}.{inner}", each
         else:
             raise _unknown(f"{key!s:.100}", (*SECTIONS, *FASTAPI_KEYS))
@@ -94,7 +94,7 @@ def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:
 def _made(section: str, values: Mapping[str, Any], written: Mapping[str, str]) -> Any:
     """A section with these values. Raises ConfigError, which names the key as the file does."""
     kind = SECTIONS[section]
-    known = settings_of(kind)
+    known = kind.settings()
     try:
         return kind(**{key: known[key].from_plain(value) for key, value in values.items()})
     except ConfigError as error:
@@ -112,7 +112,7 @@ def _items(content: Any, where: str) -> Iterable[tuple[Any, Any]]:
 
 def _unknown(name: str, known: Iterable[str]) -> ConfigError:
     """The error of an unknown key, with the most similar key of any section."""
-    names = [*FASTAPI_KEYS, *(f"{section}.{key}" for section, kind in SECTIONS.items() for key in settings_of(kind))]
+    names = [*FASTAPI_KEYS, *(f"{section}.{key}" for section, kind in SECTIONS.items() for key in kind.settings())]
     keys = [each.rpartition(".")[2] for each in names]
     close = get_close_matches(name.rpartition(".")[2], keys, 1, cutoff=0.75)
     near = [each for each, key in zip(names, keys, strict=True) if [key] == close]

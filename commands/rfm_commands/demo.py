@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rfm.config import ExportConfig
+from rfm.config import CheckpointConfig, ExportConfig
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm_client import RewardClient, Trajectory
-from rfm_client.cli.command import Given, OptionsOf, with_options
-from rfm_client.cli.options import VideoOptions
+from rfm_client.cli.command import Given, with_options
+from rfm_client.cli.options import FrameRate
 from rfm_client.cli.show import scores_table, status_tables
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.transport.status import read_status
-from rfm_commands.command import ASKED_BY, CHECKPOINT_TITLE, OF_A_CHECKPOINT, TritonPath, fail
+from rfm_client.transport.status import ServerStatus
+from rfm_commands.command import TritonPath, fail
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,8 +30,9 @@ REPOSITORY = Path("model_repository")
 @with_options
 def demo(
     video: Annotated[Path, typer.Option(help="Video file to score.")],
-    asked: Annotated[VideoOptions, OptionsOf(VideoOptions, only=("task", "fps"), required=("task",))],
-    given: Annotated[Given, OptionsOf(ExportConfig, only=(*OF_A_CHECKPOINT, *ASKED_BY), title=CHECKPOINT_TITLE)],
+    task: Annotated[str, typer.Option(help="The task, as a sentence.")],
+    rate: FrameRate,
+    given: Given[CheckpointConfig],
     repository: Annotated[Path, typer.Option(help="Repository to serve, if no checkpoint is given.")] = REPOSITORY,
     output: Annotated[Path, typer.Option(help="Folder for the plot and Triton's log.")] = Path("demo_output"),
     tritonserver: TritonPath = None,
@@ -46,7 +47,7 @@ def demo(
         fail(f'the demo needs {error.name}: pip install ".[demo,encoders,triton]"')
     console, settings = Console(), ExportConfig(**given)
     with stopped_by_signals(), TemporaryDirectory(prefix="rfm-demo-") as folder:
-        frames = read_video(video, asked.fps)
+        frames = read_video(video, rate.fps)
         try:
             output.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -54,7 +55,7 @@ def demo(
         if settings.checkpoint is not None:
             repository = _exported_frames(settings.checkpoint, settings, Path(folder) / "model_repository")
         with temporary_server(repository, output / "tritonserver.log", tritonserver) as endpoints:
-            score_video(endpoints, video, frames, asked.task, output / "rewards.png", console)
+            score_video(endpoints, video, frames, task, output / "rewards.png", console)
             show_metrics(endpoints, console)
 
 
@@ -79,7 +80,7 @@ def score_video(
 
 def show_metrics(endpoints: Endpoints, console: Console) -> None:
     """Print Triton's counts of the demo's requests."""
-    status = read_status(endpoints.http_url, metrics_url=endpoints.metrics_url)
+    status = ServerStatus.read(endpoints.http_url, metrics_url=endpoints.metrics_url)
     console.print(*status_tables(status), sep="\n", markup=False, highlight=False)
 
 

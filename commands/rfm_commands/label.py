@@ -5,23 +5,32 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Annotated
 
 import typer
 
-from rfm.config import ExportConfig
-from rfm_client.cli.command import Given, OptionsOf, with_options
-from rfm_commands.command import ASKED_BY, CHECKPOINT_TITLE, OF_A_CHECKPOINT, say
+from rfm.config import CheckpointConfig
+from rfm_client.cli.command import Given, with_options
+from rfm_client.contract.settings import setting
+from rfm_commands.command import say
 from rfm_labels import LabelOptions, RayOptions, Scorer
 from rfm_labels.commands import DatasetArgument, EpisodeTexts, LabelCommand, RunOptions
 
-_OPTIONS = (*OF_A_CHECKPOINT, *ASKED_BY, "dtype")
+_ALWAYS_TOLD = ("image_encoder", "text_encoder", "base_model", "reward_model")  # to the recipe, also where not given
+
+
+@dataclass(frozen=True)
+class LabellingCheckpoint(CheckpointConfig):
+    """The checkpoint that labels."""
+
+    checkpoint: str = setting(..., "Folder, or Hugging Face id org/name[/subfolder][@tag].")
 
 
 @with_options
 def label(
     dataset: DatasetArgument,
-    given: Annotated[Given, OptionsOf(ExportConfig, only=_OPTIONS, required=("checkpoint",), title=CHECKPOINT_TITLE)],
+    given: Given[LabellingCheckpoint],
     texts: EpisodeTexts,
     labels: LabelOptions,
     run: RunOptions,
@@ -32,16 +41,16 @@ def label(
 
     `rfm-client label` writes the same files by asking running servers.
     """
-    checkpoint, *encoders = (given.get(name) for name in OF_A_CHECKPOINT)
+    checkpoint = LabellingCheckpoint(**given)
+    options = {**dict.fromkeys(_ALWAYS_TOLD), **given}
+    del options["checkpoint"]
+    options.pop("dtype", None)
 
     @contextmanager
     def connect() -> Iterator[Scorer]:
         from rfm_commands.engine_scorer import EngineScorer
 
-        dtype = ExportConfig(dtype=given.get("dtype")).torch_dtype
-        options = dict(zip(OF_A_CHECKPOINT[1:], encoders, strict=True))
-        options |= {name: given[name] for name in ASKED_BY if name in given}
-        scorer = EngineScorer(str(checkpoint), device=device, dtype=dtype, **options)
+        scorer = EngineScorer(checkpoint.checkpoint, device=device, dtype=checkpoint.torch_dtype, **options)
         for note in scorer.notes:
             say(note)
         yield scorer

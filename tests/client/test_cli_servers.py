@@ -251,6 +251,32 @@ def test_what_is_missing_to_run_is_told_with_the_command_that_installs_it() -> N
     assert result.stderr == 'rfm-client: expected the package typer, got none: pip install "./client[cli]"\n'
 
 
+BEFORE, AFTER, VARIABLE = (
+    ["--api-key-file", "/before"],
+    ["--api-key-file", "/after"],
+    {"RFM_API_KEY_FILE": "/variable"},
+)
+WINNERS = {
+    "variable": ([], [], VARIABLE, "/variable"),
+    "before the subcommand": (BEFORE, [], VARIABLE, "/before"),
+    "after it": (BEFORE, AFTER, VARIABLE, "/after"),
+    "after it alone": ([], AFTER, VARIABLE, "/after"),
+}
+
+
+@pytest.mark.parametrize(("before", "after", "variables", "winner"), WINNERS.values(), ids=WINNERS)
+def test_an_option_wins_over_one_before_the_subcommand_and_both_over_the_variable(
+    before: list[str], after: list[str], variables: dict[str, str], winner: str
+) -> None:
+    result = invoke(*before, "status", *after, env=variables)
+    assert result.exit_code == ExitCode.USAGE
+    assert f"No such file or directory: '{winner}'" in " ".join(result.stderr.split())
+
+
+def test_a_bad_variable_hurts_no_command_that_does_not_need_it() -> None:
+    assert invoke("score", "--help", env=VARIABLE).exit_code == ExitCode.OK
+
+
 def test_a_missing_package_costs_a_line(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client.parser", None)
     result = invoke("status", "--url", served.url("grpc"))

@@ -13,8 +13,8 @@ from rich.console import Console
 
 import clip
 from client_commands import RFM_CLIENT, TASK
-from rfm_client.cli.show import shortened, status_tables
-from rfm_client.command_line import ExitCode, table
+from rfm_client.cli.show import shortened, status_tables, table
+from rfm_client.command_line import ExitCode
 from rfm_client.serving import ServerStatus
 from rfm_client.transport.status import ModelStatus
 from servers import Endpoints

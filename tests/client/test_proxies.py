@@ -14,7 +14,7 @@ from gateways import running
 from proxies import HttpProxy, Proxy
 from rfm_client import DeadlineExceededError, RewardClient
 from rfm_client.contract.proxies import grpc_proxy, open_url
-from rfm_client.serving import read_status
+from rfm_client.serving import ServerStatus
 from servers import Endpoints
 
 pytestmark = pytest.mark.triton
@@ -51,7 +51,7 @@ def test_this_machine_is_reached_without_a_proxy(
         url = f"{scheme}://{host}:{near.port}"
         with RewardClient(url, retry=False) as client:
             assert client.model_info().name == "rfm"
-        assert read_status(url, metrics_url=demo_server.metrics_url).devices
+        assert ServerStatus.read(url, metrics_url=demo_server.metrics_url).devices
 
 
 def test_a_gateway_reaches_its_triton_without_a_proxy(demo_server: Endpoints, tmp_path: Path) -> None:
@@ -67,7 +67,9 @@ def test_other_hosts_are_reached_through_it(
     with RewardClient(f"grpc://{ELSEWHERE}:8001", retry=False) as client:
         assert client.model_info().name == "rfm"
     assert proxy.asked == [f"{ELSEWHERE}:8001"]
-    assert read_status(f"grpc://{ELSEWHERE}:8001", metrics_url=demo_server.metrics_url).ready  # the proxy has no HTTP
+    assert ServerStatus.read(
+        f"grpc://{ELSEWHERE}:8001", metrics_url=demo_server.metrics_url
+    ).ready  # the proxy has no HTTP
 
 
 @pytest.mark.parametrize("variable", ["http_proxy", "https_proxy", "grpc_proxy"])
@@ -132,7 +134,7 @@ def test_ipv6_addresses_are_reached(demo_server: Endpoints, protocol: str) -> No
         )
         with RewardClient(url) as client:
             assert client.model_info().name == "rfm"
-        status = read_status(url)
+        status = ServerStatus.read(url)
         assert (status.ready, status.metrics_url) == (True, "http://[::1]:8002/metrics")
         message = invoke("sample", "--url", other).stderr
         assert f"use {url}" in message

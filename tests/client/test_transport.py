@@ -23,7 +23,7 @@ from rfm_client import (
     ServerUnavailableError,
     Trajectory,
 )
-from rfm_client.serving import Credentials, read_status
+from rfm_client.serving import Credentials, ServerStatus
 from trajectories import random_trajectory
 
 TIMEOUT_S = 1.0
@@ -128,7 +128,7 @@ def test_a_redirect_is_told_and_never_followed() -> None:
                 with pytest.raises(DeadlineExceededError, match="got a redirect to"):
                     client.wait_ready(TIMEOUT_S)
             with pytest.raises(InferenceFailedError, match=told):
-                read_status(url, credentials=Credentials(headers={"x-secret": "s"}))
+                ServerStatus.read(url, credentials=Credentials(headers={"x-secret": "s"}))
     assert arrived == []
 
 

@@ -16,11 +16,11 @@ from labelling import LEROBOT
 from paths import ROOT
 from rfm.config import ExportConfig, ServeConfig
 from rfm.supervise.supervisor import GatewayProcess, Supervisor
-from rfm_client.options import ConfigError, settings_of
+from rfm_client.options import ConfigError
 from rfm_commands import cli
 from rfm_commands.config import SECTIONS, Config
 from rfm_gateway import GatewayConfig
-from rfm_gateway.command import OPTIONS
+from rfm_gateway.command import GatewayOptions
 from servers import Endpoints
 
 REPOSITORY = ROOT / "model_repository"
@@ -170,12 +170,11 @@ def invoke(*words: str) -> Result:
 
 def test_every_setting_is_an_option_of_its_command() -> None:
     commands = get_command(cli.app).commands  # type: ignore[attr-defined]
-    for section, kind in SECTIONS.items():
+    for section, kind in {**SECTIONS, "gateway": GatewayOptions}.items():
         options = {option: each for each in commands[section].params for option in each.opts}
-        for name, setting in settings_of(kind).items():
+        for name, setting in kind.settings().items():
             assert (setting.option in options) is setting.has_option, name
-            text = OPTIONS.helps.get(name, setting.help) if section == "gateway" else setting.help
-            assert not setting.has_option or options[setting.option].help.startswith(text), name
+            assert not setting.has_option or options[setting.option].help.startswith(setting.help), name
 
 
 def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path: Path) -> None:
@@ -198,8 +197,8 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path
     }
     files = {"certificate", "key", "triton_ca_file", "triton_certificate", "triton_key"}  # which a gateway would read
     switches = {"viewer", "use_frame_steps", "refuse_blank"}
-    assert given.keys() | files | switches == settings_of(GatewayConfig).keys()
-    options = {settings_of(GatewayConfig)[name].option: [value] for name, value in given.items()}
+    assert given.keys() | files | switches == GatewayConfig.settings().keys()
+    options = {GatewayConfig.settings()[name].option: [value] for name, value in given.items()}
     words = [f"--gateway-{option.removeprefix('--')}={value}" for option, (value,) in options.items()]
     for switch in ("viewer", "no-viewer"):
         assert started(*words, f"--gateway-{switch}") == {**options, f"--{switch}": []}
@@ -281,5 +280,5 @@ def test_a_checkpoint_is_named_once() -> None:
 
 @pytest.mark.parametrize("value", [True, math.nan, math.inf, -math.inf, "5"], ids=str)
 def test_a_program_gives_numbers_too(value: Any) -> None:
-    with pytest.raises(ConfigError, match=f"^num_gpus: expected a finite number, got {re.escape(repr(value))}$"):
+    with pytest.raises(ConfigError, match=f"^num_gpus: expected a whole number, got {re.escape(repr(value))}$"):
         ExportConfig(num_gpus=value)

@@ -40,7 +40,7 @@ from gateway_requests import (
 )
 from gateways import WITHIN_S, Gateway, answers, free_port, poll, running
 from rfm_client import InvalidSampleError, ModelNotFoundError, Trajectory
-from rfm_client.serving import read_status
+from rfm_client.serving import ServerStatus
 from servers import Endpoints
 from tolerances import TOLERANCE
 
@@ -59,7 +59,7 @@ def test_gpu_status_counts_each_request_once(encoders: Gateway, tiny: Gateway, t
     for _ in range(3):
         answered(ask_json(encoders, [progress(filmed(1, 2))]))
     assert work_done(encoders)[0] == count + 3
-    models = read_status(encoders.triton_url, metrics_url=triton.endpoints.metrics_url).models
+    models = ServerStatus.read(encoders.triton_url, metrics_url=triton.endpoints.metrics_url).models
     computed_s = sum(model.busy_ms for model in models if model.name in (ENCODERS, f"{ENCODERS}_encoder")) / 1e3
     assert busy_s < work_done(encoders)[1] == pytest.approx(computed_s, rel=0.01)
     assert work_done(tiny) == of_other

@@ -31,7 +31,7 @@ from in_process import rfm_app
 from paths import ROOT
 from rfm.config import ServeConfig
 from rfm_client import AccessDeniedError, RewardClient, ServerUnavailableError, Trajectory
-from rfm_client.serving import Credentials, read_status
+from rfm_client.serving import Credentials, ServerStatus
 from servers import Endpoints, Serving, serving, wait_for
 from tolerances import TOLERANCE
 
@@ -231,7 +231,9 @@ def test_scores_through_the_proxy_are_those_of_the_server(box: Box, scheme: str,
     with box.client(f"{scheme}://{host}:{box.port}", shared_memory=True) as asked:  # which the proxy does not pass on
         again = asked.progress(FILMED)
         np.testing.assert_allclose(again.progress, expected.progress, atol=TOLERANCE)  # type: ignore[union-attr]
-    status = read_status(f"{scheme}://{host}:{box.port}", credentials=Credentials(box.ca_file, api_key=box.key(LATER)))
+    status = ServerStatus.read(
+        f"{scheme}://{host}:{box.port}", credentials=Credentials(box.ca_file, api_key=box.key(LATER))
+    )
     assert {model.name for model in status.models} >= {"rfm", "rfm_frames"}
 
 

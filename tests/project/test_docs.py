@@ -31,7 +31,6 @@ from paths import ROOT
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.contract import FRAME_SCORES, wire
 from rfm_client.contract.settings import Setting
-from rfm_client.options import settings_of
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
 from servers import Endpoints
@@ -306,8 +305,7 @@ def test_every_key_is_documented_under_its_lifetime_with_its_option_and_default(
     assert text.startswith(f"\nKeys of the section `{section}`")
     documented = [(key, option, default) for key, _, option, default in ROW.findall(text)]
     assert documented == [
-        (key, each.option if each.has_option else "", shown(each))
-        for key, each in settings_of(SECTIONS[section]).items()
+        (key, each.option if each.has_option else "", shown(each)) for key, each in SECTIONS[section].settings().items()
     ]
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -90,6 +91,13 @@ def test_what_chooses_frames_stands_in_one_group_of_score() -> None:
     group, _, _ = below.partition("\n\n")
     first_words = [line.split()[0] for line in group.splitlines() if line.startswith("  --")]
     assert first_words == ["--fps", "--max-frames", "--subsample", "--sampling", "--frames", "--frame-steps"]
+
+
+@pytest.mark.parametrize("name", ["rfm-client score", "rfm-client compare", "rfm-client label"])
+def test_the_server_stands_last(name: str) -> None:
+    shown = CliRunner().invoke(COMMANDS["rfm-client"], [*name.split()[1:], "--help"], env=COMMON).output
+    titles = re.findall(r"^(\w[\w -]*):$", shown, re.MULTILINE)
+    assert titles[-2:] == ["Credentials", "Server"]
 
 
 ALTERNATIVES = {

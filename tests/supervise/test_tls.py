@@ -28,7 +28,7 @@ from engines import load_engine
 from in_process import rfm, rfm_client
 from repositories import kill_model
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
-from rfm_client.serving import Credentials, read_status
+from rfm_client.serving import Credentials, ServerStatus
 from secured import PUBLIC_HOST, Papers, other_program
 from servers import KEY, PATIENCE_S, Endpoints, GrpcTls, Serving, serving, start_triton, wait_for
 from tolerances import TOLERANCE
@@ -139,7 +139,7 @@ def test_a_client_without_tls_is_told(secure: Endpoints, scheme: str) -> None:
 def test_a_client_is_known_by_its_certificate(mutual: Endpoints, papers: Papers) -> None:
     with client(mutual.grpc_url, **papers.client) as asked:
         scores_right(asked)
-    assert read_status(mutual.grpc_url, credentials=Credentials(**papers.client)).ready
+    assert ServerStatus.read(mutual.grpc_url, credentials=Credentials(**papers.client)).ready
     with client(mutual.grpc_url, ca_file=papers.ca, retry=False) as asked:  # Triton hangs up and does not say why
         with pytest.raises(ServerUnavailableError, match="Socket closed"):
             asked.progress(TRAJECTORY)
@@ -220,7 +220,7 @@ def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
 def test_http_through_a_proxy_with_tls_and_a_key(proxied: str, papers: Papers) -> None:
     with client(proxied, api_key=KEY, **papers.client) as asked:
         scores_right(asked)
-    status = read_status(proxied, credentials=Credentials(**papers.client, api_key=KEY))
+    status = ServerStatus.read(proxied, credentials=Credentials(**papers.client, api_key=KEY))
     assert [model.name for model in status.models] == ["rfm"]
 
 
@@ -236,7 +236,7 @@ def test_a_proxy_denies_who_shows_no_key_or_certificate_and_is_not_trusted_by_st
         with client(proxied, **options) as asked, denied_at_once(f"access denied: {told}"):
             asked.progress(TRAJECTORY)
         with pytest.raises(AccessDeniedError, match=f"access denied: {told}"):
-            read_status(proxied, credentials=Credentials(**options))
+            ServerStatus.read(proxied, credentials=Credentials(**options))
     with (
         client(proxied, api_key=KEY, ca_file=papers.ca, retry=False) as asked,
         pytest.raises((AccessDeniedError, ServerUnavailableError)),  # by the moment at which the proxy hangs up

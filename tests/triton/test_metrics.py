@@ -31,7 +31,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
-from rfm_client.serving import read_status
+from rfm_client.serving import ServerStatus
 from servers import RepositoryApi, Served, wait_for
 from tensors import infer
 from trajectories import random_trajectory
@@ -215,7 +215,7 @@ def test_the_client_s_status_and_prometheus_agree(served: Served) -> None:
     """Without the admin key: the repository's index is not asked for."""
 
     def status(protocol: str) -> tuple[int, int]:
-        read = read_status(served.url(protocol), metrics_url=served.endpoints.metrics_url)
+        read = ServerStatus.read(served.url(protocol), metrics_url=served.endpoints.metrics_url)
         (model,) = (model for model in read.models if model.name == MODEL)
         assert (model.state, model.version, read.ready) == ("READY", "1", True)
         return model.requests_succeeded, model.samples

@@ -7,36 +7,33 @@ import logging
 import os
 import sys
 from collections.abc import Mapping
-from typing import Annotated
+from dataclasses import dataclass
 
 import typer
 
-from rfm_client.command_line import OptionsOf, with_options
-from rfm_client.options import ConfigError, settings_of
+from rfm_client.command_line import with_options
+from rfm_client.options import ConfigError, setting
 from rfm_client.serving import DEFAULT_MODEL, raise_limit, write_log
-from rfm_gateway.config import DEFAULT_HOST, DEFAULT_PORT, GatewayConfig
+from rfm_gateway.config import DEFAULT_HOST, DEFAULT_PORT, MAX_PORT, GatewayConfig
 
 KEEP_ALIVE_S = 30
 STOP_WITHIN_S = 30
-OPTIONS = OptionsOf(
-    GatewayConfig,
-    required=("triton",),
-    defaults={"host": DEFAULT_HOST, "port": DEFAULT_PORT, "model": DEFAULT_MODEL},
-    helps={
-        "host": "Address to listen on.",
-        "port": "Port to listen on.",
-        "triton": "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://.",
-        "metrics_url": "Triton's metrics; else port 8002 of the same host.",
-        "model": "Name under which the checkpoint was exported.",
-    },
-    title="Gateway",
-)
-
 logger = logging.getLogger("rfm_gateway")
 
 
+@dataclass(frozen=True)
+class GatewayOptions(GatewayConfig):
+    """Settings of a gateway without ``rfm serve``."""
+
+    port: int | None = setting(DEFAULT_PORT, "Port to listen on.", least=1, most=MAX_PORT)
+    host: str | None = setting(DEFAULT_HOST, "Address to listen on.")
+    triton: str | None = setting(..., "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://.")
+    metrics_url: str | None = setting(None, "Triton's metrics; else port 8002 of the same host.")
+    model: str | None = setting(DEFAULT_MODEL, "Name under which the checkpoint was exported.")
+
+
 @with_options
-def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
+def gateway(config: GatewayOptions) -> None:
     """Serve the FastAPI server's endpoints before a Triton server.
 
     For a Triton that runs already. `rfm serve --gateway-port` starts Triton and gateway together, and restarts both.
@@ -93,11 +90,11 @@ def check_gateway(config: GatewayConfig, environment: Mapping[str, str]) -> None
 def gateway_command(config: GatewayConfig) -> list[str]:
     """Return a command line that runs this gateway in another process."""
     words = []
-    for name, each in settings_of(GatewayConfig).items():
+    for name, each in GatewayConfig.settings().items():
         value = getattr(config, name)
         if isinstance(value, bool):
             if value or each.default:  # a switch that is off by default has no --no-
-                words.append(each.option if value else each.option.replace("--", "--no-", 1))
+                words.append(each.option if value else each.negation)
             continue
         values = value if isinstance(value, tuple) else () if value is None else (value,)
         words += [word for value in values for word in (each.option, str(value))]

@@ -11,20 +11,19 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from rfm_client import AsyncRewardClient
-from rfm_client.options import ConfigError, Settings, Texts, setting
+from rfm_client.options import ConfigError, Settings, setting
 from rfm_client.serving import (
     DEFAULT_MODEL,
     Credentials,
     ListenAddress,
     ServerStatus,
     check_certificate,
-    read_status,
 )
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
 MIB = 2**20
 KEY_VARIABLE = "RFM_GATEWAY_API_KEY"
-_MAX_PORT = 65535
+MAX_PORT = 65535
 _HOST_NAME = re.compile(r"[\w.-]+", re.ASCII)
 _ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/A-Z]+")  # as browsers send it
 _SHORTEST_S, _LONGEST_S = 0.001, 86_400.0  # a day
@@ -37,9 +36,9 @@ class GatewayConfig(Settings):
     Addresses may be None, because ``rfm serve`` and ``rfm gateway`` have different defaults for them.
     """
 
-    TITLE: ClassVar[str] = "Gateway (section gateway of the file)"
+    TITLE: ClassVar[str] = "Gateway"
 
-    port: int | None = setting(None, "Port to listen on; else there is no gateway.", least=1, most=_MAX_PORT)
+    port: int | None = setting(None, "Port to listen on; else there is no gateway.", least=1, most=MAX_PORT)
     host: str | None = setting(None, "Address to listen on; else that of Triton.")
     triton: str | None = setting(
         None, "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://; else the one beside it."
@@ -52,8 +51,8 @@ class GatewayConfig(Settings):
     triton_ca_file: Path | None = setting(None, "Authorities (PEM) that Triton is trusted by; else the system's.")
     triton_certificate: Path | None = setting(None, "By which Triton knows the gateway (PEM).")
     triton_key: Path | None = setting(None, "That certificate's key (PEM).")
-    cors_origin: Texts = setting((), "Origin from which browsers may ask. Repeat for more.")
-    allow_host: Texts = setting((), "Host name by which callers may ask without a key. Repeat for more.")
+    cors_origin: tuple[str, ...] = setting((), "Origin from which browsers may ask. Repeat for more.")
+    allow_host: tuple[str, ...] = setting((), "Host name by which callers may ask without a key. Repeat for more.")
     allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
     timeout_s: float = setting(
         120.0,
@@ -68,7 +67,7 @@ class GatewayConfig(Settings):
     use_frame_steps: bool = setting(False, "Score by prefixes where a request has no field use_frame_steps.")
     refuse_blank: bool = setting(False, "Refuse black and single-colour frames; else they get a warning.")
     viewer: bool = setting(True, "Serve the page in the browser, at /.")
-    dataset: Texts = setting((), "LeRobot folder or HDF5 file to show on the page. Repeat for more.")
+    dataset: tuple[str, ...] = setting((), "LeRobot folder or HDF5 file to show on the page. Repeat for more.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -123,7 +122,7 @@ class GatewayConfig(Settings):
     async def status(self, timeout_s: float) -> ServerStatus:
         """Read the state of Triton and of its devices. Raises ServerError."""
         return await asyncio.to_thread(
-            read_status,
+            ServerStatus.read,
             self.triton_url,
             metrics_url=self.metrics_url,
             timeout_s=timeout_s,

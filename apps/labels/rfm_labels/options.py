@@ -13,7 +13,7 @@ from rfm_client import (
     RewardError,
 )
 from rfm_client.frames import Fuse, Rule
-from rfm_client.options import ConfigError, InvalidValueError, Settings, checked_count, checked_finite, setting
+from rfm_client.options import ConfigError, InvalidValueError, Settings, checked_count, setting
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import listed, require
 
@@ -129,9 +129,6 @@ class LabelOptions(Settings):
     in_place: bool = setting(False, "Write the labels into the HDF5 file itself.")
 
     def __post_init__(self) -> None:
-        for name in ("workers", "limit", "frames"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, checked_count(name, getattr(self, name)))
         for name in ("episodes", "shard"):
             if getattr(self, name) is not None:
                 numbers = tuple(checked_count(name, each, least=0) for each in getattr(self, name))
@@ -164,11 +161,6 @@ class RayOptions(Settings):
     address: str | None = setting(None, "Ray cluster; else a running cluster, or a new one on this machine.")
     actors: int = setting(1, "Ray actors, each with a scorer.", least=1)
     num_gpus_per_actor: float = setting(0.0, "GPUs of its node that a Ray actor takes.", least=0)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "actors", checked_count("actors", self.actors))
-        object.__setattr__(self, "num_gpus_per_actor", checked_finite("num_gpus_per_actor", self.num_gpus_per_actor))
-        super().__post_init__()
 
 
 def chosen_numbers(dataset: Dataset, options: LabelOptions) -> list[int]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client import SUCCESS_THRESHOLD
+from rfm_client.episodes import SuccessRule
 from rfm_labels.datasets.faults import require
 from rfm_labels.label_files import read_label_table
 from rfm_labels.metadata import PROGRESS, SUCCESS
@@ -43,7 +43,7 @@ class Summary:
     @property
     def never_succeed(self) -> npt.NDArray[np.int64] | None:
         """int64 [N], episodes in which no frame has a success of 0.5 or more; None: success is not predicted."""
-        return None if self.best_success is None else self.episodes[self.best_success < SUCCESS_THRESHOLD]
+        return None if self.best_success is None else self.episodes[self.best_success < SuccessRule.threshold]
 
     def rows(self) -> list[tuple[str, str]]:
         """Return name and value of each row of a table."""

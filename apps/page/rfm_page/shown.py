@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from fastapi import HTTPException
 
-from rfm_client import SUCCESS_THRESHOLD
+from rfm_client.episodes import SuccessRule
 from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_labels import (
     Curve,
@@ -115,7 +115,7 @@ class ShownDataset(ABC):
             "unused": [unused.get(camera) for camera in self.cameras],
             "corrections": [asdict(self._correction(file, camera)) for camera in self.cameras],
             "fps": self.fps,
-            "threshold": SUCCESS_THRESHOLD,
+            "threshold": SuccessRule.threshold,
             "provenance": None if file is None else read_provenance(file),
             "written_s": None if status is None else status.st_mtime,
             "episodes": [

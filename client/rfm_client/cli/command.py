@@ -3,26 +3,29 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import MISSING
 from enum import IntEnum
-from typing import Annotated, Any, NoReturn, TypeAlias, get_args, get_origin
+from typing import Annotated, Any, Generic, NoReturn, TypeVar, get_args, get_origin
 
 import typer
 from typer.core import TyperCommand
 from typer.models import OptionInfo
 
 from rfm_client.contract import errors
-from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of, settings_of
+from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of
 
 STANDARD_OUTPUT = "-"
 
-Given: TypeAlias = dict[str, Any]  # values of the given options, by setting
+S = TypeVar("S", bound=Settings)
+
+
+class Given(dict[str, Any], Generic[S]):
+    """Values of the options on the command line, by the name of their setting in S."""
 
 
 class ExitCode(IntEnum):
@@ -49,115 +52,33 @@ _ERROR_CODES: dict[type[BaseException], ExitCode] = {
 }
 
 
-@dataclass(frozen=True)
-class OptionsOf:
-    """A mark of a command's parameter, whose settings become options.
-
-    A ``Given`` parameter gets only the given settings, another parameter an object of ``settings``.
-
-    prefix: before each option's name
-    only: settings with an option; empty: all
-    required: settings that must be given
-    defaults: replace the settings' own defaults
-    helps: replace the settings' own help texts
-    title: replaces the settings' own heading
-    reads_variables: False: the help names environment variables, and the parent command reads them
-    """
-
-    settings: type[Settings]
-    prefix: str = ""
-    only: Collection[str] = ()
-    required: Collection[str] = ()
-    defaults: Mapping[str, Any] = field(default_factory=dict)
-    helps: Mapping[str, str] = field(default_factory=dict)
-    title: str | None = None
-    reads_variables: bool = True
-
-    @property
-    def chosen(self) -> list[Setting]:
-        """The settings with an option."""
-        known = settings_of(self.settings).values()
-        return [each for each in known if each.has_option and (not self.only or each.name in self.only)]
-
-    def option(self, setting: Setting) -> str:
-        """Return the option of a setting, with the prefix."""
-        return f"--{self.prefix}{setting.option.removeprefix('--')}"
-
-    def name(self, setting: Setting) -> str:
-        """Return the parameter name that typer makes of an option."""
-        return f"{self.prefix}{setting.name}".replace("-", "_")
-
-    def parameter(self, setting: Setting) -> inspect.Parameter:
-        """Return the parameter for typer. Its default is None, so that a file or the settings' default can decide."""
-        is_required = setting.name in self.required
-        default = None if is_required else self.defaults.get(setting.name, setting.default)
-        option = self.option(setting)
-        if default is True:
-            option += f"/--{self.prefix}no-{setting.option.removeprefix('--')}"
-        described = typer.Option(
-            option,
-            help=self._help(setting, default),
-            metavar=setting.placeholder,
-            envvar=setting.variable if self.reads_variables else None,
-            show_default=False,
-            show_envvar=False,  # ``help`` has it
-            rich_help_panel=setting.group or self.title or self.settings.TITLE,
-        )
-        kind = str if setting.parse else list[str] if setting.kind == Texts else setting.kind
-        return inspect.Parameter(
-            self.name(setting),
-            inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if is_required else None,
-            annotation=Annotated[kind if is_required else kind | None, described],
-        )
-
-    def _help(self, setting: Setting, default: Any) -> str:
-        """The help text with bounds, default and variable of the option."""
-        shown = self.option(setting) if default is True else _shown(default)
-        facts = [
-            *([setting.bounds] if setting.bounds else []),
-            *([f"default: {shown}"] if shown else []),
-            *([f"variable: {setting.variable}"] if setting.variable else []),
-        ]
-        text = self.helps.get(setting.name, setting.help)
-        return f"{text}  [{'; '.join(facts)}]" if facts else text
-
-    def taken_from(self, values: dict[str, Any]) -> Given:
-        """Remove this mark's options from ``values``, and return the given settings. Raises typer.BadParameter."""
-        given = {}
-        for each in self.chosen:
-            value = values.pop(self.name(each))
-            if value in (None, []):
-                continue
-            with usage_errors(self.option(each)):
-                value = each.parse(value) if each.parse else value
-            given[each.name] = tuple(value) if isinstance(value, list) else value
-        return given
-
-
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with an option for each setting of its ``Settings`` and ``OptionsOf`` parameters."""
+    """Return the command with an option for each setting of its ``Settings`` and ``Given`` parameters.
+
+    An option before a subcommand counts for the subcommand too, where it is not given again.
+    """
     # not typing.get_type_hints, which in Python 3.10 hides the annotation of a parameter whose default is None
-    hints = {name: each.annotation for name, each in inspect.signature(command, eval_str=True).parameters.items()}
-    marked = {name: mark for name, hint in hints.items() if (mark := _mark(hint)) is not None}
-    parameters: list[inspect.Parameter] = []
-    for name, parameter in inspect.signature(command).parameters.items():
-        if name in marked:
-            parameters += map(marked[name].parameter, marked[name].chosen)
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    chosen = {each.name: kind for each in own if (kind := _settings_class(each.annotation)) is not None}
+    options = {name: [each for each in kind.settings().values() if each.has_option] for name, kind in chosen.items()}
+    parameters = [inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)]
+    for each in own:
+        if each.name in options:
+            parameters += map(_parameter, options[each.name])
         else:
-            kind = inspect.Parameter.KEYWORD_ONLY
-            parameters.append(parameter.replace(annotation=_with_placeholder(hints[name]), kind=kind))
+            _set_placeholder(each.annotation)
+            parameters.append(each.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+    are_given = {each.name for each in own if get_origin(each.annotation) is Given}
 
     @functools.wraps(command)
-    def run(**values: Any) -> None:
+    def run(context: typer.Context, **values: Any) -> None:
         try:
-            for name, mark in marked.items():
-                given = mark.taken_from(values)
-                is_given = get_args(hints[name])[:1] == (Given,)
-                values[name] = given if is_given else mark.settings(**{**mark.defaults, **given})
+            for name, kind in chosen.items():
+                given = _given(options[name], context, values)
+                values[name] = given if name in are_given else kind(**given)
             command(**values)
         except ConfigError as error:
-            raise _named(error, marked.values()) from None
+            raise _named(error, {each.name: each.option for some in options.values() for each in some}) from None
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -262,9 +183,8 @@ def missing_package(error: ImportError) -> str:
     return f'{error}: pip install "./client[cli]"'
 
 
-def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:
+def _named(error: ConfigError, options: Mapping[str, str]) -> Exception:
     """Wrong usage of the options whose settings the error names; the error itself for other settings."""
-    options = {each.name: mark.option(each) for mark in marks for each in mark.chosen}
     if not {error.where, error.other or error.where} <= options.keys():
         return error
     named = error.named(options.__getitem__)
@@ -273,20 +193,72 @@ def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:
     return typer.BadParameter(named.problem, param_hint=f"'{named.where}'")
 
 
-def _mark(hint: Any) -> OptionsOf | None:
-    if isinstance(hint, type) and issubclass(hint, Settings):
-        return OptionsOf(hint)
-    return next((mark for mark in get_args(hint)[1:] if isinstance(mark, OptionsOf)), None)
+def _settings_class(hint: Any) -> type[Settings] | None:
+    """The class of a parameter that is an object of settings, or the ``Given`` ones; None for another parameter."""
+    (kind,) = get_args(hint) if get_origin(hint) is Given else (hint,)
+    return kind if isinstance(kind, type) and issubclass(kind, Settings) else None
 
 
-def _with_placeholder(hint: Any) -> Any:
-    """The type of a parameter; its option gets a placeholder, unless it has one."""
-    kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    marks = [copy.copy(mark) for mark in marks]
-    for mark in marks:
+def _parameter(setting: Setting) -> inspect.Parameter:
+    """A setting's parameter for typer. Its default is None, so that a file or the setting's default can decide."""
+    must_be_given = setting.default is MISSING
+    described = typer.Option(
+        f"{setting.option}/{setting.negation}" if setting.default is True else setting.option,
+        help=_help(setting),
+        metavar=setting.placeholder,
+        envvar=setting.variable,
+        show_default=False,
+        show_envvar=False,  # ``help`` has it
+        rich_help_panel=setting.title,
+    )
+    kind = str if setting.parse else list[str] if setting.kind == Texts else setting.kind
+    return inspect.Parameter(
+        _key(setting),
+        inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if must_be_given else None,
+        annotation=Annotated[kind if must_be_given else kind | None, described],
+    )
+
+
+def _key(setting: Setting) -> str:
+    """The name of the parameter that ``_parameter`` returns, which no command's own parameter has."""
+    return f"{setting.prefix}{setting.name}_option".replace("-", "_")
+
+
+def _help(setting: Setting) -> str:
+    """The help text with bounds, default and variable of the option."""
+    default = setting.option if setting.default is True else _shown(setting.default)
+    facts = [
+        *([setting.bounds] if setting.bounds else []),
+        *([f"default: {default}"] if default else []),
+        *([f"variable: {setting.variable}"] if setting.variable else []),
+    ]
+    return f"{setting.help}  [{'; '.join(facts)}]" if facts else setting.help
+
+
+def _given(options: Sequence[Setting], context: typer.Context, values: dict[str, Any]) -> Given[Any]:
+    """Remove the options from ``values``, and return the given settings. Raises typer.BadParameter."""
+    before = context.ensure_object(dict)  # options before the subcommand, which win over variables
+    given = Given[Any]()
+    for each in options:
+        key = _key(each)
+        value = values.pop(key)
+        if key in before and getattr(context.get_parameter_source(key), "name", "") != "COMMANDLINE":
+            value = before[key]
+        if value in (None, []):
+            continue
+        before[key] = value
+        with usage_errors(each.option):
+            value = each.parse(value) if each.parse else value
+        given[each.name] = tuple(value) if isinstance(value, list) else value
+    return given
+
+
+def _set_placeholder(hint: Any) -> None:
+    """Give an option its placeholder, unless it has one."""
+    for mark in get_args(hint)[1:]:
         if isinstance(mark, OptionInfo) and mark.metavar is None:
-            mark.metavar = placeholder_of(kind)
-    return Annotated[(kind, *marks)] if marks else hint
+            mark.metavar = placeholder_of(get_args(hint)[0])
 
 
 def _argument(parameter: Any) -> str:
@@ -295,7 +267,7 @@ def _argument(parameter: Any) -> str:
 
 def _shown(default: Any) -> str:
     """A default as one would type it; empty for none."""
-    if default is None or default is False:
+    if default is None or default is False or default is MISSING:
         return ""
     if isinstance(default, tuple):
         return " ".join(map(str, default))

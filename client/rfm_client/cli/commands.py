@@ -17,7 +17,7 @@ from rfm_client.cli import comparing, documents, scoring
 from rfm_client.cli.command import (
     EXIT_CODES,
     Command,
-    OptionsOf,
+    Given,
     add_missing,
     exit_code_of,
     report,
@@ -26,15 +26,17 @@ from rfm_client.cli.command import (
 )
 from rfm_client.cli.options import (
     CredentialFiles,
-    CredentialsGiven,
+    JsonOutput,
     OutputOptions,
+    PlotOutput,
     PrefixOptions,
     ServerOptions,
+    StatusOptions,
     VideoOptions,
-    credentials_of,
+    WaitOptions,
 )
 from rfm_client.cli.show import StreamedTable, print_tables, scores_table, status_tables
-from rfm_client.cli.synthetic import SyntheticSamples, are_frames, write_perf_analyzer_input
+from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames, write_perf_analyzer_input
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.names import frames_name
@@ -68,27 +70,23 @@ def _print_version(is_wanted: bool) -> None:
 @app.callback()
 @with_options
 def main(
-    context: typer.Context,
-    files: CredentialFiles,
+    credentials: Given[CredentialFiles],  # which count for the subcommand
     version: Annotated[
         bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
     ] = False,
 ) -> None:
     """Score videos with a served reward model, and show the state of its server."""
     logging.basicConfig(format="rfm-client: %(message)s", level=logging.WARNING)  # the client logs retries
-    context.obj = files
 
 
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def score(
-    context: typer.Context,
     videos: Annotated[list[str], typer.Argument(metavar="VIDEO...", help=VIDEOS)],
-    server: ServerOptions,
-    files: CredentialsGiven,
     video: VideoOptions,
     prefix: PrefixOptions,
     output: OutputOptions,
+    server: ServerOptions,
 ) -> None:
     """Score each frame of one or more videos: progress and success. A failed video does not stop the others."""
     output.begin(videos)
@@ -111,7 +109,7 @@ def score(
         if output.prints_tables:
             rows.write(outcome.row)
 
-    with scoring.recorder(output.rrd, videos) as record, server.connected(credentials_of(context, files)) as client:
+    with scoring.recorder(output.rrd, videos) as record, server.connected() as client:
         outcomes = scoring.SourceScorer(client, video, prefix, record).score_all(videos, tell)
     rows.end(prefix.rule)
     output.write_json(documents.score_document(server, video, prefix, outcomes))
@@ -128,19 +126,10 @@ def score(
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def compare(
-    context: typer.Context,
     videos: Annotated[list[str], typer.Argument(metavar="VIDEO VIDEO...", help=VIDEOS)],
-    server: ServerOptions,
-    files: CredentialsGiven,
     video: VideoOptions,
-    output: Annotated[
-        OutputOptions,
-        OptionsOf(
-            OutputOptions,
-            only=("json", "plot"),
-            helps={"plot": "Draw frames of each video above its scores, the best first: .png, .pdf or .svg."},
-        ),
-    ],
+    output: PlotOutput,
+    server: ServerOptions,
 ) -> None:
     """Rank several videos by how well they do the task.
 
@@ -150,7 +139,7 @@ def compare(
     if len(videos) < MIN_COMPARED:
         raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
     output.begin(videos)
-    with server.connected(credentials_of(context, files)) as client:
+    with server.connected() as client:
         comparison = comparing.compare(client, videos, video)
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
@@ -167,26 +156,21 @@ def compare(
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def status(
-    context: typer.Context,
-    server: Annotated[
-        ServerOptions, OptionsOf(ServerOptions, only=("urls", "timeout_s"), defaults={"timeout_s": 10.0})
-    ],
-    files: CredentialsGiven,
-    output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json",))],
+    output: JsonOutput,
+    server: StatusOptions,
     metrics_url: Annotated[
         str | None, typer.Option(help="Where the server shows its metrics; else port 8002 of its host, /metrics.")
     ] = None,
 ) -> None:
     """Show the server's models, requests, batches, GPUs and memory."""
-    from rfm_client.transport.status import read_status
+    from rfm_client.transport.status import ServerStatus
 
     if metrics_url is not None and len(server.urls) > 1:
         raise typer.BadParameter("--metrics-url needs a single --url")
     output.make_folders()
-    credentials = credentials_of(context, files)
     with usage_errors("--url"):
         statuses = [
-            read_status(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=credentials)
+            ServerStatus.read(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=server.credentials)
             for url in server.urls
         ]
     if output.prints_tables:
@@ -196,31 +180,22 @@ def status(
 
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
-def wait(
-    context: typer.Context,
-    server: Annotated[
-        ServerOptions,
-        OptionsOf(ServerOptions, defaults={"timeout_s": 120.0}, helps={"timeout_s": "Seconds to wait."}),
-    ],
-    files: CredentialsGiven,
-) -> None:
+def wait(server: WaitOptions) -> None:
     """Wait until a server has the model ready, or --timeout passes."""
-    with server.client(credentials_of(context, files)) as client:
+    with server.client() as client:
         client.wait_ready(server.timeout_s)
 
 
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def sample(
-    context: typer.Context,
-    server: ServerOptions,
-    files: CredentialsGiven,
     synthetic: SyntheticSamples,
-    output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json",))],
+    output: JsonOutput,
+    server: ServerOptions,
 ) -> None:
     """Score synthetic samples, to check that the server answers. Their scores mean nothing."""
     output.make_folders()
-    with server.connected(credentials_of(context, files)) as client:
+    with server.connected() as client:
         samples = synthetic.samples(client)
         outcomes = client.evaluate(samples, return_errors=True)
     failures = [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
@@ -238,18 +213,16 @@ def sample(
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def bench_input(
-    context: typer.Context,
     output: Annotated[Path, typer.Option(help="JSON file to write.")],
+    synthetic: BenchSamples,
     server: ServerOptions,
-    files: CredentialsGiven,
-    synthetic: Annotated[SyntheticSamples, OptionsOf(SyntheticSamples, defaults={"num_samples": 64})],
 ) -> None:
     """Write synthetic samples as input of Triton's perf_analyzer.
 
     It prints a perf_analyzer command that sends them.
     """
     output.parent.mkdir(parents=True, exist_ok=True)
-    with server.connected(credentials_of(context, files)) as client:
+    with server.connected() as client:
         samples = synthetic.samples(client)
     write_perf_analyzer_input(output, samples)
     protocol, address = split_url(server.urls[0])

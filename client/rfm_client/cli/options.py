@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import typer
 
-from rfm_client.cli.command import STANDARD_OUTPUT, Given, OptionsOf, usage_errors
+from rfm_client.cli.command import STANDARD_OUTPUT, usage_errors
 from rfm_client.client import RewardClient
 from rfm_client.client_options import DEFAULT_TIMEOUT_S
 from rfm_client.contract import errors
@@ -33,11 +34,16 @@ _PICTURES = (".png", ".pdf", ".svg")
 _ENDINGS = {"json": (".json",), "plot": _PICTURES, "strips": _PICTURES, "rrd": (".rrd",)}
 
 
+def timeout_setting(default_s: float, help: str = "Seconds that a request may take.") -> Any:
+    """Return a field for the option ``--timeout``."""
+    return setting(default_s, help, flag="--timeout", least=MIN_TIMEOUT_S, most=MAX_TIMEOUT_S)
+
+
 @dataclass(frozen=True)
 class CredentialFiles(Settings):
-    """Credentials for a protected server, as files: CAs, client certificate, API key."""
+    """Credentials for a protected server, as files: CAs, client certificate, API key. Raises ConfigError."""
 
-    TITLE: ClassVar[str] = "TLS and key"
+    TITLE: ClassVar[str] = "Credentials"
 
     ca_file: Path | None = setting(None, "Authorities (PEM) to trust; else the system's.", variable="RFM_CA_FILE")
     client_certificate: Path | None = setting(
@@ -48,8 +54,13 @@ class CredentialFiles(Settings):
         None, "File with the key that requests show as Bearer.", variable="RFM_API_KEY_FILE"
     )
 
-    def read(self) -> Credentials:
-        """Return the credentials in the files. Raises ConfigError for an unusable file."""
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.credentials  # noqa: B018  # reports an unreadable file now, and Ray's other machines may lack the key
+
+    @cached_property
+    def credentials(self) -> Credentials:
+        """The credentials in the files."""
         try:
             api_key = None if self.api_key_file is None else self.api_key_file.read_text().strip()
         except (OSError, UnicodeDecodeError) as error:
@@ -60,19 +71,9 @@ class CredentialFiles(Settings):
             raise error.named(lambda name: "api_key_file" if name == "api_key" else name) from None
 
 
-# Options after a subcommand, which win over those before it and over variables.
-CredentialsGiven: TypeAlias = Annotated[Given, OptionsOf(CredentialFiles, reads_variables=False)]
-
-
-def credentials_of(context: typer.Context, given: Given) -> Credentials:
-    """Return the credentials of a subcommand: the given files, else those before it. Raises ConfigError."""
-    before: CredentialFiles = context.obj
-    return replace(before, **given).read()
-
-
 @dataclass(frozen=True)
-class ServerOptions(Settings):
-    """Servers, model and timeout of a command."""
+class ServerOptions(CredentialFiles):
+    """Servers, model, timeout and credentials of a command."""
 
     TITLE: ClassVar[str] = "Server"
 
@@ -84,38 +85,32 @@ class ServerOptions(Settings):
         variable="RFM_URL",
     )
     model: str = setting(DEFAULT_MODEL, "Name under which the checkpoint was exported.")
-    timeout_s: float = setting(
-        DEFAULT_TIMEOUT_S,
-        "Seconds that a request may take.",
-        flag="--timeout",
-        least=MIN_TIMEOUT_S,
-        most=MAX_TIMEOUT_S,
-    )
+    timeout_s: float = timeout_setting(DEFAULT_TIMEOUT_S)
 
     @property
     def origin(self) -> dict[str, Any]:
         """The servers and the model, for JSON documents."""
         return {"servers": list(self.urls), "model": self.model}
 
-    def client(self, credentials: Credentials, **options: Any) -> RewardClient:
+    def client(self, **options: Any) -> RewardClient:
         """Return a client. Raises typer.BadParameter for an invalid URL."""
         with usage_errors("--url"):
             return RewardClient(
-                self.urls, model=self.model, **{"timeout_s": self.timeout_s, **credentials.options, **options}
+                self.urls, model=self.model, **{"timeout_s": self.timeout_s, **self.credentials.options, **options}
             )
 
     @contextmanager
-    def connected(self, credentials: Credentials) -> Iterator[RewardClient]:
+    def connected(self) -> Iterator[RewardClient]:
         """Yield a client if a server answers and serves the model. Otherwise raise RewardError at once."""
-        with self.client(credentials) as client:
-            self._check(credentials)
+        with self.client() as client:
+            self._check()
             yield client
 
-    def _check(self, credentials: Credentials) -> None:
+    def _check(self) -> None:
         problems = []
         for url in self.urls:
             with RewardClient(
-                url, model=self.model, timeout_s=self.timeout_s, retry=False, **credentials.options
+                url, model=self.model, timeout_s=self.timeout_s, retry=False, **self.credentials.options
             ) as one:
                 try:
                     try:
@@ -129,24 +124,52 @@ class ServerOptions(Settings):
 
 
 @dataclass(frozen=True)
-class VideoOptions(Settings):
-    """Task of the videos, and choice and size of the frames to send."""
+class StatusOptions(ServerOptions):
+    """Servers whose state is shown."""
+
+    NO_OPTION: ClassVar[Collection[str]] = {"model"}
+
+    timeout_s: float = timeout_setting(10.0)
+
+
+@dataclass(frozen=True)
+class WaitOptions(ServerOptions):
+    """Servers and model to wait for."""
+
+    timeout_s: float = timeout_setting(120.0, "Seconds to wait.")
+
+
+@dataclass(frozen=True)
+class VideoFiles(Settings):
+    """Task of the videos, and size, orientation and colours of the frames."""
 
     TITLE: ClassVar[str] = "Videos"
 
     task: str = setting("", "The task, as a sentence.")
-    fps: float = setting(3.0, "Take so many frames a second of a video.", least=0.001, group=FRAMES)
-    max_frames: int | None = setting(
-        None, "Score at most so many of these frames, evenly spaced.", least=1, group=FRAMES
-    )
-    subsample: bool = setting(
-        True, "Score at most as many frames in one pass as the checkpoint was trained on, evenly spaced.", group=FRAMES
-    )
     resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
     orient: Orientation = setting(
         "none", "Turn frames upright before they are scored (see docs/guides/label_a_dataset.md)."
     )
     channels: ChannelOrder = setting("rgb", "Channel order in the file; bgr swaps red and blue.")
+
+
+@dataclass(frozen=True)
+class FrameRate(Settings):
+    """Frames to take of a video."""
+
+    TITLE: ClassVar[str] = FRAMES
+
+    fps: float = setting(3.0, "Take so many frames a second of a video.", least=0.001)
+
+
+@dataclass(frozen=True)
+class VideoOptions(FrameRate, VideoFiles):
+    """Task of the videos, and choice and size of the frames to send."""
+
+    max_frames: int | None = setting(None, "Score at most so many of these frames, evenly spaced.", least=1)
+    subsample: bool = setting(
+        True, "Score at most as many frames in one pass as the checkpoint was trained on, evenly spaced."
+    )
 
 
 @dataclass(frozen=True)
@@ -274,3 +297,21 @@ class OutputOptions(Settings):
             typer.echo(text)
         else:
             Path(self.json).write_text(f"{text}\n")
+
+
+@dataclass(frozen=True)
+class JsonOutput(OutputOptions):
+    """A file with the results as JSON."""
+
+    NO_OPTION: ClassVar[Collection[str]] = {"plot", "strips", "rrd", "npy"}
+
+
+@dataclass(frozen=True)
+class PlotOutput(OutputOptions):
+    """Files with a comparison."""
+
+    NO_OPTION: ClassVar[Collection[str]] = {"strips", "rrd", "npy"}
+
+    plot: Path | None = setting(
+        None, "Draw frames of each video above its scores, the best first: .png, .pdf or .svg.", metavar="FILE"
+    )

@@ -101,6 +101,11 @@ def print_tables(*tables: object) -> None:
     console.print(*tables, sep="\n", markup=False, highlight=False)
 
 
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> None:
+    """Print the table that ``table`` returns."""
+    print_tables(table(title, columns, rows, names=names))
+
+
 class StreamedTable:
     """A table on standard output, written row by row, as wide as the terminal.
 

@@ -46,6 +46,11 @@ def parse_lengths(text: str) -> list[int]:
     return lengths
 
 
+def num_samples_setting(default: int) -> Any:
+    """Return a field for the option ``--num-samples``."""
+    return setting(default, "Samples to make up.", least=1, most=10_000)
+
+
 @dataclass(frozen=True)
 class SyntheticSamples(Settings):
     """Type and number of synthetic samples, and lengths of their trajectories."""
@@ -53,7 +58,7 @@ class SyntheticSamples(Settings):
     TITLE: ClassVar[str] = "Samples"
 
     sample_type: SampleType = setting("progress", "Type of the samples.")
-    num_samples: int = setting(4, "Samples to make up.", least=1, most=10_000)
+    num_samples: int = num_samples_setting(4)
     num_frames: Sequence[int] = setting(
         (8,),
         "Frames of a trajectory: one length, several or a range, in turn.",
@@ -77,6 +82,13 @@ class SyntheticSamples(Settings):
             return [ProgressSample(next(trajectories)) for _ in range(self.num_samples)]
         pair = PreferenceSample if self.sample_type == "preference" else SimilaritySample
         return [pair(next(trajectories), next(trajectories)) for _ in range(self.num_samples)]
+
+
+@dataclass(frozen=True)
+class BenchSamples(SyntheticSamples):
+    """Synthetic samples of a benchmark."""
+
+    num_samples: int = num_samples_setting(64)
 
 
 def are_frames(samples: Sequence[Sample]) -> bool:

@@ -11,11 +11,13 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidValueError, LocatedError
 
 
-def checked_count(where: str, value: Any, *, least: int = 1, error: type[LocatedError] = InvalidValueError) -> int:
+def checked_count(
+    where: str, value: Any, *, least: int | None = 1, error: type[LocatedError] = InvalidValueError
+) -> int:
     """Return a whole number of at least ``least``. Raises ``error``."""
     is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     require(where, is_whole, "a whole number", repr(value), error)
-    require(where, value >= least, f"at least {least}", value, error)
+    require(where, least is None or value >= least, f"at least {least}", value, error)
     return int(value)
 
 

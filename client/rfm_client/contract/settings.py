@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
-import math
+import inspect
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
 
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidValueError
+from rfm_client.contract.numbers import checked_count, checked_finite
 
 Texts: TypeAlias = tuple[str, ...]
 
@@ -55,18 +56,22 @@ class ConfigError(InvalidValueError):
 class Setting:
     """One field of a ``Settings``.
 
+    default: ``MISSING``: the setting must be given
+    title: heading in a command's help
     least, most: bounds of a number
-    flag: option on a command line; None: made from ``name``
-    metavar: placeholder for the value in a command's help
+    flag, prefix: option on a command line, and the beginning of all options; flag None: made from ``name``
+    metavar: placeholder for the value in a command's help; None: made from ``kind``
     variable: environment variable for the value
     parse: converts the text on a command line to the value; raises ValueError
-    group: heading in a command's help; None: the class's TITLE
     has_option: False: only files and programs set it
     """
 
     name: str
     kind: Any
     default: Any
+    title: str
+    prefix: str
+    has_option: bool
     help: str
     least: float | None = None
     most: float | None = None
@@ -74,13 +79,16 @@ class Setting:
     metavar: str | None = None
     variable: str | None = None
     parse: Callable[[str], Any] | None = None
-    group: str | None = None
-    has_option: bool = True
 
     @property
     def option(self) -> str:
-        """Option of this setting, in a command without another setting of the same name."""
-        return self.flag or f"--{self.name.replace('_', '-')}"
+        """The option of this setting."""
+        return f"--{self.prefix}{self._flag}"
+
+    @property
+    def negation(self) -> str:
+        """The option that turns this setting off."""
+        return f"--{self.prefix}no-{self._flag}"
 
     def from_plain(self, value: Any) -> Any:
         """Convert a plain value of YAML or JSON. Raises ConfigError for a wrong type."""
@@ -89,15 +97,18 @@ class Setting:
                 return None if value is None else kind(value)
         raise ConfigError.at(self.name, self._expected, f"{value!r:.200}")
 
-    def check(self, value: Any) -> None:
-        """Raise ConfigError for a value out of bounds or not among the choices."""
+    def checked(self, value: Any) -> Any:
+        """Return the value, a number as Python's own. Raises InvalidValueError: out of bounds, or no choice."""
         if value is None:
-            return
-        got = f"{value!r:.200}"
-        require(self.name, not self._choices or value in self._choices, self._expected, got, ConfigError)
-        require(self.name, self.least is None or _is_number(value), "a finite number", got, ConfigError)
-        require(self.name, self.least is None or value >= self.least, f"at least {self.least}", value, ConfigError)
-        require(self.name, self.most is None or value <= self.most, f"at most {self.most}", value, ConfigError)
+            return None
+        require(self.name, not self._choices or value in self._choices, self._expected, f"{value!r:.200}")
+        if int in self._kinds:
+            value = checked_count(self.name, value, least=None)
+        elif float in self._kinds:
+            value = checked_finite(self.name, value, "a finite number")
+        require(self.name, self.least is None or value >= self.least, f"at least {self.least}", value)
+        require(self.name, self.most is None or value <= self.most, f"at most {self.most}", value)
+        return value
 
     @property
     def placeholder(self) -> str | None:
@@ -107,10 +118,14 @@ class Setting:
     @property
     def bounds(self) -> str:
         """Bounds of a number in words; empty without bounds."""
-        has_most = self.most is not None and self.most < _UNBOUNDED
         if self.least is None:
-            return f"at most {self.most:g}" if has_most else ""
+            return ""
+        has_most = self.most is not None and self.most < _UNBOUNDED
         return f"{self.least:g} to {self.most:g}" if has_most else f"at least {self.least:g}"
+
+    @property
+    def _flag(self) -> str:
+        return (self.flag or self.name.replace("_", "-")).removeprefix("--")
 
     @property
     def _choices(self) -> Texts:
@@ -129,27 +144,40 @@ class Setting:
 
 
 def setting(default: Any, help: str, **more: Any) -> Any:
-    """Return a field of a ``Settings``; ``more`` are fields of ``Setting``."""
-    return field(default=default, metadata={"help": help, **more})
+    """Return a field of a ``Settings``; ``more`` are fields of ``Setting``. default: ``...``: it must be given"""
+    metadata = {"help": help, **more}
+    return field(kw_only=True, metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
 
 class Settings:
     """Base of frozen dataclasses whose fields are made by ``setting``. Raises ConfigError for an invalid value.
 
-    TITLE: heading of their options in a command's help
+    TITLE: heading of the options in a command's help; options of a base class stand under the base's heading
+    PREFIX: before the name of each option
+    NO_OPTION: settings without an option, which only files and programs set
     """
 
     TITLE: ClassVar[str] = "Options"
+    PREFIX: ClassVar[str] = ""
+    NO_OPTION: ClassVar[Collection[str]] = ()
 
     def __post_init__(self) -> None:
-        for each in settings_of(type(self)).values():
-            each.check(getattr(self, each.name))
+        try:
+            for each in self.settings().values():
+                object.__setattr__(self, each.name, each.checked(getattr(self, each.name)))
+        except InvalidValueError as error:
+            raise ConfigError.like(error) from None
 
-
-def settings_of(kind: Any) -> dict[str, Setting]:
-    """Return the settings of a ``Settings`` class by name, in their order."""
-    hints = typing.get_type_hints(kind)
-    return {each.name: Setting(each.name, hints[each.name], each.default, **each.metadata) for each in fields(kind)}
+    @classmethod
+    def settings(cls) -> dict[str, Setting]:
+        """Return the settings by name, in their order."""
+        kind: Any = cls  # a dataclass
+        hints, found = typing.get_type_hints(kind), {}
+        for each in fields(kind):
+            title = next(base.TITLE for base in kind.__mro__ if each.name in inspect.get_annotations(base))
+            own = hints[each.name], each.default, title, cls.PREFIX, each.name not in cls.NO_OPTION
+            found[each.name] = Setting(each.name, *own, **each.metadata)
+        return found
 
 
 def placeholder_of(kind: Any) -> str | None:
@@ -166,11 +194,6 @@ def _parts_of(kind: Any) -> tuple[Any, ...]:
 def _choices_of(kind: Any) -> Texts:
     literals = (part for part in _parts_of(kind) if typing.get_origin(part) is Literal)
     return tuple(text for part in literals for text in typing.get_args(part))
-
-
-def _is_number(value: Any) -> bool:
-    """True for an int or a finite float. Not isinstance, for which True is an int."""
-    return type(value) is int or (type(value) is float and math.isfinite(value))
 
 
 def _spells(value: Any, kind: Any) -> bool:

@@ -163,6 +163,46 @@ class ServerStatus:
     metrics_error: str | None
     devices: tuple[Device, ...]
 
+    @classmethod
+    def read(
+        cls,
+        url: str,
+        *,
+        metrics_url: str | None = None,
+        timeout_s: float = 60.0,
+        credentials: Credentials | None = None,
+    ) -> ServerStatus:
+        """Return the state of a server at ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or
+        ``https://``.
+
+        metrics_url: URL of its metrics; None: port METRICS_PORT of the same host. Unreadable metrics are left out
+        credentials: used for the server, not for its metrics
+
+        Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for an answer
+        that is not Triton's.
+        """
+        scheme, address = split_url(url)
+        metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
+        try:
+            version, is_ready, index, statistics = _read_server(
+                scheme, address, timeout_s, credentials or Credentials()
+            )
+            metrics = _read_metrics(metrics_url, timeout_s)
+            models = tuple(_models(index, statistics, metrics))
+        except Exception as raised:
+            proxy = grpc_proxy(address) if scheme.startswith("grpc") else None
+            error = triton.error_from(raised, url, proxy=proxy)
+            if error is None:
+                raise
+            if isinstance(error, DeadlineExceededError):
+                error = DeadlineExceededError(
+                    f"{url}{f' through {proxy}' if proxy else ''}: no answer within {timeout_s:g} s"
+                )
+            elif isinstance(error, OF_A_PORT) and (named := wrong_port(url)):
+                error = ServerUnavailableError(named)
+            raise error from raised
+        return cls(url, version, is_ready, models, metrics_url, metrics.error, metrics.devices)
+
     @property
     def checkpoints(self) -> list[str]:
         """Names of the exported checkpoints whose model for raw frames is ready, in alphabetical order."""
@@ -177,38 +217,6 @@ class _Metrics:
     batches: Mapping[_Version, Batches] = field(default_factory=dict)
     refused: Mapping[_Version, int] = field(default_factory=dict)
     error: str | None = None
-
-
-def read_status(
-    url: str, *, metrics_url: str | None = None, timeout_s: float = 60.0, credentials: Credentials | None = None
-) -> ServerStatus:
-    """Return the state of a server at ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or ``https://``.
-
-    metrics_url: URL of its metrics; None: port METRICS_PORT of the same host. Unreadable metrics are left out
-    credentials: used for the server, not for its metrics
-
-    Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for an answer that
-    is not Triton's.
-    """
-    scheme, address = split_url(url)
-    metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
-    try:
-        version, is_ready, index, statistics = _read_server(scheme, address, timeout_s, credentials or Credentials())
-        metrics = _read_metrics(metrics_url, timeout_s)
-        models = tuple(_models(index, statistics, metrics))
-    except Exception as raised:
-        proxy = grpc_proxy(address) if scheme.startswith("grpc") else None
-        error = triton.error_from(raised, url, proxy=proxy)
-        if error is None:
-            raise
-        if isinstance(error, DeadlineExceededError):
-            error = DeadlineExceededError(
-                f"{url}{f' through {proxy}' if proxy else ''}: no answer within {timeout_s:g} s"
-            )
-        elif isinstance(error, OF_A_PORT) and (named := wrong_port(url)):
-            error = ServerUnavailableError(named)
-        raise error from raised
-    return ServerStatus(url, version, is_ready, models, metrics_url, metrics.error, metrics.devices)
 
 
 def _read_server(scheme: str, address: str, timeout_s: float, credentials: Credentials) -> _Told:

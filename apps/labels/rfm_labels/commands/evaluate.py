@@ -3,20 +3,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rfm_client.command_line import OptionsOf, OutputOptions, number, print_tables, table, with_options
+from rfm_client.command_line import PlotOutput, number, print_table, with_options
+from rfm_client.options import setting
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from rfm_labels import LabelComparison
 
-HELPS = {"plot": "Draw histograms of progress at the last frame: .png, .pdf or .svg."}
 LEGEND = (
     "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, and of progress, at the last frame; "
     "0.5 is chance. Threshold: of success at the last frame, with the best balanced accuracy. Falls: steps on which "
@@ -24,10 +22,19 @@ LEGEND = (
 )
 
 
+@dataclass(frozen=True)
+class EvaluationOutput(PlotOutput):
+    """Files with an evaluation."""
+
+    plot: Path | None = setting(
+        None, "Draw histograms of progress at the last frame: .png, .pdf or .svg.", metavar="FILE"
+    )
+
+
 @with_options
 def evaluate(
     dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder or HDF5 file of the labelled dataset.")],
-    output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json", "plot"), helps=HELPS)],
+    output: EvaluationOutput,
     labels: Annotated[
         list[Path] | None,
         typer.Option(
@@ -57,7 +64,7 @@ def evaluate(
         raise DatasetError.at(dataset, expected, "none")
     comparison = evaluate_labels(files, None if outcome is None else read_outcomes(outcome, dataset))
     if output.prints_tables:
-        print_tables(*tables(comparison))
+        _print_tables(comparison)
         print(LEGEND.format("successes" if comparison.is_success is not None else "all episodes"))
     output.write_json(document(comparison))
     if output.plot is not None:
@@ -66,8 +73,8 @@ def evaluate(
         draw_evaluation(output.plot, comparison)
 
 
-def tables(comparison: LabelComparison) -> list[Table]:
-    """Return a table of the models, and a table of each pair's agreement."""
+def _print_tables(comparison: LabelComparison) -> None:
+    """Print a table of the models, and a table of each pair's agreement."""
     known, rows = comparison.is_success, []
     columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls", "frames/s"]
     if known is not None:
@@ -87,14 +94,13 @@ def tables(comparison: LabelComparison) -> list[Table]:
         counts += f": {int(known.sum())} successes, {int((~known).sum())} failures"
     if comparison.num_left_out:
         counts += f"; {comparison.num_left_out} left out, which not all files have"
-    shown = [table(counts, columns, rows)]
+    print_table(counts, columns, rows)
     if comparison.agreements:
         pairs = [
             [each.first, each.second, number(each.spearman, 3), number(each.distance, 3)]
             for each in comparison.agreements
         ]
-        shown.append(table("agreement on progress", ["labels", "and", "rho", "distance"], pairs, names=2))
-    return shown
+        print_table("agreement on progress", ["labels", "and", "rho", "distance"], pairs, names=2)
 
 
 def document(comparison: LabelComparison) -> dict[str, Any]:

@@ -15,18 +15,9 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 import typer
 
 from rfm_client import RewardError
-from rfm_client.command_line import (
-    CredentialsGiven,
-    ExitCode,
-    ServerOptions,
-    credentials_of,
-    print_tables,
-    report,
-    table,
-    with_options,
-)
+from rfm_client.command_line import ExitCode, ServerOptions, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
-from rfm_client.options import Settings, Texts, setting
+from rfm_client.options import Settings, setting
 from rfm_labels.commands.progress_bar import ProgressBar, Say
 from rfm_labels.datasets.cameras import parsed_by_camera
 from rfm_labels.datasets.dataset import Dataset, SeveralTasks
@@ -79,13 +70,13 @@ class EpisodeTexts(Settings):
         "metadata.",
         metavar="NAME",
     )
-    orient: Texts = setting(
+    orient: tuple[str, ...] = setting(
         (),
         "Turn stored pictures upright, of all cameras or of one; may be repeated. Else as stored; LIBERO's HDF5 files "
         "flip-vertical.",
         metavar="[CAMERA=]" + "|".join(get_args(Orientation)),
     )
-    channels: Texts = setting(
+    channels: tuple[str, ...] = setting(
         (),
         "Channel order of stored pictures, for all cameras or one; may be repeated. Default: rgb.",
         metavar="[CAMERA=]" + "|".join(get_args(ChannelOrder)),
@@ -128,14 +119,12 @@ class RunOptions(Settings):
 
 @with_options
 def label(
-    context: typer.Context,
     dataset: DatasetArgument,
-    server: ServerOptions,
-    files: CredentialsGiven,
     texts: EpisodeTexts,
     labels: LabelOptions,
     run: RunOptions,
     ray: RayOptions,
+    server: ServerOptions,
 ) -> None:
     """Label every frame of a dataset by asking running servers.
 
@@ -145,11 +134,10 @@ def label(
 
     Run the same command again to label the missing episodes.
     """
-    credentials = credentials_of(context, files)  # Ray cannot send the context to other machines
 
     @contextmanager
     def connect() -> Iterator[Scorer]:
-        with server.connected(credentials) as client:
+        with server.connected() as client:
             yield ClientScorer(client)
 
     raise typer.Exit(LabelCommand(dataset, texts, labels, run, ray, connect, report).run())
@@ -365,5 +353,5 @@ def _plan_rows(plan: Plan, dataset: Dataset, num_bytes: int, took_s: float) -> l
 
 
 def _print(rows: Sequence[tuple[str, str]]) -> None:
-    print_tables(table("", ("labels", ""), rows))
+    print_table("", ("labels", ""), rows)
     sys.stdout.flush()
