@@ -10,6 +10,7 @@ from lerobot.processor import (
     DeviceProcessorStep,
     PolicyProcessorPipeline,
     policy_action_to_transition,
+    transition_to_policy_action,
 )
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 
@@ -29,6 +30,9 @@ def make_rfm_pre_post_processors(config: RfmRewardConfig, dataset_stats: Any = N
         name=POLICY_PREPROCESSOR_DEFAULT_NAME,
     )
     after = PolicyProcessorPipeline(
-        steps=[], name=POLICY_POSTPROCESSOR_DEFAULT_NAME, to_transition=policy_action_to_transition
+        steps=[],
+        name=POLICY_POSTPROCESSOR_DEFAULT_NAME,
+        to_transition=policy_action_to_transition,
+        to_output=transition_to_policy_action,
     )
     return before, after
