@@ -226,6 +226,20 @@ def test_a_copy_of_a_model_asks_with_a_client_of_its_own(served: Served) -> None
         each.close()
 
 
+def test_a_model_with_a_client_of_yours_has_no_copies(recorder: Recorder) -> None:
+    """A copy would ask the configuration's server, which may be another."""
+    model = RfmRewardModel(RfmRewardConfig(), client=recorder)
+    for copied in (copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match=r"expected no client of yours .* name its server in the configuration"):
+            copied(model)
+
+
+def test_more_frames_than_are_sent_at_a_time_are_all_scored(model: RfmRewardModel, client: RewardClient) -> None:
+    images = PIXELS[:1, [0, 1, 2, 3, 4] * 8]
+    progress = model.predict_progress({KEY: images, "task": TASK}).progress
+    torch.testing.assert_close(progress, torch.tensor([stepped(client, images[0], TASK)]), **CLOSE)
+
+
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "no address": ({"url": " "}, "^url: expected the server's address"),
     "a key of no camera": ({"image_key": "pixels"}, "^image_key: expected observation.image or"),

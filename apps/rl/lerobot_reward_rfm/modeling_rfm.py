@@ -39,8 +39,8 @@ class RfmPrediction:
 class RfmRewardModel(PreTrainedRewardModel):
     """A reward model of LeRobot whose network runs on a server. Its saved form is a configuration.
 
-    client: a client of yours, which the model never closes; None: the model makes one at its first call. A process
-        that was forked, or that unpickled the model, makes a client anew
+    client: a client of yours, which the model never closes; None: the model makes one at its first call, and so does
+        each copy of the model
 
     A batch has images under the configuration's ``image_key``: uint8, or float in 0..1, [B, T, 3, H, W], the newest
     frame last, or [B, 3, H, W], which is one frame a sample; on any device. ``task`` is a sentence, or one a sample.
@@ -74,7 +74,12 @@ class RfmRewardModel(PreTrainedRewardModel):
             made.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_given": None, "_made": None}
+        if self._given is not None:
+            raise TypeError(
+                "RfmRewardModel: expected no client of yours in a model to copy or pickle, got one, which stays in its "
+                "process; name its server in the configuration instead"
+            )
+        return {**self.__dict__, "_made": None}
 
     def compute_reward(self, batch: Mapping[str, Any]) -> Tensor:
         """Return the reward of each sample at its newest frame, float32 [B], on the device of the images.

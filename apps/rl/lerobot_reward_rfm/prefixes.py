@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 from typing import Any, NamedTuple, cast
@@ -11,6 +11,8 @@ from typing import Any, NamedTuple, cast
 from lerobot_reward_rfm.configuration_rfm import RfmRewardConfig
 from rfm_client import InferenceFailedError, ModelInfo, ProgressResult, ProgressSample, RewardClient, Trajectory
 from rfm_client.frames import Sampling
+
+AT_A_TIME = 32  # samples: each copies its frames, so that those of all prefixes of an episode would fill memory
 
 
 class Score(NamedTuple):
@@ -53,7 +55,7 @@ def scores_of_all_frames(
     Costs a sample for each frame. Raises RewardError.
     """
     rule = rule_of(client.model_info(frames=True), config)
-    results = iter(evaluated(client, list(chain.from_iterable(map(rule.samples, trajectories))), config))
+    results = iter(evaluated(client, chain.from_iterable(map(rule.samples, trajectories)), config))
     joined = [rule.joined(list(islice(results, trajectory.num_frames))) for trajectory in trajectories]
     for index, result in enumerate(joined):
         for frame in range(len(result.progress)):
@@ -61,9 +63,12 @@ def scores_of_all_frames(
     return joined
 
 
-def evaluated(client: RewardClient, samples: list[ProgressSample], config: RfmRewardConfig) -> list[ProgressResult]:
-    """Return the results of samples, in order. Raises RewardError."""
-    return cast(list[ProgressResult], client.evaluate(samples, resize=config.resize))
+def evaluated(client: RewardClient, samples: Iterable[ProgressSample], config: RfmRewardConfig) -> list[ProgressResult]:
+    """Return the results of samples, in order, with the frames of a few samples in memory. Raises RewardError."""
+    waiting, results = iter(samples), list[ProgressResult]()
+    while some := list(islice(waiting, AT_A_TIME)):
+        results += cast(list[ProgressResult], client.evaluate(some, resize=config.resize))
+    return results
 
 
 def check_clear(result: ProgressResult, slot: int, where: str) -> None:
