@@ -15,11 +15,11 @@ from labelling import LEROBOT
 from paths import ROOT
 from servers import Endpoints
 
-pytestmark = pytest.mark.nightly  # five minutes, most of them to install 5 GB
+pytestmark = pytest.mark.nightly  # minutes, most of them to install 5 GB
 
 GUIDE = (ROOT / "docs" / "guides" / "use_with_lerobot.md").read_text()
 PYTHON = "python3.12"  # LeRobot needs it
-PACKAGES = ("lerobot[dataset]>=0.6", ROOT / "client", ROOT / "apps" / "rl")
+OURS = {"client": ROOT / "client", "rl": ROOT / "apps" / "rl"}
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +27,13 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A Python with LeRobot and the plug-in."""
     if subprocess.run([PYTHON, "-V"], capture_output=True, check=False).returncode if shutil.which(PYTHON) else True:
         pytest.skip(f"{PYTHON} is not installed")
-    environment = tmp_path_factory.mktemp("lerobot") / "environment"
+    folder = tmp_path_factory.mktemp("lerobot")
+    environment = folder / "environment"
+    ours = [shutil.copytree(place, folder / name) for name, place in OURS.items()]  # pip builds in the folder
     subprocess.run([PYTHON, "-m", "venv", environment], check=True)
-    subprocess.run([environment / "bin" / "pip", "install", "--quiet", *PACKAGES], check=True, timeout=1800)
+    subprocess.run(
+        [environment / "bin" / "pip", "install", "--quiet", "lerobot[dataset]>=0.6", *ours], check=True, timeout=1800
+    )
     return environment / "bin" / "python"
 
 
