@@ -39,8 +39,15 @@ FOLDERS = {
     "rfm_commands": "commands",
     "rfm_export": "export",
     **{f"rfm_{name}": f"apps/{name}" for name in ("gateway", "labels", "page", "rl")},
+    "lerobot_reward_rfm": "apps/rl",
 }
-APPLICATIONS = ("rfm_gateway", "rfm_labels", "rfm_page", "rfm_rl")  # which import public names alone
+APPLICATIONS = (
+    "lerobot_reward_rfm",
+    "rfm_gateway",
+    "rfm_labels",
+    "rfm_page",
+    "rfm_rl",
+)  # which import public names alone
 PUBLIC = {  # modules; each lists the names in __all__
     "rfm_client": {"", "command_line", "episodes", "frames", "options", "plot", "recording", "serving"},
     "rfm_gateway": {"", "mounting"},

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: MIT
+"""The reward model without weights: it asks a server."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from lerobot.rewards.pretrained import PreTrainedRewardModel
+from torch import Tensor
+
+from lerobot_reward_rfm.batches import padding_of, trajectories_of
+from lerobot_reward_rfm.configuration_rfm import RfmRewardConfig
+from lerobot_reward_rfm.prefixes import newest_scores, scores_of_all_frames
+from rfm_client import Float32Array, RewardClient, Trajectory
+from rfm_client.frames import BlankFrames
+from rfm_client.options import require
+
+logger = logging.getLogger("rfm_client")
+
+
+@dataclass(frozen=True)
+class RfmPrediction:
+    """Scores of the frames of a batch.
+
+    progress: float32 [B, T], 0 to 1
+    success_probability: float32 [B, T]; None: the checkpoint does not predict success
+    """
+
+    progress: Tensor
+    success_probability: Tensor | None
+
+
+class RfmRewardModel(PreTrainedRewardModel):
+    """A reward model of LeRobot whose network runs on a server. Its saved form is a configuration.
+
+    client: a client of yours, which the model never closes; None: the model makes one at its first call, and so does
+        each copy of the model
+
+    A batch has images under the configuration's ``image_key``: uint8, or float in 0..1, [B, T, 3, H, W], the newest
+    frame last, or [B, 3, H, W], which is one frame a sample; on any device. ``task`` is a sentence, or one a sample.
+    Frames that LeRobot marks as padding (``<image_key>_is_pad``) repeat a neighbour: no network sees them, and they
+    get the neighbour's score.
+    """
+
+    config_class = RfmRewardConfig
+    name = "rfm"
+
+    def __init__(self, config: RfmRewardConfig, client: RewardClient | None = None, **_: Any) -> None:
+        super().__init__(config)
+        self._given = client
+        self._made: RewardClient | None = None
+        self._has_told = False
+
+    @property
+    def client(self) -> RewardClient:
+        """The client that asks the server."""
+        if self._given is not None:
+            return self._given
+        made = self._made
+        if made is None:
+            made = self._made = self.config.connect()
+        return made
+
+    def close(self) -> None:
+        """Close the client that the model made. The next call makes another."""
+        made, self._made = self._made, None
+        if made is not None:
+            made.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self._given is not None:
+            raise TypeError(
+                "RfmRewardModel: expected no client of yours in a model to copy or pickle, got one, which stays in its "
+                "process; name its server in the configuration instead"
+            )
+        return {**self.__dict__, "_made": None}
+
+    def compute_reward(self, batch: Mapping[str, Any]) -> Tensor:
+        """Return the reward of each sample at its newest frame, float32 [B], on the device of the images.
+
+        It is the reward of the Gymnasium wrappers and of labels for the same frames. Raises RewardError, never a
+        number instead; ValueError for ``success`` of a checkpoint that does not predict it.
+        """
+        scores = newest_scores(self.client, self._trajectories(batch), self.config)
+        if self.config.reward_output == "progress":
+            return self._tensor(batch, [score.progress for score in scores])
+        success = np.array([score.success for score in scores])
+        require("reward_output", not np.isnan(success).any(), "progress: the checkpoint predicts no success", "success")
+        return self._tensor(batch, success >= self.config.success_threshold)
+
+    def predict_progress(self, batch: Mapping[str, Any]) -> RfmPrediction:
+        """Return the scores of all frames, each on the frames up to it alone, so the last is ``compute_reward``'s.
+
+        The server scores B times T samples. Raises RewardError.
+        """
+        trajectories = self._trajectories(batch)
+        results = scores_of_all_frames(self.client, trajectories, self.config)
+        pads = padding_of(batch, self.config.image_key)
+        progress = spread([result.progress for result in results], pads)
+        success = spread([result.success for result in results], pads)
+        knows = not np.isnan(success).any()
+        return RfmPrediction(self._tensor(batch, progress), self._tensor(batch, success) if knows else None)
+
+    def tell_blank(self, trajectory: Trajectory, where: str) -> None:
+        """Log a warning, once, for frames that are black or of one colour: the scores mean nothing."""
+        told = "" if self._has_told or trajectory.frames is None else BlankFrames(trajectory.frames).told
+        if told:
+            self._has_told = True
+            logger.warning("%s of %s: %s", self.config.image_key, where, told)
+
+    def _trajectories(self, batch: Mapping[str, Any]) -> list[Trajectory]:
+        trajectories = trajectories_of(batch, self.config)
+        for index, trajectory in enumerate(trajectories):
+            self.tell_blank(trajectory, f"sample {index} of the batch")
+        return trajectories
+
+    def _tensor(self, batch: Mapping[str, Any], values: Sequence[float] | npt.NDArray[Any]) -> Tensor:
+        device = getattr(batch[self.config.image_key], "device", None)
+        place = device if isinstance(device, torch.device) else None
+        return torch.tensor(np.asarray(values, np.float32), dtype=torch.float32, device=place)
+
+
+RfmRewardRewardModel = RfmRewardModel  # the name that LeRobot derives from RfmRewardConfig
+
+
+def spread(scores: Sequence[Float32Array], pads: npt.NDArray[np.bool_] | None) -> Float32Array:
+    """Return float32 [B, T] of the scores of real frames: padding gets the score of the frame that it repeats."""
+    if pads is None:
+        return np.stack(scores)
+    real = np.maximum(np.cumsum(~pads, axis=1) - 1, 0)
+    return np.stack([row[slots] for row, slots in zip(scores, real, strict=True)])
