@@ -73,7 +73,7 @@ class RfmAdapter(Adapter):  # type: ignore[misc]  # RoboValue is optional, and s
         return differences
 
     def close(self) -> None:
-        """Close the client."""
+        """Close the client and its connections."""
         self._client.close()
 
     def _prefix(self, query: Any, sampling: Sampling) -> tuple[ProgressSample, int]:
