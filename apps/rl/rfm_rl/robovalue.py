@@ -63,7 +63,7 @@ class RfmAdapter(Adapter):  # type: ignore[misc]  # RoboValue is optional, and s
         values = []
         for start in range(0, len(queries), self._batch_size):
             prefixes = [self._prefix(query, sampling) for query in queries[start : start + self._batch_size]]
-            results = self._client.evaluate([sample for sample, _ in prefixes])
+            results: list[Any] = self._client.evaluate([sample for sample, _ in prefixes])
             values += [float(result.progress[read]) for result, (_, read) in zip(results, prefixes, strict=True)]
         return values
 
