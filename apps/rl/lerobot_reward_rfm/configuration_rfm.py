@@ -9,7 +9,8 @@ from typing import get_args
 
 from lerobot.configs.rewards import RewardModelConfig
 
-from rfm_client import SUCCESS_THRESHOLD, RewardClient
+from rfm_client import RewardClient
+from rfm_client.episodes import SuccessRule
 from rfm_client.frames import Correction, Orientation, Rule
 from rfm_client.options import checked_count, checked_finite, require
 from rfm_client.serving import DEFAULT_MODEL
@@ -53,7 +54,7 @@ class RfmRewardConfig(RewardModelConfig):
     orient: str = "none"
     resize: bool = False
     reward_output: str = "progress"
-    success_threshold: float = SUCCESS_THRESHOLD
+    success_threshold: float = SuccessRule.threshold
 
     def __post_init__(self) -> None:
         super().__post_init__()
