@@ -55,7 +55,7 @@ class Description(Origin):
     network_frames: frames of the longest trajectory that the network can score; None: no limit
     frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
     frames_per_value: consecutive frames that share a score; 2 if a vision-language model reads trajectories as videos
-    has_preference, has_success, has_similarity: True if the checkpoint gives these scores
+    has_progress, has_preference, has_success, has_similarity: True if the checkpoint gives these scores
     more_scores: names of the scores of frames that it gives beside progress, success and progress bins: fields of
         ``FrameScores``
     scores_whole_prefixes: True if the FastAPI evaluation server shows the model all frames of a prefix, else four
@@ -81,6 +81,7 @@ class Description(Origin):
     network_frames: int | None = None
     frame_size: FrameSize | None = None
     frames_per_value: int = 1
+    has_progress: bool = True
     has_preference: bool = False
     has_success: bool = False
     has_similarity: bool = False
@@ -109,7 +110,7 @@ class Description(Origin):
     def scores(self) -> tuple[str, ...]:
         """Names of the scores of frames that the model gives: fields of ``FrameScores``."""
         bins = () if self.progress_bins is None else ("progress_logits",)
-        return ("progress", *["success"] * self.has_success, *bins, *self.more_scores)
+        return (*["progress"] * self.has_progress, *["success"] * self.has_success, *bins, *self.more_scores)
 
     @property
     def lacks(self) -> tuple[str, ...]:

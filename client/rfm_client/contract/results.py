@@ -67,16 +67,20 @@ class Score:
 class FrameScores:
     """Scores of each frame of one trajectory. Everything else that knows a score derives it from its ``Score``.
 
-    progress: float32 [T], share of the task done, 0..1
+    progress: float32 [T], share of the task done, 0..1; NaN throughout: the checkpoint does not predict it
     success: float32 [T], probability that the task is done; NaN throughout: the checkpoint does not predict it
     progress_logits: float32 [T, K], raw scores of the progress bins, on request, from discrete checkpoints only
     log_prob: float32 [T], logarithm of TOPReward's probability that the frames so far complete the task, on request
     unclear: bool [T], True where RoboReward's written answer states no single whole score, so that progress may be
         misread; None: the model writes no answers
+    remaining_s: float32 [T], RynnValue's seconds from each frame until the task is done
+    relative_s: float32 [T], RynnValue's seconds from the frame before to each frame, negative where the task went
+        backwards; 0 at the first frame
+    entropy: float32 [T], entropy in nats of the probabilities behind ``remaining_s``; larger: less sure
     frame_indices: int64 [T], indices of the scored frames in the trajectory; None: all frames
     """
 
-    progress: Annotated[Float32Array, Score("Share of the task that is done", asked="always")]
+    progress: Annotated[Float32Array, Score("Share of the task that is done", asked="always", may_be_unknown=True)]
     success: Annotated[Float32Array, Score("Probability that the task is done", asked="always", may_be_unknown=True)]
     progress_logits: Annotated[
         Float32Array | None, Score("Raw scores of the progress bins", is_per_bin=True, bounds=(None, None))
@@ -94,6 +98,25 @@ class FrameScores:
             " be misread; --strict-answers refuses these",
             higher_is_better=False,
             is_newer=True,
+        ),
+    ] = None
+    remaining_s: Annotated[
+        Float32Array | None,
+        Score(
+            "Seconds that remain until the task is done", asked="if given", bounds=(None, None), higher_is_better=False
+        ),
+    ] = None
+    relative_s: Annotated[
+        Float32Array | None,
+        Score("Seconds since the frame before, by the model", asked="if given", bounds=(None, None)),
+    ] = None
+    entropy: Annotated[
+        Float32Array | None,
+        Score(
+            "Entropy of the remaining seconds in nats: how unsure the model is",
+            asked="if given",
+            bounds=(0.0, None),
+            higher_is_better=False,
         ),
     ] = None
     frame_indices: npt.NDArray[np.int64] | None = None
