@@ -104,7 +104,9 @@ class Settings:
         if stated != ISOLATED and stated not in _CAUSAL:
             expected = f"{ISOLATED} or one of {', '.join(_CAUSAL)}"
             raise CheckpointError.at(f"{self._file}: attn_implementation", expected, shown(stated))
-        return "isolated" if stated == ISOLATED else "causal"
+        attention = "isolated" if stated == ISOLATED else "causal"
+        self._decide("attention", attention, f"{NETWORK_CONFIG}: attn_implementation")
+        return attention
 
     def _use_meta(self) -> bool:
         stated = self.processor.get("use_meta")

@@ -60,6 +60,8 @@ class RewardOptions:
         observation to its frame; None: ``render()``
     cameras: keys of the frames to score and fuse, in the observation or the result of ``frames_from``; empty: a single
         camera without a name
+    score: what rewards are made of: ``progress``, or ``remaining_s``: minus the remaining seconds, in place of progress
+        in each mode, so that a step pays the seconds that it gains
     sampling, fuse, orient, channels, resize, live: as in ``rfm_client.episodes.EpisodeOptions``; rendered frames are
         changed alike
     max_frames: ``frames`` of EpisodeOptions: the rule's number of frames
@@ -88,6 +90,7 @@ class RewardOptions:
     max_pending: int = 4
     await_last: bool = True
     live: LiveView | None = None
+    score: Literal["progress", "remaining_s"] = "progress"
 
     def __post_init__(self) -> None:
         require("mode", self.mode in get_args(Mode), f"one of {', '.join(get_args(Mode))}", repr(self.mode))
@@ -217,7 +220,7 @@ class RewardedEpisode:
             expected = f"{none} with a checkpoint that does not predict success"
             raise ValueError(f"{name}: expected {expected}, got {getattr(self._options, name)}")
         if self.known is None:
-            self._paid_progress = score.progress
+            self._paid_progress = score.value(self._options.score)
         score = replace(score, succeeded=score.succeeded and score.step > 0)  # a reset is no success
         self.known = score
         self._has_succeeded |= rule is not None and score.succeeded
@@ -229,7 +232,7 @@ class RewardedEpisode:
         terminated: True if the environment has reached a terminal state; False at a time limit
         """
         options = self._options
-        progress = np.nan if self.known is None else self.known.progress
+        progress = np.nan if self.known is None else self.known.value(options.score)
         if options.shapes_another and (terminated or self.succeeded):
             progress = 0.0
         before, self._paid_progress = self._paid_progress, progress
@@ -245,6 +248,7 @@ class RewardedEpisode:
         """Return the newest known scores, and their lag in steps."""
         known = self.known or StepScore(np.nan, np.nan, False, -1, np.nan)
         told = {"progress": known.progress, "success": known.success, "step": known.step}
+        told |= {"remaining_s": known.remaining_s} if self._options.score == "remaining_s" else {}
         told |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped}
         return told if self._options.success_rule is None else told | {"succeeded": self._has_succeeded}
 

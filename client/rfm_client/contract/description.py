@@ -27,8 +27,8 @@ class Origin:
     license: licence of the weights, by the checkpoint's model card or config.json; None: unknown
     run_config: config.yaml of the training run, without secrets; empty: the checkpoint has none
     computation: number type, PyTorch version and attention kernel, as at the export; None: unknown
-    weights_difference: largest difference of progress from the full checkpoint's, which the export measured on noise
-        when it rounded weights; None: not measured
+    weights_difference: largest difference of the first of ``scores`` from the full checkpoint's, which the export
+        measured on noise when it rounded weights; None: not measured
     """
 
     source: str | None = None
@@ -62,7 +62,7 @@ class Description(Origin):
     may_not_answer: True if its answer may hold no score, also on blank frames. It then gets no warm-up, because Triton
         does not load a model whose warm-up fails
     needs_whole_episode: True if its scores are relative to the whole episode, so it cannot score while one runs
-    asks_in_words: True for an ordinary language model, which has no heads, so that none is missing
+    asks_in_words: True for an ordinary language model, or one with heads of its own, so that no reward head is missing
     keeps_features: True if it can cache features of frames; it then takes samples with frame references
     uses_graphs: True if its predictor can score small batches with CUDA graphs
     is_large: True if float32 on the CPU is slow; exports are verified in the dtype that serves, on a GPU with room

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 SUCCESS_THRESHOLD = 0.5
 PAIR_SCORES = ("preference", "similarity")  # of two trajectories
 EVEN = 0.5  # preference for neither trajectory
+ProgressRule: TypeAlias = Literal["remaining_over_first"]
 
 
 @dataclass(frozen=True)
@@ -163,6 +164,21 @@ class FrameScores:
         """
         progress = _known("progress", self.progress)
         return np.diff(progress, prepend=progress[:1])
+
+    def progress_by(self, rule: ProgressRule) -> Float32Array:
+        """Return progress by a rule, float32 [T], 0..1, from the seconds that RynnValue predicts in its place.
+
+        rule: ``remaining_over_first``: 1 - remaining_s / remaining_s of the first frame, within 0..1. So the scores
+            must be of one whole episode, whose first frame has progress 0
+
+        Raises ValueError for another rule, without remaining seconds, or if they are not above 0 at the first frame.
+        """
+        require("rule", rule in get_args(ProgressRule), f"one of {', '.join(get_args(ProgressRule))}", repr(rule))
+        require("remaining_s", self.remaining_s is not None, "seconds", "none: this checkpoint does not predict them")
+        seconds = np.asarray(self.remaining_s)
+        require("remaining_s", bool(seconds[0] > 0), "more than 0 at the first frame", float(seconds[0]))
+        progress: Float32Array = np.clip(1 - seconds / seconds[0], 0, 1).astype(np.float32)
+        return progress
 
     def succeeded(self, *, last: int = 1, threshold: float = SUCCESS_THRESHOLD) -> bool:
         """True if success reaches ``threshold`` at more than half of the ``last`` frames (all, if there are fewer).

@@ -123,14 +123,15 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
 
     def _gathered(self, scores: Mapping[int, StepScore]) -> StepScores:
         """The scores of all episodes; NaN and False where there is none."""
-        progress, success = (np.full(len(self), np.nan, np.float32) for _ in range(2))
+        progress, success, remaining_s = (np.full(len(self), np.nan, np.float32) for _ in range(3))
         succeeded, unclear = (np.zeros(len(self), bool) for _ in range(2))
         for index, score in scores.items():
             progress[index], success[index] = score.progress, score.success
             succeeded[index], unclear[index] = score.succeeded, score.unclear
+            remaining_s[index] = score.remaining_s
         steps = np.array([steps.newest for steps in self.steps], np.int64)
         ms = max((score.ms for score in scores.values()), default=0.0)
-        return StepScores(progress, success, succeeded, steps, ms, unclear)
+        return StepScores(progress, success, succeeded, steps, ms, unclear, remaining_s)
 
 
 class AsyncEpisode(AsyncClosing, OneProcess):

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypedDict
+from typing import Literal, Protocol, TypeAlias, TypedDict, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -19,17 +20,20 @@ from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.sampling import Rule, Sampling
 
+StepValue: TypeAlias = Literal["progress", "remaining_s"]
+
 
 @dataclass(frozen=True)
 class StepScore:
     """The score of one episode at its newest frame.
 
-    progress: how much of the task is done, 0..1
+    progress: how much of the task is done, 0..1; NaN with ``score="remaining_s"`` if the checkpoint does not predict it
     success: probability that the task is done; NaN: the checkpoint does not predict it
     succeeded: True if the success rule holds; False where success is NaN
     step: index of the scored frame in the episode, from 0
     ms: milliseconds to the answer, without the wait for an open ``add_nowait`` request
     unclear: True if a camera's written answer states no single whole score (RoboReward only)
+    remaining_s: seconds until the task is done; NaN: the checkpoint does not predict them
     """
 
     progress: float
@@ -38,6 +42,11 @@ class StepScore:
     step: int
     ms: float
     unclear: bool = False
+    remaining_s: float = math.nan
+
+    def value(self, score: StepValue) -> float:
+        """Return the number that grows as the task is done: progress, or minus the remaining seconds."""
+        return self.progress if score == "progress" else -self.remaining_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +58,7 @@ class StepScores:
     step: int64 [N], number of each newest frame, from 0; -1: none yet
     ms: time to the answer, milliseconds
     unclear: bool [N], as in StepScore
+    remaining_s: float32 [N], as in StepScore; NaN where ``mask`` left an episode out
     """
 
     progress: Float32Array
@@ -57,12 +67,13 @@ class StepScores:
     step: npt.NDArray[np.int64]
     ms: float
     unclear: npt.NDArray[np.bool_]
+    remaining_s: Float32Array
 
     def of(self, index: int) -> StepScore:
         """Return the score of one episode."""
         numbers = float(self.progress[index]), float(self.success[index])
         succeeded, unclear = bool(self.succeeded[index]), bool(self.unclear[index])
-        return StepScore(*numbers, succeeded, int(self.step[index]), self.ms, unclear)
+        return StepScore(*numbers, succeeded, int(self.step[index]), self.ms, unclear, float(self.remaining_s[index]))
 
 
 @dataclass(frozen=True)
@@ -113,6 +124,7 @@ class StepKeywords(TypedDict, total=False):
     success: SuccessRule
     live: StepView | None
     timeout_s: float | None
+    score: StepValue
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +144,8 @@ class EpisodeOptions:
     success: rule of a step's success
     live: view to which each step is reported, with the first camera's frame; it delays no step
     timeout_s: longest time of a step, retries included; None: the client's
+    score: the score that each step must have, ``progress`` or ``remaining_s``; a step of a checkpoint that does not
+        predict it raises ValueError
     """
 
     sampling: Rule | None = None
@@ -144,8 +158,12 @@ class EpisodeOptions:
     success: SuccessRule = SuccessRule()
     live: StepView | None = None
     timeout_s: float | None = None
+    score: StepValue = "progress"
 
     def __post_init__(self) -> None:
+        require(
+            "score", self.score in get_args(StepValue), f"one of {', '.join(get_args(StepValue))}", repr(self.score)
+        )
         require("cameras", not isinstance(self.cameras, str), "a sequence of names", repr(self.cameras))
         object.__setattr__(self, "cameras", tuple(self.cameras))
         is_each_once = len(set(self.cameras)) == len(self.cameras)

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -13,7 +14,7 @@ import numpy as np
 
 from rfm_client.contract import wire
 from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InvalidSampleError, RewardError
+from rfm_client.contract.errors import InvalidSampleError, InvalidValueError, RewardError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import FrameScores, ProgressResult, Result
@@ -163,21 +164,33 @@ class Steps:
     def score(self, step: int, prefix: Prefix, outcomes: Sequence[Result | RewardError], ms: float) -> StepScore:
         """Return the score of a step from the outcomes of its ``windows``.
 
-        Raises the RewardError of a failed window; ValueError if the checkpoint does not predict progress.
+        Raises the RewardError of a failed window; ValueError if the checkpoint does not predict what ``options.score``
+        names.
         """
         for outcome in outcomes:
             if isinstance(outcome, RewardError):
                 raise self._located(outcome)
         shown = [result.at(prefix.frame_slots) for result in cast("Sequence[ProgressResult]", outcomes)]
-        fuse, rule = FUSES[self.options.fuse], self.options.success
-        fused = FrameScores(
-            progress=fuse([each.progress for each in shown], axis=0),
-            success=fuse([each.success for each in shown], axis=0),
-        )
+        fused, rule = _fused(shown, FUSES[self.options.fuse]), self.options.success
+        self._check_predicted(fused)
         is_predicted = not np.isnan(fused.success).any()
         succeeded = is_predicted and fused.succeeded(last=rule.last, threshold=rule.threshold)
         unclear = any(each.unclear is not None and bool(each.unclear[-1]) for each in shown)
-        return StepScore(fused.last_progress, float(fused.success[-1]), succeeded, step, ms, unclear)
+        numbers = float(fused.progress[-1]), float(fused.success[-1])
+        remaining_s = math.nan if fused.remaining_s is None else float(fused.remaining_s[-1])
+        return StepScore(*numbers, succeeded, step, ms, unclear, remaining_s)
+
+    def _check_predicted(self, scores: FrameScores) -> None:
+        """Raise ValueError if the checkpoint does not predict the score that the options name."""
+        name = self.options.score
+        values = getattr(scores, name)
+        if values is None or np.isnan(values).any():
+            other = "remaining_s" if name == "progress" else "progress"
+            has_other = name != "progress" or scores.remaining_s is not None
+            remedy = f"; score={other!r} takes what it predicts" if has_other else ""
+            raise InvalidValueError.at(
+                name, "a score of each frame", f"NaN: this checkpoint does not predict it{remedy}"
+            )
 
     def report(self, score: StepScore) -> None:
         """Report a score to the live view, unless the episode has ended or a newer score was reported."""
@@ -211,6 +224,16 @@ def _fault_of(pixels: Sequence[UInt8Array]) -> str:
         return f"pictures that change, got {len(pixels)} {_STILL if newest.any() else _BLACK}"
     told = BlankFrames(pixels).told if is_blank(newest) else ""
     return told and f"pictures that show something, got {told}, {len(pixels)} in a row"
+
+
+def _fused(shown: Sequence[FrameScores], fuse: Callable[..., Any]) -> FrameScores:
+    """Return the fused scores of the cameras. Fewer remaining seconds are better, so these are fused with a minus."""
+    seconds = [-each.remaining_s for each in shown if each.remaining_s is not None]
+    return FrameScores(
+        progress=fuse([each.progress for each in shown], axis=0),
+        success=fuse([each.success for each in shown], axis=0),
+        remaining_s=-fuse(seconds, axis=0) if seconds else None,
+    )
 
 
 def check_cameras(where: str, frames: Any, cameras: Sequence[str]) -> None:
