@@ -102,6 +102,7 @@ def _facts(
         trained_padding=description.trained_padding,
         needs_whole_episode=description.needs_whole_episode,
         weights=getattr(checkpoint.config, "weights", None),
+        has_progress=description.has_progress,
     )
 
 

@@ -176,7 +176,7 @@ def _exported(folder: Path, content: dict[str, Any], options: Options) -> RynnCh
     changed = options.settings(_OF_USER)
     config = RynnConfig(backbone=backbone_config(content, folder / NETWORK_CONFIG), **{**saved, **changed})
     own = folder / PROCESSOR_FOLDER
-    names = [name for name in vars(config) if name not in ("backbone", "video_prompt", "weights")]
+    names = [name for name in vars(config) if name not in ("backbone", "video_prompt", "weights", "causal_mask")]
     decisions = [
         Decision(name, _plain(getattr(config, name)), "--as" if name in changed else NETWORK_CONFIG) for name in names
     ]

@@ -94,6 +94,7 @@ class RynnConfig(LanguageConfig):
     use_meta: the prompt names the robot and the camera
     robot, camera: their descriptions; None: not named
     least_px, most_px: of a frame after resizing
+    causal_mask: always True: no frame's value depends on later frames, so one pass scores every prefix
     """
 
     attention: Attention
@@ -111,6 +112,7 @@ class RynnConfig(LanguageConfig):
     most_px: int
     robot: str | None = None
     camera: str | None = None
+    causal_mask: Literal[True] = True
 
     reward_model: ClassVar[str] = "rynnvalue"
     multi_image: ClassVar[bool] = True

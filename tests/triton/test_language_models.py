@@ -308,6 +308,35 @@ def test_labels_mark_unclear_answers(asked: Served, tmp_path: Path) -> None:
     assert len(parquet.read_table(data / "rfm_progress.parquet")["unclear"]) == 6
 
 
+def test_labels_of_seconds_name_the_rule_that_makes_progress(asked: Served, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    frames = np.random.default_rng(1).integers(0, 256, (5, 48, 80, 3), np.uint8)
+    np.save(data / "a.npy", frames)
+    words = ["label", data, "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "rynn", "--no-picture"]
+    words += ["--name", "rynnvalue"]
+    refused = rfm_client(*words)
+    assert refused.exit_code != 0
+    told = " ".join((refused.output + refused.stderr).split())
+    assert "predicts remaining seconds and no progress, got none; give --progress-rule remaining_over_first" in told
+    done = rfm_client(*words, "--progress-rule", "remaining_over_first")
+    assert done.exit_code == 0, done.output + done.stderr
+    with asked.client("rynn") as client:
+        expected = client.progress(Trajectory(frames=frames, task=TASK))
+    assert expected.remaining_s is not None
+    signals = parquet.read_table(data / "reward_signals" / "rynnvalue.parquet")
+    seconds = signals["reward.rynnvalue.remaining_time_s"].to_numpy()
+    np.testing.assert_allclose(seconds, expected.remaining_s, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(signals["reward.rynnvalue.potential"].to_numpy(), -seconds)
+    assert signals["reward.rynnvalue.is_inference_frame"].to_pylist() == [1] * 5
+    progress = signals["reward.rynnvalue.progress"].to_numpy()
+    np.testing.assert_allclose(progress, expected.progress_by("remaining_over_first"), rtol=0, atol=1e-3)
+    provenance = json.loads(signals.schema.metadata[b"lerobot.reward_scoring.provenance"])
+    assert "remaining_over_first" in json.dumps(provenance)
+    again = rfm_client(*words, "--progress-rule", "remaining_over_first")
+    assert again.exit_code == 0, again.output + again.stderr
+
+
 def test_the_description_tells_what_is_given(asked: Served) -> None:
     infos = {}
     for name in NAMES:

@@ -37,6 +37,7 @@ class CheckpointFacts:
     is_causal: True if no frame's score depends on later frames
     trained_padding: True if training padded shorter trajectories, or if unknown
     needs_whole_episode: True if scores are relative to the whole episode
+    has_progress: False if it predicts remaining seconds in place of progress
     weights: form of rounded weights, whose scores are not the full checkpoint's; None: not rounded
     """
 
@@ -52,6 +53,7 @@ class CheckpointFacts:
     needs_whole_episode: bool = False
     computation: str | None = None
     weights: str | None = None
+    has_progress: bool = True
 
     def document(self) -> dict[str, Any]:
         """Return the facts for the provenance."""
@@ -106,6 +108,7 @@ class ClientScorer:
             needs_whole_episode=info.needs_whole_episode,
             computation=info.computation,
             weights=info.weights,
+            has_progress=info.has_progress,
         )
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
