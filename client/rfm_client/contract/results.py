@@ -42,6 +42,7 @@ class Score:
     asked: when a client asks for it: always; of each model for raw frames that gives it (for embeddings: with
         ``all_scores``); or with an option of a call
     may_be_unknown: NaN at all frames if the checkpoint does not predict it
+    replaced_by: a score whose models predict it in place of this one, which is NaN at all frames then; empty: none
     is_per_bin: [T, K], and neither in JSON nor in labels; else [T]
     mark: what True says about a frame, as a clause; empty: numbers, not marks
     bounds: smallest and largest value; None: no bound
@@ -52,6 +53,7 @@ class Score:
     meaning: str
     asked: Literal["always", "if given", "on request"] = "on request"
     may_be_unknown: bool = False
+    replaced_by: str = ""
     is_per_bin: bool = False
     mark: str = ""
     bounds: tuple[float | None, float | None] = (0.0, 1.0)
@@ -81,7 +83,9 @@ class FrameScores:
     frame_indices: int64 [T], indices of the scored frames in the trajectory; None: all frames
     """
 
-    progress: Annotated[Float32Array, Score("Share of the task that is done", asked="always", may_be_unknown=True)]
+    progress: Annotated[
+        Float32Array, Score("Share of the task that is done", asked="always", replaced_by="remaining_s")
+    ]
     success: Annotated[Float32Array, Score("Probability that the task is done", asked="always", may_be_unknown=True)]
     progress_logits: Annotated[
         Float32Array | None, Score("Raw scores of the progress bins", is_per_bin=True, bounds=(None, None))
