@@ -100,6 +100,7 @@ def _facts(
         encodes=encoders is not None,
         is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
         weights=getattr(checkpoint.config, "weights", None),
+        has_progress=description.has_progress,
     )
 
 

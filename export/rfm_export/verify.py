@@ -43,7 +43,7 @@ WORKING_ROOM = 1.5  # times the weights' bytes, for weights and a pass over a fe
 def compare(source: Source, version: Version, staged: Path, say: Say) -> float | None:
     """Raise ExportDiffersError unless the staged weights give the checkpoint's scores.
 
-    Return the largest difference that rounding the weights makes to progress; None: nothing is rounded.
+    Return the largest difference that rounding the weights makes to the first score; None: nothing is rounded.
     """
     difference = _difference(source, say)
     _compare_staged(source, version, staged, say)
@@ -51,7 +51,7 @@ def compare(source: Source, version: Version, staged: Path, say: Say) -> float |
 
 
 def _difference(source: Source, say: Say) -> float | None:
-    """Return the largest difference that rounding the weights makes to progress; None: nothing is rounded."""
+    """Return the largest difference that rounding the weights makes to the first score; None: nothing is rounded."""
     full = None if source.full is None else source.full()
     if full is None or full.config.weights is not None:
         return None
@@ -60,8 +60,9 @@ def _difference(source: Source, say: Say) -> float | None:
     engine = partial(Engine.of, device=device, dtype=settings.torch_dtype)
     samples = probes(full.description, with_encoders=False)
     with needing_room(device):
-        largest = largest_difference(partial(engine, full), partial(engine, source.checkpoint), samples)
-    say(f"--weights {kind}: progress differs by at most {largest:.2g} from the full checkpoint's, on noise")
+        score = full.description.scores[0]
+        largest = largest_difference(partial(engine, full), partial(engine, source.checkpoint), samples, score)
+    say(f"--weights {kind}: {score} differs by at most {largest:.2g} from the full checkpoint's, on noise")
     return float(f"{largest:.2g}")
 
 
@@ -172,8 +173,10 @@ def verify(
             raise ExportDiffersError.at(f"probe {index}", "the checkpoint's scores", f"a difference of {largest:g}")
 
 
-def largest_difference(full: Callable[[], Engine], rounded: Callable[[], Engine], samples: Sequence[Sample]) -> float:
-    """Return the largest difference of progress between both engines. Only one engine exists at a time.
+def largest_difference(
+    full: Callable[[], Engine], rounded: Callable[[], Engine], samples: Sequence[Sample], score: str = "progress"
+) -> float:
+    """Return the largest difference of a score between both engines. Only one engine exists at a time.
 
     Samples that either engine refuses do not count.
     """
@@ -181,7 +184,8 @@ def largest_difference(full: Callable[[], Engine], rounded: Callable[[], Engine]
     pairs = [pair for pair in zip(*scores, strict=True) if not any(isinstance(each, RewardError) for each in pair)]
     scored = [map(trajectory_scores, pair) for pair in pairs]
     frames = [frame for before, after in scored for frame in zip(before.values(), after.values(), strict=True)]
-    return max((float(np.abs(after.progress - before.progress).max()) for before, after in frames), default=0.0)
+    of_frames = [[getattr(each, score) for each in pair] for pair in frames]
+    return max((float(np.abs(after - before).max()) for before, after in of_frames), default=0.0)
 
 
 def verify_graphs(make: Callable[[], Engine], description: Description, say: Say) -> None:

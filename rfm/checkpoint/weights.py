@@ -61,6 +61,7 @@ _NETWORKS = {
     "qwen2_5_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.gate_proj\."),
     "qwen3_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.linear_fc1\."),
 }
+_ON = {"rynn_value_lang": "qwen3_vl"}  # names of networks on a backbone
 _MAY_BE_ZERO = re.compile(r"(progress|preference|success|similarity)_head\.|.*\.lora_[AB]\.")  # before training
 _STRIP = (
     "import sys, safetensors.torch as s; prefix, target, *files = sys.argv[1:]; "
@@ -92,9 +93,10 @@ def _check_network(folder: Path, names: Iterable[str]) -> None:
     file = folder / NETWORK_CONFIG
     content = read_json(file) if is_there(file) else {}
     stated = content.get("model_type")
+    backbone = _ON.get(stated, stated) if isinstance(stated, str) else stated
     found = next((kind for name in names for kind, own in _NETWORKS.items() if own.search(name)), None)
     is_first = stated is None and found == next(iter(_NETWORKS))  # the first ReWiND checkpoints state nothing
-    if found is None or "type" in content or is_first or stated == found:  # ``type``: of LeRobot
+    if found is None or "type" in content or is_first or backbone == found:  # ``type``: of LeRobot
         return
     got = "none" if stated is None else shown(stated)
     expected = f"{found}, by the names of the weights"

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,15 +13,15 @@ from rfm_client.contract import FRAME_SCORES, InferenceFailedError, Result, Rewa
 from rfm_client.contract.results import answer, trajectory_scores
 
 
-def finite(outcomes: Sequence[Result | RewardError], *, has_success: bool) -> list[Result | RewardError]:
+def finite(outcomes: Sequence[Result | RewardError], *, lacks: Collection[str]) -> list[Result | RewardError]:
     """Return the outcomes, with an error in place of each result with a score that is not finite.
 
-    has_success: False if the network does not predict success, which is NaN then
+    lacks: scores that the network does not predict, which are NaN then
 
     Logits of progress are not checked: RoboReward has none for an answer without a digit, and progress shows the
     others' faults.
     """
-    scores = [[] if isinstance(each, RewardError) else list(_scores(each, has_success)) for each in outcomes]
+    scores = [[] if isinstance(each, RewardError) else list(_scores(each, lacks)) for each in outcomes]
     of_all = [array for of_one in scores for array in of_one]
     if not of_all or np.isfinite(np.concatenate(of_all)).all():  # all at once, which is faster
         return list(outcomes)
@@ -32,12 +32,11 @@ def finite(outcomes: Sequence[Result | RewardError], *, has_success: bool) -> li
     ]
 
 
-def _scores(result: Result, has_success: bool) -> Iterator[npt.NDArray[Any]]:
+def _scores(result: Result, lacks: Collection[str]) -> Iterator[npt.NDArray[Any]]:
     """Yield the result's scores, [N] each."""
     if of_pair := answer(result):
         yield np.array([*of_pair.values()], np.float32)
     for scores in trajectory_scores(result).values():
         for name, array in scores.arrays.items():
-            score = FRAME_SCORES[name]
-            if not score.is_per_bin and (has_success or not score.may_be_unknown):
+            if not FRAME_SCORES[name].is_per_bin and name not in lacks:
                 yield array

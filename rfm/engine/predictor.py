@@ -35,6 +35,10 @@ class Predictor(Protocol[Row, Batch]):
     """
 
     @property
+    def has_progress(self) -> bool:
+        """False if the network does not predict progress, which is NaN then."""
+
+    @property
     def has_success(self) -> bool:
         """False if the network does not predict success, which is NaN then."""
 

@@ -203,7 +203,8 @@ class Engine:
             else self._outcome(sample.sample, scores[of_sample], timing)
             for sample, of_sample in zip(prepared, rows_of, strict=True)
         ]
-        return finite(outcomes, has_success=self.predictor.has_success)
+        lacks = [name for name in ("progress", "success") if not getattr(self.predictor, f"has_{name}")]
+        return finite(outcomes, lacks=lacks)
 
     def _scores(self, rows: Sequence[Any], execution: Execution) -> list[RowScores | RewardError]:
         scores: dict[int, RowScores | RewardError] = {}

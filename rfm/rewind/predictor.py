@@ -148,6 +148,7 @@ class RewindPredictor:
     """
 
     works_ahead = False
+    has_progress = True
 
     def __init__(self, network: RewindTransformer, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
         self.network = network.to(device, dtype).eval()

@@ -23,6 +23,7 @@ from rfm.vlm.images import (
     QwenImages,
     check_aspect,
     resized,
+    scaled_in_integers,
     scaled_video,
 )
 from rfm.vlm.language import LanguageCollator, LanguageConfig
@@ -196,14 +197,4 @@ class TopRewardCollator(LanguageCollator):
         pixels = torch.from_numpy(frames if frames.flags.writeable else frames.copy())
         if self.config.variant == "robometer":
             return scaled_video(pixels, size)
-        return _scaled_by_v2(pixels, size)
-
-
-def _scaled_by_v2(video: Tensor, size: tuple[int, int]) -> Tensor:
-    """Resize a video on the CPU as torchvision's v2 does, in integers: uint8 [T, H, W, 3] -> [T, *size, 3]."""
-    if video.shape[1:3] == size:
-        return video
-    if len(video) == 0:  # all features are cached
-        return video.new_empty(0, *size, video.shape[-1])
-    planes = F.interpolate(video.movedim(-1, 1), size, mode="bicubic", antialias=True)
-    return planes.movedim(1, -1).contiguous()
+        return scaled_in_integers(pixels, size)

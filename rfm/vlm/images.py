@@ -180,6 +180,16 @@ def scaled_video(video: Tensor, size: tuple[int, int]) -> Tensor:
     return scaled
 
 
+def scaled_in_integers(video: Tensor, size: tuple[int, int]) -> Tensor:
+    """Resize a video on the CPU as torchvision's v2 does, in integers: uint8 [T, H, W, 3] -> [T, *size, 3]."""
+    if video.shape[1:3] == size:
+        return video
+    if len(video) == 0:  # all features are cached
+        return video.new_empty(0, *size, video.shape[-1])
+    planes = F.interpolate(video.movedim(-1, 1), size, mode="bicubic", antialias=True)
+    return planes.movedim(1, -1).contiguous()
+
+
 def _to_sizes(frames: UInt8Array, sizes: Sequence[tuple[int, int]]) -> Tensor:
     """Resize frames to each of ``sizes`` in turn: uint8 [T, H, W, 3] -> [T, *sizes[-1], 3]."""
     if frames.flags.writeable and all(size == frames.shape[1:3] for size in sizes):

@@ -72,7 +72,7 @@ class LanguageFolder:
         own = folder / PROCESSOR_FOLDER
         processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
         base = Decision("base_model", source_name(processor), _BASE_MODEL if options.base_model else "the checkpoint")
-        dtype, form = _dtype(backbone, file), _video_prompt(backbone, options)
+        dtype, form = dtype_of(backbone, file), _video_prompt(backbone, options)
         kind = kind_of(weights) if settings is None else settings.get("weights")
         rounded = None if kind is None else (kind, OF_WEIGHTS if settings is None else NETWORK_CONFIG)
         if rounded is None and options.weights is not None:
@@ -149,7 +149,7 @@ def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> N
         del weights[HEAD]
 
 
-def _dtype(config: Mapping[str, Any], file: Path) -> Decision:
+def dtype_of(config: Mapping[str, Any], file: Path) -> Decision:
     """Return the number type of the network, which config.json states. Raises CheckpointError."""
     key = next((name for name in ("dtype", "torch_dtype") if config.get(name)), None)
     if key is None:

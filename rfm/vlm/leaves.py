@@ -34,6 +34,7 @@ class Leaf:
     position_ids: int64 [3, P]
     shown: int64, the frames in the whole conversation
     reads: the tokens among the P (first, behind the last) whose states are read
+    is_mutual: its tokens see each other in both directions; else each sees those before it
     """
 
     from_trunk: int
@@ -42,6 +43,7 @@ class Leaf:
     position_ids: Indices
     shown: Indices
     reads: tuple[int, int]
+    is_mutual: bool = False
 
     @property
     def num_tokens(self) -> int:
@@ -151,7 +153,8 @@ def padded(packs: Sequence[PlacedPack], pad: int, visual_pad: int, features: Cal
             ids[at], leaves[at], from_trunk[at] = leaf.input_ids, index, leaf.from_trunk
             positions[:, at[0], at[1]] = leaf.position_ids
             places[at] = np.arange(leaf.num_tokens)
-            for level, (other, count) in enumerate(((index, places[at] + 1), *leaf.from_leaves)):
+            own = leaf.num_tokens if leaf.is_mutual else places[at] + 1
+            for level, (other, count) in enumerate(((index, own), *leaf.from_leaves)):
                 seen[(level, *at)], upto[(level, *at)] = other, count
             num_visual = int((leaf.input_ids == visual_pad).sum())
             shown = features(leaf)

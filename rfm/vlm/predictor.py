@@ -35,6 +35,7 @@ class VlmPredictor:
     """
 
     works_ahead = True
+    has_progress = True
     makes_trees: ClassVar[bool] = True  # of prefixes, whose common beginnings are computed once
 
     def __init__(

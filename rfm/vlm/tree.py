@@ -77,7 +77,7 @@ def trees(rows: Sequence[VlmRow], pad: int, *, are_images: bool) -> list[VlmRow]
     found: list[VlmRow] = []
     for _, group in groupby(rows, key=lambda row: id(row.videos[0])):
         of_video = list(group)
-        if len(of_video) == 1:
+        if len(of_video) == 1 or of_video[0].packs:  # trees already
             found += of_video
         else:
             found += _trees([Conversation.of(row, pad, are_images=are_images) for row in of_video])

@@ -76,6 +76,30 @@ def test_what_a_checkpoint_does_not_predict_becomes_no_number(name: str) -> None
         getattr(scores, name)() if name == "succeeded" else getattr(scores, name)
 
 
+def seconds(*remaining_s: float) -> FrameScores:
+    nothing = np.full(len(remaining_s), np.nan, np.float32)
+    return FrameScores(progress=nothing, success=nothing, remaining_s=np.array(remaining_s, np.float32))
+
+
+def test_a_named_rule_makes_progress_of_seconds() -> None:
+    scores = seconds(8, 6, 10, 0, -1)
+    np.testing.assert_array_equal(scores.progress_by("remaining_over_first"), np.array([0, 0.25, 0, 1, 1], np.float32))
+    assert np.isnan(scores.progress).all()
+
+
+def test_without_seconds_no_rule_makes_progress() -> None:
+    with pytest.raises(ValueError, match="remaining_s: expected seconds, got none"):
+        every_seconds_but_none().progress_by("remaining_over_first")
+    with pytest.raises(ValueError, match="remaining_s: expected more than 0 at the first frame, got 0"):
+        seconds(0, 1).progress_by("remaining_over_first")
+    with pytest.raises(ValueError, match="rule: expected one of remaining_over_first, got 'best'"):
+        seconds(1).progress_by("best")  # type: ignore[arg-type]
+
+
+def every_seconds_but_none() -> FrameScores:
+    return replace(every_score(0, 2), remaining_s=None)
+
+
 VERDICTS: dict[str, tuple[float, float | None, float, bool | None, str | None]] = {
     "first, asked once": (0.9, None, 0.9, None, "first"),
     "second, asked once": (0.1, None, 0.1, None, "second"),

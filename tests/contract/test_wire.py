@@ -113,6 +113,7 @@ def test_results_arrive_as_they_were() -> None:
 def lacking(name: str, row: int, at: slice) -> wire.Tensors:
     tensors = {key: array.copy() for key, array in wire.encode_results(results()[1], 5, OUTPUTS).items()}
     tensors[name][row, at] = np.nan
+    tensors.pop("remaining_s", None)  # a model that predicts progress gives no seconds
     return tensors
 
 
@@ -134,6 +135,16 @@ def test_a_score_that_lacks_is_an_error(name: str, row: int, at: slice) -> None:
     tensors = lacking(name, row, at)
     with pytest.raises(InferenceFailedError, match=f"{name}: expected "):
         wire.decode_results(tensors, samples)
+
+
+def test_progress_may_lack_at_all_frames_where_seconds_take_its_place() -> None:
+    samples, _ = results()
+    seconds = wire.encode_results(results()[1], 5, OUTPUTS)["remaining_s"]
+    tensors = {**lacking("progress", 0, slice(0, None)), "remaining_s": seconds}
+    (result, *_) = wire.decode_results(tensors, samples)
+    assert all(np.isnan(each.progress).all() for each in goldens.frame_scores(result))
+    with pytest.raises(InferenceFailedError, match="progress: expected "):
+        wire.decode_results({**tensors, "progress": lacking("progress", 0, slice(0, 1))["progress"]}, samples)
 
 
 @pytest.mark.parametrize("row", [0, 1])

@@ -34,7 +34,7 @@ WAIT_S = 30
 class Pipelined:
     """A predictor whose forward waits until the next batch has been collated."""
 
-    has_success = True
+    has_progress = has_success = True
 
     def __init__(self, batches: int) -> None:
         self.collated = [threading.Event() for _ in range(batches)]
@@ -81,6 +81,8 @@ def test_the_next_batch_is_collated_while_the_current_one_runs() -> None:
 
 class Fixed:
     """A predictor of given scores, a sample a row."""
+
+    has_progress = True
 
     def __init__(self, scores: Sequence[RowScores], *, has_success: bool = True) -> None:
         self.scores, self.has_success = iter(scores), has_success

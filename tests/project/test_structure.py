@@ -32,6 +32,7 @@ FAMILIES = {
     "vlm": set(),
     "topreward": {"rfm.vlm"},
     "roboreward": {"rfm.vlm"},
+    "rynnvalue": {"rfm.vlm"},
 }  # and the families that each extends
 FOLDERS = {
     "rfm": ".",

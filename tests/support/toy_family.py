@@ -103,6 +103,7 @@ class ToyPredictor:
 
     network: Redness
     works_ahead: bool = False
+    has_progress: bool = True
     has_success: bool = True
 
     def rows(self, sample: Sample) -> list[list[np.ndarray]]:

@@ -15,6 +15,8 @@ import requests
 from pyarrow import parquet
 
 import rfm_export
+import rynnvalue
+from environments import cart_pole, play
 from faulty_servers import url_of
 from gateways import metric_at, poll, running
 from in_process import rfm_client
@@ -32,6 +34,7 @@ from rfm_client import (
     RewardClient,
     Trajectory,
 )
+from rfm_rl import RewardModelWrapper, RewardOptions
 from servers import Endpoints, start_triton
 from transports import Connection
 from viewer_requests import SCORE, curve_of, events, post
@@ -39,9 +42,11 @@ from viewer_requests import SCORE, curve_of, events, post
 pytestmark = pytest.mark.triton
 
 TOP, ROBO = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied", ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint"
+RYNN = ROOT / "rynnvalue" / "bro_symlog_bf16_tied" / "checkpoint"
 LEROBOT = ROOT / "lerobot_robometer" / "tok_disc10" / "checkpoint"
 DATASET = ROOT / "lerobot_rabc" / "home" / "golden" / "tiny_shared"
 NAMES = {"top": (TOP, "topreward"), "baseline": (TOP, "topreward-robometer"), "robo": (ROBO, "roboreward")}
+NAMES["rynn"] = RYNN, "rynnvalue,robot=a Franka single-arm robot,camera=the main right camera"
 TASK = "put the red block in the bowl"
 
 
@@ -90,6 +95,80 @@ def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str, mo
         assert every.log_prob is not None
         np.testing.assert_allclose(every.log_prob, expected.log_prob, rtol=0, atol=2e-5)
         assert np.isnan(result.success).all()
+
+
+def test_remaining_seconds_are_those_of_the_original(asked: Served, protocol: str) -> None:
+    told = next(each for each in rynnvalue.CASES if each.checkpoint == RYNN and each.file.stem == "B3_ragged")
+    samples = told.asked()
+    with asked.client("rynn", protocol) as client:
+        results = client.evaluate([each.sample for each in samples])
+        (dense,) = client.evaluate([ProgressSample(samples[1].sample.trajectory, 8)])
+        info = client.model_info(frames=True)
+    assert info.scores == ("remaining_s", "relative_s", "entropy")
+    for each, result in zip(samples, results, strict=True):
+        assert isinstance(result, ProgressResult)
+        seconds = told.expected(each.prefix, "value.pred_value")
+        np.testing.assert_allclose(result.remaining_s, seconds, rtol=2e-4, atol=2e-4)
+        assert np.isnan(result.progress).all()
+        assert np.isnan(result.success).all()
+        assert result.relative_s is not None
+        assert result.relative_s[0] == 0
+        assert result.entropy is not None
+        with pytest.raises(ValueError, match="this checkpoint does not predict it"):
+            _ = result.last_progress
+        shares = result.progress_by("remaining_over_first")
+        np.testing.assert_allclose(shares, (1 - seconds / seconds[0]).clip(0, 1), rtol=0, atol=1e-3)
+    assert isinstance(dense, ProgressResult)
+    assert dense.remaining_s is not None
+    assert len(dense.remaining_s) == 3
+
+
+def test_steps_and_rewards_are_made_of_remaining_seconds(asked: Served) -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (4, 48, 80, 3), np.uint8)
+    with asked.client("rynn") as client:
+        whole = client.progress(Trajectory(frames=frames, task=TASK))
+        with client.episode(TASK, score="remaining_s") as episode:
+            steps = [episode.add(frame) for frame in frames]
+        expected = r"progress: expected a score of each frame, got NaN: .*; score='remaining_s' takes what it predicts"
+        with client.episode(TASK) as episode, pytest.raises(ValueError, match=expected):
+            episode.add(frames[0])
+        options = RewardOptions(mode="shaping", gamma=1.0, score="remaining_s", max_frames=4)
+        with RewardModelWrapper(cart_pole(max_episode_steps=3), client, TASK, options) as env:
+            rewards, infos = play(env)
+    np.testing.assert_allclose([step.remaining_s for step in steps], whole.remaining_s, rtol=1e-4, atol=1e-4)
+    assert all(np.isnan(step.progress) and not step.succeeded for step in steps)
+    seconds = [info["reward_model"]["remaining_s"] for info in infos]
+    assert np.isfinite(seconds).all()
+    np.testing.assert_allclose(rewards, -np.diff(seconds), rtol=0, atol=1e-4)
+
+
+def test_the_gateway_answers_as_rynnvalue_s_server(asked: Served, tmp_path: Path) -> None:
+    told = next(each for each in rynnvalue.CASES if each.checkpoint == RYNN and each.file.stem == "steps_B2_T10_T3")
+    samples = [
+        {
+            "sample_type": "progress",
+            "trajectory": {
+                "task": each.sample.trajectory.task,
+                "frames": each.sample.trajectory.positions.tolist(),
+                "metadata": {"robot_description": each.meta[0], "camera_description": each.meta[1]},
+            },
+        }
+        for each in told.asked()
+    ]
+    other = json.loads(json.dumps(samples[:1]))
+    other[0]["trajectory"]["metadata"]["robot_description"] = "a robot of another kind"
+    with running(asked.endpoints, tmp_path, "rynn") as gateway:
+        url = f"{gateway.url}/evaluate_batch"
+        answer = requests.post(url, json={"samples": samples, "use_frame_steps": True}, timeout=60).json()
+        refused = requests.post(url, json={"samples": other}, timeout=60)
+    for each, values in zip(told.asked(), answer["outputs_progress"]["progress_pred"], strict=True):
+        (expected,) = told.engine(each.meta).evaluate([each.sample])
+        assert isinstance(expected, ProgressResult)
+        assert expected.remaining_s is not None
+        np.testing.assert_allclose(values, -expected.remaining_s, rtol=1e-4, atol=1e-4)
+    assert answer["outputs_success"] is None
+    assert refused.status_code == 422
+    assert "expected 'a Franka single-arm robot', as the model was exported with" in refused.text
 
 
 def test_lerobot_s_robometer_is_answered_as_by_lerobot(asked: Served, protocol: str) -> None:
@@ -229,15 +308,46 @@ def test_labels_mark_unclear_answers(asked: Served, tmp_path: Path) -> None:
     assert len(parquet.read_table(data / "rfm_progress.parquet")["unclear"]) == 6
 
 
+def test_labels_of_seconds_name_the_rule_that_makes_progress(asked: Served, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    frames = np.random.default_rng(1).integers(0, 256, (5, 48, 80, 3), np.uint8)
+    np.save(data / "a.npy", frames)
+    words = ["label", data, "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "rynn", "--no-picture"]
+    words += ["--name", "rynnvalue"]
+    refused = rfm_client(*words)
+    assert refused.exit_code != 0
+    told = " ".join((refused.output + refused.stderr).split())
+    assert "predicts remaining seconds and no progress, got none; give --progress-rule remaining_over_first" in told
+    done = rfm_client(*words, "--progress-rule", "remaining_over_first")
+    assert done.exit_code == 0, done.output + done.stderr
+    with asked.client("rynn") as client:
+        expected = client.progress(Trajectory(frames=frames, task=TASK))
+    assert expected.remaining_s is not None
+    signals = parquet.read_table(data / "reward_signals" / "rynnvalue.parquet")
+    seconds = signals["reward.rynnvalue.remaining_time_s"].to_numpy()
+    np.testing.assert_allclose(seconds, expected.remaining_s, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(signals["reward.rynnvalue.potential"].to_numpy(), -seconds)
+    assert signals["reward.rynnvalue.is_inference_frame"].to_pylist() == [1] * 5
+    progress = signals["reward.rynnvalue.progress"].to_numpy()
+    np.testing.assert_allclose(progress, expected.progress_by("remaining_over_first"), rtol=0, atol=1e-3)
+    provenance = json.loads(signals.schema.metadata[b"lerobot.reward_scoring.provenance"])
+    assert "remaining_over_first" in json.dumps(provenance)
+    again = rfm_client(*words, "--progress-rule", "remaining_over_first")
+    assert again.exit_code == 0, again.output + again.stderr
+
+
 def test_the_description_tells_what_is_given(asked: Served) -> None:
     infos = {}
     for name in NAMES:
         with asked.client(name) as client:
             infos[name] = client.model_info(frames=True)
+    assert infos["rynn"].kind == "RynnValue"
+    assert not infos["rynn"].has_progress
     assert infos["top"].kind == "TOPReward, as LeRobot computes it"
     assert infos["robo"].kind == "RoboReward"
     assert {name: info.needs_whole_episode for name, info in infos.items()} == {
-        "top": True, "baseline": True, "robo": False,
+        "top": True, "baseline": True, "robo": False, "rynn": False,
     }  # fmt: skip
     assert infos["top"].scores == ("progress", "log_prob")
     assert infos["robo"].scores == ("progress", "progress_logits", "unclear")

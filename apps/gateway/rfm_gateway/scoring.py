@@ -41,6 +41,8 @@ from rfm_gateway.folder import RequestFiles
 from rfm_gateway.observe import within
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
+FRAME_STEPS_OF_SECONDS = 8  # the same, for a model of remaining seconds
+_DESCRIPTIONS = {"robot_description": "robot", "camera_description": "camera"}  # settings, by keys of metadata
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
 _BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the embedding of the task
@@ -95,7 +97,7 @@ class Evaluator:
         texts = await self._texts(batch.samples, request_id) if embeddings is not None else {}
         use_frame_steps = self._use_frame_steps if batch.use_frame_steps is None else batch.use_frame_steps
         by_prefix = use_frame_steps and frames is not None and frames.scores_whole_prefixes
-        frame_steps = FRAME_STEPS if use_frame_steps and not by_prefix else 0
+        frame_steps = _frame_steps(frames) if use_frame_steps and not by_prefix else 0
         conversion = _Conversion(embeddings, frames, texts, files, frame_steps, self._refuse_blank)
         num_bytes = batch.num_bytes if self._folder is None else None  # files may be large
         samples, warning = await off_loop(num_bytes, conversion.samples, batch)
@@ -237,11 +239,27 @@ class _Conversion:
         if self.frame_model is None:
             expected = "embeddings, since no model for raw frames is served"
             raise InvalidSampleError.at("frames", expected, "frames")
+        _check_descriptions(given, self.frame_model)
         frames = self.files.frames(given.frames) if isinstance(given.frames, list) else given.uint8_frames
         trajectory = Trajectory(frames=frames, task=given.task or "")
         if self.refuse_blank:
             refuse_blank_frames(trajectory)
         return trajectory
+
+
+def _frame_steps(frames: ModelInfo | None) -> int:
+    is_of_seconds = frames is not None and "remaining_s" in frames.scores
+    return FRAME_STEPS_OF_SECONDS if is_of_seconds else FRAME_STEPS
+
+
+def _check_descriptions(given: schema.TrajectoryInput, model: ModelInfo) -> None:
+    """Raise InvalidSampleError if metadata describes another robot or camera than the prompt of a model of seconds."""
+    told = given.metadata if isinstance(given.metadata, Mapping) else {}
+    named = model.network.get("config", {})
+    for key, setting in _DESCRIPTIONS.items() if "remaining_s" in model.scores else ():
+        if told.get(key) is not None and told[key] != named.get(setting):
+            expected = f"{named.get(setting)!r}, as the model was exported with (rfm export --as)"
+            raise InvalidSampleError.at(f"metadata.{key}", expected, repr(told[key]))
 
 
 def _prefixes(sample: Sample) -> list[Sample]:
@@ -275,6 +293,11 @@ def _joined(results: Sequence[Result]) -> Result:
     return ProgressResult.of_parts([each.at(newest) for each in results if isinstance(each, ProgressResult)])
 
 
+def _progress(result: ProgressResult) -> Float32Array:
+    """Return progress; of a model of seconds minus the seconds, as the evaluation server's default mode answers."""
+    return result.progress if result.remaining_s is None else -result.remaining_s
+
+
 def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: int) -> schema.EvaluateBatchAnswer:
     """Return the evaluation server's answer for these results.
 
@@ -286,7 +309,7 @@ def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: 
     similar = [sample for sample in samples if isinstance(sample, schema.SimilarityInput)]
     answer = schema.EvaluateBatchAnswer()
     if progress:
-        values = [result.progress[::group].tolist() for result in progress]
+        values = [_progress(result)[::group].tolist() for result in progress]
         answer.outputs_progress = schema.ProgressOutputs.model_construct(progress_pred=values)
     if progress and all(np.isfinite(result.success[::group]).all() for result in progress):
         values = [result.success[::group].tolist() for result in progress]

@@ -18,6 +18,7 @@ from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import listed, require
 
 Mode: TypeAlias = Literal["prefix", "whole"]
+ProgressRule: TypeAlias = Literal["remaining_over_first"]
 Format: TypeAlias = Literal["progress", "signals", "hdf5"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_WORKERS = 4
@@ -108,6 +109,11 @@ class LabelOptions(Settings):
         None, "Rule by which frame t's prefix is sampled; else that of the checkpoint's training."
     )
     frames: int | None = setting(None, "Frames that the rule shows the model; else as many as in training.", least=1)
+    progress_rule: ProgressRule | None = setting(
+        None,
+        "How progress is made of remaining seconds, for a model without progress: "
+        "remaining_over_first: 1 - the seconds / those of the episode's first frame.",
+    )
     mode: Mode = setting("prefix", "prefix: frame t is scored on the frames up to t. whole: all frames together.")
     resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
     episodes: Sequence[int] | None = setting(

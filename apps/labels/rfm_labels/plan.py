@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 from rfm_client import InvalidSampleError, RewardError
 from rfm_client.frames import ChannelOrder, Correction, Fuse, Orientation, Sampling
@@ -17,7 +17,7 @@ from rfm_client.options import InvalidValueError, first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import FaultsError, listed, require
 from rfm_labels.datasets.stored_files import digest_of
-from rfm_labels.options import QUIET, LabelOptions, Mode, Watch, chosen_numbers
+from rfm_labels.options import QUIET, LabelOptions, Mode, ProgressRule, Watch, chosen_numbers
 from rfm_labels.scorer import CheckpointFacts, Scorer
 
 _RECIPE_FORMAT = 4  # increased when the same recipe gives other scores or other digests
@@ -32,6 +32,7 @@ class Recipe:
     decoders: library that decodes each camera's frames, with version, since versions differ in colours; None: pixels
     corrections: of the cameras whose frames are turned, or stored as BGR
     verify: True: videos are identified by their content
+    progress_rule: makes progress of remaining seconds; None: the checkpoint predicts progress
     """
 
     checkpoint: CheckpointFacts
@@ -43,6 +44,7 @@ class Recipe:
     fuse: Fuse
     resize: bool
     verify: bool
+    progress_rule: ProgressRule | None = None
 
     @classmethod
     def of(cls, options: LabelOptions, dataset: Dataset, checkpoint: CheckpointFacts) -> Recipe:
@@ -57,6 +59,7 @@ class Recipe:
         if checkpoint.needs_whole_episode and options.mode != "whole":
             why = "of this model, whose scores are relative to the whole episode"
             raise InvalidSampleError.at("mode", f"whole {why}", f"{options.mode}; give --mode whole")
+        _check_progress(options.progress_rule, checkpoint)
         rule = "all" if options.mode == "whole" else options.sampling
         padding = checkpoint.trained_padding
         try:
@@ -74,6 +77,7 @@ class Recipe:
             fuse=options.fuse,
             resize=options.resize,
             verify=options.verify,
+            progress_rule=options.progress_rule,
         )
 
     @property
@@ -106,6 +110,7 @@ class Recipe:
             "fuse": self.fuse if len(self.cameras) > 1 else None,
             "resize": str(self.checkpoint.frame_size) if self.resize else None,
             "verify": self.verify,
+            **({"progress_rule": self.progress_rule} if self.progress_rule else {}),
         }
 
     def told(self, options: LabelOptions) -> list[str]:
@@ -199,6 +204,16 @@ def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisod
         videos = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.cameras]
         items.append(Item(episode, digest_of(part.encode() for part in (document, about, *videos))))
     return Plan(items, recipe, {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision})
+
+
+def _check_progress(rule: ProgressRule | None, checkpoint: CheckpointFacts) -> None:
+    """Raise InvalidSampleError unless either the checkpoint or a rule gives progress."""
+    if checkpoint.has_progress and rule is not None:
+        raise InvalidSampleError.at("progress_rule", "none with this model, which predicts progress", rule)
+    if not checkpoint.has_progress and rule is None:
+        known = " or ".join(get_args(ProgressRule))
+        expected = f"{known} with this model, which predicts remaining seconds and no progress"
+        raise InvalidSampleError.at("progress_rule", expected, f"none; give --progress-rule {known}")
 
 
 @contextmanager

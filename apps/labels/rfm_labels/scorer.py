@@ -31,6 +31,7 @@ class CheckpointFacts:
     settings_digest: of all else that decides the scores: configuration, encoders, dtype, device
     encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
     is_causal: True if no frame's score depends on later frames
+    has_progress: False if it predicts remaining seconds in place of progress
     """
 
     source: str | None
@@ -45,6 +46,7 @@ class CheckpointFacts:
     needs_whole_episode: bool = False
     computation: str | None = None
     weights: str | None = None
+    has_progress: bool = True
 
     @classmethod
     def of(cls, described: object, **own: Any) -> CheckpointFacts:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from traceback import clear_frames
 from typing import Any
 
@@ -35,9 +35,10 @@ from rfm_client import (
     UInt8Array,
 )
 from rfm_client.frames import BlankFrames, resize_frames
+from rfm_client.options import InvalidValueError
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import require
-from rfm_labels.metadata import SCORES, Columns, Cost
+from rfm_labels.metadata import REMAINING, SCORES, Columns, Cost
 from rfm_labels.options import Watch
 from rfm_labels.plan import Item, Plan, Recipe
 from rfm_labels.scorer import DECISIVE, Scorer
@@ -247,7 +248,8 @@ def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: Dataset
             continue
         _check_numbers(name, scores, episode)
         fuse: Any = np.max if about.mark else getattr(np, recipe.fuse)  # mean, min or max
-        columns[name] = np.asarray(fuse(np.stack(scores), axis=0), np.float32)
+        sign = np.float32(-1 if name == REMAINING else 1)  # fewer seconds are better
+        columns[name] = sign * np.asarray(fuse(sign * np.stack(scores), axis=0), np.float32)
         if len(by_camera) > 1:
             columns |= {f"{name}.{camera}": score for camera, score in zip(by_camera, scores, strict=True)}
     return columns
@@ -256,12 +258,22 @@ def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: Dataset
 def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]) -> ProgressResult:
     if recipe.in_one_pass(trajectory.num_frames):
         (result,) = scorer.evaluate([ProgressSample(trajectory)])
-        return result
+        return _with_progress(result, recipe)
     results: list[ProgressResult] = []
     for together in _by_bytes(recipe.sampling.samples(trajectory)):
         go_on()
         results += scorer.evaluate(together)
-    return recipe.sampling.joined(results)
+    return _with_progress(recipe.sampling.joined(results), recipe)
+
+
+def _with_progress(result: ProgressResult, recipe: Recipe) -> ProgressResult:
+    """Return the result with progress by the recipe's rule, if it has one. Raises InvalidSampleError."""
+    if recipe.progress_rule is None:
+        return result
+    try:
+        return replace(result, progress=result.progress_by(recipe.progress_rule))
+    except InvalidValueError as error:
+        raise InvalidSampleError(error.problem, error.where) from error
 
 
 def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], None]) -> Iterator[UInt8Array]:

@@ -30,6 +30,7 @@ import numpy as np
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.metadata import (
     PROGRESS,
+    REMAINING,
     SCORES,
     SUCCESS,
     Columns,
@@ -47,7 +48,11 @@ PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run sees if its labels still hold
 COST_KEY = b"rfm.cost"  # apart from the provenance, which is equal for equal runs
-SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability"}
+SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability", REMAINING: "remaining_time_s"}
+_OF_SECONDS = {  # further signals of remaining seconds, with their meaning
+    "potential": "Minus the remaining seconds",
+    "is_inference_frame": "1 where the model scored the frame itself",
+}
 
 _DIGEST_KEY = b"rfm.digest"
 _SUFFIX = ".parquet"
@@ -207,6 +212,10 @@ def with_totals(labels: Any, plan: Plan) -> Any:
     """
     import pyarrow as pa
 
+    if REMAINING in labels.column_names:
+        seconds = labels[REMAINING].to_numpy()
+        for name, values in zip(_OF_SECONDS, (-seconds, np.ones_like(seconds)), strict=True):
+            labels = labels.append_column(name, pa.array(values))
     if not _has_several_tasks(plan):
         return labels
     progress = labels[PROGRESS].to_numpy()
@@ -230,11 +239,13 @@ def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost
     for column in columns:
         score, dot, camera = column.partition(".")
         signals[column] = f"reward.{name}.{SIGNAL_NAMES[score]}{dot}{camera}"
+    if REMAINING in signals:
+        signals |= {column: f"reward.{name}.{column}" for column in _OF_SECONDS}
     metadata = {
         "format": b"lerobot.frame_signals",
         "schema_version": b"1",
         "provenance": canonical_json(plan.provenance()),
-        "descriptors": canonical_json({signals[column]: _descriptor(column) for column in columns}),
+        "descriptors": canonical_json({signal: _descriptor(column) for column, signal in signals.items()}),
         "episode_indices": canonical_json([item.episode.index for item in plan.items]),
     }
     ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
@@ -250,11 +261,12 @@ def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
 
 def _descriptor(column: str) -> dict[str, Any]:
     name, _, camera = column.partition(".")
-    score = SCORES[name]
+    score = SCORES.get(name)
+    meaning = _OF_SECONDS[name] if score is None else score.meaning
     return {
-        "description": score.meaning + (f", seen by {camera}" if camera else ""),
-        "direction": "higher" if score.higher_is_better else "lower",
-        "bounds": [*score.bounds],
+        "description": meaning + (f", seen by {camera}" if camera else ""),
+        "direction": "higher" if score is None or score.higher_is_better else "lower",
+        "bounds": [None, None] if score is None else [*score.bounds],
         "unit": None,
         "missing_values": "forbidden",
         "allow_nan": False,  # the same in another revision of the proposal

@@ -58,6 +58,8 @@ class RewardOptions(FrameOptions):
         observation to its frame; None: ``render()``
     cameras: keys of the frames to score and fuse, in the observation or the result of ``frames_from``; empty: a single
         camera without a name
+    score: what rewards are made of: ``progress``, or ``remaining_s``: minus the remaining seconds, in place of progress
+        in each mode, so that a step pays the seconds that it gains
     sampling, fuse, orient, channels, resize, live: as in ``rfm_client.episodes.FrameOptions``; rendered frames are
         changed alike
     max_frames: ``frames`` of EpisodeOptions: the rule's number of frames
@@ -209,7 +211,7 @@ class RewardedEpisode:
             expected = f"{none} with a checkpoint that does not predict success"
             raise InvalidValueError.at(name, expected, getattr(self._options, name))
         if self.known is None:
-            self._paid_progress = score.progress
+            self._paid_progress = score.value(self._options.score)
         score = replace(score, succeeded=score.succeeded and score.step > 0)  # a reset is no success
         self.known = score
         self._has_succeeded |= rule is not None and score.succeeded
@@ -221,7 +223,7 @@ class RewardedEpisode:
         terminated: True if the environment has reached a terminal state; False at a time limit
         """
         options = self._options
-        progress = np.nan if self.known is None else self.known.progress
+        progress = np.nan if self.known is None else self.known.value(options.score)
         if options.shapes_another and (terminated or self.succeeded):
             progress = 0.0
         before, self._paid_progress = self._paid_progress, progress

@@ -27,8 +27,8 @@ class Origin:
     license: licence of the weights, by the checkpoint's model card or config.json; None: unknown
     run_config: config.yaml of the training run, without secrets; empty: the checkpoint has none
     computation: number type, PyTorch version and attention kernel, as at the export; None: unknown
-    weights_difference: largest difference of progress from the full checkpoint's, which the export measured on noise
-        when it rounded weights; None: not measured
+    weights_difference: largest difference of the first of ``scores`` from the full checkpoint's, which the export
+        measured on noise when it rounded weights; None: not measured
     """
 
     source: str | None = None
@@ -55,14 +55,14 @@ class Description(Origin):
     network_frames: frames of the longest trajectory that the network can score; None: no limit
     frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
     frames_per_value: consecutive frames that share a score; 2 if a vision-language model reads trajectories as videos
-    has_preference, has_success, has_similarity: True if the checkpoint gives these scores
+    has_progress, has_preference, has_success, has_similarity: True if the checkpoint gives these scores
     more_scores: names of the scores of frames that it gives beside progress, success and progress bins: fields of
         ``FrameScores``
     scores_whole_prefixes: True if the FastAPI evaluation server shows the model all frames of a prefix, else four
     may_not_answer: True if its answer may hold no score, also on blank frames. It then gets no warm-up, because Triton
         does not load a model whose warm-up fails
     needs_whole_episode: True if its scores are relative to the whole episode, so it cannot score while one runs
-    asks_in_words: True for an ordinary language model, which has no heads, so that none is missing
+    asks_in_words: True for an ordinary language model, or one with heads of its own, so that no reward head is missing
     keeps_features: True if it can cache features of frames; it then takes samples with frame references
     uses_graphs: True if its predictor can score small batches with CUDA graphs
     is_large: True if float32 on the CPU is slow; exports are verified in the dtype that serves, on a GPU with room
@@ -81,6 +81,7 @@ class Description(Origin):
     network_frames: int | None = None
     frame_size: FrameSize | None = None
     frames_per_value: int = 1
+    has_progress: bool = True
     has_preference: bool = False
     has_success: bool = False
     has_similarity: bool = False
@@ -109,7 +110,7 @@ class Description(Origin):
     def scores(self) -> tuple[str, ...]:
         """Names of the scores of frames that the model gives: fields of ``FrameScores``."""
         bins = () if self.progress_bins is None else ("progress_logits",)
-        return ("progress", *["success"] * self.has_success, *bins, *self.more_scores)
+        return (*["progress"] * self.has_progress, *["success"] * self.has_success, *bins, *self.more_scores)
 
     @property
     def lacks(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 SUCCESS_THRESHOLD = 0.5
 PAIR_SCORES = ("preference", "similarity")  # of two trajectories
 EVEN = 0.5  # preference for neither trajectory
+ProgressRule: TypeAlias = Literal["remaining_over_first"]
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Score:
     asked: when a client asks for it: always; of each model for raw frames that gives it (for embeddings: with
         ``all_scores``); or with an option of a call
     may_be_unknown: NaN at all frames if the checkpoint does not predict it
+    replaced_by: a score whose models predict it in place of this one, which is NaN at all frames then; empty: none
     is_per_bin: [T, K], and neither in JSON nor in labels; else [T]
     mark: what True says about a frame, as a clause; empty: numbers, not marks
     bounds: smallest and largest value; None: no bound
@@ -51,6 +53,7 @@ class Score:
     meaning: str
     asked: Literal["always", "if given", "on request"] = "on request"
     may_be_unknown: bool = False
+    replaced_by: str = ""
     is_per_bin: bool = False
     mark: str = ""
     bounds: tuple[float | None, float | None] = (0.0, 1.0)
@@ -67,16 +70,22 @@ class Score:
 class FrameScores:
     """Scores of each frame of one trajectory. Everything else that knows a score derives it from its ``Score``.
 
-    progress: float32 [T], share of the task done, 0..1
+    progress: float32 [T], share of the task done, 0..1; NaN throughout: the checkpoint does not predict it
     success: float32 [T], probability that the task is done; NaN throughout: the checkpoint does not predict it
     progress_logits: float32 [T, K], raw scores of the progress bins, on request, from discrete checkpoints only
     log_prob: float32 [T], logarithm of TOPReward's probability that the frames so far complete the task, on request
     unclear: bool [T], True where RoboReward's written answer states no single whole score, so that progress may be
         misread; None: the model writes no answers
+    remaining_s: float32 [T], RynnValue's seconds from each frame until the task is done
+    relative_s: float32 [T], RynnValue's seconds from the frame before to each frame, negative where the task went
+        backwards; 0 at the first frame
+    entropy: float32 [T], entropy in nats of the probabilities behind ``remaining_s``; larger: less sure
     frame_indices: int64 [T], indices of the scored frames in the trajectory; None: all frames
     """
 
-    progress: Annotated[Float32Array, Score("Share of the task that is done", asked="always")]
+    progress: Annotated[
+        Float32Array, Score("Share of the task that is done", asked="always", replaced_by="remaining_s")
+    ]
     success: Annotated[Float32Array, Score("Probability that the task is done", asked="always", may_be_unknown=True)]
     progress_logits: Annotated[
         Float32Array | None, Score("Raw scores of the progress bins", is_per_bin=True, bounds=(None, None))
@@ -94,6 +103,25 @@ class FrameScores:
             " be misread; --strict-answers refuses these",
             higher_is_better=False,
             is_newer=True,
+        ),
+    ] = None
+    remaining_s: Annotated[
+        Float32Array | None,
+        Score(
+            "Seconds that remain until the task is done", asked="if given", bounds=(None, None), higher_is_better=False
+        ),
+    ] = None
+    relative_s: Annotated[
+        Float32Array | None,
+        Score("Seconds since the frame before, by the model", asked="if given", bounds=(None, None)),
+    ] = None
+    entropy: Annotated[
+        Float32Array | None,
+        Score(
+            "Entropy of the remaining seconds in nats: how unsure the model is",
+            asked="if given",
+            bounds=(0.0, None),
+            higher_is_better=False,
         ),
     ] = None
     frame_indices: npt.NDArray[np.int64] | None = None
@@ -140,6 +168,21 @@ class FrameScores:
         """
         progress = _known("progress", self.progress)
         return np.diff(progress, prepend=progress[:1])
+
+    def progress_by(self, rule: ProgressRule) -> Float32Array:
+        """Return progress by a rule, float32 [T], 0..1, from the seconds that RynnValue predicts in its place.
+
+        rule: ``remaining_over_first``: 1 - remaining_s / remaining_s of the first frame, within 0..1. So the scores
+            must be of one whole episode, whose first frame has progress 0
+
+        Raises ValueError for another rule, without remaining seconds, or if they are not above 0 at the first frame.
+        """
+        require("rule", rule in get_args(ProgressRule), f"one of {', '.join(get_args(ProgressRule))}", repr(rule))
+        require("remaining_s", self.remaining_s is not None, "seconds", "none: this checkpoint does not predict them")
+        seconds = np.asarray(self.remaining_s)
+        require("remaining_s", bool(seconds[0] > 0), "more than 0 at the first frame", float(seconds[0]))
+        progress: Float32Array = np.clip(1 - seconds / seconds[0], 0, 1).astype(np.float32)
+        return progress
 
     def succeeded(self, *, last: int = 1, threshold: float = SUCCESS_THRESHOLD) -> bool:
         """True if success reaches ``threshold`` at more than half of the ``last`` frames (all, if there are fewer).

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypedDict
+from typing import Any, Literal, Protocol, TypeAlias, TypedDict, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -19,12 +19,14 @@ from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.sampling import Rule, Sampling
 
+StepValue: TypeAlias = Literal["progress", "remaining_s"]
+
 
 @dataclass(frozen=True)
 class StepScore:
     """The score of one episode at its newest frame.
 
-    progress: how much of the task is done, 0..1
+    progress: how much of the task is done, 0..1; NaN with ``score="remaining_s"`` if the checkpoint does not predict it
     success: probability that the task is done; NaN: the checkpoint does not predict it
     succeeded: True if the success rule holds; False where success is NaN
     step: index of the scored frame in the episode, from 0
@@ -44,6 +46,10 @@ class StepScore:
     def unclear(self) -> bool:
         """True if a camera's written answer states no single whole score (RoboReward only)."""
         return bool(self.more_scores.get("unclear"))
+
+    def value(self, score: StepValue) -> float:
+        """Return the number that grows as the task is done: progress, or minus the remaining seconds."""
+        return self.progress if score == "progress" else -self.more_scores[score]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +130,7 @@ class StepKeywords(TypedDict, total=False):
     success: SuccessRule
     live: StepView | None
     timeout_s: float | None
+    score: StepValue
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +146,8 @@ class FrameOptions:
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
     live: view to which each step is reported, with the first camera's frame; it delays no step
+    score: the score that each step must have, ``progress`` or ``remaining_s``; a step of a checkpoint that does not
+        predict it raises ValueError
     """
 
     sampling: Rule | None = None
@@ -148,8 +157,12 @@ class FrameOptions:
     channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
     resize: bool = False
     live: StepView | None = None
+    score: StepValue = "progress"
 
     def __post_init__(self) -> None:
+        require(
+            "score", self.score in get_args(StepValue), f"one of {', '.join(get_args(StepValue))}", repr(self.score)
+        )
         require("cameras", not isinstance(self.cameras, str), "a sequence of names", repr(self.cameras))
         object.__setattr__(self, "cameras", tuple(self.cameras))
         is_each_once = len(set(self.cameras)) == len(self.cameras)

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import FRAME_SCORES, FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, as_array, check_task
-from rfm_client.episodes.options import EpisodeOptions, StepReport, StepScore
+from rfm_client.episodes.options import EpisodeOptions, StepReport, StepScore, StepValue
 from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW, BlankFrames, is_black, is_blank
 from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.resize import resize_frames
@@ -163,18 +163,28 @@ class Steps:
     def score(self, step: int, prefix: Prefix, outcomes: Sequence[Result | RewardError], ms: float) -> StepScore:
         """Return the score of a step from the outcomes of its ``windows``.
 
-        Raises the RewardError of a failed window; ValueError if the checkpoint does not predict progress.
+        Raises the RewardError of a failed window; ValueError if the checkpoint does not predict what ``options.score``
+        names.
         """
         for outcome in outcomes:
             if isinstance(outcome, RewardError):
                 raise self._located(outcome)
         shown = [result.at(prefix.frame_slots) for result in cast("Sequence[ProgressResult]", outcomes)]
         fused, rule = _fused(shown, self.options.fuse), self.options.success
+        self._check_predicted(fused)
         is_predicted = not np.isnan(fused.success).any()
         succeeded = is_predicted and fused.succeeded(last=rule.last, threshold=rule.threshold)
         unasked = [name for name in fused.arrays if FRAME_SCORES[name].asked == "if given"]
         more = {name: fused.arrays[name][-1].item() for name in unasked}
-        return StepScore(fused.last_progress, float(fused.success[-1]), succeeded, step, ms, more)
+        return StepScore(float(fused.progress[-1]), float(fused.success[-1]), succeeded, step, ms, more)
+
+    def _check_predicted(self, scores: FrameScores) -> None:
+        """Raise ValueError if the checkpoint does not predict the score that the options name."""
+        name, arrays = self.options.score, scores.arrays
+        predicted = [each for each in get_args(StepValue) if each in arrays and not np.isnan(arrays[each]).any()]
+        remedy = f"; score={predicted[0]!r} takes what it predicts" if predicted else ""
+        got = f"NaN: this checkpoint does not predict it{remedy}"
+        require(name, name in predicted, "a score of each frame", got)
 
     def report(self, score: StepScore) -> None:
         """Report a score to the live view, unless the episode has ended or a newer score was reported."""
@@ -201,12 +211,16 @@ class Steps:
 
 
 def _fused(of_cameras: Sequence[FrameScores], fuse: Fuse) -> FrameScores:
-    """Return one trajectory's scores from those of each camera. A mark is True where one camera has it."""
+    """Return one trajectory's scores from those of each camera. A mark is True where one camera has it.
+
+    Where lower is better, ``min`` keeps the largest value and ``max`` the smallest.
+    """
     fused: dict[str, Any] = {}
     for name, score in FRAME_SCORES.items():
         arrays = [each.arrays[name] for each in of_cameras if name in each.arrays]
         if arrays:
-            fused[name] = np.any(arrays, axis=0) if score.mark else FUSES[fuse](arrays, axis=0)
+            sign = 1 if score.higher_is_better else -1
+            fused[name] = np.any(arrays, axis=0) if score.mark else sign * FUSES[fuse](sign * np.array(arrays), axis=0)
     return FrameScores(**fused)
 
 

@@ -53,7 +53,7 @@ def decode_results(
     """Return the results of the samples of one request, which ``model_version`` answered.
 
     Raises InferenceFailedError if the answer lacks a score: a missing reward is not 0 or NaN. Only a score that a
-    checkpoint need not predict (success) may be NaN, at all frames.
+    checkpoint need not predict (success, and progress where remaining seconds are there) may be NaN, at all frames.
     """
     return [_decode_result(tensors, row, sample, model_version) for row, sample in enumerate(samples)]
 
@@ -101,7 +101,7 @@ def _timing(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> BatchTiming | 
 
 def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: slice) -> FrameScores:
     given: dict[str, Any] = {
-        name: _present(tensors, name, row, positions, may_lack=score.may_be_unknown)
+        name: _present(tensors, name, row, positions, may_lack=score.may_be_unknown or score.replaced_by in tensors)
         for name, score in FRAME_SCORES.items()
         if name in tensors or score.asked == "always"
     }

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: MIT
+"""RynnValue's checkpoints: as they were published, or exported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
+from rfm.checkpoint.provenance import OF_WEIGHTS, Decision, source_name
+from rfm.checkpoint.weights import read_weights
+from rfm.engine.feature_cache import FeatureCache
+from rfm.family import Options
+from rfm.rynnvalue.network import Bins, HeadConfig, RynnConfig, RynnNetwork
+from rfm.rynnvalue.predictor import RynnPredictor
+from rfm.rynnvalue.prompts import RELATIVE_TOKEN, VALUE_TOKEN, RynnCollator, RynnImages
+from rfm.rynnvalue.settings import PUBLISHED, Settings
+from rfm.vlm.backbone import QWEN_NAMES, UNUSED, backbone_config, renamed
+from rfm.vlm.collator import QWEN3
+from rfm.vlm.language import EMBEDDING, REWARD_MODEL, LanguageCheckpoint, processor_name
+from rfm.vlm.language_folder import dtype_of, reward_model_of
+from rfm.vlm.network import build_backbone
+from rfm.vlm.preprocessor import SIZED_BY_PROCESSOR, normalisation_of, patch_px
+from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, read_processor
+from rfm.vlm.qwen_checkpoint import SETTINGS, QwenCheckpoint
+from rfm.vlm.rounding import FLAG, decision, read_published, read_unrounded_config, round_layers
+from rfm_client.contract.description import Description
+
+NAME = "rynnvalue"  # of ``--as``
+REWARD_MODELS = (NAME,)
+MODEL_TYPE = "rynn_value_lang"
+TRAINED_FRAMES = 8
+_OF_USER = {"robot": str, "camera": str}  # settings that ``--as`` takes
+_LIMITS = ("shortest_edge", "longest_edge")
+_EXAMPLE = f"--as '{NAME},robot=a Franka single-arm robot,camera=the main right camera'"
+_OF_BACKBONE = "model."  # begins the names of the backbone's weights
+
+
+@dataclass(frozen=True)
+class RynnCheckpoint(LanguageCheckpoint):
+    """A RynnValue in memory.
+
+    unexpected: lines for the user about keys that no known checkpoint has
+    """
+
+    unexpected: tuple[str, ...] = ()
+
+    @property
+    def description(self) -> Description:
+        """The model's inputs and outputs."""
+        return Description(
+            kind="RynnValue",
+            network={"class": RynnNetwork.__name__},
+            trained_frames=TRAINED_FRAMES,
+            trained_padding=False,
+            has_progress=False,
+            more_scores=("remaining_s", "relative_s", "entropy"),
+            asks_in_words=True,
+            keeps_features=True,
+            uses_graphs=self.config.attention == "causal",  # else the groups need a mask
+            is_large=True,
+        )
+
+    @property
+    def notes(self) -> list[str]:
+        """A line for each sign that the files differ from the published checkpoints."""
+        return [
+            f"{name}: not expected, and not used: scores may differ from the original's" for name in self.unexpected
+        ]
+
+    @cached_property
+    def collator(self) -> RynnCollator:  # type: ignore[override]  # the prompts of the others have one video
+        """The collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+        tokenizer, preprocessor = read_processor(self.processor)
+        num_rows = self.config.backbone["text_config"]["vocab_size"]
+        if len(tokenizer) > num_rows:
+            expected = f"a tokenizer of at most {num_rows} tokens, as the embedding"
+            raise CheckpointError.at(f"base model {self.processor}", expected, len(tokenizer))
+        check_tokens(self.config, tokenizer, self.processor, self._value_tokens)
+        where = f"base model {self.processor}: preprocessing of images"
+        normalisation = normalisation_of(preprocessor, SIZED_BY_PROCESSOR, where)
+        patch = patch_px(preprocessor, self.config.backbone["vision_config"], where)
+        limits = {"least_px": self.config.least_px, "most_px": self.config.most_px}
+        collator = RynnCollator(self.config, tokenizer, RynnImages(patch, normalisation, **limits))
+        collator.check_template()
+        return collator
+
+    @property
+    def _value_tokens(self) -> dict[str, int]:
+        return {VALUE_TOKEN: self.config.value_token, RELATIVE_TOKEN: self.config.relative_token}
+
+    def network(self, dtype: torch.dtype) -> RynnNetwork:  # type: ignore[override]  # a network with other heads
+        """Return the network, with weights of no use."""
+        return RynnNetwork(self.config, build_backbone(self.config, dtype))
+
+    def make_predictor(
+        self, network: RynnNetwork, device: torch.device, cache: FeatureCache[Any] | None
+    ) -> RynnPredictor:
+        """Return the predictor with this network."""
+        return RynnPredictor(network, self.collator, device, cache)
+
+    def loaded(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the weights: no language head is tied to the embedding."""
+        return {**weights}
+
+    def build(self, dtype: torch.dtype | None = None) -> Any:
+        """Return the network with these weights, as ``QwenCheckpoint.build``. Raises CheckpointError."""
+        return QwenCheckpoint.build(self, dtype)
+
+
+def reads(folder: Path) -> bool:
+    """True if the folder holds a RynnValue as it was published, or an export of it."""
+    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
+    return content.get("model_type") == MODEL_TYPE or reward_model_of(folder) == RynnConfig.reward_model
+
+
+def load(folder: Path, options: Options) -> RynnCheckpoint:
+    """Load the checkpoint of a local folder. Raises CheckpointError."""
+    content = read_json(folder / NETWORK_CONFIG)
+    if SETTINGS in content:
+        return _exported(folder, content, options)
+    if content.get("model_type") != MODEL_TYPE:
+        got = shown(content.get("model_type"))
+        raise CheckpointError.at(f"{folder / NETWORK_CONFIG}: model_type", f"{MODEL_TYPE}, of a RynnValue", got)
+    return _published(folder, content, options)
+
+
+def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnCheckpoint:
+    """Load a checkpoint as it was published."""
+    file = folder / NETWORK_CONFIG
+    read = Settings.read(folder, content)
+    fields = read.fields()
+    told = {name: value for name, value in content.items() if name not in PUBLISHED and "value_token_id" not in name}
+    backbone = backbone_config({**told, "model_type": QWEN3}, file)
+    tensors, _ = read_published(folder, read_unrounded_config(backbone, file))
+    weights = {name: each for name, each in renamed(tensors, QWEN_NAMES).items() if not UNUSED.fullmatch(name)}
+    rows = _rows(backbone, weights, file)
+    processor = options.base_model or folder
+    tokenizer, preprocessor = read_processor(processor)
+    fields["value_token"] = read.token("value_token_id", VALUE_TOKEN, tokenizer)
+    fields["relative_token"] = read.token("relative_value_token_id", RELATIVE_TOKEN, tokenizer)
+    meta = _meta(options, use_meta=fields["use_meta"])
+    base = Decision("base_model", source_name(processor), "--base-model" if options.base_model else "the checkpoint")
+    dtype = dtype_of(backbone, file)
+    limits = _limits(preprocessor, processor)
+    config = RynnConfig(
+        backbone=backbone,
+        dtype=dtype.value,
+        base_model_id=str(base.value),
+        **{**fields, **limits, **{each.name: each.value for each in meta}},
+    )
+    size = [Decision(name, value, f"{processor_name(processor)}: size") for name, value in limits.items()]
+    decisions = (Decision("backbone", QWEN3, NETWORK_CONFIG), base, dtype, rows, *read.decisions, *meta, *size)
+    return _rounded(RynnCheckpoint(config, weights, processor, decisions, tuple(read.unexpected)), options)
+
+
+def _exported(folder: Path, content: dict[str, Any], options: Options) -> RynnCheckpoint:
+    """Load what ``LanguageCheckpoint.save`` wrote."""
+    saved = {name: value for name, value in content.pop(SETTINGS).items() if name != REWARD_MODEL}
+    parts = {"value_head": HeadConfig, "relative_head": HeadConfig, "value_bins": Bins, "relative_bins": Bins}
+    for name, made in parts.items():
+        told = {key: tuple(each) if isinstance(each, list) else each for key, each in saved[name].items()}
+        saved[name] = made(**told)
+    changed = options.settings(_OF_USER)
+    config = RynnConfig(backbone=backbone_config(content, folder / NETWORK_CONFIG), **{**saved, **changed})
+    own = folder / PROCESSOR_FOLDER
+    names = [name for name in vars(config) if name not in ("backbone", "video_prompt", "weights", "causal_mask")]
+    decisions = [
+        Decision(name, _plain(getattr(config, name)), "--as" if name in changed else NETWORK_CONFIG) for name in names
+    ]
+    rounded = () if config.weights is None else (decision(config.weights, NETWORK_CONFIG),)
+    checkpoint = RynnCheckpoint(config, read_weights(folder), options.base_model or own, (*decisions, *rounded))
+    return _rounded(checkpoint, options)
+
+
+def _plain(value: Any) -> Any:
+    """Return a setting as a value of JSON, in short."""
+    if isinstance(value, Bins):
+        return f"{value.count} {value.transform} bins from {value.least_s:g} to {value.most_s:g} s"
+    return vars(value) if isinstance(value, HeadConfig) else value
+
+
+def _rounded(checkpoint: RynnCheckpoint, options: Options) -> RynnCheckpoint:
+    """Return the checkpoint, with the backbone's layers rounded if the user asks for it, and checked."""
+    config = checkpoint.config
+    if options.weights is not None and config.weights is None:
+        ours = {name: each for name, each in checkpoint.weights.items() if name.startswith(_OF_BACKBONE)}
+        rounded, _ = round_layers(ours, {}, options.weights, config.torch_dtype)
+        heads = {name: each for name, each in checkpoint.weights.items() if name not in ours}
+        checkpoint = replace(
+            checkpoint,
+            config=replace(config, weights=options.weights),
+            weights={**rounded, **heads},
+            settings=(*checkpoint.settings, decision(options.weights, FLAG)),
+        )
+    checkpoint.check()
+    return checkpoint
+
+
+def _rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Path) -> Decision:
+    """Take the rows of the embedding from the weights: its padding may have been kept or cut."""
+    if EMBEDDING not in weights:
+        raise CheckpointError.at(file.parent, f"a weight {EMBEDDING}", "none")
+    backbone["text_config"]["vocab_size"] = len(weights[EMBEDDING])
+    return Decision("rows_of_the_embedding", len(weights[EMBEDDING]), OF_WEIGHTS)
+
+
+def _meta(options: Options, *, use_meta: bool) -> list[Decision]:
+    """Return the user's descriptions of robot and camera. Raises CheckpointError if the prompt needs one."""
+    given = options.settings(_OF_USER)
+    if given and not use_meta:
+        raise CheckpointError.at("--as", "no description: the prompt of this checkpoint has none", ", ".join(given))
+    if use_meta and not given:
+        expected = "robot=..., camera=... or both, which the prompt of this checkpoint names"
+        raise CheckpointError.at("--as", expected, "neither", f"for example {_EXAMPLE}")
+    return [Decision(name, given.get(name), "--as" if name in given else "default: not named") for name in _OF_USER]
+
+
+def _limits(preprocessor: Mapping[str, Any], processor: str | Path) -> dict[str, int]:
+    """Return the least and most pixels of a frame."""
+    size = preprocessor.get("size")
+    if not isinstance(size, Mapping) or not all(type(size.get(edge)) is int for edge in _LIMITS):
+        raise CheckpointError.at(f"base model {processor}: size", " and ".join(_LIMITS), shown(size))
+    return dict(zip(("least_px", "most_px"), (size[edge] for edge in _LIMITS), strict=True))

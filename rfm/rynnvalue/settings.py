@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: MIT
+"""The settings of a RynnValue, from config.json and processor_config.json, with the source of each."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
+from rfm.checkpoint.provenance import Decision
+from rfm.rynnvalue.network import ACTIVATIONS, Bins, HeadConfig, Transform
+from rfm.vlm.preprocessor import PROCESSOR_CONFIG
+
+ISOLATED = "pred_slot_isolated_eager"
+_CAUSAL = ("eager", "sdpa", "flash_attention_2", "flash_attention_3", "flex_attention")
+_STYLE = "interleaved_history"
+# Facts of the published checkpoints, for keys that a file lacks.
+_HEAD = {"head_type": "bro", "hidden_dims": 4096, "depth": 8, "activation": "relu"}
+_BINS = {"bins": 256, "support_transform": "symlog", "bin_edges": None}
+PUBLISHED: dict[str, Any] = {
+    "attn_implementation": ISOLATED,
+    "num_value_heads": 1,
+    "value_token_repeat": 8,
+    "relative_value_token_repeat": 8,
+    "value_head_config": _HEAD,
+    "relative_value_head_config": _HEAD,
+    "value_tokenizer_config": {**_BINS, "min_value": 0.0, "max_value": 512.0},
+    "relative_value_tokenizer_config": {**_BINS, "min_value": -256.0, "max_value": 256.0},
+    "use_meta": True,
+}
+# Keys without effect on scores: of transformers, of training, and of the remote code.
+_IDLE = {
+    "_name_or_path", "architectures", "auto_map", "bos_token_id", "dtype", "encoding", "eos_token_id",
+    "hl_gauss_sigma_ratio", "bin_edges_path", "initializer_range", "model_type", "pad_token_id", "processor_class",
+    "torch_dtype", "transformers_version", "use_cache",
+}  # fmt: skip
+_OF_BACKBONE = {
+    "image_token_id", "text_config", "tie_word_embeddings", "video_token_id", "vision_config", "vision_end_token_id",
+    "vision_start_token_id", "quantization_config",
+}  # fmt: skip
+_OF_TOKENS = {"value_token_id", "relative_value_token_id"}
+_COPY = "copy the file as it was published"
+
+
+@dataclass
+class Settings:
+    """What the files of a checkpoint say, and what they lack.
+
+    unexpected: keys that are read nowhere
+    """
+
+    folder: Path
+    content: Mapping[str, Any]
+    processor: Mapping[str, Any]
+    decisions: list[Decision] = field(default_factory=list)
+    unexpected: list[str] = field(default_factory=list)
+
+    @classmethod
+    def read(cls, folder: Path, content: Mapping[str, Any]) -> Settings:
+        """Return the settings of a folder with this config.json. Raises CheckpointError."""
+        file = folder / PROCESSOR_CONFIG
+        settings = cls(folder, content, read_json(file) if is_there(file) else {})
+        known = PUBLISHED.keys() | _IDLE | _OF_BACKBONE | _OF_TOKENS
+        settings._tell_unknown(NETWORK_CONFIG, content, known)
+        settings._check_style()
+        return settings
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of RynnConfig that these files decide. Raises CheckpointError."""
+        return {
+            "attention": self._attention(),
+            "num_heads": self._count("num_value_heads"),
+            "value_copies": self._copies("value_token_repeat"),
+            "relative_copies": self._copies("relative_value_token_repeat"),
+            "value_head": self._head("value_head_config"),
+            "relative_head": self._head("relative_value_head_config"),
+            "value_bins": self._bins("value_tokenizer_config"),
+            "relative_bins": self._bins("relative_value_tokenizer_config"),
+            "use_meta": self._use_meta(),
+        }
+
+    def token(self, key: str, token: str, tokenizer: Any) -> int:
+        """Return the id of a token, on which config.json and tokenizer agree. Raises CheckpointError."""
+        known = tokenizer.get_vocab().get(token)
+        if known is None:
+            raise CheckpointError.at(f"{self.folder}: tokenizer", f"a token {token}", "none", _COPY)
+        stated = self.content.get(key)
+        if stated not in (None, known):
+            where = f"{self._file}: {key}"
+            raise CheckpointError.at(where, f"{known}, the tokenizer's id of {token}", shown(stated), _COPY)
+        self._decide(key, known, f"{NETWORK_CONFIG} and the tokenizer" if stated is not None else "the tokenizer")
+        return int(known)
+
+    @property
+    def _file(self) -> Path:
+        return self.folder / NETWORK_CONFIG
+
+    def _attention(self) -> str:
+        stated = self._value("attn_implementation")
+        if stated != ISOLATED and stated not in _CAUSAL:
+            expected = f"{ISOLATED} or one of {', '.join(_CAUSAL)}"
+            raise CheckpointError.at(f"{self._file}: attn_implementation", expected, shown(stated))
+        attention = "isolated" if stated == ISOLATED else "causal"
+        self._decide("attention", attention, f"{NETWORK_CONFIG}: attn_implementation")
+        return attention
+
+    def _use_meta(self) -> bool:
+        stated = self.processor.get("use_meta")
+        if stated is not None and type(stated) is not bool:
+            raise CheckpointError.at(f"{self.folder / PROCESSOR_CONFIG}: use_meta", "true or false", shown(stated))
+        is_assumed = stated is None
+        used = bool(PUBLISHED["use_meta"] if is_assumed else stated)
+        source = "default, as the published checkpoints" if is_assumed else f"{PROCESSOR_CONFIG}: use_meta"
+        self._decide("use_meta", used, source, is_assumed=is_assumed)
+        return used
+
+    def _check_style(self) -> None:
+        stated = self.processor.get("conversation_style")
+        if stated not in (None, _STYLE):
+            raise CheckpointError.at(f"{self.folder / PROCESSOR_CONFIG}: conversation_style", _STYLE, shown(stated))
+
+    def _copies(self, key: str) -> int:
+        count, other = self._count(key), self.processor.get(key)
+        if other not in (None, count):
+            where = f"{self.folder / PROCESSOR_CONFIG}: {key}"
+            raise CheckpointError.at(where, f"{count}, as in {NETWORK_CONFIG}", shown(other), _COPY)
+        return count
+
+    def _count(self, key: str) -> int:
+        value = self._value(key)
+        if type(value) is not int or value < 1:
+            raise CheckpointError.at(f"{self._file}: {key}", "a whole number of at least 1", shown(value))
+        return value
+
+    def _head(self, key: str) -> HeadConfig:
+        read = self._section(key)
+        where = f"{self._file}: {key}"
+        kind, activation = read["head_type"], read["activation"]
+        if kind not in ("bro", "linear"):
+            raise CheckpointError.at(f"{where}.head_type", "bro or linear", shown(kind))
+        if activation not in ACTIVATIONS:
+            raise CheckpointError.at(f"{where}.activation", f"one of {', '.join(ACTIVATIONS)}", shown(activation))
+        for name, least in (("hidden_dims", 1), ("depth", 0)):
+            if type(read[name]) is not int or read[name] < least:
+                raise CheckpointError.at(f"{where}.{name}", f"a whole number of at least {least}", shown(read[name]))
+        return HeadConfig(kind, read["hidden_dims"], read["depth"], activation)
+
+    def _bins(self, key: str) -> Bins:
+        read = self._section(key)
+        where = f"{self._file}: {key}"
+        transform, count = read["support_transform"], read["bins"]
+        if transform not in get_args(Transform):
+            expected = f"one of {', '.join(get_args(Transform))}"
+            raise CheckpointError.at(f"{where}.support_transform", expected, shown(transform))
+        if type(count) is not int or count < 1:
+            raise CheckpointError.at(f"{where}.bins", "a whole number of at least 1", shown(count))
+        ends = [read[name] for name in ("min_value", "max_value")]
+        if not all(map(_is_number, ends)) or ends[0] > ends[1]:
+            raise CheckpointError.at(where, "min_value, and a max_value that is not smaller", shown(ends))
+        edges = _edges(read["bin_edges"], count, f"{where}.bin_edges") if transform == "quantile" else None
+        return Bins(count, transform, float(ends[0]), float(ends[1]), edges)
+
+    def _section(self, key: str) -> dict[str, Any]:
+        """Return a section of config.json, with the published values of keys that it lacks."""
+        stated = self._value(key)
+        if not isinstance(stated, Mapping):
+            raise CheckpointError.at(f"{self._file}: {key}", "settings", shown(stated))
+        self._tell_unknown(f"{NETWORK_CONFIG}: {key}", stated, PUBLISHED[key].keys() | _IDLE)
+        for name in PUBLISHED[key].keys() - stated.keys() - {"bin_edges"}:
+            source = "default, as the published checkpoints"
+            self._decide(f"{key}.{name}", PUBLISHED[key][name], source, is_assumed=True)
+        return {**PUBLISHED[key], **stated}
+
+    def _value(self, key: str) -> Any:
+        stated = self.content.get(key)
+        is_assumed = stated is None
+        value = PUBLISHED[key] if is_assumed else stated
+        told = _told(value)
+        source = "default, as the published checkpoints" if is_assumed else f"{NETWORK_CONFIG}: {key}"
+        self._decide(key, told, source, is_assumed=is_assumed)
+        return value
+
+    def _decide(self, name: str, value: Any, source: str, *, is_assumed: bool = False) -> None:
+        self.decisions.append(Decision(name, value, source, is_assumed))
+
+    def _tell_unknown(self, where: str, content: Mapping[str, Any], known: Any) -> None:
+        self.unexpected += [f"{where}: {shown(name)}" for name in sorted(content.keys() - known)]
+
+
+def _told(value: Any) -> Any:
+    """Return a section in short, without keys that change no score, and without the edges of its bins."""
+    if not isinstance(value, Mapping):
+        return value
+    read = {name: each for name, each in value.items() if name not in _IDLE and each is not None}
+    edges = read.get("bin_edges")
+    return {**read, "bin_edges": f"{len(edges)} edges"} if isinstance(edges, list) else read
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _edges(edges: Any, count: int, where: str) -> tuple[float, ...]:
+    is_list = isinstance(edges, list) and len(edges) == count + 1 and all(map(_is_number, edges))
+    if not is_list or any(last <= first for first, last in itertools.pairwise(edges)):
+        expected = f"{count + 1} ascending numbers of seconds, as the transform is quantile"
+        raise CheckpointError.at(where, expected, shown(edges), _COPY)
+    return tuple(map(float, edges))

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: MIT
+"""Reference cases of RynnValue by the original code."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from reward_models import ROOT
+from rfm import families
+from rfm.engine import Engine
+from rfm_client import ProgressSample, Trajectory
+
+FOLDER = ROOT / "rynnvalue"
+FRAME_STEPS = 8  # of the original's server
+RELATIVE_TOLERANCE = 2e-4  # of seconds, relative and absolute
+ISOLATED = "pred_slot_isolated_eager"
+# The original's table of descriptions, for a request without them.
+SOURCES = {"usc_xarm_policy_ranking": ("an xArm single-arm robot", "the main right camera")}
+USUAL = ("a Franka single-arm robot", "the main right camera")
+
+Meta = tuple[str | None, str | None]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One sample of a case. prefix: of its arrays; meta: descriptions of robot and camera"""
+
+    sample: ProgressSample
+    prefix: str
+    meta: Meta
+
+
+@dataclass(frozen=True)
+class Case:
+    """A request and the answer. file: ``CONFIG/cases/CASE.json``"""
+
+    file: Path
+
+    def __str__(self) -> str:
+        return f"{self.config.name}/{self.file.stem}"
+
+    @property
+    def config(self) -> Path:
+        return self.file.parents[1]
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.config / "checkpoint"
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        return dict(json.loads((self.config / "config_summary.json").read_text()))
+
+    @property
+    def content(self) -> dict[str, Any]:
+        return dict(json.loads(self.file.read_text()))
+
+    @property
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return dict(np.load(self.file.with_suffix("").with_suffix(".expected.npz")))
+
+    @property
+    def attention(self) -> str:
+        return str(self.summary["attn_implementation_in_config_json"])
+
+    def expected(self, prefix: str, name: str) -> npt.NDArray[np.float32]:
+        """The original's numbers in float32, [N]: the mean of all heads."""
+        rounded = "fp32." if self.summary["dtype"] == "bfloat16" else ""
+        array = self.arrays[f"{prefix}{rounded}{self.attention}.{name}"]
+        return array.mean(0) if name.startswith("value") else array.reshape(-1)
+
+    def asked(self) -> list[Asked]:
+        inputs = self.file.parent / self.content["inputs"]
+        request, arrays = json.loads(inputs.with_suffix(".json").read_text()), np.load(inputs.with_suffix(".npz"))
+        found = []
+        for index, sample in enumerate(request["samples"]):
+            trajectory = sample["trajectory"]
+            if not trajectory["task"]:
+                continue  # a sample of ours needs a task
+            frames = np.clip(arrays[trajectory["frames"]["__numpy_file__"]], 0, 255).astype(np.uint8)
+            steps = FRAME_STEPS if request["use_frame_steps"] else 0
+            told = trajectory.get("metadata")
+            meta = SOURCES[trajectory["data_source"]] if not told else _descriptions(told)
+            found.append(
+                Asked(
+                    ProgressSample(Trajectory(frames=frames, task=trajectory["task"]), steps),
+                    f"sample_{index}.",
+                    meta if self.summary["use_meta"] else (None, None),
+                )
+            )
+        return found
+
+    def engine(self, meta: Meta) -> Engine:
+        return engine_of(self.checkpoint, meta)
+
+
+def _descriptions(metadata: dict[str, Any]) -> Meta:
+    return metadata.get("robot_description"), metadata.get("camera_description")
+
+
+def said(meta: Meta) -> str:
+    """The argument of ``--as`` with these descriptions."""
+    given = [f"{name}={text}" for name, text in zip(("robot", "camera"), meta, strict=True) if text is not None]
+    return ",".join(["rynnvalue", *given])
+
+
+@lru_cache(maxsize=8)
+def engine_of(checkpoint: Path, meta: Meta) -> Engine:
+    return Engine.of(families.load(checkpoint, reward_model=said(meta)))
+
+
+CASES = [Case(file) for file in sorted(FOLDER.glob("*/cases/*.json"))]
