@@ -130,8 +130,8 @@ def robometer(run: Run, graphs: bool = False) -> Iterator[Row]:
 
 
 def graphs(run: Run) -> Iterator[Row]:
-    """Serve Robometer with CUDA graphs, where the export knows the setting."""
-    if "cuda_graphs" in {field.name for field in fields(ExportConfig)}:
+    """Serve Robometer with CUDA graphs on a GPU, where the export knows the setting."""
+    if run.scale.device != "cpu" and "cuda_graphs" in {field.name for field in fields(ExportConfig)}:
         yield from robometer(run, graphs=True)
 
 

@@ -12,7 +12,6 @@ import goldens
 from every_score import NUM_BINS, assert_same_scores, every_score
 from rfm_client import (
     FRAME_SCORES,
-    BatchTiming,
     InferenceFailedError,
     InvalidSampleError,
     PreferenceResult,
@@ -25,7 +24,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract import wire
+from rfm_client.contract import BatchTiming, wire
 from rfm_client.contract.samples import EncoderSample
 
 OF_SOME = [name for name, score in FRAME_SCORES.items() if score.asked != "always" and not score.is_per_bin]
