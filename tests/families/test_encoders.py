@@ -18,7 +18,6 @@ from rfm.checkpoint.content import PREPROCESSOR_CONFIG, CheckpointError
 from rfm.engine import Execution
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
 from rfm_client import (
-    BatchTiming,
     InferenceFailedError,
     InvalidSampleError,
     PreferenceSample,
@@ -28,6 +27,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
+from rfm_client.contract import BatchTiming
 from rfm_client.contract.samples import EncoderSample
 from spoilt import in_json
 from vlm import assert_close, video

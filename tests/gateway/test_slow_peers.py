@@ -242,7 +242,9 @@ def test_bodies_without_a_place_take_bounded_memory() -> None:
 
 
 @contextmanager
-def few_descriptors(count: int) -> Iterator[None]:
+def few_descriptors(free: int) -> Iterator[None]:
+    """Leave this process and those it starts ``free`` descriptors."""
+    count = sum(1 for _ in Path("/proc/self/fd").iterdir()) + free
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (count, limits[1]))
     try:

@@ -23,11 +23,10 @@ import numpy as np
 import pytest
 import tritonclient.grpc
 from tritonclient.utils import InferenceServerException
-from typer.main import get_command
 
 import clip
 from commands import RFM
-from in_process import rfm_app
+from in_process import rfm_parsed
 from paths import ROOT
 from rfm.config import ServeConfig
 from rfm_client import AccessDeniedError, RewardClient, ServerUnavailableError, Trajectory
@@ -398,7 +397,7 @@ def unit() -> configparser.SectionProxy:
 def test_the_unit_runs_what_nginx_and_the_guide_expect() -> None:
     program, name, *arguments = shlex.split(unit()["ExecStart"])
     assert (program, name) == ("/opt/rfm/bin/rfm", "serve")
-    given = get_command(rfm_app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
+    given = rfm_parsed(name, *arguments)
     default = ServeConfig()
     assert (default.http_port, default.grpc_port) == (PORTS["http"], PORTS["grpc"])
     assert (given["http_port"], given["grpc_port"], given["gateway_port"]) == (None, None, PORTS["gateway"])
@@ -423,7 +422,7 @@ def test_the_export_with_the_image_alone_is_a_command_of_it() -> None:
     image = next(index for index, word in enumerate(words) if word.startswith("rfm-triton:"))
     assert words[words.index("--entrypoint") + 1] == "rfm"
     name, *arguments = words[image + 1 :]
-    given = get_command(rfm_app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
+    given = rfm_parsed(name, *arguments)
     mounts = [words[index + 1].split(":") for index, word in enumerate(words) if word == "-v"]
     assert {mount[1]: mount[0] for mount in mounts} == {
         str(given["config_file"]): "$PWD/docker/serve.yaml",

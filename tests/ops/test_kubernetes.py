@@ -26,9 +26,8 @@ import kubernetes_validate
 import pytest
 import yaml
 from referencing import Registry, Resource
-from typer.main import get_command
 
-from in_process import rfm_app
+from in_process import rfm_parsed
 from paths import ROOT
 from repositories import kill_model
 from rfm.launch.ending import KILL_AFTER_S
@@ -101,12 +100,6 @@ def workloads(*folders: str) -> list[Any]:
     ]
 
 
-def parameters(words: list[str]) -> dict[str, Any]:
-    """Parse words as ``rfm`` does, without running it."""
-    name, *arguments = words
-    return get_command(rfm_app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
-
-
 def selected(selector: dict[str, str], folder: str) -> list[Object]:
     """Deployments whose pods have these labels."""
     deployments = built(folder, "Deployment")
@@ -174,7 +167,7 @@ def test_a_gpu_is_asked_for_where_there_is_one() -> None:
 def test_arguments_are_those_of_the_program(workload: Object) -> None:
     container = container_of(workload)
     assert container["command"] == ["rfm"]
-    given = parameters(container["args"])
+    given = rfm_parsed(*container["args"])
     assert given["host"] == "0.0.0.0"
     ports = {port["name"]: port["containerPort"] for port in container["ports"]}
     assert ports == {name: given[PORT_OPTIONS[name]] for name in ports}
@@ -195,7 +188,7 @@ def test_keys_are_files_that_others_cannot_read(workload: Object) -> None:
     container, pod = container_of(workload), pod_of(workload)
     (secret,) = (volume for volume in pod["volumes"] if "secret" in volume)
     (mount,) = (mount for mount in container["volumeMounts"] if mount["name"] == secret["name"])
-    given = parameters(container["args"])
+    given = rfm_parsed(*container["args"])
     file = given["api_key_file"] if container["args"][0] == "gateway" else given["admin_key_file"]
     assert file.parent == Path(mount["mountPath"])
     assert secret["secret"]["defaultMode"] == 0o400
@@ -205,7 +198,7 @@ def test_keys_are_files_that_others_cannot_read(workload: Object) -> None:
 
 def test_kserve_s_key_is_a_variable() -> None:
     container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
-    assert parameters(container["args"])["admin_key_file"] is None
+    assert rfm_parsed(*container["args"])["admin_key_file"] is None
     (key,) = (one["valueFrom"]["secretKeyRef"] for one in container["env"] if one["name"] == "RFM_ADMIN_KEY")
     assert_readme_creates(key["name"], key["key"])
 
@@ -270,7 +263,7 @@ def test_policies_open_the_ports_that_there_are(folder: str) -> None:
 
 @pytest.mark.parametrize("folder", OVERLAYS)
 def test_the_gateway_reaches_triton(folder: str) -> None:
-    gateway = parameters(container_of(named(folder, "Deployment", "rfm-gateway"))["args"])
+    gateway = rfm_parsed(*container_of(named(folder, "Deployment", "rfm-gateway"))["args"])
     triton, metrics = urlsplit(gateway["triton"]), urlsplit(gateway["metrics_url"])
     pods = named(folder, "Service", triton.hostname)["spec"]
     assert triton.scheme == "grpc"
@@ -426,5 +419,5 @@ def run_kserve_s_liveness_probe(status_port: int) -> None:
     container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
     program, *words, script = container["livenessProbe"]["exec"]["command"]
     assert program == "python"
-    port = parameters(container["args"])["status_port"]
+    port = rfm_parsed(*container["args"])["status_port"]
     subprocess.run([sys.executable, *words, script.replace(f":{port}/", f":{status_port}/")], check=True)

@@ -566,7 +566,7 @@ def test_the_key_opens_datasets_and_one_that_breaks_says_why(
         browser.until("document.getElementById('errors').textContent")
         assert browser.all("#episodes tr") == []
         for key in ("sesame", KEY):
-            browser.until("document.getElementById('errors').textContent.startsWith('key: expected X-API-Key')")
+            browser.until("document.getElementById('errors').textContent.startsWith('key: expected it in X-API-Key')")
             browser.write("key", key)
             browser.all("#key-form button")[0].click()
         browser.until("document.getElementById('model').value")
