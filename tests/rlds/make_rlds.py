@@ -52,7 +52,7 @@ class _Robot(tfds.core.GeneratorBasedBuilder):
             "state": tfds.features.Tensor(shape=(7,), dtype=np.float32),
         }
         step = {"observation": observations, "action": tfds.features.Tensor(shape=(7,), dtype=np.float32)}
-        flags = {name: np.bool_ for name in ("is_first", "is_last", "is_terminal")}
+        flags = dict.fromkeys(("is_first", "is_last", "is_terminal"), np.bool_)
         text = {"language_instruction": tfds.features.Text()} if self.IN_STEPS else {}
         about = {} if self.IN_STEPS else {"natural_language_instruction": tfds.features.Text()}
         features = {
