@@ -62,10 +62,10 @@ def test_an_instruction_of_the_episode_is_the_task_of_all_its_frames() -> None:
     assert not any(episode.tasks for episode in dataset.episodes)
 
 
-def test_opening_and_reading_imports_no_tensorflow() -> None:
-    dataset = open_dataset(RLDS / "toy_steps_texts")
-    next(dataset.frames(dataset.episode(0), "image"))
-    assert not any(name.partition(".")[0] in ("tensorflow", "tensorflow_datasets") for name in sys.modules)
+def test_a_missing_package_is_named_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "google_crc32c", None)
+    with pytest.raises(ImportError, match=r'pip install \./client "\./apps/labels\[rlds\]"'):
+        label(open_dataset(RLDS / "toy_steps_texts"), BrightnessScorer(), LabelOptions())
 
 
 @pytest.mark.triton
@@ -89,11 +89,13 @@ def test_black_and_depth_pictures_are_left_out_with_a_line(output: Path) -> None
     notes = Notes()
     report = label(open_dataset(RLDS / "toy_episode_texts"), BrightnessScorer(), LabelOptions(output=output), notes)
     assert "left out: depth: float32 [16, 16, 1]: expected 3 channels of uint8" in notes.lines
-    assert "left out: image_padding: black pictures in all 5 episodes" in notes.lines
+    assert "left out: image_padding: black pictures in every chosen episode" in notes.lines
     frames = decoded()
     expected = np.mean([np.concatenate([brightness(frames[f"{p}/{c}"]) for p in PLACES]) for c in CAMERAS], axis=0)
     np.testing.assert_allclose(parquet.read_table(report.files[0])["progress_sparse"], expected, rtol=0, atol=1e-6)
-    with pytest.raises(DatasetError, match="got 'image_padding', which is left out: black pictures in all 5 episodes"):
+    with pytest.raises(
+        DatasetError, match="got 'image_padding', which is left out: black pictures in every chosen episode"
+    ):
         label(open_dataset(RLDS / "toy_episode_texts"), BrightnessScorer(), LabelOptions(cameras=("image_padding",)))
 
 
@@ -181,6 +183,10 @@ def test_a_damaged_file_is_refused_by_name_and_number_and_other_episodes_can_be_
     assert label(open_dataset(copied), scorer, LabelOptions(output=output, episodes=[last])).files
 
 
+def leaves_the_folder(info: Any) -> None:
+    info["splits"][1]["filepathTemplate"] = "../{DATASET}-{SPLIT}-{SHARD_INDEX}"
+
+
 NOT_READ: dict[str, tuple[Callable[[Path], object], str]] = {
     "another format": (
         edited("dataset_info.json", lambda info: info.update(fileFormat="array_record")),
@@ -189,6 +195,10 @@ NOT_READ: dict[str, tuple[Callable[[Path], object], str]] = {
     "features of an old version": (
         edited("features.json", lambda features: features.clear()),
         r"features\.json: expected features as TensorFlow Datasets 4\.6 or later writes them, got none",
+    ),
+    "files elsewhere": (
+        edited("dataset_info.json", leaves_the_folder),
+        r"splits: val: expected files in the folder of the version, got \.\./toy_steps_texts-val-00000",
     ),
     "two versions": (
         lambda root: shutil.copytree(root, root.with_name("2.0.0")),

@@ -100,7 +100,7 @@ class RldsDataset(Dataset):
         for camera in self.cameras if readable else ():
             told = [record.pictures[camera].blank for record in readable]
             if all(told):
-                blank[camera] = f"{told[0]} in all {len(readable)} episodes"
+                blank[camera] = f"{told[0]} in every chosen episode"
         cameras = [camera for camera in self.cameras if camera not in blank]
         require(self.root, bool(cameras), "a camera that shows something", "; ".join(map(": ".join, blank.items())))
         return cameras, {**self.left_out, **blank}

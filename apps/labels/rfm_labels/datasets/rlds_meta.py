@@ -101,6 +101,7 @@ def _shards_of(root: Path, dataset: str, split: Any) -> Iterator[Shard]:
         name = template
         for word, value in words.items():
             name = name.replace(f"{{{word}}}", value)
+        require(f"{where}: {split['name']}", Path(name).name == name, "files in the folder of the version", name)
         is_count = str(length).isdecimal()
         require(f"{where}: {split['name']}: shardLengths", is_count, "a number of episodes", repr(length))
         yield Shard(root / name, split["name"], int(length))

@@ -48,17 +48,20 @@ class RecordFile:
         """Return a record. Raises DatasetError if it or a length before it is damaged, or the file has others."""
         try:
             with self.file.open("rb") as opened:
-                for before in range(len(self._starts) - 1, number):
-                    self._starts.append(self._starts[before] + self._length(opened, before) + _HEAD.size + _CRC.size)
-                return self._checked(opened, number)
+                starts = list(self._starts)  # a copy, since threads share the file
+                for before in range(len(starts) - 1, number):
+                    length = self._length(opened, before, starts[before])
+                    starts.append(starts[before] + _HEAD.size + length + _CRC.size)
+                self._starts = starts
+                return self._checked(opened, number, starts[number])
         except FileNotFoundError as error:
             got = "none: copy or download it, or leave its episodes out (--episodes)"
             raise DatasetError.at(self.file, f"a file with {self._num_records} episodes", got) from error
         except OSError as error:
             raise DatasetError.at(self.file, "a readable file", error.strerror) from error
 
-    def _checked(self, opened: BinaryIO, number: int) -> bytes:
-        length = self._length(opened, number)
+    def _checked(self, opened: BinaryIO, number: int, start: int) -> bytes:
+        length = self._length(opened, number, start)
         content, crc = opened.read(length), opened.read(_CRC.size)
         where = f"{self.file}: record {number}"
         require(where, len(crc) == _CRC.size, f"{length} bytes and a CRC", f"the end of the file: {_AGAIN}")
@@ -69,8 +72,8 @@ class RecordFile:
         require(self.file, not has_more, f"{self._num_records} records, as dataset_info.json says", got)
         return content
 
-    def _length(self, opened: BinaryIO, number: int) -> int:
-        opened.seek(self._starts[number])
+    def _length(self, opened: BinaryIO, number: int, start: int) -> int:
+        opened.seek(start)
         head = opened.read(_HEAD.size)
         where = f"{self.file}: record {number}"
         require(where, len(head) == _HEAD.size, "a record", f"the end of the file: {_AGAIN}")
