@@ -99,6 +99,40 @@ def test_black_and_depth_pictures_are_left_out_with_a_line(output: Path) -> None
         label(open_dataset(RLDS / "toy_episode_texts"), BrightnessScorer(), LabelOptions(cameras=("image_padding",)))
 
 
+def of_steps(features: Any) -> Any:
+    return features["featuresDict"]["features"]["steps"]["sequence"]["feature"]["featuresDict"]["features"]
+
+
+def of_observations(features: Any) -> Any:
+    return of_steps(features)["observation"]["featuresDict"]["features"]
+
+
+def test_a_dataset_whose_cameras_are_all_black_is_refused(copied: Path) -> None:
+    edited("features.json", lambda features: [of_observations(features).pop(camera) for camera in CAMERAS])(copied)
+    with pytest.raises(DatasetError, match="a camera that shows something, got image_padding: black pictures in every"):
+        label(open_dataset(copied), BrightnessScorer(), LabelOptions())
+
+
+def test_instructions_of_the_steps_come_before_others_with_a_line(copied: Path) -> None:
+    def add(features: Any) -> None:
+        about = features["featuresDict"]["features"]["episode_metadata"]["featuresDict"]["features"]
+        about["natural_language_instruction"] = about["file_path"]
+
+    edited("features.json", add)(copied)
+    dataset = open_dataset(copied)
+    told = "tasks: from steps/language_instruction, not from episode_metadata/natural_language_instruction"
+    assert (dataset.notes, dataset.episode(0).task) == ([told], "open the drawer")
+
+
+def test_a_dataset_without_instructions_needs_a_task(copied: Path) -> None:
+    edited("features.json", lambda features: of_steps(features).pop("language_instruction"))(copied)
+    with pytest.raises(
+        DatasetError, match=r"natural_language_instruction: expected a task as a sentence, got none: add"
+    ):
+        _ = open_dataset(copied).episodes
+    assert {episode.task for episode in open_dataset(copied, task="wave").episodes} == {"wave"}
+
+
 def test_a_task_of_the_caller_replaces_the_instructions() -> None:
     dataset = open_dataset(RLDS / "toy_steps_texts", task="wave", override_task=True)
     assert {task for episode in dataset.episodes for task in tasks_of(episode)} == {"wave"}
