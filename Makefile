@@ -218,7 +218,7 @@ $(INSTALLED): pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.t
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	  --editable "client[cli,rerun]" --editable apps/gateway --editable "apps/labels[hdf5,ray,rerun]" \
+	  --editable "client[cli,rerun]" --editable apps/gateway --editable "apps/labels[hdf5,ray,rerun,rlds]" \
 	  --editable apps/page --editable "apps/rl[sb3]" --editable ".[encoders,vlm,quantized,triton,demo,dev]"
 	touch $@
 

@@ -31,8 +31,7 @@ TO_ALOHA = (
     "got ALOHA's layout, one episode per file (observations/images): convert its folder to LeRobot with openpi's "
 )
 UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the end of the message
-    "RLDS": (["1.0.0/features.json"], "", "got an RLDS (TensorFlow) dataset: convert it to "),
-    "RLDS, a version": (["1.0.0/a.tfrecord-00000-of-00001"], "1.0.0", "got an RLDS (TensorFlow) dataset: convert it"),
+    "TFRecord files alone": (["1.0.0/a.tfrecord-00000-of-00001"], "1.0.0", "got TFRecord files without features.json"),
     "Zarr": ([".zgroup", "data/.zgroup"], "", "got Zarr arrays: convert them to LeRobot with "),
     "Zarr in an archive": (["buffer.zarr.zip"], "buffer.zarr.zip", "got Zarr arrays: convert them to LeRobot with "),
     "a rosbag of ROS 2": (["metadata.yaml", "a_0.db3"], "", "got a rosbag: convert it to LeRobot with "),

@@ -89,6 +89,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ):  # fmt: skip
         clip.write(tmp_path / name)
     shutil.copytree(LEROBOT / "toy_v21", tmp_path / "my_dataset")
+    shutil.copytree(ROOT / "tests" / "rlds" / "toy_steps_texts", tmp_path / "rlds_dataset")
     shutil.copytree(ROOT / "tests" / "videos", tmp_path / "tests" / "videos")
     outcomes = "".join(
         f"{episode.index},{episode.index % 2}\n" for episode in open_dataset(tmp_path / "my_dataset").episodes

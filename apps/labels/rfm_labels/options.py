@@ -120,7 +120,9 @@ class LabelOptions(Settings):
         None, "Some of the episodes, by number.", metavar="0:100,205", parse=parse_episodes
     )
     filter_key: str | None = setting(
-        None, "Only the episodes of a filter key of robomimic's HDF5 files, such as train or valid.", metavar="KEY"
+        None,
+        "Only the episodes of an RLDS split, or of a filter key of robomimic's HDF5 files, such as train or valid.",
+        metavar="KEY",
     )
     limit: int | None = setting(None, "At most so many episodes.", least=1)
     shard: tuple[int, int] | None = setting(

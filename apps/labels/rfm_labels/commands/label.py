@@ -45,8 +45,8 @@ DatasetArgument = Annotated[
     str,
     typer.Argument(
         metavar="DATASET",
-        help="LeRobot folder or Hub id org/name@revision; HDF5 file, or a folder of them; folder of videos, of folders "
-        "of pictures, or of .npy and .npz files, with tasks.csv or tasks.json.",
+        help="LeRobot folder or Hub id org/name@revision; HDF5 file, or a folder of them; RLDS folder; folder of "
+        "videos, of folders of pictures, or of .npy and .npz files, with tasks.csv or tasks.json.",
     ),
 ]
 

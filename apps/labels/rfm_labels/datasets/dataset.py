@@ -110,7 +110,7 @@ class Dataset(ABC):
     depth_cameras: cameras that the dataset marks as those of distances, used only if named
     left_out: pictures that cannot be scored, with the reason; not in ``cameras``
     numbers: of all episodes, in order
-    filter_keys: numbers of the episodes of each filter key, such as ``train``
+    filter_keys: numbers of the episodes of each filter key or split, such as ``train``
     given_task: the caller's task
     corrections: how ``frames`` makes stored frames upright RGB, by camera; others are left as stored
     notes: lines for the caller to read before scoring

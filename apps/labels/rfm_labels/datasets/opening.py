@@ -29,12 +29,14 @@ from rfm_labels.datasets.lerobot import LeRobotDataset
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.lerobot_meta import INFO_FILE, Info
 from rfm_labels.datasets.lerobot_rows import TASK_COLUMN
+from rfm_labels.datasets.rlds import RldsDataset, rlds_folder
+from rfm_labels.datasets.rlds_meta import FEATURES_FILE
 from rfm_labels.datasets.task_tables import TABLES, read_table_of_tasks, table_in
 
 _HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
 _LAYOUTS = (
-    f"a LeRobot dataset ({INFO_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), a folder of videos, of folders "
-    f"of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {' or '.join(TABLES)}, "
+    f"a LeRobot dataset ({INFO_FILE}), an RLDS dataset ({FEATURES_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), a "
+    f"folder of videos, of folders of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {' or '.join(TABLES)}, "
     "or a Hub id org/name[@revision]"
 )
 _TABLE = "list the videos in tasks.csv (columns video, task)"
@@ -43,8 +45,8 @@ _FILL = "put a video, an array or a folder of pictures for each episode in it"
 _UNREAD = {  # remedies for layouts without a reader, by pattern of file names
     r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with convert_dataset_v1_to_v2.py of lerobot/datasets/v2 "
     "(LeRobot 0.3), and label that",
-    r"features\.json|.*\.tfrecord.*": "an RLDS (TensorFlow) dataset: convert it to LeRobot with openx2lerobot of "
-    "https://github.com/Tavish9/any4lerobot",
+    r".*\.tfrecord.*": f"TFRecord files without {FEATURES_FILE}, which TensorFlow Datasets 4.6 or later writes beside "
+    "them: copy the whole folder of the version",
     r".*\.zarr(\.zip)?|\.z(group|array|attrs|metadata)|zarr\.json": "Zarr arrays: convert them to LeRobot with "
     "https://github.com/arpitg1304/forge, or write each episode's pictures to a video "
     f"(imageio.mimwrite('0.mp4', frames, fps=10)) and {_TABLE}",
@@ -95,6 +97,8 @@ def open_dataset(
         return Hdf5Dataset(path, task=given, corrections=corrections)
     if (path / INFO_FILE).is_file():
         return LeRobotDataset(path, task=given, corrections=corrections, tolerance_s=tolerance_s)
+    if folder := rlds_folder(path):
+        return RldsDataset(folder, task=given, corrections=corrections)
     if path.exists():
         return _open_files(path, given, corrections)
     match = _HUB_ID.fullmatch(str(source))

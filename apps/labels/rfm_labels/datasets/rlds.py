@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: MIT
+"""RLDS datasets, such as those of Open X-Embodiment, read without TensorFlow. Needs ``rfm-labels[rlds]`` and Pillow.
+
+An episode is a record of a TFRecord file. The splits follow each other, and are the filter keys. The frames are JPEG or
+PNG files in ``steps/observation/<camera>``; the task is an instruction in the steps or in the episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rfm_client import RewardError, UInt8Array
+from rfm_client.frames import BlankFrames, FrameFileError, Picture
+from rfm_labels.datasets.cameras import AskedCorrections
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.rlds_meta import FEATURES_FILE, INSTRUCTIONS, RldsInfo
+from rfm_labels.datasets.stored_files import digest_of, faults_at
+from rfm_labels.datasets.tfrecords import RecordFile, features_of
+
+
+def rlds_folder(path: Path) -> Path | None:
+    """Return the folder of an RLDS dataset: ``path``, or its only version; None: it is none. Raises DatasetError."""
+    if not path.is_dir() or (path / FEATURES_FILE).is_file():
+        return path if path.is_dir() else None
+    versions = sorted(file.parent for file in path.glob(f"*/{FEATURES_FILE}"))
+    got = f"{', '.join(each.name for each in versions)}: name one of these folders"
+    require(path, len(versions) < 2, "one version of an RLDS dataset", got)
+    return versions[0] if versions else None
+
+
+@dataclass(frozen=True)
+class _Pictures:
+    """One camera's pictures in an episode.
+
+    blank: what all of them show, if they are one black or flat picture; else empty
+    fault: of the first broken one
+    """
+
+    digest: str
+    num_bytes: int
+    blank: str
+    fault: DatasetError | None
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What the dataset keeps of a record. texts: first step and instruction of each stretch of steps with one"""
+
+    num_steps: int
+    texts: Sequence[tuple[int, bytes]]
+    pictures: Mapping[str, _Pictures]
+
+
+class RldsDataset(Dataset):
+    """The episodes of all splits.
+
+    task: task from the caller
+    corrections: corrections from the caller
+    """
+
+    kind = "RLDS"
+
+    def __init__(
+        self, root: Path, *, task: TaskOverride = TaskOverride(), corrections: AskedCorrections = AskedCorrections()
+    ) -> None:
+        self.root = root
+        self._info = info = RldsInfo.read(root)
+        self.source, self.given_task, self.notes = info.source, task, info.notes
+        self.cameras, self.left_out = tuple(info.cameras), info.left_out
+        self.corrections = corrections.of_cameras(self.cameras)
+        files = [RecordFile(each.file, each.num_episodes) for each in info.shards]
+        counts = [each.num_episodes for each in info.shards]
+        self._places = [(file, n) for file, count in zip(files, counts, strict=True) for n in range(count)]
+        splits = [each.split for each in info.shards for _ in range(each.num_episodes)]
+        self.numbers = range(len(self._places))
+        self.filter_keys = {
+            split: [number for number in self.numbers if splits[number] == split] for split in dict.fromkeys(splits)
+        }
+        self._records: dict[int, _Record] = {}
+        self._firsts = [0]
+
+    def read_episode(self, number: int) -> DatasetEpisode:
+        """Read an episode, and count the frames before it; a broken one before it has none. Raises DatasetError."""
+        record = self._record(number)
+        stretches = self._tasks(number, record)
+        while len(self._firsts) <= number:
+            self._firsts.append(self._firsts[-1] + self._length_or_0(len(self._firsts) - 1))
+        several = tuple(stretches) if len(stretches) > 1 else ()
+        first = self._firsts[number]
+        return DatasetEpisode(number, self._name(number), stretches[0][1], record.num_steps, first, several)
+
+    def cameras_in(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
+        readable = [record for number in numbers if (record := self._readable(number))]
+        blank: dict[str, str] = {}
+        for camera in self.cameras if readable else ():
+            told = [record.pictures[camera].blank for record in readable]
+            if all(told):
+                blank[camera] = f"{told[0]} in every chosen episode"
+        cameras = [camera for camera in self.cameras if camera not in blank]
+        require(self.root, bool(cameras), "a camera that shows something", "; ".join(map(": ".join, blank.items())))
+        return cameras, {**self.left_out, **blank}
+
+    def decoder(self, camera: str) -> str | None:
+        return Picture.decoder()
+
+    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        return self._record(episode.index).pictures[camera].digest
+
+    def check(self, episode: DatasetEpisode, camera: str) -> int:
+        pictures = self._record(episode.index).pictures[camera]
+        if pictures.fault is not None:
+            raise pictures.fault
+        return pictures.num_bytes
+
+    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
+        where = f"{self._where(episode.index)}: {camera}"
+        stored = self._values(self._features(episode.index), self._info.cameras[camera])
+        require(where, len(stored) == episode.num_frames, f"{episode.num_frames} pictures", len(stored))
+        for t, picture in enumerate(stored):
+            with faults_at(f"{where}: frame {t}"):
+                yield Picture(picture).pixels()
+
+    def _record(self, number: int) -> _Record:
+        """What a record holds; only the first call reads it. Raises DatasetError."""
+        if number not in self._records:
+            features, where = self._features(number), self._where(number)
+            stored = {camera: self._values(features, name) for camera, name in self._info.cameras.items()}
+            texts = self._values(features, self._info.instruction or "")
+            num_steps = len(stored[self.cameras[0]])
+            counts = {name: len(each) for name, each in stored.items()}
+            if self._has_step_texts:
+                counts[str(self._info.instruction)] = len(texts)
+            told = ", ".join(f"{name} {count}" for name, count in counts.items())
+            require(where, num_steps > 0 and len({*counts.values()}) == 1, "one number of steps, above 0", told)
+            pictures = {camera: _pictures(f"{where}: {camera}", each) for camera, each in stored.items()}
+            changes = [(t, text) for t, text in enumerate(texts) if t == 0 or text != texts[t - 1]]
+            self._records[number] = _Record(num_steps, changes, pictures)
+        return self._records[number]
+
+    def _readable(self, number: int) -> _Record | None:
+        """The record; None for a broken one, which ``read_episode`` refuses."""
+        try:
+            return self._record(number)
+        except RewardError:
+            return None
+
+    def _length_or_0(self, number: int) -> int:
+        record = self._readable(number)
+        return record.num_steps if record else 0
+
+    @property
+    def _has_step_texts(self) -> bool:
+        return (self._info.instruction or "").startswith("steps/")
+
+    def _tasks(self, number: int, record: _Record) -> list[tuple[int, str]]:
+        """First frame and task of each stretch of frames with one task. Raises DatasetError."""
+        where = f"{self._where(number)}: {self._info.instruction or ' or '.join(INSTRUCTIONS)}"
+        texts = record.texts if record.texts and not self.given_task.overrides else [(0, b"")]
+        texts = texts[:1] if self.given_task.several == "first" else texts
+        return [(t, self.given_task.of(where, _decoded(where, text))) for t, text in texts]
+
+    def _features(self, number: int) -> Mapping[str, Any]:
+        file, record = self._places[number]
+        return features_of(file.record(record), self._where(number))
+
+    @staticmethod
+    def _values(features: Mapping[str, Any], name: str) -> Sequence[bytes]:
+        return features[name].bytes_list.value if name in features else ()
+
+    def _name(self, number: int) -> str:
+        file, record = self._places[number]
+        return f"{file.file.name}#{record}"
+
+    def _where(self, number: int) -> str:
+        file, record = self._places[number]
+        return f"{file.file}: record {record}"
+
+
+def _pictures(where: str, stored: Sequence[bytes]) -> _Pictures:
+    digest, num_bytes = digest_of(stored), sum(map(len, stored))
+    for t, picture in enumerate(stored):
+        try:
+            with faults_at(f"{where}: frame {t}"):
+                Picture(picture).check()
+        except DatasetError as fault:
+            return _Pictures(digest, num_bytes, "", fault)
+    blank = ""
+    if all(picture == stored[0] for picture in stored):
+        with suppress(FrameFileError):  # raised again by the frames
+            blank = BlankFrames([Picture(stored[0]).pixels()]).told
+    return _Pictures(digest, num_bytes, blank, None)
+
+
+def _decoded(where: str, text: bytes) -> str:
+    try:
+        return text.decode()
+    except UnicodeDecodeError as error:
+        raise DatasetError.at(where, "a task in UTF-8", error) from error

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: MIT
+"""Metadata of an RLDS dataset, as TensorFlow Datasets writes them: ``dataset_info.json`` and ``features.json``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rfm_labels.datasets.faults import DatasetError, require
+
+FEATURES_FILE = "features.json"
+INSTRUCTIONS = ("language_instruction", "natural_language_instruction")
+
+_INFO_FILE = "dataset_info.json"
+_OBSERVATION = "steps/observation/"
+_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
+_COLOURS = "3 channels of uint8"
+_LEAST_SIZE_PX = 8  # a smaller array of numbers is no picture
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A file of a split, with the number of episodes in it."""
+
+    file: Path
+    split: str
+    num_episodes: int
+
+
+@dataclass(frozen=True)
+class RldsInfo:
+    """What the metadata tell.
+
+    source: name and version
+    shards: in the order of the splits
+    cameras: features of pictures with 8-bit colours, by the names below ``steps/observation``
+    left_out: other pictures there, with the reason
+    instruction: feature with the task, of each step or of the episode; None: the dataset has none
+    notes: lines for the caller
+    """
+
+    source: str
+    shards: Sequence[Shard]
+    cameras: Mapping[str, str]
+    left_out: Mapping[str, str]
+    instruction: str | None
+    notes: Sequence[str]
+
+    @classmethod
+    def read(cls, root: Path) -> RldsInfo:
+        """Return the information in ``root``. Raises DatasetError."""
+        info = _document(root / _INFO_FILE)
+        features = _features(root / FEATURES_FILE)
+        shown = {name.removeprefix(_OBSERVATION): each for name, each in features.items() if _shown(name, each)}
+        faults = {name: _fault(each) for name, each in shown.items()}
+        cameras = {name: _OBSERVATION + name for name, fault in faults.items() if not fault}
+        told = "; ".join(f"{name}: {fault}" for name, fault in faults.items()) or "none"
+        require(f"{root / FEATURES_FILE}: {_OBSERVATION}", bool(cameras), f"a picture with {_COLOURS}", told)
+        texts = [name for name, each in features.items() if name.split("/")[-1] in INSTRUCTIONS and _is_text(each)]
+        texts.sort(key=lambda name: (not name.startswith("steps/"), name.count("/")))
+        return cls(
+            source=f"{info.get('name')}/{info.get('version')}",
+            shards=_shards(root, info),
+            cameras=cameras,
+            left_out={name: fault for name, fault in faults.items() if fault},
+            instruction=texts[0] if texts else None,
+            notes=[f"tasks: from {texts[0]}, not from {', '.join(texts[1:])}"] if len(texts) > 1 else [],
+        )
+
+
+def _document(file: Path) -> Mapping[str, Any]:
+    try:
+        found = json.loads(file.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise DatasetError.at(file, "a readable JSON file of TensorFlow Datasets", error) from error
+    require(file, isinstance(found, dict), "a JSON object", type(found).__name__)
+    return dict(found)
+
+
+def _shards(root: Path, info: Mapping[str, Any]) -> list[Shard]:
+    where, kind = root / _INFO_FILE, info.get("fileFormat", "tfrecord")
+    remedy = f"{kind}: write it again with file_format='tfrecord' (tfds convert_format)"
+    require(f"{where}: fileFormat", kind == "tfrecord", "tfrecord", remedy)
+    splits = info.get("splits")
+    require(f"{where}: splits", isinstance(splits, list) and bool(splits), "at least one split", splits)
+    return [shard for split in splits or () for shard in _shards_of(root, str(info.get("name")), split)]
+
+
+def _shards_of(root: Path, dataset: str, split: Any) -> Iterator[Shard]:
+    where = f"{root / _INFO_FILE}: splits"
+    is_known = isinstance(split, dict) and isinstance(split.get("shardLengths"), list) and bool(split.get("name"))
+    require(where, is_known, "name and shardLengths of each split", split)
+    lengths, template = split["shardLengths"], str(split.get("filepathTemplate") or _TEMPLATE)
+    for number, length in enumerate(lengths):
+        index, total = f"{number:05d}", f"{len(lengths):05d}"
+        words = {"DATASET": dataset, "SPLIT": split["name"], "FILEFORMAT": "tfrecord", "SHARD_INDEX": index}
+        words |= {"NUM_SHARDS": total, "SHARD_X_OF_Y": f"{index}-of-{total}"}
+        name = template
+        for word, value in words.items():
+            name = name.replace(f"{{{word}}}", value)
+        require(f"{where}: {split['name']}", Path(name).name == name, "files in the folder of the version", name)
+        is_count = str(length).isdecimal()
+        require(f"{where}: {split['name']}: shardLengths", is_count, "a number of episodes", repr(length))
+        yield Shard(root / name, split["name"], int(length))
+
+
+def _features(file: Path) -> Mapping[str, Mapping[str, Any]]:
+    """The features with values, by path. Raises DatasetError."""
+    expected = "features as TensorFlow Datasets 4.6 or later writes them"
+    try:
+        features = dict(_leaves(_document(file)))
+        for feature in features.values():
+            _shape(feature.get("image", feature.get("tensor", {})))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise DatasetError.at(file, expected, f"{error}: copy the file again") from error
+    require(file, bool(features), expected, "none: write the dataset again with a later version")
+    return features
+
+
+def _leaves(feature: Any, name: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Features with values by path, such as ``steps/observation/image``."""
+    if not isinstance(feature, dict):
+        return
+    if name == "steps" and "sequence" in feature:
+        yield from _leaves(feature["sequence"].get("feature"), name)
+    elif "featuresDict" in feature:
+        for key, each in feature["featuresDict"].get("features", {}).items():
+            yield from _leaves(each, f"{name}/{key}".lstrip("/"))
+    elif name:
+        yield name, feature
+
+
+def _shown(name: str, feature: Mapping[str, Any]) -> bool:
+    """True for an observation that may be a picture."""
+    shape = _shape(feature.get("tensor", {}))
+    is_array = len(shape) in (2, 3) and all(size >= _LEAST_SIZE_PX for size in shape[:2])
+    return name.startswith(_OBSERVATION) and ("image" in feature or "video" in feature or is_array)
+
+
+def _shape(value: Mapping[str, Any]) -> list[int]:
+    return [int(size) for size in value.get("shape", {}).get("dimensions", ())]
+
+
+def _fault(feature: Mapping[str, Any]) -> str:
+    """Why a feature is no camera; empty: it is one."""
+    if "image" not in feature:
+        return "an array or a video: expected a JPEG or PNG file for each step"
+    image = feature["image"]
+    kind, shape = image.get("dtype", "uint8"), _shape(image)
+    is_colour = kind == "uint8" and shape[-1:] == [3]
+    return "" if is_colour else f"{kind} {shape}: expected {_COLOURS}"
+
+
+def _is_text(feature: Mapping[str, Any]) -> bool:
+    return "text" in feature or feature.get("tensor", {}).get("dtype") == "string"
