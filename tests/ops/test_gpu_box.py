@@ -399,9 +399,10 @@ def test_the_unit_runs_what_nginx_and_the_guide_expect() -> None:
     program, name, *arguments = shlex.split(unit()["ExecStart"])
     assert (program, name) == ("/opt/rfm/bin/rfm", "serve")
     given = get_command(rfm_app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
-    default = ServeConfig()
+    default = Endpoints.of(ServeConfig(), PORTS["gateway"])
     assert (default.http_port, default.grpc_port) == (PORTS["http"], PORTS["grpc"])
-    assert (given["http_port"], given["grpc_port"], given["gateway_port"]) == (None, None, PORTS["gateway"])
+    names = [f"{name}_option" for name in ("http_port", "grpc_port", "gateway_port")]
+    assert [given[name] for name in names] == [None, None, PORTS["gateway"]]
     assert arguments[0] == "/srv/rfm/my_models"
     assert f"--repository {arguments[0]} " in GUIDE
     assert f"/usr/bin/python3 -m venv {Path(program).parents[1]} " in GUIDE
