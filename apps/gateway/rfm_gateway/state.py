@@ -65,7 +65,7 @@ class TritonState:
         """Return the answer of ``/model_info``. Raises ServerError."""
         info = (await within(STATUS_TIMEOUT_S, self._infos()))[0]
         devices = await self._devices(STATUS_TIMEOUT_S)
-        parts = info.network.get("parameters", {})
+        parts, types = info.network.get("parameters", {}), info.network.get("types", {})
         total = sum(parts.values())
         return schema.ModelInformation(
             model_path=info.source,
@@ -74,11 +74,14 @@ class TritonState:
             experiment_config=dict(info.run_config) or {"model": info.network.get("config", {})},
             model_architecture={
                 "model_class": info.network.get("class"),
+                "model_module": info.network.get("module"),
                 "total_parameters": total,
                 "trainable_parameters": 0,  # served weights are frozen
                 "frozen_parameters": total,
                 "trainable_percentage": 0.0,
-                "architecture_summary": [{"name": name, "parameters": count} for name, count in parts.items()],
+                "architecture_summary": [
+                    {"name": name, "type": types.get(name), "parameters": count} for name, count in parts.items()
+                ],
             },
         )
 
