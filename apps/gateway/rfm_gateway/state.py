@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 
 from rfm_client import (
+    AccessDeniedError,
     AsyncRewardClient,
     DeadlineExceededError,
     ModelInfo,
@@ -27,6 +28,20 @@ STALL_S = 30.0  # a model with late probes that finishes no request for so long 
 HEALTH_KEPT_S = 1.0  # an answer is kept, since requests without a key must not load the models
 STATUS_TIMEOUT_S = 5.0
 MS_PER_S = 1e3
+
+
+_REMEDIES = {  # for callers over HTTP, who have no option of the client
+    AccessDeniedError: "whoever runs the gateway sets --triton-ca-file, --triton-certificate and --triton-key",
+    ModelNotFoundError: "whoever runs the gateway names a served model with --model",
+    ServerUnavailableError: "whoever runs the gateway starts Triton there, or names another with --triton",
+}
+
+
+def told(error: RewardError) -> str:
+    """Return an error's message, with a remedy for callers over HTTP instead of one for users of the client."""
+    if not isinstance(error, ServerError) or not error.remedy:
+        return str(error)
+    return str(error).replace(error.remedy, _REMEDIES[type(error)])
 
 
 class TritonState:
@@ -112,7 +127,7 @@ class TritonState:
         try:
             stall = await within(HEALTH_TIMEOUT_S, self._stall())
         except RewardError as error:
-            return str(error)
+            return told(error)
         if stall is not None:
             return stall
         devices = await self._devices(ends_s - time.monotonic())
