@@ -22,7 +22,7 @@ from rfm_client.contract.settings import ConfigError, Settings, setting
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["CheckpointConfig", "ExportConfig", "ServeConfig"]
+__all__ = ["CheckpointConfig", "ExportConfig", "ServeConfig", "address_of"]
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
@@ -38,6 +38,7 @@ Weights: TypeAlias = Literal["int8", "nf4"]
 _COUNT = {"least": 1, "most": MAX_INT32}
 _PORT = {"least": 1, "most": MAX_PORT}
 _OF_A_MACHINE = {"most": MAX_OF_A_MACHINE}
+_OR_MOVED = ", or 10 more while another setting names that port."
 
 
 @dataclass(frozen=True)
@@ -143,15 +144,15 @@ class ExportConfig(CheckpointConfig):
 class ServeConfig(Settings):
     """The settings of ``rfm serve`` itself. To change them, start it again.
 
-    ``host`` may be a URL, as in the FastAPI server's file; only its address is kept.
+    ``host`` may be a URL; only its address is kept. ``Endpoints.of`` chooses Triton's ports that are None.
     """
 
     TITLE: ClassVar[str] = "Triton and its watch"
 
     host: str = setting(DEFAULT_HOST, "IP address to listen on, 0.0.0.0 or :: for all of IPv4 or IPv6.")
-    http_port: int = setting(8000, "Triton's HTTP port.", **_PORT)
-    grpc_port: int = setting(8001, "Triton's gRPC port.", **_PORT)
-    metrics_port: int = setting(8002, "Port of Triton's metrics.", **_PORT)
+    http_port: int | None = setting(None, f"Triton's HTTP port; else 8000{_OR_MOVED}", **_PORT)
+    grpc_port: int | None = setting(None, f"Triton's gRPC port; else 8001{_OR_MOVED}", **_PORT)
+    metrics_port: int | None = setting(None, f"Port of Triton's metrics; else 8002{_OR_MOVED}", **_PORT)
     status_port: int | None = setting(None, "Port of rfm serve's own state: /live, /ready and /metrics.", **_PORT)
     http_threads: int | None = setting(
         None, "Threads that read HTTP requests; else Triton's choice.", least=1, **_OF_A_MACHINE
@@ -173,7 +174,7 @@ class ServeConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "host", _address(self.host))
+        object.__setattr__(self, "host", address_of(self.host))
         ConfigError.require_both(self, "grpc_certificate", "grpc_key")
         if self.grpc_client_ca is not None and self.grpc_certificate is None:
             raise ConfigError.of_two("grpc_client_ca", "needs", "grpc_certificate")
@@ -184,7 +185,8 @@ class ServeConfig(Settings):
         return is_loopback(self.host)
 
 
-def _address(host: str) -> str:
+def address_of(host: str) -> str:
+    """Return the IP address in a host's URL or name. Raises ConfigError."""
     address = (host.partition("://")[2] or host).rstrip("/")
     if address == "localhost":
         return DEFAULT_HOST
@@ -195,5 +197,5 @@ def _address(host: str) -> str:
             raise ValueError
         return str(ipaddress.ip_address(address))
     except ValueError:  # Triton would take a name as 255.255.255.255
-        expected = "an IP address without port (http_port), such as 127.0.0.1, ::1, 0.0.0.0 or ::"
+        expected = "an IP address without a port, such as 127.0.0.1, ::1, 0.0.0.0 or ::"
         raise ConfigError.at("host", expected, f"{address!r:.200}") from None

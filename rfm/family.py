@@ -19,7 +19,7 @@ from rfm_client.contract.samples import EncoderSample, Float32Array
 
 if TYPE_CHECKING:
     import torch
-    from torch import Tensor
+    from torch import Tensor, nn
 
     from rfm.engine.execution import Execution
     from rfm.engine.feature_cache import FeatureCache
@@ -161,6 +161,9 @@ class Checkpoint(Protocol):
     @property
     def notes(self) -> Sequence[str]:
         """A line for the user about each contradiction to the known facts of training."""
+
+    def skeleton(self) -> nn.Module:
+        """Return the network without weights, on PyTorch's device ``meta``."""
 
     def decisions(self) -> Sequence[Decision]:
         """Return the source of each setting that scores depend on. Raises CheckpointError for missing files."""

@@ -174,7 +174,7 @@ def serve(
         logger.warning("%s is no loopback address, and %s", config.serve.host, ACCEPTED_WARNING)
     server = TritonServer(
         folder,
-        Endpoints.of(config.serve),
+        Endpoints.of(config.serve, config.gateway.port),
         find_installation(tritonserver),
         http_threads=config.serve.http_threads,
         admin_key=take_key(admin_key_file, os.environ),

@@ -6,10 +6,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from rfm.config import ExportConfig, ServeConfig
+from rfm.config import ExportConfig, ServeConfig, address_of
 from rfm.plain_yaml import read_yaml
 from rfm_client.contract.settings import ConfigError, Settings
 from rfm_gateway import GatewayConfig
@@ -21,10 +22,12 @@ FASTAPI_KEYS = {  # keys of the FastAPI server's file, and their settings here
     "num_gpus": "export.num_gpus",
     "batch_size": "export.batch_size",
     "max_workers": "serve.http_threads",
-    "server_url": "serve.host",
-    "server_port": "serve.http_port",
+    "server_url": "gateway.host",
+    "server_port": "gateway.port",
     "use_frame_steps": "gateway.use_frame_steps",
 }
+
+_PORT_REMEDY = "leave Triton's out, and rfm serve chooses it"
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,11 @@ class Config:
         serve = self.serve
         ports = {f"serve.{name}": getattr(serve, name) for name in ServeConfig.settings() if name.endswith("_port")}
         ports["gateway.port"] = self.gateway.port
-        taken = {name: port for name, port in ports.items() if port is not None}
-        if len(set(taken.values())) < len(taken):
-            raise ConfigError.at("ports", "different ones", taken)
+        given = [(name, port) for name, port in ports.items() if port is not None]
+        for (name, port), (other, other_port) in combinations(given, 2):
+            if port == other_port:
+                where = f"{_with_option(name)} and {_with_option(other)}"
+                raise ConfigError.at(where, "different ports", f"{port} for both", _PORT_REMEDY)
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Config:
@@ -77,11 +82,18 @@ class Config:
         return replace(self, **changed)
 
 
+def _with_option(setting: str) -> str:
+    """A setting's key in the file, and its option of ``rfm serve``."""
+    section, _, key = setting.partition(".")
+    option = SECTIONS[section].settings()[key].option
+    return f"{setting} ({option.replace('--', '--gateway-') if section == 'gateway' else option})"
+
+
 def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:
     """Each key as the file writes it, its setting (``section.key``), and its value. Raises ConfigError."""
     for key, value in _items(content, ""):
         if key in FASTAPI_KEYS:
-            yield key, FASTAPI_KEYS[key], value
+            yield key, FASTAPI_KEYS[key], _address(value) if key == "server_url" else value
         elif key in SECTIONS:
             for inner, each in _items(value, key):
                 if inner not in SECTIONS[key].settings():
@@ -89,6 +101,14 @@ def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:
                 yield f"{key}.{inner}", f"{key}.{inner}", each
         else:
             raise _unknown(f"{key!s:.100}", (*SECTIONS, *FASTAPI_KEYS))
+
+
+def _address(url: Any) -> Any:
+    """The address in the FastAPI server's ``server_url``. Raises ConfigError."""
+    try:
+        return address_of(url) if isinstance(url, str) else url
+    except ConfigError as error:
+        raise error.named(lambda _: "server_url") from None
 
 
 def _made(section: str, values: Mapping[str, Any], written: Mapping[str, str]) -> Any:

@@ -230,8 +230,12 @@ def _network(checkpoint: Checkpoint) -> dict[str, Any]:
     parameters: Counter[str] = Counter()
     for name, count in num_values(checkpoint.parts[NETWORK]).items():
         parameters[name.partition(".")[0]] += count
+    skeleton = checkpoint.skeleton()
+    tops = dict((*skeleton.named_parameters(recurse=False), *skeleton.named_children()))
     return {
         **checkpoint.description.network,
+        "module": type(skeleton).__module__,
+        "types": {name: type(tops[name]).__name__ for name in sorted(parameters) if name in tops},
         "config": config_fields(checkpoint.config),
         "parameters": dict(sorted(parameters.items())),  # as in the exported file, whose tensors are in another order
     }

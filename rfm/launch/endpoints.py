@@ -8,7 +8,7 @@ import re
 import socket
 from collections import deque
 from dataclasses import dataclass
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 
 from rfm.config import DEFAULT_HOST, ServeConfig
@@ -18,6 +18,7 @@ from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.listening import ListenAddress, in_url
 
 PORTS = range(20_000, 32_000)  # below the ports that Linux gives to outgoing connections
+PORT_STEP = 10  # the defaults stay different from each other
 SECURITY_FLOOR = (
     2,
     71,
@@ -59,12 +60,21 @@ class Endpoints:
     grpc_tls: GrpcTls | None = None
 
     @classmethod
-    def of(cls, config: ServeConfig) -> Endpoints:
-        """Return the endpoints of a configuration."""
+    def of(cls, config: ServeConfig, gateway_port: int | None = None) -> Endpoints:
+        """Return the endpoints of a configuration.
+
+        A port of Triton that is None becomes Triton's default, or 10 more while another setting names that port.
+        """
+        named = {config.http_port, config.grpc_port, config.metrics_port, config.status_port, gateway_port}
+        defaults = {"http_port": cls.http_port, "grpc_port": cls.grpc_port, "metrics_port": cls.metrics_port}
+        ports = {
+            name: getattr(config, name) or next(port for port in count(default, PORT_STEP) if port not in named)
+            for name, default in defaults.items()
+        }
         tls = None
         if config.grpc_certificate is not None and config.grpc_key is not None:
             tls = GrpcTls(config.grpc_certificate, config.grpc_key, config.grpc_client_ca)
-        return cls(config.host, config.http_port, config.grpc_port, config.metrics_port, tls)
+        return cls(config.host, grpc_tls=tls, **ports)
 
     @classmethod
     def free(cls) -> Endpoints:

@@ -217,9 +217,12 @@ class RewindCheckpoint:
 
     def check(self) -> None:
         """Raise CheckpointError unless the weights fit the network, before memory is allocated for it."""
+        check_shapes(self.skeleton().state_dict(), self.network)
+
+    def skeleton(self) -> RewindTransformer:
+        """Return the network without weights."""
         with torch.device("meta"):
-            network = RewindTransformer(self.config)
-        check_shapes(network.state_dict(), self.network)
+            return RewindTransformer(self.config)
 
 
 def reads(folder: Path) -> bool:

@@ -53,6 +53,11 @@ class QwenCheckpoint:
         """Return the network, with weights of no use."""
         raise NotImplementedError
 
+    def skeleton(self) -> nn.Module:
+        """Return the network without weights."""
+        with torch.device("meta"):
+            return self.network(self.config.torch_dtype)
+
     def make_predictor(self, network: Any, device: torch.device, cache: FeatureCache[Any] | None) -> VlmPredictor:
         """Return the predictor with this network."""
         raise NotImplementedError

@@ -65,7 +65,8 @@ def test_the_fastapi_servers_file_is_accepted(tmp_path: Path) -> None:
     )
     assert (config.export.checkpoint, config.export.num_gpus, config.serve.http_threads) == ("org/name", None, 4)
     assert (config.export.batch_size, config.export.max_batch_size) == (16, None)  # the original never reads it
-    assert (config.serve.host, config.serve.http_port) == ("127.0.0.1", 8010)
+    assert (config.gateway.host, config.gateway.port) == ("127.0.0.1", 8010)
+    assert (config.serve.host, config.serve.http_port) == ("127.0.0.1", None)
     assert config.gateway.use_frame_steps
     assert not read(tmp_path, "").gateway.use_frame_steps
 
@@ -103,10 +104,18 @@ BAD = {  # text, and the message after the file name
     "too small": ("batch_size: 0", "batch_size: expected at least 1, got 0"),
     "a truth that is a number": ("gateway: {viewer: 1}", r"gateway\.viewer: expected bool, got 1"),
     "a port that is none": ("serve: {grpc_port: 70000}", r"serve\.grpc_port: expected at most 65535, got 70000"),
-    "one port twice": ("serve: {grpc_port: 8000}", r"ports: expected different ones, got {.*'serve\.grpc_port': 8000"),
+    "one port twice": (
+        "serve: {grpc_port: 8000, http_port: 8000}",
+        r"serve\.http_port \(--http-port\) and serve\.grpc_port \(--grpc-port\): expected different ports, got 8000 for both",
+    ),
+    "Triton on the FastAPI server's port": (
+        "server_port: 8000\nserve: {http_port: 8000}",
+        r"serve\.http_port \(--http-port\) and gateway\.port \(--gateway-port\): expected different ports, got 8000 for both; "
+        "leave Triton's out, and rfm serve chooses it$",
+    ),
     "a port in the address": (
         "server_url: http://localhost:8000",
-        r"server_url: expected an IP address without port \(http_port\), such as .*, got 'localhost:8000'",
+        "server_url: expected an IP address without a port, such as .*, got 'localhost:8000'",
     ),
     "a host by name": ("serve: {host: gpu.example}", r"serve\.host: expected an IP address .*, got 'gpu\.example'"),
     "half a certificate": ("serve: {grpc_key: a}", r"serve\.grpc_key needs serve\.grpc_certificate$"),
@@ -133,8 +142,29 @@ def test_options_win_over_the_file(tmp_path: Path) -> None:
     assert (config.serve.http_port, config.serve.host, config.gateway.timeout_s) == (9000, "127.0.0.1", 5.0)
     with pytest.raises(ConfigError, match=r"^gateway\.key needs gateway\.certificate$"):
         config.with_options(gateway={"key": Path("key.pem")})
-    with pytest.raises(ConfigError, match=r"^ports: expected different ones, got"):
+    with pytest.raises(
+        ConfigError, match=r"^serve\.grpc_port .* and gateway\.port .*: expected different ports, got 9001 "
+    ):
         config.with_options(gateway={"port": 9000 + 1}, serve={"grpc_port": 9000 + 1})
+
+
+MOVED: dict[str, tuple[dict[str, int], int | None, tuple[int, int, int]]] = {
+    "no gateway": ({}, None, (8000, 8001, 8002)),
+    "a gateway elsewhere": ({}, 8100, (8000, 8001, 8002)),
+    "a gateway on Triton's HTTP port": ({}, 8000, (8010, 8001, 8002)),
+    "a gateway on Triton's gRPC port": ({}, 8001, (8000, 8011, 8002)),
+    "a gateway on the port of the metrics": ({}, 8002, (8000, 8001, 8012)),
+    "the next one is taken, too": ({"status_port": 8010}, 8000, (8020, 8001, 8002)),
+    "another port of Triton": ({"grpc_port": 8000}, None, (8010, 8000, 8002)),
+    "given ports stay": ({"http_port": 9000, "grpc_port": 9001, "metrics_port": 9002}, 8000, (9000, 9001, 9002)),
+}
+
+
+@pytest.mark.parametrize(("given", "gateway_port", "ports"), MOVED.values(), ids=MOVED)
+def test_ports_of_triton_that_nobody_gave_make_room(
+    given: dict[str, int], gateway_port: int | None, ports: tuple[int, int, int]
+) -> None:
+    assert Endpoints.of(ServeConfig(**given), gateway_port) == Endpoints("127.0.0.1", *ports)
 
 
 @pytest.fixture
@@ -245,6 +275,22 @@ def test_a_gateway_takes_from_the_server_what_its_section_leaves_open(started: A
     assert options["--timeout"] == ["120.0"]
     (tmp_path / "serve.yaml").write_text("use_frame_steps: true\n")
     assert "--use-frame-steps" in started("--config", str(tmp_path / "serve.yaml"), "--gateway-port=8100")
+
+
+def test_a_gateway_on_a_port_of_triton_asks_triton_where_it_moved(started: Any) -> None:
+    assert started("--gateway-port=8001")["--triton"] == ["grpc://127.0.0.1:8011"]
+    result = invoke("serve", str(REPOSITORY), "--gateway-port=8001", "--grpc-port=8001")
+    assert result.exit_code == 1
+    assert (
+        "(--grpc-port) and gateway.port (--gateway-port): expected different ports, got 8001 for both" in result.stderr
+    )
+
+
+def test_the_fastapi_servers_file_starts_a_gateway_on_its_port(started: Any, tmp_path: Path) -> None:
+    (tmp_path / "server.yaml").write_text("server_url: 0.0.0.0\nserver_port: 8001\n")
+    options = started("--config", str(tmp_path / "server.yaml"))
+    assert (options["--host"], options["--port"]) == (["0.0.0.0"], ["8001"])
+    assert options["--triton"] == ["grpc://127.0.0.1:8011"]
 
 
 WORDS: dict[str, tuple[list[str], str]] = {

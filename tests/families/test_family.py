@@ -112,6 +112,8 @@ def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> No
     assert rfm_export.check(running.repository, TOY) == []
     assert description_of(running.repository / "toy").network == {
         "class": "Redness",
+        "module": "toy_family",
+        "types": {"line": "Linear"},
         "config": {"num_colours": 3},
         "parameters": {"line": 4},
     }

@@ -14,7 +14,9 @@ import pytest
 
 from gateways import inside, running
 from in_process import rfm
+from rfm_client import ServerError
 from rfm_client.contract.process_log import LogLines
+from rfm_client.contract.triton import denied, not_served, unreachable
 from rfm_gateway import GatewayConfig
 from rfm_gateway.command import page_link
 from rfm_gateway.state import TritonState
@@ -92,6 +94,29 @@ LINKS = {
 @pytest.mark.parametrize(("link", "config"), LINKS.items())
 def test_a_browser_can_open_the_link(link: str, config: GatewayConfig) -> None:
     assert page_link(config) == link
+
+
+OF_TRITON = {
+    "no connection": (unreachable("grpc://gpu:1", "refused"), "names another with --triton"),
+    "no access": (denied("grpc://gpu:1", "401", "a key is missing"), "sets --triton-ca-file, --triton-certificate and"),
+    "another model": (not_served("rfm is unknown", ["toy"]), "names a served model with --model"),
+}
+
+
+@pytest.mark.parametrize(("error", "remedy"), OF_TRITON.values(), ids=OF_TRITON)
+def test_a_fault_of_triton_tells_a_caller_who_can_mend_it_and_no_option_of_the_client(
+    monkeypatch: pytest.MonkeyPatch, error: ServerError, remedy: str
+) -> None:
+    async def failing(_: TritonState) -> None:
+        raise error
+
+    monkeypatch.setattr(TritonState, "model_info", failing)
+    with inside() as client:
+        detail = client.get("/model_info").json()["detail"]
+    fault = str(error).removesuffix(error.remedy)
+    assert detail.startswith(f"{fault}whoever runs the gateway ")
+    assert remedy in detail
+    assert error.remedy not in detail
 
 
 def test_every_line_about_a_failed_request_names_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -79,6 +79,17 @@ def test_the_reports_that_clients_read_have_their_keys(gateway: Gateway, request
     assert set(request_.expected["keys"]) <= json.loads(body).keys()
 
 
+def test_model_info_shows_a_client_that_it_asks_a_qwen3(gateway: Gateway) -> None:
+    (asking,) = (report for report in REPORTS if str(report) == "get.model_info")
+    status, _, body = asking.sent(gateway.url)
+    assert status == 200
+    architecture = json.loads(body)["model_architecture"]
+    assert architecture["model_module"] == "rfm.vlm.network"
+    assert {"name": "model", "type": "Qwen3VLModel"}.items() <= architecture["architecture_summary"][1].items(), (
+        architecture
+    )
+
+
 def test_the_table_of_differences_to_the_original_server_shows_none_between_a_server_and_itself(
     gateway: Gateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:

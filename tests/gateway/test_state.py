@@ -95,9 +95,12 @@ def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: torch.nn.M
     architecture = info.pop("model_architecture")
     parts = architecture.pop("architecture_summary")
     assert sum(part["parameters"] for part in parts) == total
+    tops = dict((*tiny_network.named_parameters(recurse=False), *tiny_network.named_children()))
+    assert {part["name"]: part["type"] for part in parts} == {name: type(top).__name__ for name, top in tops.items()}
     assert {part["name"] for part in parts} == {name.partition(".")[0] for name in tiny_network.state_dict()}
     assert architecture == {
         "model_class": "RewindTransformer",
+        "model_module": "rfm.rewind.network",
         "total_parameters": total,
         "trainable_parameters": 0,
         "frozen_parameters": total,

@@ -398,7 +398,7 @@ def test_the_unit_runs_what_nginx_and_the_guide_expect() -> None:
     program, name, *arguments = shlex.split(unit()["ExecStart"])
     assert (program, name) == ("/opt/rfm/bin/rfm", "serve")
     given = rfm_parsed(name, *arguments)
-    default = ServeConfig()
+    default = Endpoints.of(ServeConfig(), PORTS["gateway"])
     assert (default.http_port, default.grpc_port) == (PORTS["http"], PORTS["grpc"])
     assert (given["http_port"], given["grpc_port"], given["gateway_port"]) == (None, None, PORTS["gateway"])
     assert arguments[0] == "/srv/rfm/my_models"

@@ -57,14 +57,18 @@ def environment(pid: int) -> set[str]:
 
 @pytest.mark.triton
 @pytest.mark.slow
-def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At an IPv6 address. Only the gateway has the key."""
+def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """At an IPv6 address, with the FastAPI server's file. Only the gateway has the key."""
     keys = {name: f"a-secret-of-{name}" for name in ("RFM_ADMIN_KEY", "RFM_GATEWAY_API_KEY")}
     for name, key in keys.items():
         monkeypatch.setenv(name, key)
     http, grpc, metrics, status, gateway = free_ports(5)
     endpoints = Endpoints("::1", http, grpc, metrics)
-    words = [*command(REPOSITORY, endpoints), "--host=::1", f"--status-port={status}", f"--gateway-port={gateway}"]
+    (tmp_path / "server.yaml").write_text(f"server_url: http://[::1]/\nserver_port: {gateway}\n")
+    words = [*command(REPOSITORY, endpoints), "--host=::1", f"--status-port={status}"]
+    words += ["--config", str(tmp_path / "server.yaml")]
     page = f"http://[::1]:{gateway}/"
     video = Trajectory(frames=clip.render()[::8], task=clip.TASK)
     samples = [ProgressSample(video), PreferenceSample(video, video)]
@@ -96,6 +100,7 @@ def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(monkey
             _, log = process.communicate(timeout=EXIT_S)
     assert process.returncode == 0
     assert f"at grpc://[::1]:{grpc}, http://[::1]:{http}, metrics at http://[::1]:{metrics}/metrics\n" in log
+    assert f"answers requests at {page}\n" in log
     assert f"look at rewards in the browser: {page}\n" in log
     assert not re.search(r"^I\d{4} ", log, re.MULTILINE)  # Triton's remarks
 

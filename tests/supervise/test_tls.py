@@ -349,6 +349,8 @@ def test_the_gateway_s_own_certificate_is_not_the_caller_s_fault(
         trusted = ssl.create_default_context(cafile=papers.ca)
         answer = httpx.get(f"https://127.0.0.1:{port}/model_info", verify=trusted)
         assert (answer.status_code, "access denied" in answer.json()["detail"]) == (502, True)
+        assert "--triton-ca-file" in answer.json()["detail"]
+        assert "(--ca-file)" not in answer.json()["detail"]
 
 
 def test_half_a_certificate_of_the_gateway_is_refused(papers: Papers) -> None:

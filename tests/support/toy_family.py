@@ -169,6 +169,9 @@ class ToyCheckpoint:
     def notes(self) -> tuple[str, ...]:
         return ()
 
+    def skeleton(self) -> Redness:
+        return Redness(self.config)
+
     def decisions(self) -> list[Decision]:
         return [Decision("num_colours", self.config.num_colours, NETWORK_CONFIG)]
 

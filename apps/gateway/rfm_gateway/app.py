@@ -41,7 +41,7 @@ from rfm_gateway.observe import (
 )
 from rfm_gateway.refusals import RefusalLog, asked
 from rfm_gateway.scoring import Evaluator
-from rfm_gateway.state import TritonState
+from rfm_gateway.state import TritonState, told
 
 _REFERENCE = "#/components/schemas/{model}"
 _MODELS = (schema.EvaluateBatchRequest, schema.InvalidRequest, schema.Failure)
@@ -192,7 +192,7 @@ def _handlers() -> dict[Any, Any]:
 
     async def failed(_request: Request, error: RewardError) -> JSONResponse:
         code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
-        return JSONResponse({"detail": str(error)}, code, RETRY_AFTER if code == 503 else None)
+        return JSONResponse({"detail": told(error)}, code, RETRY_AFTER if code == 503 else None)
 
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
         logger.error("500 %s: unexpected", asked(request.scope), exc_info=error)

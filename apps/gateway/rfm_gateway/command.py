@@ -60,6 +60,7 @@ def gateway(config: GatewayOptions) -> None:
     if api_key is None and not address.is_loopback:
         open_to_all = "%s is no loopback address, and no key is required: every host that reaches it can use it"
         logger.warning(open_to_all, address.host)
+    logger.info("answers requests at %s", page_link(config))
     if page_of(config) is not None:
         logger.info("look at rewards in the browser: %s", page_link(config))
     elif config.viewer:
@@ -102,5 +103,5 @@ def gateway_command(config: GatewayConfig) -> list[str]:
 
 
 def page_link(config: GatewayConfig) -> str:
-    """Return the page's URL for browsers that can reach the address."""
+    """Return the URL of the page and the endpoints, for callers that can reach the address."""
     return f"{config.address.url('http' if config.certificate is None else 'https')}/"

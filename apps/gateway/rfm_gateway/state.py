@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 
 from rfm_client import (
+    AccessDeniedError,
     AsyncRewardClient,
     DeadlineExceededError,
     ModelInfo,
@@ -27,6 +28,20 @@ STALL_S = 30.0  # a model with late probes that finishes no request for so long 
 HEALTH_KEPT_S = 1.0  # an answer is kept, since requests without a key must not load the models
 STATUS_TIMEOUT_S = 5.0
 MS_PER_S = 1e3
+
+
+_REMEDIES = {  # for callers over HTTP, who have no option of the client
+    AccessDeniedError: "whoever runs the gateway sets --triton-ca-file, --triton-certificate and --triton-key",
+    ModelNotFoundError: "whoever runs the gateway names a served model with --model",
+    ServerUnavailableError: "whoever runs the gateway starts Triton there, or names another with --triton",
+}
+
+
+def told(error: RewardError) -> str:
+    """Return an error's message, with a remedy for callers over HTTP instead of one for users of the client."""
+    if not isinstance(error, ServerError) or not error.remedy:
+        return str(error)
+    return str(error).replace(error.remedy, _REMEDIES[type(error)])
 
 
 class TritonState:
@@ -65,7 +80,7 @@ class TritonState:
         """Return the answer of ``/model_info``. Raises ServerError."""
         info = (await within(STATUS_TIMEOUT_S, self._infos()))[0]
         devices = await self._devices(STATUS_TIMEOUT_S)
-        parts = info.network.get("parameters", {})
+        parts, types = info.network.get("parameters", {}), info.network.get("types", {})
         total = sum(parts.values())
         return schema.ModelInformation(
             model_path=info.source,
@@ -74,11 +89,14 @@ class TritonState:
             experiment_config=dict(info.run_config) or {"model": info.network.get("config", {})},
             model_architecture={
                 "model_class": info.network.get("class"),
+                "model_module": info.network.get("module"),
                 "total_parameters": total,
                 "trainable_parameters": 0,  # served weights are frozen
                 "frozen_parameters": total,
                 "trainable_percentage": 0.0,
-                "architecture_summary": [{"name": name, "parameters": count} for name, count in parts.items()],
+                "architecture_summary": [
+                    {"name": name, "type": types.get(name), "parameters": count} for name, count in parts.items()
+                ],
             },
         )
 
@@ -109,7 +127,7 @@ class TritonState:
         try:
             stall = await within(HEALTH_TIMEOUT_S, self._stall())
         except RewardError as error:
-            return str(error)
+            return told(error)
         if stall is not None:
             return stall
         devices = await self._devices(ends_s - time.monotonic())

@@ -46,8 +46,8 @@ class Description(Origin):
     A new fact is a field with a default, so that older exports stay readable. Unknown fields in JSON are ignored.
 
     kind: name of the reward model, such as TOPReward; None: unknown
-    network: ``class`` and, of an exported checkpoint, ``config`` and the number of weights of each part
-        (``parameters``)
+    network: ``class`` and, of an exported checkpoint, ``module`` (of the class), ``config``, and for each part its
+        class (``types``) and number of weights (``parameters``)
     video_dim, text_dim: widths D and Dt of embeddings that the model reads, or writes as an encoder; None: neither
     progress_bins: number C of progress bins of a discrete checkpoint; None: continuous
     trained_frames: most frames of a trajectory in training; None: unknown

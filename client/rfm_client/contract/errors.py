@@ -114,7 +114,12 @@ class ClientClosedError(RewardError, RuntimeError):
 
 
 class ServerError(RewardError):
-    """A failure of the server or of the connection to it; the sample may be valid."""
+    """A failure of the server or of the connection to it; the sample may be valid.
+
+    remedy: end of the message, for users of this library; empty: none
+    """
+
+    remedy = ""
 
 
 class ServerUnavailableError(ServerError):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 from urllib.parse import urljoin
 
 from rfm_client.contract import errors
@@ -22,6 +22,8 @@ OUT_OF_TIME = ("StatusCode.DEADLINE_EXCEEDED", "504")
 CANCELLED = ("StatusCode.CANCELLED", "499")
 BAD_GATEWAY = ("502",)  # a proxy's connection to the server ended or was refused
 DENIED = ("StatusCode.UNAUTHENTICATED", "StatusCode.PERMISSION_DENIED", "401", "403")
+
+_ServerError = TypeVar("_ServerError", bound=errors.ServerError)
 
 _REDIRECTS = range(300, 400)
 
@@ -58,6 +60,7 @@ _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # 
 _FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
 _START = "start the server there (rfm serve), or give the URL of one that runs"
 _NO_PROXY = "unset that variable, or add the server's host to no_proxy"
+_NAME = "give the checkpoint's name with model (--model)"
 _SHOW_KEY = "show the key that it wants with api_key (--api-key-file) or headers"
 _TRUST = {
     "[Hh]ostname|IP address mismatch": "use a host name in the URL that its certificate has",
@@ -170,18 +173,25 @@ def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
     """Return the error of a refused connection or request, with its remedy."""
     is_keyed = status in DENIED or RESTRICTED in message
     fitting = (remedy for words, remedy in _TRUST.items() if re.search(words, message))
-    remedy = _SHOW_KEY if is_keyed else next(fitting, None)
-    return errors.AccessDeniedError(f"{url}: access denied: {message}{f': {remedy}' if remedy else ''}")
+    remedy = _SHOW_KEY if is_keyed else next(fitting, "")
+    return _with_remedy(errors.AccessDeniedError, f"{url}: access denied: {message}", remedy)
 
 
 def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.ServerUnavailableError:
     """Return the error of a failed connection to the server, or to its proxy."""
     if proxy is None:
-        return errors.ServerUnavailableError(f"{url}: no connection: {reason}: {_START}")
-    return errors.ServerUnavailableError(f"{url}: no connection through {proxy}: {reason}: {_NO_PROXY}")
+        return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", _START)
+    fault = f"{url}: no connection through {proxy}: {reason}"
+    return _with_remedy(errors.ServerUnavailableError, fault, _NO_PROXY)
 
 
 def not_served(message: str, served: Collection[str]) -> errors.ModelNotFoundError:
     """Return the error of a missing model, with the names of the served models."""
     names = ", ".join(sorted(served)) or "none"
-    return errors.ModelNotFoundError(f"{message}; served: {names}: give the checkpoint's name with model (--model)")
+    return _with_remedy(errors.ModelNotFoundError, f"{message}; served: {names}", _NAME)
+
+
+def _with_remedy(kind: type[_ServerError], fault: str, remedy: str) -> _ServerError:
+    error = kind(f"{fault}: {remedy}" if remedy else fault)
+    error.remedy = remedy
+    return error
