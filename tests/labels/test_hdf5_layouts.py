@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -126,8 +127,8 @@ def test_red_and_blue_are_as_the_mark_of_robotwin_says_unless_the_caller_does(tm
     stored = pixels(SWAPPED["head_camera"])
     (line,) = (note for note in open_dataset(file).notes if note.startswith("channels: "))
     assert line == (
-        "channels: head_camera bgr (RoboTwin's JPEG files without its mark of RGB, from before September 2026, hold "
-        "blue as red; --channels rgb leaves them)"
+        "channels: head_camera bgr (RoboTwin's JPEG files without its mark of RGB, from before September 2026, store "
+        "red as blue; --channels rgb leaves them)"
     )
     told: Any
     for told in ("rgb", {"head_camera": "rgb"}):
@@ -204,7 +205,9 @@ def test_the_task_may_be_an_attribute(tmp_path: Path, attributes: Any) -> None:
 
 
 def test_a_file_without_a_task_says_where_it_was_sought(tmp_path: Path) -> None:
-    file = writers.write_aloha(tmp_path / "episode_0.hdf5", {"high": video(LENGTH)})
+    file = writers.write_aloha(tmp_path / "data/episode0.hdf5", {"high": video(LENGTH)})
+    writers.write_robotwin(tmp_path / "other", MARKED)
+    shutil.copytree(tmp_path / "other/instructions", tmp_path / "instructions")  # of another layout
     with pytest.raises(DatasetError) as refused:
         _ = open_dataset(file).episodes
     assert f"{file}: attribute or dataset language_instruction, instruction, task, language_raw, or " in str(
@@ -222,8 +225,12 @@ def test_several_sentences_in_a_file_are_no_task(tmp_path: Path) -> None:
         _ = open_dataset(file).episodes
 
 
-def test_the_task_of_robotwin_is_the_first_sentence_of_its_side_file(tmp_path: Path) -> None:
+def test_the_task_of_robotwin_is_the_first_sentence_of_its_side_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = writers.write_robotwin(tmp_path, MARKED)
+    monkeypatch.chdir(file.parent)
+    assert open_dataset(file.name).episodes[0].task == TASK
     assert "task: the first of 3 sentences in instructions/episode0.json" in open_dataset(file).notes
     (tmp_path / "instructions/episode0.json").write_text("[")
     with pytest.raises(DatasetError, match=r'episode0\.json: expected a JSON object \{"seen": \[sentences\]\}'):

@@ -124,7 +124,7 @@ class Hdf5Dataset(Dataset):
             return []
         forms = [f"{camera}{' (JPEG or PNG)' * (camera in self._firsts)}" for camera in self.cameras]
         notes = [f"layout: {self._layout.name}, cameras {', '.join(forms)}"]
-        told = instructions_of(self.file)
+        told = instructions_of(self.file) if self._layout is ROBOTWIN else []
         if told and self._tasks[0] == told[0] and self.given_task.text is None:
             notes.append(f"task: the first of {len(told)} sentences in instructions/{self.file.stem}.json")
         return notes
@@ -134,7 +134,7 @@ class Hdf5Dataset(Dataset):
         untold = [camera for camera in self._firsts if {"", camera}.isdisjoint(asked.channels)]
         swapped = [camera for camera in untold if camera in unmarked]
         if swapped:
-            why = "RoboTwin's JPEG files without its mark of RGB, from before September 2026, hold blue as red"
+            why = "RoboTwin's JPEG files without its mark of RGB, from before September 2026, store red as blue"
             return [f"channels: {', '.join(swapped)} bgr ({why}; --channels rgb leaves them)"]
         colours = self._layout.colours
         return [f"channels: {', '.join(untold)} {colours}"] if untold and colours else []

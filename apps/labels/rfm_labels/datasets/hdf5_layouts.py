@@ -139,7 +139,7 @@ def _trajectories(file: Path, opened: Any) -> dict[int, Any]:
 
 def task_places(file: Path) -> str:
     """Return where ``task_in`` looks, for messages."""
-    return f"attribute or dataset {', '.join(_TASK_NAMES)}, or {_instructions(file).name} in instructions/"
+    return f"attribute or dataset {', '.join(_TASK_NAMES)}, or RoboTwin's instructions/{file.stem}.json"
 
 
 def task_in(file: Path, opened: Any, episode: Any) -> Any:
@@ -147,7 +147,7 @@ def task_in(file: Path, opened: Any, episode: Any) -> Any:
     found = own_task_of(episode)
     for name in _TASK_NAMES:
         found = found or attribute(getattr(episode, "attrs", {}), name) or _one(texts_in(opened.get(name)))
-    return found or next(iter(instructions_of(file)), None)
+    return found or next(iter(instructions_of(file) if layout_of(opened) is ROBOTWIN else ()), None)
 
 
 def _one(texts: list[str] | None) -> Any:
@@ -158,15 +158,11 @@ def _one(texts: list[str] | None) -> Any:
 
 def instructions_of(file: Path) -> list[str]:
     """Return the sentences of RoboTwin's side file, those of training first; empty without it. Raises DatasetError."""
-    side = _instructions(file)
+    side = file.absolute().parent.parent / "instructions" / f"{file.stem}.json"
     if not side.is_file():
         return []
     try:
         told = json.loads(side.read_text(encoding="utf-8"))
         return [str(text) for kind in ("seen", "unseen") for text in told.get(kind, ())]
     except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
-        raise DatasetError.at(side, 'a JSON object {"seen": [sentences]}', error) from error
-
-
-def _instructions(file: Path) -> Path:
-    return file.parent.parent / "instructions" / f"{file.stem}.json"
+        raise DatasetError.at(side, 'a JSON object {"seen": [sentences]}', f"{error}: correct or remove it") from error
