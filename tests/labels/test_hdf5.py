@@ -51,11 +51,7 @@ def write(file: Path, attributes: Mapping[str, Any], *observations: Mapping[str,
             demo["actions"] = np.zeros((LENGTHS[index], 7))
             demo.create_group("obs")
             for name, value in of_demo.items():
-                if isinstance(value, list):  # of a file a step
-                    stored = demo.create_dataset(f"obs/{name}", (len(value),), dtype=h5py.vlen_dtype(np.uint8))
-                    stored[:] = value
-                else:
-                    demo[f"obs/{name}"] = value
+                demo[f"obs/{name}"] = value
     return file
 
 
@@ -202,7 +198,6 @@ def test_videos_are_turned_as_the_caller_says() -> None:
 
 
 FRAMES = np.random.default_rng(3).integers(0, 256, (5, 16, 24, 3), np.uint8)
-JPEG = np.frombuffer(b"\xff\xd8\xff\xe0" + bytes(60), np.uint8)
 
 
 def virtual(file: Path, *sources: tuple[str, str, int, slice]) -> None:
@@ -281,7 +276,6 @@ UNLIKE: dict[str, tuple[Any, str]] = {
         np.concatenate([FRAMES, FRAMES[..., :1]], -1),
         "uint8 [5, 16, 24, 4], RGBA: store its first three channels, if they are uint8 RGB",
     ),
-    "JPEG files": ([JPEG] * 5, "object [5], JPEG or PNG files: store decoded pictures as uint8 [T, H, W, 3]"),
     "depth": (FRAMES[..., 0].astype(np.uint16), f"uint16 [5, 16, 24], {NO_COLOURS}"),
 }
 

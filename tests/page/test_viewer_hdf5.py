@@ -18,6 +18,7 @@ import pytest
 
 from gateway_requests import failure
 from gateways import inside
+from hdf5_writers import decoded, jpeg, video, write_robomind
 from labelling import LEROBOT, BrightnessScorer
 from rfm_client.options import ConfigError
 from rfm_labels import LabelOptions, label, open_dataset, read_episode_labels
@@ -164,3 +165,19 @@ def test_cameras_that_are_not_labelled_have_no_faults(tmp_path: Path) -> None:
     with inside(dataset=(str(root),)) as gateway:
         assert gateway.get("/viewer/datasets/0").json()["unused"] == [None, "depth"]
         assert gateway.get("/viewer/datasets/0/faults").json() == {}
+
+
+def test_the_page_shows_an_episode_of_jpeg_files_with_its_labels(tmp_path: Path) -> None:
+    files = [jpeg(frame) for frame in video(LENGTH)]
+    file = write_robomind(tmp_path / "trajectory.hdf5", {"camera_top": files})
+    label(open_dataset(file), BrightnessScorer(), LabelOptions())
+    with inside(dataset=(str(file),)) as gateway:
+        (about,) = gateway.get("/viewer/datasets").json()["datasets"]
+        table = gateway.get("/viewer/datasets/0").json()
+        shown = gateway.get("/viewer/datasets/0/episodes/0/videos/0")
+    assert about["kind"] == "HDF5 (RoboMIND)"
+    assert about["labels"] == ["trajectory.rfm_rewards.hdf5/rfm"]
+    assert (table["cameras"], table["fps"]) == (["camera_top"], 30)
+    with av.open(io.BytesIO(shown.content)) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert np.abs(np.stack(frames).astype(int) - np.stack([decoded(each) for each in files])).mean() < 6

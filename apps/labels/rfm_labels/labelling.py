@@ -204,7 +204,9 @@ class Outputs:
         expected = "progress or signals for a dataset that is no HDF5 file"
         require("format", is_written or "hdf5" not in self.options.formats, expected, "hdf5")
         got = f"{self.dataset.kind if self.dataset else 'none'}: leave --in-place away"
-        require("in_place", is_written or not self.options.in_place, "an HDF5 file", got)
+        takes = isinstance(self.dataset, Hdf5Dataset) and self.dataset.takes_labels
+        expected = f"an HDF5 file{' of robomimic or LIBERO' * isinstance(self.dataset, Hdf5Dataset)}"
+        require("in_place", self.dataset is None or takes or not self.options.in_place, expected, got)
 
     @property
     def formats(self) -> Sequence[Format]:

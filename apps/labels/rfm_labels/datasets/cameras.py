@@ -77,14 +77,21 @@ class AskedCorrections:
         return asked
 
     def of_cameras(
-        self, cameras: Sequence[str], turns: Mapping[str, Orientation] | None = None
+        self,
+        cameras: Sequence[str],
+        turns: Mapping[str, Orientation] | None = None,
+        orders: Mapping[str, ChannelOrder] | None = None,
     ) -> Mapping[str, Correction]:
         """Return the correction of each camera whose frames change. Raises DatasetError for an unknown camera.
 
         turns: orientations of cameras for which the caller gives none
+        orders: orders of colours of cameras for which the caller gives none
         """
         orient = {**({} if "" in self.orient else turns or {}), **_known("orient", self.orient, cameras)}
-        channels = _known("channels", self.channels, cameras)
+        channels = {
+            **({} if "" in self.channels else orders or {}),
+            **_known("channels", self.channels, cameras),
+        }
         found = {camera: Correction.of(camera, orient, channels) for camera in cameras}
         return {camera: correction for camera, correction in found.items() if correction != Correction()}
 

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 files of robomimic and LIBERO: ``data/demo_<i>/obs/<camera>``. Needs ``rfm-labels[hdf5]``.
+"""HDF5 files of robomimic and LIBERO (``data/demo_<i>/obs/<camera>``), ALOHA, RoboTwin, RoboMIND and ManiSkill.
 
-The task is the demonstration's own (``ep_meta``), else LIBERO's sentence (``problem_info`` of ``data``), robomimic's
-(``env_args``), or the caller's. LIBERO stores its pictures upside down: they are turned, unless the caller says
-otherwise. robomimic's filter keys (``mask/train``) name some of the demonstrations.
+Needs ``rfm-labels[hdf5]``. An episode's name is ``demo_<i>`` in all layouts.
+
+In a file of robomimic or LIBERO the task is the demonstration's own (``ep_meta``), else LIBERO's sentence
+(``problem_info`` of ``data``), robomimic's (``env_args``), or the caller's. LIBERO stores its pictures upside down:
+they are turned, unless the caller says otherwise. robomimic's filter keys (``mask/train``) name some demonstrations.
 """
 
 from __future__ import annotations
@@ -12,10 +14,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-import numpy as np
-
 from rfm_client import RewardError, UInt8Array
-from rfm_client.frames import Orientation
+from rfm_client.frames import Orientation, Picture
 from rfm_client.options import first_names
 from rfm_labels.datasets.cameras import AskedCorrections
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
@@ -23,17 +23,26 @@ from rfm_labels.datasets.faults import DatasetError, FaultsError, require
 from rfm_labels.datasets.hdf5_contents import (
     DOCUMENTS,
     attribute,
-    demonstrations,
     filter_keys,
     fps_of,
     is_of_libero,
     lacking,
-    members_of,
     opened_hdf5,
     own_task_of,
     task_of,
     unread,
     unread_documents,
+)
+from rfm_labels.datasets.hdf5_layouts import ROBOMIMIC, ROBOTWIN, instructions_of, layout_of, task_in, task_places
+from rfm_labels.datasets.hdf5_pictures import (
+    EncodedFrames,
+    fault_of,
+    first_files,
+    form_of,
+    forms_in,
+    has_rgb_mark,
+    is_encoded,
+    pictures_in,
 )
 from rfm_labels.datasets.stored_files import digest_of
 
@@ -42,9 +51,6 @@ SUFFIXES = (".hdf5", ".h5")
 _FRAMES_AT_A_TIME = 64
 _LIBERO: Orientation = "flip-vertical"  # as in upstream's training data and evaluation
 _LIBERO_CAMERAS = ("agentview_rgb", "eye_in_hand_rgb")
-_NO_PICTURES = "robomimic's dataset_states_to_obs.py renders the pictures of a low-dimensional file"
-_LEAST_SIZE_PX = 8  # a smaller array of numbers is no picture
-_ENCODED = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG
 _ACTIONS = "actions"
 
 
@@ -70,39 +76,74 @@ class Hdf5Dataset(Dataset):
         self.source = file.name
         self.given_task = task
         with opened_hdf5(file) as opened:
-            demos = demonstrations(file, opened)
+            self._layout = layout_of(opened)
+            demos = self._layout.episodes(file, opened)
             self._demos = {index: name for index, (name, _) in demos.items()}
-            self._pictures = _pictures_in(demos)
-            self._forms = _forms_in(demos)
-            of_all = task_of(opened["data"].attrs)
-            self._tasks = {index: own_task_of(demo) or of_all for index, (_, demo) in demos.items()}
+            self._pictures = pictures_in(demos, self._layout.are_pictures)
+            self._forms = forms_in(demos)
+            attributes = (opened["data"] if self.takes_labels else opened).attrs
+            self._tasks = {index: self._task_in(opened, demo, attributes) for index, (_, demo) in demos.items()}
             self.filter_keys, notes = filter_keys(opened, self._demos)
             self.cameras, self.left_out = self._shared(list(demos))
             self._lengths = {
                 index: _lengths_of(demo, self.cameras or self._cameras_of(index)) for index, (_, demo) in demos.items()
             }
-            attributes = opened["data"].attrs
             self._broken = unread_documents(attributes)
-            notes = [*unread(opened, self._demos.values()), *notes, *_notes_on_lengths(demos, self._lengths)]
+            others = unread(opened, self._demos.values()) if self.takes_labels else []
+            notes = [*others, *notes, *_notes_on_lengths(demos, self._lengths)]
             notes += [
                 f"data: {name} is not a JSON object, so it states neither a task nor LIBERO" for name in self._broken
             ]
-            is_libero = is_of_libero(attributes)
-            self.fps = fps_of(attributes)
+            is_libero = self.takes_labels and is_of_libero(attributes)
+            self.fps = self._layout.fps or fps_of(attributes)
+            self._firsts = first_files(demos, self._pictures, self._layout.are_pictures)
             is_upright = "opencv" in str(attribute(attributes, "macros_image_convention"))  # robosuite then does
+        self.kind = "HDF5" if self.takes_labels else f"HDF5 ({self._layout.name})"
         self.numbers = list(demos)
         known = [camera for camera in self._pictures if any(camera in self._cameras_of(each) for each in self.numbers)]
         if not known:
             self.cameras_in(self.numbers)  # raises the reason
         defaults: dict[str, Orientation] = dict.fromkeys(known, _LIBERO) if is_libero and not is_upright else {}
-        self.corrections = corrections.of_cameras(known, defaults)
+        is_robotwin = self._layout is ROBOTWIN
+        unmarked = [camera for camera, file in self._firsts.items() if is_robotwin and not has_rgb_mark(file)]
+        self.corrections = corrections.of_cameras(known, defaults, dict.fromkeys(unmarked, "bgr"))
         untold = [camera for camera in known if {"", camera}.isdisjoint(corrections.orient)]
         self.notes = [*notes, *([] if is_upright else _notes(untold, is_libero))]
+        self.notes += self._notes_on_colours(corrections, unmarked) + self._notes_on_layout()
+
+    @property
+    def takes_labels(self) -> bool:
+        """True if labels can be written into the file: it is robomimic's or LIBERO's."""
+        return self._layout is ROBOMIMIC
+
+    def _task_in(self, opened: Any, demo: Any, attributes: Mapping[str, Any]) -> Any:
+        return own_task_of(demo) or task_of(attributes) if self.takes_labels else task_in(self.file, opened, demo)
+
+    def _notes_on_layout(self) -> list[str]:
+        if self.takes_labels:
+            return []
+        forms = [f"{camera}{' (JPEG or PNG)' * (camera in self._firsts)}" for camera in self.cameras]
+        notes = [f"layout: {self._layout.name}, cameras {', '.join(forms)}"]
+        told = instructions_of(self.file) if self._layout is ROBOTWIN else []
+        if told and self._tasks[0] == told[0] and self.given_task.text is None:
+            notes.append(f"task: the first of {len(told)} sentences in instructions/{self.file.stem}.json")
+        return notes
+
+    def _notes_on_colours(self, asked: AskedCorrections, unmarked: Sequence[str]) -> list[str]:
+        """A line on red and blue of the cameras for which the caller gives no order."""
+        untold = [camera for camera in self._firsts if {"", camera}.isdisjoint(asked.channels)]
+        swapped = [camera for camera in untold if camera in unmarked]
+        if swapped:
+            why = "RoboTwin's JPEG files without its mark of RGB, from before September 2026, store red as blue"
+            return [f"channels: {', '.join(swapped)} bgr ({why}; --channels rgb leaves them)"]
+        colours = self._layout.colours
+        return [f"channels: {', '.join(untold)} {colours}"] if untold and colours else []
 
     def read_episode(self, number: int) -> DatasetEpisode:
-        where = f"{self.file}: data/{self._demos[number]}"
+        where = f"{self.file}: {self._layout.group_of(self._demos[number])}".removesuffix(": ")
         told = " or ".join(name + " (no JSON object)" * (name in self._broken) for name in DOCUMENTS)
-        task = self.given_task.of(f"{where}: ep_meta, or data: {told}", self._tasks[number])
+        places = f"ep_meta, or data: {told}" if self.takes_labels else task_places(self.file)
+        task = self.given_task.of(f"{where}: {places}", self._tasks[number])
         lengths = self._lengths[number]
         got = ", ".join(f"{key} {length}" for key, length in lengths.items()) or self._forms[number]
         require(where, _one_length(lengths) > 0, "one length, above 0", got)
@@ -124,9 +165,10 @@ class Hdf5Dataset(Dataset):
         for number in numbers[:1] if whole else faulty:
             own = {name: reasons[number] for name, reasons in self._pictures.items() if reasons[number]}
             got = "; ".join(f"{name}: {reason}" for name, reason in (left_out if whole else own).items())
-            got = got or f"{self._forms[number]}: {_NO_PICTURES}"
+            got = got or f"{self._forms[number]}: {self._layout.without_pictures}"
             expected = "a camera as uint8 [T, H, W, 3]" + " in every demonstration" * whole
-            faults[number] = DatasetError.at(f"{self.file}: data/{self._demos[number]}/obs", expected, got)
+            where = f"{self.file}: {self._layout.cameras_at(self._demos[number])}"
+            faults[number] = DatasetError.at(where, expected, got)
         raise faults[numbers[0]] if whole else FaultsError.of(faults, numbers)
 
     def _shared(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
@@ -140,56 +182,50 @@ class Hdf5Dataset(Dataset):
         return [name for name, faults in self._pictures.items() if not faults[number]]
 
     def decoder(self, camera: str) -> str | None:
-        return None
+        return Picture.decoder() if camera in self._firsts else None
 
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        with opened_hdf5(self.file) as opened:
+            encoded = self._encoded(self._video(opened, episode, camera), episode, camera)
+            if encoded is not None:
+                return digest_of(encoded.files())
         return digest_of(frame.tobytes() for frame in self.stored_frames(episode, camera))
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
         with opened_hdf5(self.file) as opened:
-            return int(self._video(opened, episode, camera).nbytes)
+            video = self._video(opened, episode, camera)
+            encoded = self._encoded(video, episode, camera)
+            return int(video.nbytes) if encoded is None else encoded.check()
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         with opened_hdf5(self.file) as opened:
             video = self._video(opened, episode, camera)
+            if encoded := self._encoded(video, episode, camera):
+                yield from encoded.pixels()
+                return
             for start in range(0, episode.num_frames, _FRAMES_AT_A_TIME):
                 try:
                     yield from video[start : start + _FRAMES_AT_A_TIME]
                 except OSError as error:
                     raise DatasetError.at(self._where(episode, camera), "readable frames", error) from error
 
+    def _encoded(self, video: Any, episode: DatasetEpisode, camera: str) -> EncodedFrames | None:
+        """The frames as files; None: they are pixels."""
+        is_file = is_encoded(video, self._layout.are_pictures)
+        return EncodedFrames(video, self._where(episode, camera)) if is_file else None
+
     def _video(self, opened: Any, episode: DatasetEpisode, camera: str) -> Any:
-        video = opened.get(f"data/{episode.name}/obs/{camera}")
-        is_video = video is not None and not _fault(video) and len(video) == episode.num_frames
-        got = "none" if video is None else _form(video)
+        video = opened.get(self._layout.path_of(episode.name, camera))
+        is_whole = video is not None and not fault_of(video, self._layout.are_pictures)
+        is_video = is_whole and len(video) == episode.num_frames
+        got = "none" if video is None else form_of(video)
         require(self._where(episode, camera), is_video, f"uint8 [{episode.num_frames}, H, W, 3]", got)
         lacks = lacking(video)
         require(self._where(episode, camera), not lacks, f"{lacks}, a source of this virtual dataset", "none")
         return video
 
     def _where(self, episode: DatasetEpisode, camera: str) -> str:
-        return f"{self.file}: data/{episode.name}/obs/{camera}"
-
-
-def _pictures_in(demos: Mapping[int, tuple[str, Any]]) -> Mapping[str, Mapping[int, str]]:
-    """Faults by picture and demonstration; "" for no fault."""
-    observations = {number: (name, _observations(demo)) for number, (name, demo) in demos.items()}
-    found = {name: None for _, stored in observations.values() for name, value in stored.items() if _is_picture(value)}
-    return {
-        picture: {
-            number: _fault(stored[picture]) if stored.get(picture) is not None else _missing(picture, demos[number])
-            for number, (name, stored) in observations.items()
-        }
-        for picture in found
-    }
-
-
-def _forms_in(demos: Mapping[int, tuple[str, Any]]) -> Mapping[int, str]:
-    """Descriptions of the observations by demonstration, for messages."""
-    found = {number: _observations(demo) for number, (_, demo) in demos.items()}
-    return {
-        n: ", ".join(f"{name} {_form(value)}" for name, value in each.items()) or "none" for n, each in found.items()
-    }
+        return f"{self.file}: {self._layout.path_of(episode.name, camera)}"
 
 
 def _lengths_of(demo: Any, cameras: Sequence[str]) -> Mapping[str, int]:
@@ -222,72 +258,6 @@ def _notes_on_lengths(demos: Mapping[int, tuple[str, Any]], lengths: Mapping[int
     every = "each observation gets a label"
     notes = [f"lengths: {first_names(longer)}: one observation more than actions: {every}"] if longer else []
     return notes + ([f"lengths: num_samples differs: {first_names(others)}: {every}"] if others else [])
-
-
-def _missing(picture: str, demo: tuple[str, Any]) -> str:
-    """Why a demonstration lacks a picture."""
-    name, stored = demo
-    if stored is None:
-        return f"{name} is a broken link"
-    return f"{name} has a broken link or no array" if picture in _observations(stored) else f"missing in {name}"
-
-
-def _observations(demo: Any) -> Mapping[str, Any]:
-    observations: Any = demo.get("obs") if hasattr(demo, "keys") else None
-    return {name: value if _is_known(value) else None for name, value in members_of(observations).items()}
-
-
-def _is_known(value: Any) -> bool:
-    """True for a group, and an array of numbers or texts that NumPy knows."""
-    try:
-        return hasattr(value, "keys") or (getattr(value, "shape", None) is not None and bool(value.dtype.kind))
-    except (TypeError, OSError, RuntimeError):
-        return False
-
-
-def _fault(value: Any) -> str:
-    """Why an observation is not a camera's frames; "": it is."""
-    if not hasattr(value, "shape"):
-        return "a group: expected its pictures one level up"
-    shape = value.shape if len(value.shape) == 4 else (0, 0, 0, 0)
-    if _is_encoded(value):
-        what = "JPEG or PNG files: store decoded pictures as uint8 [T, H, W, 3]"
-    elif shape[3] == 3:
-        what = (
-            "no pixels" if 0 in shape[1:] else "" if value.dtype == np.uint8 else "not uint8: store colours as 0..255"
-        )
-    elif shape[3] == 4:
-        what = "RGBA: store its first three channels, if they are uint8 RGB"
-    elif shape[1] in (3, 4):
-        what = "channels first: store it as uint8 [T, H, W, 3]"
-    else:
-        what = "a depth map, a mask or another form: no colours as uint8 [T, H, W, 3]"
-    return what and f"{_form(value)}, {what}"
-
-
-def _form(value: Any) -> str:
-    if value is None:
-        return "(unreadable)"
-    return f"{value.dtype} {list(value.shape)}" if hasattr(value, "shape") else "(a group)"
-
-
-def _is_picture(value: Any) -> bool:
-    if value is None:  # it may have been one
-        return True
-    if not hasattr(value, "shape"):
-        return bool(value.visititems(lambda _, each: (hasattr(each, "shape") and _is_picture(each)) or None))
-    if len(value.shape) == 3:
-        return all(size >= _LEAST_SIZE_PX for size in value.shape[1:])
-    return len(value.shape) > 3 or _is_encoded(value)
-
-
-def _is_encoded(value: Any) -> bool:
-    if len(value.shape) not in (1, 2) or not value.shape[0] or value.dtype.kind not in "OSVu":
-        return False
-    try:
-        return bool(np.asarray(value[0]).tobytes().startswith(_ENCODED))
-    except (OSError, RuntimeError):  # refused when read
-        return False
 
 
 def _notes(untold: Sequence[str], is_libero: bool) -> Sequence[str]:

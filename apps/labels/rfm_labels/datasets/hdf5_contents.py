@@ -26,26 +26,6 @@ _DEMO = re.compile(r"demo_(\d+)")
 _SENTENCES = ("language_instruction", "language", "lang")  # keys of the task in problem_info and env_args
 _DEFAULT_FPS = 20.0  # robosuite's
 _BLOCKS = "%b"  # in a source's name: HDF5 then counts only the sources that exist
-_GUIDE = 'see "HDF5 files in other layouts" in docs/guides/label_a_dataset.md'
-_ENCODED = "with JPEG files as pictures"
-_ALOHA = (
-    "ALOHA's layout, one episode per file (observations/images): convert its folder to LeRobot with openpi's "
-    "examples/aloha_real/convert_aloha_data_to_lerobot.py"
-)
-_ROBOMIND = (
-    f"RoboMIND's layout, one episode per file (observations/rgb_images) {_ENCODED}: convert its folder to LeRobot with "
-    f"robomind2lerobot of https://github.com/Tavish9/any4lerobot, or {_GUIDE}"
-)
-_ROBOTWIN = (
-    f"RoboTwin's layout, one episode per file (observation/CAMERA/rgb) {_ENCODED}: label the folder of videos beside "
-    f"it (video/), which shows the head camera, or {_GUIDE}"
-)
-_MANISKILL = (
-    "ManiSkill's layout (traj_0, traj_1 and so on): link its pictures (obs/sensor_data/CAMERA/rgb) into "
-    f"data/demo_<i>/obs/CAMERA, {_GUIDE}. A file without pictures gets them from python -m "
-    "mani_skill.trajectory.replay_trajectory -o rgb --save-traj"
-)
-_TRAJECTORY = re.compile(r"traj_\d+")
 
 
 @contextmanager
@@ -74,10 +54,8 @@ def opened_hdf5(file: Path) -> Iterator[Any]:
 def demonstrations(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
     """Return the names and groups of demonstrations by number; None for a group that cannot be opened.
 
-    Raises DatasetError for another layout, no demonstration, or two demonstrations with one number.
+    Raises DatasetError for no demonstration, or two demonstrations with one number.
     """
-    layout = foreign_layout(opened)
-    require(file, layout is None, "data/demo_0/obs/<camera>", layout)
     group = opened.get("data")
     members = members_of(group)
     demos: dict[int, tuple[str, Any]] = {}
@@ -107,7 +85,7 @@ def filter_keys(opened: Any, names: Mapping[int, str]) -> tuple[Mapping[str, Seq
     found: dict[str, Sequence[int]] = {}
     notes = ["left out: mask: expected a group"] if "mask" in opened and not hasattr(group, "keys") else []
     for key, stored in members_of(group).items():
-        told = _texts(stored)
+        told = texts_in(stored)
         known = [numbers.get(name, _missing_number(name, names)) for name in told or ()]
         if told is not None and None not in known:
             found[key] = sorted(number for number in known if number is not None)
@@ -127,8 +105,8 @@ def unread(opened: Any, names: Iterable[str]) -> list[str]:
     return [f"left out: {first_names(others)}: demonstrations are data/demo_<number>"] if others else []
 
 
-def _texts(stored: Any) -> list[str] | None:
-    """The texts in a dataset; None if it holds something else or cannot be read."""
+def texts_in(stored: Any) -> list[str] | None:
+    """Return the texts in a dataset; None if it holds something else or cannot be read."""
     if getattr(stored, "shape", None) is None:
         return None
     try:
@@ -260,25 +238,3 @@ def _places(dataset: Any, name: str) -> list[Path]:
     prefixes = os.environ.get("HDF5_VDS_PREFIX", "").replace("${ORIGIN}", str(file.parent)).split(":")
     folders = [*map(Path, filter(None, prefixes)), file.parent, Path(), file.resolve().parent]
     return [folder / each for folder in folders for each in (name, Path(name).name)]
-
-
-def foreign_layout(opened: Any) -> str | None:
-    """Return the name of an open file's layout, with a remedy; None if it is unknown or has a reader."""
-    for group, layout in (("observations/rgb_images", _ROBOMIND), ("observations/images", _ALOHA)):
-        if group in opened:
-            return layout
-    cameras = opened.get("observation")
-    if hasattr(cameras, "keys") and any(f"{camera}/rgb" in cameras for camera in cameras):
-        return _ROBOTWIN
-    return _MANISKILL if "data" not in opened and any(map(_TRAJECTORY.fullmatch, opened)) else None
-
-
-def foreign_layout_of(file: Path) -> str | None:
-    """Return ``foreign_layout`` of a file; None also without h5py or for an unreadable file."""
-    try:
-        import h5py
-
-        with h5py.File(file, "r") as opened:
-            return foreign_layout(opened)
-    except (ImportError, OSError, RuntimeError):
-        return None

@@ -24,7 +24,6 @@ from rfm_labels.datasets.folders import (
     is_picture,
 )
 from rfm_labels.datasets.hdf5 import SUFFIXES, Hdf5Dataset, is_hdf5
-from rfm_labels.datasets.hdf5_contents import foreign_layout_of
 from rfm_labels.datasets.lerobot import LeRobotDataset
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.lerobot_meta import INFO_FILE, Info
@@ -233,10 +232,9 @@ def _unread(path: Path) -> str | None:
     if path.is_file():
         is_video = path.suffix.lower() in _VIDEO_SUFFIXES
         return f"a video: label its folder, with {_GIVE_TASK} or with tasks.csv in it" if is_video else None
-    files = hdf5_files(path)
-    if files:
+    if hdf5_files(path):
         remedy = "rfm-client label takes the folder, open_dataset each file"
-        return foreign_layout_of(files[0]) or f"a folder of HDF5 files, each a dataset of its own: {remedy}"
+        return f"a folder of HDF5 files, each a dataset of its own: {remedy}"
     if pictures := [file for file in path.iterdir() if _is_frame(file)]:
         moved = f"mkdir {path}/0 && mv {path}/*{pictures[0].suffix} {path}/0"
         return f"pictures outside of the folder of an episode: {moved}"

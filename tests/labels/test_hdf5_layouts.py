@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: MIT
+"""HDF5 files of one episode: cameras, files of frames, colours, tasks, labels."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import hdf5_writers as writers
+from client_commands import invoke
+from hdf5_writers import RGB_MARK, TASK, decoded, jpeg, video
+from labelling import BrightnessScorer
+from rfm_client import RewardClient, Trajectory, UInt8Array
+from rfm_labels import ClientScorer, Dataset, DatasetError, LabelOptions, label, open_dataset
+from servers import Endpoints
+from tolerances import TOLERANCE
+
+LENGTH = 6
+FILES = {name: [jpeg(frame) for frame in video(LENGTH, seed)] for seed, name in enumerate(("high", "left", "right"))}
+SWAPPED = {name: [jpeg(frame[..., ::-1]) for frame in video(LENGTH, 0)] for name in ("head_camera",)}
+MARKED = {name: [jpeg(frame, RGB_MARK) for frame in video(LENGTH, 0)] for name in ("head_camera",)}
+EMBODIMENTS = {
+    "h5_franka_3rgb": ("camera_left", "camera_right", "camera_top"),
+    "h5_agilex_3rgb": ("camera_front", "camera_left_wrist", "camera_right_wrist"),
+    "h5_tienkung_gello_1rgb": ("camera_top",),
+}
+
+Expected = dict[str, UInt8Array]
+Writer = Callable[[Path], tuple[Path, Expected]]
+
+
+def pixels(files: list[bytes]) -> UInt8Array:
+    return np.stack([decoded(each) for each in files])
+
+
+def aloha(root: Path) -> tuple[Path, Expected]:
+    raw = video(LENGTH, 5)
+    file = writers.write_aloha(root / "episode_0.hdf5", {**FILES, "raw": raw}, language_instruction=TASK)
+    return file, {**{name: pixels(files) for name, files in FILES.items()}, "raw": raw}
+
+
+def robotwin_before(root: Path) -> tuple[Path, Expected]:
+    file = writers.write_robotwin(root, SWAPPED)
+    return file, {name: pixels(files)[..., ::-1] for name, files in SWAPPED.items()}
+
+
+def robotwin_since(root: Path) -> tuple[Path, Expected]:
+    return writers.write_robotwin(root, MARKED), {name: pixels(files) for name, files in MARKED.items()}
+
+
+def robomind(embodiment: str) -> Writer:
+    def write(root: Path) -> tuple[Path, Expected]:
+        cameras = dict(zip(EMBODIMENTS[embodiment], FILES.values(), strict=False))
+        expected = {name: pixels(files) for name, files in cameras.items()}
+        first = EMBODIMENTS[embodiment][0]
+        raw = expected[first][2][..., ::-1].tobytes()  # pixels as OpenCV has them
+        mixed = {**cameras, first: [*cameras[first][:2], raw, *cameras[first][3:]]}
+        return writers.write_robomind(root / embodiment / "success_episodes/1/data/trajectory.hdf5", mixed), expected
+
+    return write
+
+
+def maniskill(root: Path) -> tuple[Path, Expected]:
+    expected = {"base_camera": video(LENGTH, 1), "hand_camera": video(LENGTH, 2)}
+    return writers.write_maniskill(root / "trajectory.rgb.pd_ee_delta_pose.physx_cpu.h5", {0: expected}), expected
+
+
+WRITERS: dict[str, Writer] = {
+    "ALOHA": aloha,
+    "RoboTwin": robotwin_before,
+    "RoboTwin since September 2026": robotwin_since,
+    **{f"RoboMIND {name}": robomind(name) for name in EMBODIMENTS},
+    "ManiSkill": maniskill,
+}
+
+
+def frames_of(dataset: Dataset, camera: str) -> UInt8Array:
+    return np.stack(list(dataset.frames(dataset.episodes[0], camera)))
+
+
+def opened(file: Path) -> Dataset:
+    return open_dataset(file, task=TASK if "trajectory.rgb" in file.name else None)
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_a_file_gives_its_cameras_task_and_frames(tmp_path: Path, write: Writer) -> None:
+    file, expected = write(tmp_path)
+    dataset = opened(file)
+    assert set(dataset.cameras) == set(expected)
+    (episode,) = dataset.episodes
+    assert (episode.index, episode.name, episode.task, episode.num_frames) == (0, "demo_0", TASK, LENGTH)
+    (line,) = (note for note in dataset.notes if note.startswith("layout: "))
+    assert all(camera in line for camera in expected)
+    for camera, frames in expected.items():
+        assert dataset.check(episode, camera) > 0
+        np.testing.assert_array_equal(frames_of(dataset, camera), frames)
+
+
+@pytest.mark.triton
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_labels_are_what_the_client_says_about_frames_that_pillow_decodes(
+    tmp_path: Path, client: RewardClient, write: Writer
+) -> None:
+    file, expected = write(tmp_path)
+    report = label(opened(file), ClientScorer(client), LabelOptions(mode="whole", fuse="mean"))
+    assert report.files == [file.with_name(f"{file.stem}.rfm_rewards.hdf5")]
+    of_cameras = {
+        camera: client.progress(Trajectory(frames=np.ascontiguousarray(frames), task=TASK)).progress
+        for camera, frames in expected.items()
+    }
+    with h5py.File(report.files[0]) as stored:
+        fused = stored["data/demo_0/rfm_progress"][()]
+        np.testing.assert_allclose(fused, np.mean(list(of_cameras.values()), axis=0), rtol=0, atol=TOLERANCE)
+        for camera, progress in of_cameras.items() if len(expected) > 1 else ():
+            told = stored[f"data/demo_0/rfm_progress.{camera}"][()]
+            np.testing.assert_allclose(told, progress, rtol=0, atol=TOLERANCE)
+
+
+def test_red_and_blue_are_as_the_mark_of_robotwin_says_unless_the_caller_does(tmp_path: Path) -> None:
+    file = writers.write_robotwin(tmp_path, SWAPPED)
+    stored = pixels(SWAPPED["head_camera"])
+    (line,) = (note for note in open_dataset(file).notes if note.startswith("channels: "))
+    assert line == (
+        "channels: head_camera bgr (RoboTwin's JPEG files without its mark of RGB, from before September 2026, store "
+        "red as blue; --channels rgb leaves them)"
+    )
+    told: Any
+    for told in ("rgb", {"head_camera": "rgb"}):
+        dataset = open_dataset(file, channels=told)
+        assert not any(note.startswith("channels: ") for note in dataset.notes)
+        np.testing.assert_array_equal(frames_of(dataset, "head_camera"), stored)
+
+
+def test_files_of_a_camera_with_and_without_the_mark_are_refused(tmp_path: Path) -> None:
+    file = writers.write_robotwin(tmp_path, {"head_camera": [*MARKED["head_camera"][:3], *SWAPPED["head_camera"][3:]]})
+    dataset = open_dataset(file)
+    with pytest.raises(DatasetError, match="observation/head_camera/rgb: expected JPEG files all with RoboTwin's mark"):
+        dataset.check(dataset.episodes[0], "head_camera")
+
+
+@pytest.mark.parametrize("layout", ["ALOHA", "RoboMIND"])
+def test_a_command_swaps_red_and_blue_of_one_camera(tmp_path: Path, layout: str) -> None:
+    is_aloha = layout == "ALOHA"
+    write = writers.write_aloha if is_aloha else writers.write_robomind
+    file = write(tmp_path / "episode_0.hdf5", {"high": FILES["high"], "left": FILES["left"]})
+    dataset = open_dataset(file, task=TASK if is_aloha else None, channels={"left": "bgr"})
+    np.testing.assert_array_equal(frames_of(dataset, "left"), pixels(FILES["left"])[..., ::-1])
+    np.testing.assert_array_equal(frames_of(dataset, "high"), pixels(FILES["high"]))
+    (line,) = (note for note in dataset.notes if note.startswith("channels: "))
+    assert line.startswith("channels: high read as JPEG files say; some recorders store blue in the place of red")
+
+
+BROKEN: dict[str, tuple[bytes, str]] = {
+    "cut off": (FILES["left"][3][:-100], "expected a whole JPEG file, got one without an end"),
+    "no picture": (b"no picture", "expected an image, got "),
+    "empty": (b"", "expected an image, got "),
+}
+
+
+@pytest.mark.parametrize(("stored", "message"), BROKEN.values(), ids=BROKEN)
+@pytest.mark.parametrize("layout", ["ALOHA", "RoboTwin", "RoboMIND"])
+def test_broken_bytes_are_an_error_with_file_camera_and_frame(
+    tmp_path: Path, layout: str, stored: bytes, message: str
+) -> None:
+    files = {"high": FILES["high"], "left": [*FILES["left"][:3], stored, *FILES["left"][4:]]}
+    if layout == "ALOHA":
+        file, path = writers.write_aloha(tmp_path / "episode_0.hdf5", files, task=TASK), "observations/images/left"
+    elif layout == "RoboTwin":
+        file, path = writers.write_robotwin(tmp_path, files), "observation/left/rgb"
+    else:
+        file, path = writers.write_robomind(tmp_path / "t.hdf5", files), "observations/rgb_images/left"
+    dataset = open_dataset(file)
+    for read in (lambda: dataset.check(dataset.episodes[0], "left"), lambda: frames_of(dataset, "left")):
+        with pytest.raises(DatasetError) as refused:
+            read()
+        assert str(refused.value).startswith(f"{file}: {path}: frame 3: {message}")
+    with pytest.raises(DatasetError, match=f"{path}: frame 3"):
+        label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path))
+
+
+def test_a_first_frame_that_is_broken_does_not_hide_its_camera(tmp_path: Path) -> None:
+    files = {"high": FILES["high"], "left": [b"no picture", *FILES["left"][1:]]}
+    dataset = open_dataset(writers.write_robomind(tmp_path / "t.hdf5", files))
+    with pytest.raises(DatasetError, match="left: frame 0: expected an image"):
+        label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path))
+
+
+def test_a_frame_of_another_size_is_refused(tmp_path: Path) -> None:
+    files = {"high": [*FILES["high"][:4], jpeg(video(1)[0, :40]), FILES["high"][5]]}
+    dataset = open_dataset(writers.write_robomind(tmp_path / "t.hdf5", files))
+    with pytest.raises(DatasetError, match="high: frame 4: expected a frame of 48 x 64 pixels, as the first, got 40 x"):
+        frames_of(dataset, "high")
+
+
+@pytest.mark.parametrize("attributes", [{"task": TASK}, {"instruction": np.bytes_(TASK)}, {"language": TASK}])
+def test_the_task_may_be_an_attribute(tmp_path: Path, attributes: Any) -> None:
+    file = writers.write_aloha(tmp_path / "episode_0.hdf5", {"high": video(LENGTH)}, **attributes)
+    assert open_dataset(file).episodes[0].task == TASK
+
+
+def test_a_file_without_a_task_says_where_it_was_sought(tmp_path: Path) -> None:
+    file = writers.write_aloha(tmp_path / "data/episode0.hdf5", {"high": video(LENGTH)})
+    writers.write_robotwin(tmp_path / "other", MARKED)
+    shutil.copytree(tmp_path / "other/instructions", tmp_path / "instructions")  # of another layout
+    with pytest.raises(DatasetError) as refused:
+        _ = open_dataset(file).episodes
+    assert f"{file}: attribute or dataset language_instruction, instruction, task, language_raw, or " in str(
+        refused.value
+    )
+    assert str(refused.value).splitlines()[0].endswith('got none: add --task "SENTENCE"')
+    assert open_dataset(file, task=TASK).episodes[0].task == TASK
+
+
+def test_several_sentences_in_a_file_are_no_task(tmp_path: Path) -> None:
+    file = writers.write_robomind(tmp_path / "t.hdf5", {"high": FILES["high"]}, task=None)
+    with h5py.File(file, "r+") as stored:
+        stored["language_raw"] = np.array([TASK, "another"], h5py.string_dtype())
+    with pytest.raises(DatasetError, match=r"expected a task as a sentence, got .*another"):
+        _ = open_dataset(file).episodes
+
+
+def test_the_task_of_robotwin_is_the_first_sentence_of_its_side_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = writers.write_robotwin(tmp_path, MARKED)
+    monkeypatch.chdir(file.parent)
+    assert open_dataset(file.name).episodes[0].task == TASK
+    assert "task: the first of 3 sentences in instructions/episode0.json" in open_dataset(file).notes
+    (tmp_path / "instructions/episode0.json").write_text("[")
+    with pytest.raises(DatasetError, match=r'episode0\.json: expected a JSON object \{"seen": \[sentences\]\}'):
+        open_dataset(file)
+
+
+def test_trajectories_of_maniskill_keep_their_numbers(tmp_path: Path) -> None:
+    frames = {3: {"base_camera": video(LENGTH, 3)}, 12: {"base_camera": video(LENGTH - 2, 4)}}
+    dataset = open_dataset(writers.write_maniskill(tmp_path / "trajectory.h5", frames), task=TASK)
+    assert [(e.index, e.name, e.num_frames) for e in dataset.episodes] == [(3, "demo_3", 6), (12, "demo_12", 4)]
+    assert "lengths: demo_3, demo_12: one observation more than actions: each observation gets a label" in dataset.notes
+
+
+def test_a_file_of_maniskill_without_pictures_says_how_to_add_them(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError) as refused:
+        open_dataset(writers.write_maniskill(tmp_path / "trajectory.h5", {0: {"c": video(2)[:, :4, :4, 0]}}), task=TASK)
+    assert "traj_0/obs/sensor_data: expected a camera" in str(refused.value)
+
+
+def test_labels_are_not_written_into_a_file_of_another_program(tmp_path: Path) -> None:
+    file = writers.write_robomind(tmp_path / "t.hdf5", {"high": FILES["high"]})
+    with pytest.raises(DatasetError) as refused:
+        label(open_dataset(file), BrightnessScorer(), LabelOptions(in_place=True))
+    assert str(refused.value) == (
+        "in_place: expected an HDF5 file of robomimic or LIBERO, got HDF5 (RoboMIND): leave --in-place away"
+    )
+
+
+def test_robomimics_layout_may_hold_files_too(tmp_path: Path) -> None:
+    file = tmp_path / "demos.hdf5"
+    with h5py.File(file, "w") as stored:
+        frames = stored.create_dataset("data/demo_0/obs/front", (LENGTH,), dtype=h5py.vlen_dtype(np.uint8))
+        frames[:] = [np.frombuffer(each, np.uint8) for each in FILES["high"]]
+    np.testing.assert_array_equal(frames_of(open_dataset(file, task=TASK), "front"), pixels(FILES["high"]))
+
+
+@pytest.mark.triton
+def test_a_folder_of_episodes_is_labelled_file_by_file(tmp_path: Path, demo_server: Endpoints) -> None:
+    for number in range(2):
+        writers.write_aloha(tmp_path / f"episode_{number}.hdf5", {"high": FILES["high"]}, task=TASK)
+    result = invoke("label", tmp_path, "--no-picture", "--mode", "whole", "--url", demo_server.grpc_url)
+    assert result.exit_code == 0, result.output
+    assert "layout: ALOHA, cameras high (JPEG or PNG)" in result.output
+    assert {file.name for file in tmp_path.glob("*_rewards.hdf5")} == {
+        f"episode_{n}.rfm_rewards.hdf5" for n in range(2)
+    }
