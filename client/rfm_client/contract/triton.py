@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 from urllib.parse import urljoin
 
 from rfm_client.contract import errors
+from rfm_client.contract.names import frames_name
 from rfm_client.contract.wire import NUM_FRAMES, SECOND_FRAMES
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
@@ -181,7 +182,9 @@ def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.Serve
     return errors.ServerUnavailableError(f"{url}: no connection through {proxy}: {reason}: {_NO_PROXY}")
 
 
-def not_served(message: str, served: Collection[str]) -> errors.ModelNotFoundError:
-    """Return the error of a missing model, with the names of the served models."""
-    names = ", ".join(sorted(served)) or "none"
-    return errors.ModelNotFoundError(f"{message}; served: {names}: give the checkpoint's name with model (--model)")
+def not_served(model: str, message: str, served: Collection[str]) -> errors.ModelNotFoundError:
+    """Return the error of a missing model, with the names of the served models and the remedy."""
+    names, remedy = ", ".join(sorted(served)) or "none", "give the checkpoint's name with model (--model)"
+    if frames_name(model) in served:
+        remedy = "this checkpoint takes no embeddings: give frames, and ask model_info(frames=True)"
+    return errors.ModelNotFoundError(f"{message}; served: {names}: {remedy}")
