@@ -126,12 +126,14 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     folder = repository / scorer / str(number) / CHECKPOINT_FOLDER
     family = families.choose(folder, config.parameters[FAMILY_PARAMETER].string_value or None)
     checkpoint = family.load(folder, Options())
+    description = described(checkpoint, origin)
+    _check_weights(folder, description.weights, settings)
     settings = with_batch_size(settings, checkpoint, _nobody)
     encoders = repository / encoder_name(settings.name) / str(number)
     of_encoders = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
     of_encoders = None if of_encoders is None else described_encoders(of_encoders, origin)
     version = Version(number, settings, num_gpus(settings), family.name)
-    models = generated_models(described(checkpoint, origin), of_encoders, version)
+    models = generated_models(description, of_encoders, version)
     differences = []
     for path, content in generated_files(models, repository).items():
         if not (repository / path).is_file():
@@ -139,6 +141,13 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
         elif (repository / path).read_bytes() != content:
             differences.append(f"{repository / path}: differs from what `rfm export` generates")
     return differences
+
+
+def _check_weights(folder: Path, weights: str | None, settings: ExportConfig) -> None:
+    """Raise ExportError if the settings name other weights than the export has: an export would write them anew."""
+    if settings.weights not in (None, weights):
+        remedy = "leave out --weights, or export again"
+        raise ExportError.at(folder, f"weights in {settings.weights}", weights or "full ones", remedy)
 
 
 def _read_config(repository: Path, name: str) -> Any:

@@ -182,7 +182,7 @@ def test_a_client_that_is_not_closed_does_not_keep_the_interpreter(served: Serve
 from rfm_client import RewardClient
 assert RewardClient({served.url("grpc")!r}, model={MODEL!r}).is_ready()
 client = RewardClient({served.url("http")!r}, model={MODEL!r})
-assert client.is_ready()
+client.wait_ready(60)  # in a worker thread, too
 """
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")

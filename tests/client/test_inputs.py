@@ -136,6 +136,13 @@ def test_steps_beyond_the_episode_s_ends_are_left_out() -> None:
     np.testing.assert_array_equal(as_trajectory(episode).positions, FRAMES[2:])
 
 
+@pytest.mark.parametrize("key", ["frames", "video_embeddings"])
+def test_padding_is_left_out_under_our_own_keys_too(key: str) -> None:
+    values = FRAMES if key == "frames" else np.ones((4, 5), np.float32) * np.arange(4)[:, None]
+    episode = {key: values, f"{key}_is_pad": [False, False, True, True]}
+    np.testing.assert_array_equal(as_trajectory(episode).positions, values[:2])
+
+
 def test_embeddings_are_read_from_a_dict() -> None:
     episode = {"video_embeddings": torch.ones(3, 5, requires_grad=True), "text_embedding": torch.ones(2).bfloat16()}
     trajectory = as_trajectory(episode)
@@ -207,6 +214,11 @@ BAD_EPISODES: dict[str, tuple[Any, str | None, str]] = {
         {TOP: FRAMES, f"{TOP}_is_pad": np.array([True])},
         None,
         f"{TOP}_is_pad: expected bool [4], got bool [1]",
+    ),
+    "marks of another length for our own frames": (
+        {"frames": FRAMES, "frames_is_pad": np.array([True])},
+        None,
+        "frames_is_pad: expected bool [4], got bool [1]",
     ),
     "nothing but padding": (
         {TOP: FRAMES, f"{TOP}_is_pad": np.ones(4, bool)},

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from rfm.vlm import nf4
 from rfm.vlm.rounded import Int8Linear, Nf4Linear, RoundedLinear, fit, rounded
 from rfm_client import ModelInfo, ProgressSample
 from rfm_commands.engine_scorer import EngineScorer
+from rfm_export.errors import ExportError
 from rfm_export.pbtxt import parse
 from rfm_export.verify import device_for
 from vlm import PLAIN, assert_close, video
@@ -148,6 +150,9 @@ def test_an_export_holds_the_rounded_weights_and_says_how_far_scores_are(tmp_pat
     assert line.endswith(told)
     assert info.network["parameters"] == numbers_of(load_engine(name))
     assert rfm_export.check(tmp_path, settings) == []
+    (other,) = {*KINDS} - {kind}
+    with pytest.raises(ExportError, match=rf"expected weights in {other}, got {kind}; leave out --weights"):
+        rfm_export.check(tmp_path, replace(settings, weights=other))
     table = json.loads((folder / "1" / "checkpoint" / "provenance.json").read_text())
     (row,) = [each for each in table if each["name"] == "weights"]
     assert row["value"] == f"{kind}: rounded, so the scores are not the full checkpoint's"

@@ -260,6 +260,7 @@ def test_what_the_run_did_not_train_is_told(output: Path) -> None:
 
 WRONG = {
     "a format": (["--format", "csv"], "'--format': expected one of progress, signals, hdf5, got 'csv'"),
+    "a rule": (["--sampling", "first"], "Invalid value for '--sampling': 'first' is not one of 'linspace_trunc', "),
     "an option that contradicts": (["--shard", "3/3"], "'--shard': expected i/n with i from 0 to n - 1, got 3/3"),
     "an orientation": (["--orient", "up"], "Invalid value for '--orient': expected one of none, rotate180, "),
     "an order of colours": (

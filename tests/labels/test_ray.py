@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,9 +14,11 @@ import pytest
 
 from labelling import FEW, LEROBOT, BrightnessScorer, picky, slow, without_cost
 from rfm_client import ProgressResult, RewardError
+from rfm_client.command_line import ServerOptions
 from rfm_labels import LabelOptions, RayOptions, Scorer, Watch, label, label_with_ray, open_dataset
 from rfm_labels.plan import plan_labels
 from rfm_labels.ray_engine import EpisodeActor, RayJob
+from secured import Papers
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::FutureWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning"
@@ -59,6 +62,16 @@ def test_an_actor_opens_the_dataset_as_it_is_told_and_its_scorer_for_as_long_as_
     assert scorer.tasks == {"juggle"}
     stored = list(open_dataset(ROOT).frames(dataset.episodes[0], plan.recipe.cameras[0]))
     assert any(np.array_equal(frame, np.rot90(stored[-1], -1)[..., ::-1]) for frame in scorer.seen)
+
+
+def test_the_options_of_a_server_with_tls_reach_an_actor(tmp_path: Path) -> None:
+    (tmp_path / "key").write_text("secret")
+    papers = Papers.issue(tmp_path)
+    options = ServerOptions(urls=("grpcs://127.0.0.1:1",), api_key_file=tmp_path / "key", **papers.client)
+    (tmp_path / "key").unlink()  # as on another machine
+    received = pickle.loads(pickle.dumps(options))
+    with received.client():
+        assert received.credentials == options.credentials
 
 
 @pytest.mark.nightly  # a minute

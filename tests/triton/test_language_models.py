@@ -28,6 +28,7 @@ from rfm.engine import Engine
 from rfm_client import (
     InvalidSampleError,
     ModelInfo,
+    ModelNotFoundError,
     PreferenceSample,
     ProgressResult,
     ProgressSample,
@@ -356,6 +357,12 @@ def test_the_description_tells_what_is_given(asked: Served) -> None:
     assert infos["robo"].progress_bins == 5
     assert infos["baseline"].max_frames == 64
     assert infos["top"].lacks == ("preference", "similarity", "success")
+
+
+def test_a_model_for_frames_alone_says_how_to_ask_for_its_description(asked: Served, protocol: str) -> None:
+    remedy = r"give frames, and ask model_info\(frames=True\)$"
+    with asked.client("robo", protocol) as client, pytest.raises(ModelNotFoundError, match=remedy):
+        client.model_info()
 
 
 def test_what_has_no_meaning_is_refused_by_name(asked: Served, protocol: str) -> None:

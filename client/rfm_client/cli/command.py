@@ -95,14 +95,18 @@ class Command(TyperCommand):
     has_codes = True  # False: every error ends the command with 1
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Give ``--json`` without a value the value ``-``, which the parser cannot do."""
+        """Give ``--json`` without a value the value ``-``, which the parser cannot do. Raises typer.BadParameter."""
         completed: list[str] = []
         for index, word in enumerate(args):
             completed.append(word)
             following = args[index + 1] if index + 1 < len(args) else "--"
             if word == "--json" and following.startswith("-") and following != STANDARD_OUTPUT:
                 completed.append(STANDARD_OUTPUT)
-        return super().parse_args(ctx, completed)
+        try:
+            return super().parse_args(ctx, completed)
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")  # by pydantic, with which typer validates
+            raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the words of the usage line: an argument's name, in brackets if it may be left out."""

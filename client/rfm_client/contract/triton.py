@@ -13,6 +13,7 @@ from typing import Any, TypeAlias, TypeVar
 from urllib.parse import urljoin
 
 from rfm_client.contract import errors
+from rfm_client.contract.names import frames_name
 from rfm_client.contract.wire import NUM_FRAMES, SECOND_FRAMES
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
@@ -185,10 +186,14 @@ def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.Serve
     return _with_remedy(errors.ServerUnavailableError, fault, _NO_PROXY)
 
 
-def not_served(message: str, served: Collection[str]) -> errors.ModelNotFoundError:
-    """Return the error of a missing model, with the names of the served models."""
+def not_served(model: str, message: str, served: Collection[str]) -> errors.ModelNotFoundError:
+    """Return the error of a missing model, with the names of the served models and the remedy."""
+    takes_frames = frames_name(model) in served
+    remedy = (
+        "this checkpoint takes no embeddings: give frames, and ask model_info(frames=True)" if takes_frames else _NAME
+    )
     names = ", ".join(sorted(served)) or "none"
-    return _with_remedy(errors.ModelNotFoundError, f"{message}; served: {names}", _NAME)
+    return _with_remedy(errors.ModelNotFoundError, f"{message}; served: {names}", remedy)
 
 
 def _with_remedy(kind: type[_ServerError], fault: str, remedy: str) -> _ServerError:

@@ -31,7 +31,13 @@ def is_blank(frame: UInt8Array) -> bool:
 
 
 class BlankFrames:
-    """The blank frames of one camera in one episode."""
+    """Find out if a camera is blank in an episode: ten frames in a row, or all of a shorter episode, show nothing.
+
+    Frames are blank if they are black to the eye or of one colour. Add them one by one, then read ``told``, a
+    description such as "black pictures" for a warning, or ``highest``, a number for statistics. No frame is kept.
+
+    frames: the first frames, uint8 [H, W, 3] each
+    """
 
     def __init__(self, frames: Iterable[UInt8Array] = ()) -> None:
         self._num_frames = self._in_a_row = self._most_in_a_row = self._highest = 0

@@ -84,9 +84,11 @@ def as_trajectory(
 
     ``observation.images.<camera>`` or ``frames``: [T, H, W, 3] or [T, 3, H, W], or a sequence of T images (arrays,
         tensors, PIL, which is turned as its EXIF data say); uint8, or float in 0..1, which is multiplied by 255 and
-        rounded. Steps that LeRobot marks as padding (``<key>_is_pad``) are left out.
+        rounded
     ``video_embeddings``, ``text_embedding``: as in Trajectory
     ``task``: text, the same at all steps
+    ``<key>_is_pad``: bool [T], True for a step that LeRobot marks as padding, which is left out; the key is that of the
+        frames or ``video_embeddings``
 
     Other keys are ignored, but ``episode_index``, if present, must be the same at all steps.
 
@@ -100,20 +102,24 @@ def as_trajectory(
     task = task or _only(columns, "task", "")
     if camera is None and not {"frames", "video_embeddings"}.isdisjoint(columns):
         return Trajectory(
-            frames=_frames("frames", columns["frames"]) if "frames" in columns else None,
-            video_embeddings=columns.get("video_embeddings"),
+            frames=_unpadded(columns, "frames", _frames("frames", columns["frames"])) if "frames" in columns else None,
+            video_embeddings=_unpadded(columns, "video_embeddings", columns.get("video_embeddings")),
             text_embedding=columns.get("text_embedding"),
             task=task,
         )
     key = _camera_key(columns, camera)
-    frames = _frames(key, columns[key])
-    if key + _IS_PAD in columns:
-        padding = as_array(columns[key + _IS_PAD])
-        is_of_frames = padding.dtype == bool and padding.shape == (len(frames),)
-        got = f"{padding.dtype} {list(padding.shape)}"
-        require(key + _IS_PAD, is_of_frames, f"bool [{len(frames)}]", got, InvalidSampleError)
-        frames = frames[~padding]
-    return Trajectory(frames=frames, task=task)
+    return Trajectory(frames=_unpadded(columns, key, _frames(key, columns[key])), task=task)
+
+
+def _unpadded(columns: Mapping[str, Any], key: str, values: Any) -> Any:
+    """Return the values [T, ...] of the steps that are no padding. Without marks, return them unchanged."""
+    if key + _IS_PAD not in columns or values is None:
+        return values
+    steps, padding = as_array(values), as_array(columns[key + _IS_PAD])
+    is_of_steps = padding.dtype == bool and padding.shape == steps.shape[:1]
+    expected, got = f"bool {list(steps.shape[:1])}", f"{padding.dtype} {list(padding.shape)}"
+    require(key + _IS_PAD, is_of_steps, expected, got, InvalidSampleError)
+    return steps[~padding]
 
 
 def _corrected(trajectory: Trajectory, correction: Correction) -> Trajectory:

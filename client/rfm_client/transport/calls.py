@@ -103,21 +103,21 @@ class TritonTransport:
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
         request = partial(self._infer, model, inputs, outputs, request_id, timeout_s)
-        return await self._call(request, timeout_s)
+        return await self._call(model, request, timeout_s)
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         async def request(client: Any) -> ModelInfo:
             config = await client.get_model_config(model, **self._as_json)
             return ModelInfo.from_config(config.get("config", config))  # nested in gRPC's answer
 
-        return await self._call(request, timeout_s, bad_request=errors.ModelNotFoundError)
+        return await self._call(model, request, timeout_s, bad_request=errors.ModelNotFoundError)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         async def request(client: Any) -> bool:
             return bool(await client.is_server_ready() and await client.is_model_ready(model))
 
         try:
-            return await self._call(request, timeout_s)
+            return await self._call(model, request, timeout_s)
         except errors.ServerError:
             return False
 
@@ -161,6 +161,7 @@ class TritonTransport:
 
     async def _call(
         self,
+        model: str,
         request: Callable[[Any], Awaitable[Answered]],
         timeout_s: float,
         *,
@@ -178,16 +179,17 @@ class TritonTransport:
             if error is None:
                 raise
             if isinstance(error, errors.ModelNotFoundError):
-                error = await self._not_served(error)
+                error = await self._not_served(model, error)
             raise error from raised
 
-    async def _not_served(self, error: errors.ModelNotFoundError) -> errors.ModelNotFoundError:
+    async def _not_served(self, model: str, error: errors.ModelNotFoundError) -> errors.ModelNotFoundError:
         """The error with the names of served models, if the server tells them in time."""
         with suppress(Exception):
             async with timeout(_SERVED_TIMEOUT_S):
                 with self._connected().used() as client:
                     told = await client.get_inference_statistics(**self._as_json)
-                    return triton.not_served(error.message, {each["name"] for each in told.get("model_stats", [])})
+                    served = {each["name"] for each in told.get("model_stats", [])}
+                    return triton.not_served(model, error.message, served)
         return error
 
     async def _answer(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:

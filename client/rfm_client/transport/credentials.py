@@ -7,7 +7,6 @@ import re
 import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -64,9 +63,9 @@ class Credentials:
         given = {name.lower(): value for name, value in self.headers.items()}
         return given if self.api_key is None else {**given, AUTHORIZATION: f"Bearer {self.api_key}"}
 
-    @cached_property
+    @property
     def ssl_context(self) -> ssl.SSLContext:
-        """The TLS context for connections over HTTP."""
+        """A new TLS context for connections over HTTP. It is not kept, since it cannot be pickled."""
         if self.ca_file is not None:
             check_authorities(self.ca_file, "ca_file")
         context = ssl.create_default_context(cafile=self.ca_file)

@@ -7,7 +7,7 @@ import asyncio
 import os
 import threading
 from collections.abc import Callable, Coroutine
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from rfm_client.contract.errors import ClientClosedError, clear_variables
@@ -20,6 +20,8 @@ class LoopThread:
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.new_event_loop()
+        self._workers = ThreadPoolExecutor()  # the loop's own would need a new thread to end, which 3.12 denies at exit
+        self._loop.set_default_executor(self._workers)
         self._process_id = os.getpid()
         self._starting = threading.Lock()  # _is_stopped must not change between check and use
         self._is_stopped = False
@@ -74,6 +76,7 @@ class LoopThread:
             ended.result()
         finally:
             self._thread.join()
+            self._workers.shutdown()
             self._loop.close()
 
     async def _until_stopped(self, coroutine: Coroutine[Any, Any, Returned]) -> Returned:
@@ -91,8 +94,8 @@ class LoopThread:
         try:
             await asyncio.gather(*self._cancelled, return_exceptions=True)
             await last()
-            await self._loop.shutdown_default_executor()
         finally:
+            self._workers.shutdown(wait=False)
             # A TLS connection whose call was cancelled waits for its peer's goodbye, which comes too late or never.
             for transport in [*getattr(self._loop, "_transports", {}).values()]:
                 transport.abort()
