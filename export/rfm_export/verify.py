@@ -213,7 +213,8 @@ def verify_graphs(make: Callable[[], Engine], description: Description, say: Say
         ]
         if not (difference := max(differences)) <= GRAPHS_TOLERANCE:
             where, remedy = f"probe {index}: cuda_graphs", "leave out --cuda-graphs"
-            raise ExportDiffersError.at(where, "the scores of a plain pass", f"a difference of {difference:g}", remedy)
+            got = f"a difference of {difference:g} times the largest"
+            raise ExportDiffersError.at(where, "the scores of a plain pass", got, remedy)
     if engine.graphs.has_failed:
         say("cuda_graphs: this device cannot capture the network's passes, so the setting gains nothing here")
 
