@@ -461,6 +461,7 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
             left_s = f"{episode.add(frame).more_scores['remaining_s']:.3f} s"
         card = "[...document.querySelectorAll('#live-episodes dl div')].map((each) => each.textContent)"
         page.until(f"{card}.includes('Remaining{left_s}')")
+        assert page.cells("#live-runs tr")[0][4] == f"{left_s} remaining"
         assert f"final remaining {left_s}" in str(page["live-episodes"].get_attribute("innerHTML"))
 
 

@@ -3,7 +3,7 @@
 
 import { hasKey, KeyWanted, liveNews } from "./api.js";
 import { LiveCard } from "./livecard.js";
-import { learn, measured } from "./signals.js";
+import { cellOf, learn } from "./signals.js";
 import { cell, label } from "./table.js";
 import { NONE, shown } from "./text.js";
 
@@ -120,7 +120,7 @@ export class LiveTab {
       const newest = own[0] ?? cards.find((card) => card.run === run);
       const alike = own.filter(({ leading }) => leading === newest.leading); // seconds and shares have no mean
       const means = [
-        measured(newest.leading, mean(alike.map(({ lastLeading }) => lastLeading))),
+        cellOf(newest.leading, mean(alike.map(({ lastLeading }) => lastLeading))),
         shown(mean(own.map(({ lastSuccess }) => lastSuccess))),
       ];
       const steps = mean(own.map(({ numSteps }) => numSteps));

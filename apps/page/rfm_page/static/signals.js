@@ -44,10 +44,9 @@ export function toldAt(curve, index) {
   return `${shortOf(signal)} ${measured(signal, curve[signal].at(index))}`;
 }
 
-/** The same as a cell below the head "progress". */
-export function cellAt(curve, index) {
-  const signal = leadingOf(curve);
-  const text = measured(signal, curve[signal].at(index));
+/** A number of a score as a cell below the head "progress". */
+export function cellOf(signal, value) {
+  const text = measured(signal, value);
   return signal === "progress" || text === NONE ? text : `${text} ${shortOf(signal)}`;
 }
 
