@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.checks import require
-from rfm_client.contract.results import FrameScores
+from rfm_client.contract.results import FRAME_SCORES, FrameScores
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,6 +41,8 @@ def plot_scores(
 ) -> Figure:
     """Return a figure with a curve of progress for each result and, below it, of success where it is predicted.
 
+    Models that predict another score in place of progress, such as remaining seconds, have an axis in its unit.
+
     It is light, whatever style is set, and 3.5 inches wide. ``save`` writes it.
 
     names: of the curves, in the legend; long names lose their middle
@@ -64,17 +66,21 @@ def plot_scores(
     if not has_times:
         positions = [result.scored_frames.astype(np.float64) for result in results]
     has_success = not all(np.isnan(result.success).all() for result in results)
-    heights_in = [_HEIGHT_IN, _SUCCESS_IN] if has_success else [_HEIGHT_IN]
+    scores = [*dict.fromkeys(result.leading for result in results), *["success"] * has_success]
+    heights_in = [_SUCCESS_IN if score == "success" else _HEIGHT_IN for score in scores]
     with matplotlib.style.context(["default", _STYLE]):
         figure = Figure(figsize=(_WIDTH_IN, sum(heights_in) + _LINE_IN * (len(results) + 2)), layout="constrained")
         axes = figure.subplots(len(heights_in), 1, sharex=True, squeeze=False, height_ratios=heights_in)[:, 0]
-        for ax, score in zip(axes, ("progress", "success"), strict=False):
+        for ax, score in zip(axes, scores, strict=True):
             for number, (result, x) in enumerate(zip(results, positions, strict=True)):
+                if score not in ("success", result.leading):
+                    continue
                 colour, line = _COLOURS[number % len(_COLOURS)], _LINES[number // len(_COLOURS)]
                 marker = "o" if len(x) == 1 else ""  # a point alone makes no line
-                label = _shortened(names[number]) if score == "progress" else None
+                label = _shortened(names[number]) if score == result.leading else None
                 ax.plot(x, getattr(result, score), color=colour, linestyle=line, marker=marker, lw=1.2, label=label)
-            ax.set(ylabel=score, ylim=(-0.02, 1.02))
+            about = FRAME_SCORES[score]
+            ax.set(ylabel=about.title(score), **({} if None in about.bounds else {"ylim": (-0.02, 1.02)}))
         axes[-1].set_xlabel("time (s)" if has_times else "frame")
         if title is not None:
             figure.suptitle(title, fontsize=9, wrap=True)

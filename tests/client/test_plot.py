@@ -48,6 +48,20 @@ def test_seconds_stand_on_the_axis_if_all_are_known_and_success_only_if_predicte
     assert ax.get_xlabel() == "frame"
 
 
+def test_a_model_of_remaining_seconds_has_an_axis_in_seconds_beside_that_of_progress() -> None:
+    nothing = np.full(3, np.nan, np.float32)
+    seconds = FrameScores(progress=nothing, success=nothing, remaining_s=np.array([30, 12, 1], np.float32))
+    of_seconds, success = plot_scores([seconds, scores(2)], ["a", "b"]).axes[::2]
+    progress = plot_scores([seconds, scores(2)], ["a", "b"]).axes[1]
+    assert [ax.get_ylabel() for ax in (of_seconds, progress, success)] == ["remaining (s)", "progress", "success"]
+    (line,) = of_seconds.get_lines()
+    np.testing.assert_array_equal(line.get_ydata(), [30, 12, 1])
+    assert of_seconds.get_ylim()[1] > 30
+    assert len(progress.get_lines()) == 1
+    figure = plot_scores([seconds, scores(2)], ["a", "b"])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b"]
+
+
 def test_forty_curves_differ_and_the_figure_stays_light_in_a_dark_style(tmp_path: Path) -> None:
     with matplotlib.style.context("dark_background"):
         figure = plot_scores([scores(3)] * 40, [f"{index}" for index in range(40)])

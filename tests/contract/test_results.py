@@ -76,6 +76,17 @@ def test_what_a_checkpoint_does_not_predict_becomes_no_number(name: str) -> None
         getattr(scores, name)() if name == "succeeded" else getattr(scores, name)
 
 
+def test_the_leading_score_is_progress_or_what_the_model_predicts_in_its_place() -> None:
+    assert seconds(3, 1).leading == "remaining_s"
+    nothing = np.full(2, np.nan, np.float32)
+    assert FrameScores(progress=nothing, success=nothing).leading == "progress"
+    both = FrameScores(progress=np.ones(2, np.float32), success=nothing, remaining_s=np.ones(2, np.float32))
+    assert both.leading == "progress"
+    assert {name: score.title(name) for name, score in FRAME_SCORES.items() if score.unit} == {
+        "remaining_s": "remaining (s)", "relative_s": "relative (s)", "entropy": "entropy (nats)",
+    }  # fmt: skip
+
+
 def seconds(*remaining_s: float) -> FrameScores:
     nothing = np.full(len(remaining_s), np.nan, np.float32)
     return FrameScores(progress=nothing, success=nothing, remaining_s=np.array(remaining_s, np.float32))

@@ -7,7 +7,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -22,6 +24,8 @@ from rfm import families
 from rfm.engine import Engine
 from rfm.engine.graphs import Captured, Function, Graphs
 from rfm.family import NETWORK
+from rfm_client import ProgressResult
+from rfm_client.contract import Sample
 from rfm_export import ExportDiffersError
 from rfm_export.source import device_named
 from rfm_export.verify import WORKING_ROOM, device_for, needing_room, verify_graphs
@@ -123,6 +127,30 @@ def test_an_export_compares_graphs_with_plain_passes() -> None:
         compare(Stale())
     _, said = compare(Failing())
     assert said == ["cuda_graphs: this device cannot capture the network's passes, so the setting gains nothing here"]
+
+
+class OfSeconds:
+    """Stands in for an engine whose graphs differ from plain passes by a share of the seconds."""
+
+    graphs = Graphs(CalledAgain())
+
+    def __init__(self, share: float) -> None:
+        self._share, self._known = share, set[int]()
+
+    def evaluate(self, samples: Sequence[Sample]) -> list[ProgressResult]:
+        (sample,) = samples
+        graphed = id(sample) in self._known
+        self._known.add(id(sample))
+        seconds = np.array([400.0, 0.0]) * (1 + self._share * graphed)
+        nothing = np.full(2, np.nan, np.float32)
+        return [ProgressResult(progress=nothing, success=nothing, remaining_s=seconds)]
+
+
+def test_seconds_of_graphs_may_differ_as_their_size_lets_them() -> None:
+    description = families.load(PLAIN.checkpoint, **PLAIN.sources).description
+    verify_graphs(lambda: cast(Engine, OfSeconds(5e-6)), description, print)
+    with pytest.raises(ExportDiffersError, match="a difference of 2e-05 times the largest"):
+        verify_graphs(lambda: cast(Engine, OfSeconds(2e-5)), description, print)
 
 
 def test_graphs_are_refused_where_nothing_uses_them(tmp_path: Path) -> None:

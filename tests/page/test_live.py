@@ -77,6 +77,16 @@ def test_an_unknown_cursor_gets_everything(gateway: TestClient, after: str) -> N
     assert 0 in of(answer, 2)["steps"]
 
 
+def test_what_a_model_predicts_in_place_of_progress_is_kept_and_other_scores_are_refused(gateway: TestClient) -> None:
+    steps = [step(number, None, None, instead={"remaining_s": 30.0 - number}) for number in range(2)]
+    assert post(gateway, report(episode(40, *steps))).status_code == 204
+    assert of(told(gateway), 40)["instead"] == {"remaining_s": [30.0, 29.0]}
+    assert told(gateway)["scores"] == {"remaining_s": {"short": "remaining", "unit": "s", "bounds": [None, None]}}
+    assert of(told(gateway), 40)["newest"]["instead"] == {"remaining_s": 29.0}
+    answer = post(gateway, report(episode(41, step(0, instead={"log_prob": -1.0}))))
+    assert "expected only remaining_s, got 'log_prob'" in failure(answer, 422)
+
+
 def test_a_report_that_comes_twice_counts_once(gateway: TestClient) -> None:
     for _ in range(2):
         post(gateway, report(episode(3, step(0, 0.1), step(1, 0.2))))

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import shutil
 from collections.abc import Iterator
@@ -13,9 +15,11 @@ import numpy as np
 import pytest
 import requests
 from pyarrow import parquet
+from selenium.webdriver.support.select import Select
 
 import rfm_export
 import rynnvalue
+from browsers import Browser
 from environments import cart_pole, play
 from faulty_servers import url_of
 from gateways import metric_at, poll, running
@@ -35,7 +39,7 @@ from rfm_client import (
     RewardClient,
     Trajectory,
 )
-from rfm_rl import RewardModelWrapper, RewardOptions
+from rfm_rl import LiveView, RewardModelWrapper, RewardOptions
 from servers import Endpoints, start_triton
 from transports import Connection
 from viewer_requests import SCORE, curve_of, events, post
@@ -424,6 +428,50 @@ def test_the_page_shows_the_whole_episode_s_curve(asked: Served, tmp_path: Path)
     assert {*curve["success"]} == {None}
     assert refused.status_code == 422
     assert "relative to the whole episode" in refused.text
+
+
+def test_tables_pictures_and_the_page_show_remaining_seconds(
+    asked: Served, tmp_path: Path, quiet_browser: Browser
+) -> None:
+    video, page = VIDEOS / "jaco_play_pick_up_green_cup.mp4", quiet_browser
+    words = [video, "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "rynn", "--fps", "0.5"]
+    scored = ["--sampling", "rint_pad", "--frames", "4", "--json", tmp_path / "scores.json"]
+    pictures = ["--plot", tmp_path / "plot.svg", "--strips", tmp_path / "strips.svg"]
+    done = rfm_client("score", *words, *scored, *pictures)
+    assert done.exit_code == 0, done.output
+    (told,) = json.loads((tmp_path / "scores.json").read_text())["videos"]
+    seconds = told["remaining_s"]
+    (row,) = (line for line in done.output.splitlines() if video.name[-10:] in line)
+    assert f"{seconds[-1]:.2f} s" in row
+    assert "In s, in place of progress: seconds that remain until the task is done." in " ".join(done.output.split())
+    with running(asked.endpoints, tmp_path, "rynn") as gateway:
+        page.open(gateway.url)
+        Select(page["rule"]).select_by_visible_text("rint_pad")
+        for name, text in {"tasks": TASK, "fps": "0.5", "frames": "4"}.items():
+            page.write(name, text)
+        page.drop([video])
+        page.until_text("status", "1 of 1 curves are done.")
+        assert page.cells("#curves tr")[0][5:7] == [f"{seconds[-1]:.3f} s remaining", "-"]
+        assert list(page.values("chart", "remaining_s").values()) == [f"{seconds[0]:.3f}"]
+        assert page.values("chart", "progress") == {}
+        page["json"].click()
+        (shown,) = json.loads(page.saved("curves.json"))["videos"]
+        np.testing.assert_allclose(shown["remaining_s"], seconds, rtol=1e-4, atol=1e-4)
+        page["csv"].click()
+        lines = list(csv.DictReader(io.StringIO(page.saved("curves.csv").decode())))
+        assert [line["progress"] for line in lines] == [""] * len(seconds)
+        np.testing.assert_allclose([float(line["remaining_s"]) for line in lines], seconds, rtol=1e-4, atol=1e-4)
+        page["svg"].click()
+        assert "remaining (s)" in page.saved("curves.svg").decode()
+        page["live-tab"].click()
+        frame = np.random.default_rng(1).integers(0, 256, (48, 80, 3), np.uint8)
+        with asked.client("rynn") as client, LiveView(gateway.url, name="run") as view:
+            episode = client.episode(TASK, score="remaining_s", live=view)
+            left_s = f"{episode.add(frame).more_scores['remaining_s']:.3f} s"
+        card = "[...document.querySelectorAll('#live-episodes dl div')].map((each) => each.textContent)"
+        page.until(f"{card}.includes('Remaining{left_s}')")
+        assert page.cells("#live-runs tr")[0][4] == f"{left_s} remaining"
+        assert f"final remaining {left_s}" in str(page["live-episodes"].get_attribute("innerHTML"))
 
 
 def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path) -> None:

@@ -23,10 +23,20 @@ from typing import Annotated, Any
 from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from PIL import Image, UnidentifiedImageError
-from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, StringConstraints, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    FailFast,
+    Field,
+    StringConstraints,
+    ValidationError,
+)
 
 from rfm_client.serving import off_loop
 from rfm_gateway.mounting import BodyLimits, field_errors
+from rfm_page.scores import ABOUT, INSTEAD
 
 MOST_BODY_BYTES = 4 * 2**20
 MOST_EPISODES = 128  # ended episodes are forgotten first, then the longest silent
@@ -72,12 +82,21 @@ _Text = Annotated[str, StringConstraints(max_length=_MOST_LETTERS)]
 _Count = Annotated[int, Field(ge=0, le=_MOST_NUMBER)]
 
 
+def _known(scores: dict[str, float]) -> dict[str, float]:
+    if others := sorted(set(scores) - set(INSTEAD)):
+        raise ValueError(f"expected only {', '.join(INSTEAD)}, got {others[0]!r}")
+    return scores
+
+
 class _Step(_Strict):
+    """A step. instead: what the model predicts in place of progress, by the score's name"""
+
     step: _Count
     progress: float | None
     success: float | None
     succeeded: bool
     ms: Annotated[float, Field(ge=0)]
+    instead: Annotated[dict[str, float], AfterValidator(_known)] = {}
 
 
 class _ReportedEpisode(_Strict):
@@ -126,15 +145,19 @@ class _KeptEpisode:
         """Return the changes since a report, by its number."""
         if self.changed <= known:
             return {}
+        newest = self.points[-1][1] if self.points else None
         new = [point for _, point in itertools.takewhile(lambda each: each[0] > known, reversed(self.points))][::-1]
         return {
             **self.about,
             "has_ended": self.has_ended,
             "frame": self.frame_changed or None,
-            "newest": self.points[-1][1] if self.points else None,
+            "newest": newest,
             "steps": [point["step"] for point in new],
             "progress": [point["progress"] for point in new],
             "success": [point["success"] for point in new],
+            "instead": {
+                name: [point["instead"].get(name) for point in new] for name in (newest["instead"] if newest else ())
+            },
         }
 
 
@@ -185,6 +208,7 @@ class LiveEpisodes:
             "cursor": f"{self._life}.{self._changed}",
             "is_whole": known == 0,
             "most_points": MOST_POINTS,
+            "scores": ABOUT,
             "episodes": [
                 {"id": key, "age_s": self._clock_s() - episode.heard_s, **episode.since(known)}
                 for key, episode in self._episodes.items()

@@ -38,6 +38,7 @@ from rfm_client.frames import BlankFrames, ChannelOrder, Orientation, Rule, Samp
 from rfm_client.serving import off_loop
 from rfm_gateway.mounting import GatewayConfig, PageHost, invalid, while_connected
 from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest
+from rfm_page.scores import ABOUT
 
 MOST_PREFIXES = 32  # in a request
 MOST_BYTES = 64 * 2**20  # of the frames in a request
@@ -69,7 +70,7 @@ def viewer_routes(host: PageHost) -> APIRouter:
         rules = [{"name": rule, "frames": _frames_of(rule)} for rule in get_args(Rule)]
         about = {"models": models, "model": config.checkpoint, "rules": rules}
         about |= {"orientations": get_args(Orientation), "channel_orders": get_args(ChannelOrder)}
-        return JSONResponse({**about, "fps": DEFAULT_FPS, "url": config.triton_url})
+        return JSONResponse({**about, "scores": ABOUT, "fps": DEFAULT_FPS, "url": config.triton_url})
 
     @router.post("/viewer/score")
     async def score(request: Request) -> Response:
@@ -189,7 +190,8 @@ def _points(first: int, parts: Sequence[ProgressResult]) -> dict[str, Any]:
     points = ProgressResult.of_parts(parts)
     return {
         "first": first,
-        "progress": points.progress.tolist(),
+        "leading": points.leading,
+        **{name: points.arrays[name].tolist() for name in {"progress", points.leading}},
         "success": points.success.tolist(),
         "model_version": points.model_version,
     }

@@ -30,7 +30,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from PIL import Image
 
-from rfm_client import UInt8Array
+from rfm_client import FRAME_SCORES, UInt8Array
 from rfm_client.episodes import StepScore, SuccessRule
 from rfm_client.options import checked_count, require
 from rfm_client.serving import Credentials
@@ -72,7 +72,10 @@ class LiveEpisode:
         if self._has_ended:
             return
         scores = {"progress": _or_none(score.progress), "success": _or_none(score.success)}
-        step = {"step": score.step, **scores, "succeeded": score.succeeded, "ms": score.ms}
+        step: dict[str, Any] = {"step": score.step, **scores, "succeeded": score.succeeded, "ms": score.ms}
+        instead = FRAME_SCORES["progress"].replaced_by
+        if scores["progress"] is None and instead in score.more_scores:
+            step["instead"] = {instead: score.more_scores[instead]}
         self._reporter.add(self._about, step, np.asarray(frame))
 
     def end(self) -> None:

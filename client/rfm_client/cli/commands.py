@@ -35,7 +35,7 @@ from rfm_client.cli.options import (
     VideoOptions,
     WaitOptions,
 )
-from rfm_client.cli.show import StreamedTable, print_tables, scores_table, status_tables
+from rfm_client.cli.show import StreamedTable, in_place_of_progress, print_tables, scores_table, status_tables
 from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames, write_perf_analyzer_input
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import RewardError
@@ -111,9 +111,9 @@ def score(
 
     with scoring.recorder(output.rrd, videos) as record, server.connected() as client:
         outcomes = scoring.SourceScorer(client, video, prefix, record).score_all(videos, tell)
-    rows.end(prefix.rule)
-    output.write_json(documents.score_document(server, video, prefix, outcomes))
     scored = [outcome for outcome in outcomes if isinstance(outcome, scoring.Scored)]
+    rows.end(" ".join(filter(None, (prefix.rule, in_place_of_progress(each.result for each in scored)))))
+    output.write_json(documents.score_document(server, video, prefix, outcomes))
     if output.plot is not None and scored:
         save(scoring.figure(scored, video.task), output.plot)
     if output.strips is not None and scored:

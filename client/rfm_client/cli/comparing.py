@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, cast
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.scoring import Source, fitted_to
-from rfm_client.cli.show import number, table
+from rfm_client.cli.show import at_end, number, table
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
 from rfm_client.contract.results import FrameScores, PreferenceResult
@@ -114,8 +114,8 @@ class Comparison:
 
     def _row(self, index: int) -> tuple[str, ...]:
         scores = self.scores[index]
-        figures = (self.wins[index], scores.progress[-1], scores.success[-1])
-        return (self.sources[index].name, self._rank(index), *map(number, figures), str(len(scores.progress)))
+        figures = (number(self.wins[index]), at_end(scores), number(scores.success[-1]))
+        return (self.sources[index].name, self._rank(index), *figures, str(len(scores.progress)))
 
     def _pair_row(self, first: int, second: int) -> tuple[str, ...]:
         pair = self.pair(first, second)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.results import FrameScores
-from rfm_client.contract.samples import Float32Array, UInt8Array
+from rfm_client.contract.results import FRAME_SCORES, FrameScores
+from rfm_client.contract.samples import UInt8Array
 from rfm_client.plot import save
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ WIDTH_IN = 10.0
 COLUMN_WIDTH_IN = 7.0  # of panels side by side
 PANEL_HEIGHT_IN = 4.0
 
-_CURVES = (("progress", "tab:blue", "-", "o"), ("success", "tab:green", "--", "s"))
+_LOOKS = (("tab:blue", "-", "o"), ("tab:green", "--", "s"))  # of progress, or what replaces it, and of success
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,13 +100,23 @@ def _draw(part: SubFigure, panel: Panel) -> None:
             picture.set_axis_off()
             picture.set_title(f"{position:.1f} s" if panel.unit == "s" else f"{position:.0f}", fontsize=8)
         axes = part.add_subplot(grid[1, :])
-    for name, colour, line, marker in _CURVES:
-        scores: Float32Array = getattr(panel.scores, name)
+    leading = FRAME_SCORES[panel.scores.leading]
+    of_shares = axes.twinx() if leading.unit and not np.isnan(panel.scores.success).all() else axes
+    handles = []
+    for (colour, line, marker), name in zip(_LOOKS, (panel.scores.leading, "success"), strict=True):
+        scores, own = panel.scores.arrays[name], of_shares if name == "success" else axes
         if np.isnan(scores).all():
-            axes.plot([], [], color=colour, label=f"{name}: not predicted")
+            handles += own.plot([], [], color=colour, label=f"{name}: not predicted")
         else:
-            axes.plot(panel.positions, scores, color=colour, linestyle=line, marker=marker, markersize=4, label=name)
-    axes.set(xlabel="time (s)" if panel.unit == "s" else "frame", ylabel="score", ylim=(-0.02, 1.02))
+            label = FRAME_SCORES[name].title(name)
+            handles += own.plot(
+                panel.positions, scores, color=colour, linestyle=line, marker=marker, markersize=4, label=label
+            )
+    axes.set(xlabel="time (s)" if panel.unit == "s" else "frame")
+    if leading.unit:
+        axes.set(ylabel=leading.title(panel.scores.leading))
+    if of_shares is not axes or not leading.unit:
+        of_shares.set(ylabel="score", ylim=(-0.02, 1.02))
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper left", fontsize=8)
+    axes.legend(handles=handles, loc="upper left", fontsize=8)
     part.suptitle(panel.title, fontsize=10)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package
 from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel
-from rfm_client.cli.show import number
+from rfm_client.cli.show import at_end, number
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import (
     DeadlineExceededError,
@@ -112,11 +112,11 @@ class Scored:
     @property
     def row(self) -> tuple[str, ...]:
         """The source's cells under ``COLUMNS``."""
-        progress, success = self.result.progress, self.result.success
-        frames = str(len(progress)) if len(progress) == self.num_frames else f"{len(progress)} of {self.num_frames}"
+        count, success = len(self.result.progress), number(self.result.success[-1])
+        frames = str(count) if count == self.num_frames else f"{count} of {self.num_frames}"
         seconds = "-" if self.times_s is None else f"{self.times_s[-1]:.1f}"
         version = self.result.model_version or "-"
-        return (self.name, number(progress[-1]), number(success[-1]), frames, seconds, f"{self.took_s:.2f}", version)
+        return (self.name, at_end(self.result), success, frames, seconds, f"{self.took_s:.2f}", version)
 
 
 @dataclass(frozen=True)

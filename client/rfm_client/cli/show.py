@@ -6,11 +6,18 @@ from __future__ import annotations
 import itertools
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, trajectory_scores
+from rfm_client.contract.results import (
+    FRAME_SCORES,
+    FrameScores,
+    PreferenceResult,
+    ProgressResult,
+    Result,
+    trajectory_scores,
+)
 from rfm_client.transport.status import DEVICE_METRICS, Device, ServerStatus
 
 if TYPE_CHECKING:
@@ -38,6 +45,18 @@ _GIB = 2**30
 def number(value: float | None, digits: int = 4) -> str:
     """Return the number as text; ``-`` for None and NaN, which mean not predicted."""
     return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+
+def at_end(scores: FrameScores) -> str:
+    """Return progress at the last frame as text, or what the model predicts in its place, with the unit."""
+    last, unit = float(scores.arrays[scores.leading][-1]), FRAME_SCORES[scores.leading].unit
+    return f"{number(last, 2)} {unit}" if unit else number(last)
+
+
+def in_place_of_progress(results: Iterable[FrameScores]) -> str:
+    """Return a sentence about numbers that stand in place of progress; empty: none do."""
+    instead = [FRAME_SCORES[name] for name in sorted({result.leading for result in results} - {"progress"})]
+    return " ".join(f"In {score.unit}, in place of progress: {score.meaning.lower()}." for score in instead)
 
 
 def shortened(name: str, width: int) -> str:
@@ -151,7 +170,7 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
             told = f"similarity = {result.similarity:.4f}"
         for role, frames in trajectory_scores(result).items():
             row = ": ".join(filter(None, (name, role)))
-            shown.append((row, told, number(frames.progress[-1]), number(frames.success[-1])))
+            shown.append((row, told, at_end(frames), number(frames.success[-1])))
             told = ""
     return table(title, ("sample", "answer", "progress at the end", "success at the end"), shown)
 

@@ -46,6 +46,7 @@ class Score:
     is_per_bin: [T, K], and neither in JSON nor in labels; else [T]
     mark: what True says about a frame, as a clause; empty: numbers, not marks
     bounds: smallest and largest value; None: no bound
+    unit: of the values, such as ``s``; empty: none
     higher_is_better: False: lower values are better
     is_newer: exports of its family exist that lack it, so a served model may gain it
     """
@@ -57,8 +58,17 @@ class Score:
     is_per_bin: bool = False
     mark: str = ""
     bounds: tuple[float | None, float | None] = (0.0, 1.0)
+    unit: str = ""
     higher_is_better: bool = True
     is_newer: bool = False
+
+    def short(self, name: str) -> str:
+        """Return the name without the unit: ``remaining``."""
+        return name.removesuffix(f"_{self.unit}")
+
+    def title(self, name: str) -> str:
+        """Return the name for an axis, with the unit: ``remaining (s)``."""
+        return f"{self.short(name)} ({self.unit})" if self.unit else name
 
     def told(self, values: npt.NDArray[Any]) -> str:
         """Return a line about the marked frames among ``values``, [T]; empty: none is marked."""
@@ -108,12 +118,16 @@ class FrameScores:
     remaining_s: Annotated[
         Float32Array | None,
         Score(
-            "Seconds that remain until the task is done", asked="if given", bounds=(None, None), higher_is_better=False
+            "Seconds that remain until the task is done",
+            asked="if given",
+            bounds=(None, None),
+            unit="s",
+            higher_is_better=False,
         ),
     ] = None
     relative_s: Annotated[
         Float32Array | None,
-        Score("Seconds since the frame before, by the model", asked="if given", bounds=(None, None)),
+        Score("Seconds since the frame before, by the model", asked="if given", bounds=(None, None), unit="s"),
     ] = None
     entropy: Annotated[
         Float32Array | None,
@@ -121,6 +135,7 @@ class FrameScores:
             "Entropy of the remaining seconds in nats: how unsure the model is",
             asked="if given",
             bounds=(0.0, None),
+            unit="nats",
             higher_is_better=False,
         ),
     ] = None
@@ -130,6 +145,12 @@ class FrameScores:
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """The scores that are there, by name."""
         return {name: scores for name in FRAME_SCORES if (scores := getattr(self, name)) is not None}
+
+    @property
+    def leading(self) -> str:
+        """The name of the score that tells how far the task is: ``progress``, or what replaces it."""
+        instead = FRAME_SCORES["progress"].replaced_by
+        return instead if instead in self.arrays and np.isnan(self.progress).all() else "progress"
 
     @property
     def scored_frames(self) -> npt.NDArray[np.int64]:

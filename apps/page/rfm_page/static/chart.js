@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: MIT
-// The chart: progress of each curve above, success in a band below, over time or over steps, drawn by uPlot.
+// The chart: progress of each curve above, or what its model predicts in place of it, success in a band below, over time or over steps, drawn by uPlot.
 
 import { pointAt } from "./curves.js";
+import { leadingOf, marksOf, scaleOf, titleOf } from "./signals.js";
 import { shown } from "./text.js";
 import uPlot from "./uplot/uPlot.esm.js";
 
@@ -13,11 +14,10 @@ export const MARK_PX = 72; // at least between the marks of the axis below
 const POINT_PX = 20; // nearer to each other, points are not drawn as dots
 const LARGE_PX = 400; // a chart so high and so wide has larger letters
 const LOW_PX = 240; // a chart so low has fewer marks
-const TICKS = { progress: [0, 0.25, 0.5, 0.75, 1], success: [0, 0.5, 1] };
-const FEW_TICKS = { progress: [0, 0.5, 1], success: [0, 1] };
-const WITH_SUCCESS = { progress: [0.37, 0.98], success: [0.03, 0.27] }; // shares of the height, from 0 to 1 of the signal
-const LOW_WITH_SUCCESS = { progress: [0.46, 0.98], success: [0.03, 0.36] };
-const WITHOUT_SUCCESS = { progress: [0.03, 0.98] };
+const WITH_SUCCESS = { leading: [0.37, 0.98], success: [0.03, 0.27] }; // shares of the height
+const LOW_WITH_SUCCESS = { leading: [0.46, 0.98], success: [0.03, 0.36] };
+const WITHOUT_SUCCESS = { leading: [0.03, 0.98] };
+const GAP = 0.06; // of the height, between progress and what other models predict in place of it
 
 /** The name of the colour of curve number `index`, which the style sheet has for each theme. */
 export function colourName(index) {
@@ -34,17 +34,26 @@ export function colourOf({ colour, index, successIndex }, signal = "progress", e
   return colour ?? themed(`--${colourName(signal === "success" ? successIndex ?? index : index)}`, element);
 }
 
-/** Where the signals of the curves lie in a chart: shares of its height, for 0 and for 1. */
+/** Where each signal of the curves lies in a chart: `from` and `to`, shares of its height, stand for `scale`. */
 export function panesOf(curves, isLow = false) {
-  if (!curves.some(({ success }) => success.some((value) => value !== null))) return WITHOUT_SUCCESS;
-  return isLow ? LOW_WITH_SUCCESS : WITH_SUCCESS;
+  const hasSuccess = curves.some(({ success }) => success.some((value) => value !== null));
+  const { leading, success } = !hasSuccess ? WITHOUT_SUCCESS : isLow ? LOW_WITH_SUCCESS : WITH_SUCCESS;
+  const signals = [...new Set(curves.map(leadingOf))].sort();
+  if (!signals.length) signals.push("progress");
+  const height = (leading[1] - leading[0] - GAP * (signals.length - 1)) / signals.length;
+  const panes = signals.map((signal, place) => {
+    const to = leading[1] - place * (height + GAP);
+    return [signal, { from: to - height, to, scale: scaleOf(signal, curves) }];
+  });
+  if (success) panes.push(["success", { from: success[0], to: success[1], scale: scaleOf("success", curves) }]);
+  return Object.fromEntries(panes);
 }
 
 /** The share of a chart's height at which a value of a signal lies; null: it has none. */
 export function heightOf(panes, signal, value) {
   if (value === null || value === undefined || !panes[signal]) return null;
-  const [from, to] = panes[signal];
-  return from + value * (to - from);
+  const { from, to, scale: [low, high] } = panes[signal];
+  return from + ((value - low) / (high - low)) * (to - from);
 }
 
 /**
@@ -60,7 +69,7 @@ export class Chart {
   #isOfSteps;
   #plot = null;
   #curves = [];
-  #panes = WITHOUT_SUCCESS;
+  #panes = panesOf([]);
   #shape = "";
   #begin = 0;
   #end = 1;
@@ -92,7 +101,8 @@ export class Chart {
   }
 
   /**
-   * Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`.
+   * Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`; one with a `leading`
+   * has the array of this name in place of progress.
    * Some have a `begin`, a `colour`, a `successIndex` of another colour for success, or are `isDashed`.
    */
   show(curves) {
@@ -104,10 +114,10 @@ export class Chart {
     if (this.#end <= this.#begin) this.#end = this.#begin + 1; // uPlot divides an axis of no length for ever
     const signals = Object.keys(this.#panes);
     const tables = this.#drawn.map((curve) => [
-      curve.times, ...signals.map((signal) => curve[signal].map((value) => heightOf(this.#panes, signal, value))),
+      curve.times, ...signals.map((signal) => curve.times.map((_, index) => heightOf(this.#panes, signal, curve[signal]?.[index]))),
     ]);
     const data = tables.length ? uPlot.join(tables) : [[], []];
-    const shape = `${signals} ${this.#isLow} ${this.#curves.map(({ isDashed }) => (isDashed ? "-" : "_")).join("")}`;
+    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${this.#curves.map(({ isDashed }) => (isDashed ? "-" : "_")).join("")}`;
     if (shape !== this.#shape || !this.#plot) {
       this.#plot?.destroy();
       this.#plot = this.#curves.length ? this.#newPlot(signals, data) : null;
@@ -155,12 +165,12 @@ export class Chart {
     const labels = Object.keys(this.#panes).flatMap((signal) => {
       const here = this.#curves.map((curve) => {
         const index = pointAt(curve.times, seconds);
-        return { curve, signal, time: curve.times[index], value: index === null ? null : curve[signal][index] };
+        return { curve, signal, time: curve.times[index], value: index === null ? null : curve[signal]?.[index] };
       });
       const known = here.filter(({ value }) => value !== null && value !== undefined);
       dots.push(...known.map(({ curve, time, value }) => this.#dot(curve, signal, time, value)));
       for (const each of known) each.top = this.#top(signal, each.value) - VALUE_PX / 2;
-      const [lowest, highest] = [0, 1].map((value) => this.#top(signal, value));
+      const [lowest, highest] = this.#panes[signal].scale.map((value) => this.#top(signal, value));
       const texts = known.map(({ value }) => shown(value));
       known.forEach((each, place) => { // equal numbers are seen once
         each.isAgain = texts.indexOf(texts[place]) < place;
@@ -209,8 +219,9 @@ export class Chart {
 
   #newPlot(signals, data) {
     const panes = this.#panes; // a plot is drawn once more after the curves have gone
-    const ticks = this.#isLow ? FEW_TICKS : TICKS;
-    const marks = signals.flatMap((signal) => ticks[signal].map((value) => [heightOf(panes, signal, value), value]));
+    const kind = this.#isLow || signals.length > 2 ? "few" : "usual";
+    const marks = signals.flatMap((signal) => marksOf(signal, panes[signal].scale, kind)
+      .map((value) => [heightOf(panes, signal, value), value]));
     const { clientWidth, clientHeight } = this.#host;
     const letterPx = Math.min(clientWidth, clientHeight) < LARGE_PX ? 12 : 14;
     const font = `${letterPx}px system-ui, sans-serif`;
@@ -271,7 +282,7 @@ export class Chart {
       if (!this.#onThreshold || !this.#line.hasPointerCapture(event.pointerId)) return;
       event.stopPropagation();
       const { top, height } = plot.over.getBoundingClientRect();
-      const [from, to] = this.#panes.success;
+      const { from, to } = this.#panes.success;
       const value = ((1 - (event.clientY - top) / height) - from) / (to - from);
       this.#onThreshold(Math.round(100 * Math.min(Math.max(value, 0), 1)) / 100);
     };
@@ -281,11 +292,13 @@ export class Chart {
 const STEPS = [1, 2, 5].flatMap((digit) => [1, 10, 100, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8].map((power) => digit * power))
   .sort((one, other) => one - other);
 
-/** Ends the grid between two signals. */
-function clearBetween({ ctx, bbox }, { progress, success }) {
-  if (!success) return;
-  const [top, bottom] = [1 - progress[0], 1 - success[1]].map((share) => bbox.top + share * bbox.height + devicePixelRatio);
-  ctx.clearRect(bbox.left, top, bbox.width, bottom - top - 2 * devicePixelRatio);
+/** Ends the grid between signals. */
+function clearBetween({ ctx, bbox }, panes) {
+  const ordered = Object.values(panes); // from above
+  ordered.slice(1).forEach(({ to }, place) => {
+    const [top, bottom] = [1 - ordered[place].from, 1 - to].map((share) => bbox.top + share * bbox.height + devicePixelRatio);
+    ctx.clearRect(bbox.left, top, bbox.width, bottom - top - 2 * devicePixelRatio);
+  });
 }
 
 /** Writes the name of each signal beside its part of the axis. */
@@ -295,11 +308,12 @@ function drawNames({ ctx, bbox }, panes, letterPx) {
   ctx.fillStyle = themed("--faint");
   ctx.font = `${letterPx * scale}px system-ui, sans-serif`;
   ctx.textAlign = "center";
-  for (const [signal, [from, to]] of Object.entries(panes)) {
+  for (const [signal, { from, to }] of Object.entries(panes)) {
+    const title = titleOf(signal);
     ctx.save();
     ctx.translate(bbox.left - 50 * scale, bbox.top + (1 - (from + to) / 2) * bbox.height);
     ctx.rotate(-Math.PI / 2);
-    if ((to - from) * bbox.height > ctx.measureText(signal).width) ctx.fillText(signal, 0, 8 * scale);
+    if ((to - from) * bbox.height > ctx.measureText(title).width) ctx.fillText(title, 0, 8 * scale);
     ctx.restore();
   }
   ctx.restore();

@@ -11,6 +11,7 @@ export class Curve {
   times = [];
   progress = [];
   success = [];
+  leading = "progress"; // the score that tells how far the task is
   state = "waiting";
   error = null;
   version = null;
@@ -55,6 +56,8 @@ export class Curve {
       this.allTimes = document.times_s ?? Array.from({ length: this.numFrames }, (_, index) => index / this.fps);
       this.state = "scoring";
     } else if (name === "scores") {
+      this.leading = document.leading;
+      if (this.leading !== "progress") (this[this.leading] ??= []).push(...document[this.leading]);
       this.progress.push(...document.progress);
       this.success.push(...document.success);
       this.times = this.allTimes.slice(0, this.progress.length);

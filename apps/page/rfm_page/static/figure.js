@@ -3,6 +3,7 @@
 
 import { colourOf, heightOf, panesOf, themed } from "./chart.js";
 import { shortNames } from "./curves.js";
+import { leadingOf, marksOf, titleOf } from "./signals.js";
 import { cut } from "./text.js";
 
 const [WIDTH, PLOT_HEIGHT] = [252, 150]; // points; 3.5 inches, the column of a two-column paper
@@ -10,7 +11,6 @@ const [LEFT, RIGHT, TOP] = [34, 10, 6];
 const LINE = 10; // points
 const FONT = "Helvetica, Arial, sans-serif";
 const LETTERS = 42; // that fit into the width
-const MARKS = { progress: [0, 0.5, 1], success: [0, 1] };
 const NUM_TIMES = 6;
 const PNG_WIDTH_PX = 2100; // 600 dots an inch: twice what papers ask of pictures
 
@@ -40,12 +40,13 @@ export function svgFigure(template, curves, { title, threshold, label = "seconds
   add("rect", { width: WIDTH, height, fill: themed("--page", template) });
   titles.forEach((text) => add("text", { x: LEFT, y: TOP + 8, "font-size": 8, fill: ink }, text));
   for (const signal of Object.keys(panes)) {
-    for (const value of MARKS[signal]) {
+    const { scale } = panes[signal];
+    for (const value of marksOf(signal, scale, "few")) {
       add("line", { x1: LEFT, x2: WIDTH - RIGHT, y1: y(signal, value), y2: y(signal, value), stroke: grid, "stroke-width": 0.5 });
       add("text", { x: LEFT - 3, y: y(signal, value) + 2.5, "text-anchor": "end", fill: faint }, `${value}`);
     }
-    const middle = (y(signal, 0) + y(signal, 1)) / 2;
-    add("text", { x: 0, y: 0, transform: `translate(9 ${middle}) rotate(-90)`, "text-anchor": "middle", fill: ink }, signal);
+    const middle = (y(signal, scale[0]) + y(signal, scale[1])) / 2;
+    add("text", { x: 0, y: 0, transform: `translate(9 ${middle}) rotate(-90)`, "text-anchor": "middle", fill: ink }, titleOf(signal));
   }
   const bottom = top + PLOT_HEIGHT;
   for (const time of roundTimes(end)) {
@@ -68,7 +69,7 @@ export function svgFigure(template, curves, { title, threshold, label = "seconds
   }
   shortNames(drawn, LETTERS).forEach((name, place) => {
     const at = bottom + 2 * LINE + 8 + place * (LINE + 2);
-    const stroke = colourOf(drawn[place], "progress", template);
+    const stroke = colourOf(drawn[place], leadingOf(drawn[place]), template);
     add("line", { x1: LEFT, x2: LEFT + 14, y1: at - 2.5, y2: at - 2.5, stroke, "stroke-width": 1.5 });
     add("text", { x: LEFT + 18, y: at, fill: ink }, name);
   });
@@ -95,7 +96,7 @@ export async function pngFigure(svg) {
 function runs(curve, signal) {
   const pieces = [[]];
   curve.times.forEach((time, index) => {
-    const value = curve[signal][index];
+    const value = curve[signal]?.[index];
     if (value === null || value === undefined) pieces.push([]);
     else pieces.at(-1).push([time, value]);
   });

@@ -3,6 +3,7 @@
 
 import { hasKey, KeyWanted, liveNews } from "./api.js";
 import { LiveCard } from "./livecard.js";
+import { cellOf, learn } from "./signals.js";
 import { cell, label } from "./table.js";
 import { NONE, shown } from "./text.js";
 
@@ -65,7 +66,8 @@ export class LiveTab {
     this.#timer = setTimeout(() => this.#ask(asking), after);
   }
 
-  #take({ cursor, is_whole: isWhole, most_points: mostPoints, episodes }) {
+  #take({ cursor, is_whole: isWhole, most_points: mostPoints, scores, episodes }) {
+    learn(scores);
     this.#cursor = cursor;
     const there = new Set(episodes.map(({ id }) => id));
     for (const id of [...this.#cards.keys()].filter((each) => isWhole || !there.has(each))) this.#remove(id);
@@ -115,7 +117,12 @@ export class LiveTab {
       const own = all.slice(0, last);
       const numRunning = cards.filter((card) => card.run === run && !card.hasEnded).length;
       const rate = own.length ? `${(100 * mean(own.map(({ succeeded }) => Number(succeeded)))).toFixed(0)} %` : NONE;
-      const means = ["lastProgress", "lastSuccess"].map((name) => shown(mean(own.map((card) => card[name]))));
+      const newest = own[0] ?? cards.find((card) => card.run === run);
+      const alike = own.filter(({ leading }) => leading === newest.leading); // seconds and shares have no mean
+      const means = [
+        cellOf(newest.leading, mean(alike.map(({ lastLeading }) => lastLeading))),
+        shown(mean(own.map(({ lastSuccess }) => lastSuccess))),
+      ];
       const steps = mean(own.map(({ numSteps }) => numSteps));
       const texts = [numRunning, all.length, rate, ...means, steps === null ? NONE : steps.toFixed(1)];
       const row = document.createElement("tr");

@@ -3,6 +3,7 @@
 
 import { liveFrame } from "./api.js";
 import { Chart } from "./chart.js";
+import { leadingOf, shortOf, measured, toldAt } from "./signals.js";
 import { shown } from "./text.js";
 
 const NUMBERS = ["Step", "Progress", "Success", "Lag", "Last step"];
@@ -62,8 +63,13 @@ export class LiveCard {
     return this.#newest?.succeeded ?? false;
   }
 
-  get lastProgress() {
-    return this.#newest?.progress ?? null;
+  /** The name of the score that tells how far the task is. */
+  get leading() {
+    return leadingOf(this.#curve);
+  }
+
+  get lastLeading() {
+    return this.#curve[this.leading].at(-1) ?? null;
   }
 
   get lastSuccess() {
@@ -88,16 +94,16 @@ export class LiveCard {
   }
 
   /** Takes over what is new, and its rank. */
-  take({ id: _id, age_s: ageS, steps, progress, success, newest, frame, ...about }, rank) {
+  take({ id: _id, age_s: ageS, steps, progress, success, instead, newest, frame, ...about }, rank) {
     this.#rank = rank;
     this.#heardMs = performance.now() - 1000 * ageS;
     if (!steps) return; // nothing
     const most = (values) => values.slice(-this.#mostPoints);
-    const { times, progress: oldProgress, success: oldSuccess } = this.#curve;
-    this.#curve = {
-      index: 0, successIndex: 1, times: most([...times, ...steps]),
-      progress: most([...oldProgress, ...progress]), success: most([...oldSuccess, ...success]),
-    };
+    const old = this.#curve;
+    const [leading = "progress"] = Object.keys(instead);
+    const news = { times: steps, progress, success, ...instead };
+    const joined = Object.entries(news).map(([name, values]) => [name, most([...(old[name] ?? []), ...values])]);
+    this.#curve = { index: 0, successIndex: 1, leading, ...Object.fromEntries(joined) };
     this.#about = about;
     this.#newest = newest;
     this.#frame = frame;
@@ -122,19 +128,20 @@ export class LiveCard {
 
   #showNews() {
     const { task, has_ended: hasEnded, threshold } = this.#about;
-    const { step, progress, success, succeeded, ms } = this.#newest ?? {};
+    const { step, success, succeeded, ms } = this.#newest ?? {};
     this.#heading.textContent = this.title;
     this.#state.textContent = `${hasEnded ? "ended" : "running"}${succeeded ? ", succeeded" : hasEnded ? ", no success" : ""}`;
     this.#state.className = `state ${succeeded ? "good" : hasEnded ? "bad" : ""}`;
     this.#task.textContent = task;
     this.element.classList.toggle("ended", hasEnded);
     this.#image.alt = `Newest frame of ${this.title}: ${task}`;
-    const texts = { Step: `${step ?? "-"}`, Progress: shown(progress), Success: shown(success), Lag: ms === undefined ? "-" : `${ms.toFixed(0)} ms` };
+    const texts = { Step: `${step ?? "-"}`, Progress: measured(this.leading, this.lastLeading), Success: shown(success), Lag: ms === undefined ? "-" : `${ms.toFixed(0)} ms` };
     for (const [name, text] of Object.entries(texts)) this.#numbers.get(name).textContent = text;
     const { times } = this.#curve;
+    this.#numbers.get("Progress").previousSibling.textContent = capitalised(shortOf(this.leading));
     this.#chart.setThreshold(threshold);
     this.#chart.show([{ ...this.#curve, label: this.title, begin: times[0], allTimes: times }]);
-    this.#chartHost.setAttribute("aria-label", `${times.length} steps: final progress ${shown(progress)}, final success ${shown(success)}`);
+    this.#chartHost.setAttribute("aria-label", `${times.length} steps: final ${toldAt(this.#curve, -1)}, final success ${shown(success)}`);
   }
 
   /** Fetches the newest frame if somebody can see it. */
@@ -152,4 +159,8 @@ export class LiveCard {
       this.#isFetching = false;
     }
   }
+}
+
+function capitalised(word) {
+  return word[0].toUpperCase() + word.slice(1);
 }

@@ -14,7 +14,7 @@ import { showTable } from "./table.js";
 import { Tabs } from "./tabs.js";
 import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
-import { shown } from "./text.js";
+import { learn, toldAt } from "./signals.js";
 import { addVerdict } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
@@ -48,6 +48,7 @@ async function begin() {
     failed(error);
     return;
   }
+  learn(gateway.scores);
   page["key-form"].hidden = true;
   page.model.replaceChildren(...gateway.models.map(({ name }) => new Option(name)));
   page.rule.replaceChildren(...gateway.rules.map(({ name }) => new Option(name)));
@@ -308,7 +309,7 @@ function update() {
   const done = curves.filter(({ state }) => state === "done").length;
   if (curves.length) page.status.textContent = `${done} of ${curves.length} curves are done.`;
   page.chart.setAttribute("aria-label", scored.length
-    ? scored.map((curve) => `${curve.label}: final progress ${shown(curve.progress.at(-1))}`).join("; ")
+    ? scored.map((curve) => `${curve.label}: final ${toldAt(curve, -1)}`).join("; ")
     : "No curves yet.");
 }
 

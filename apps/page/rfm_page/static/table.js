@@ -2,6 +2,7 @@
 // The curves as a table: what was asked, and how each ends.
 
 import { colourOf } from "./chart.js";
+import { cellOf, leadingOf } from "./signals.js";
 import { cut, NONE, shown } from "./text.js";
 
 const NAME_LETTERS = 28;
@@ -23,8 +24,8 @@ function row(curve, threshold) {
   const from = curve.succeedsAt(threshold);
   const frames = curve.numFrames === null ? NONE : `${curve.progress.length} of ${curve.numFrames}`;
   element.append(named(curve, curve.name), ...[curve.task, curve.model, curve.sampling].map((text) => cell(text)), cell(frames, "number"));
-  const numbers = [curve.progress.at(-1), curve.success.at(-1)];
-  element.append(...numbers.map((value) => cell(shown(value), "number")));
+  const leading = leadingOf(curve);
+  element.append(...[cellOf(leading, curve[leading].at(-1)), shown(curve.success.at(-1))].map((text) => cell(text, "number")));
   element.append(cell(from === null ? NONE : `${from.toFixed(2)} s`, "number"));
   const warning = curve.blank && `${curve.blank}: the scores mean nothing`;
   element.append(cell(curve.error ?? [curve.state, warning].filter(Boolean).join("; "), curve.error || warning ? "failed" : ""));

@@ -1,18 +1,27 @@
 // SPDX-License-Identifier: MIT
 // What can be taken along: CSV, JSON, files, and the command lines that give the same numbers.
 
+import { leadingOf } from "./signals.js";
+
 const LOOPBACK = /^\w+:\/\/(localhost|127\.[\d.]+|\[::1\])([:/]|$)/;
 
 /** The curves as CSV, one line a point. */
 export function csv(curves) {
-  const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "orient", "channels", "frame", "time_s", "progress", "success"];
+  const instead = insteadOf(curves);
+  const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "orient", "channels", "frame", "time_s", "progress", "success", ...instead];
   const lines = curves.flatMap((curve) =>
     curve.times.map((time, index) => [
       curve.video.name, curve.task, curve.model, curve.version, curve.rule, curve.sampledFrames, curve.fps,
       curve.orient, curve.channels, index, time, curve.progress[index], curve.success[index],
+      ...instead.map((name) => curve[name]?.[index]),
     ]),
   );
   return [columns, ...lines].map((values) => values.map(csvField).join(",") + "\r\n").join("");
+}
+
+/** The scores that models predict in place of progress. */
+function insteadOf(curves) {
+  return [...new Set(curves.map(leadingOf))].filter((name) => name !== "progress").sort();
 }
 
 function csvField(value) {
@@ -36,6 +45,7 @@ export function json(url, curves, verdicts) {
     num_frames: curve.numFrames,
     progress: curve.progress,
     success: curve.success,
+    ...Object.fromEntries(insteadOf([curve]).map((name) => [name, curve[name]])),
     frame_indices: curve.progress.map((_, index) => index),
     frame_times_s: curve.times,
     ...(curve.error ? { error: curve.error } : {}),

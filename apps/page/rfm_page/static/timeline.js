@@ -3,6 +3,7 @@
 
 import { Chart } from "./chart.js";
 import { pointAt } from "./curves.js";
+import { toldAt } from "./signals.js";
 import { shown } from "./text.js";
 import { Videos } from "./videos.js";
 
@@ -62,9 +63,9 @@ export class Timeline {
 
   /** What stands beside the lines, for somebody who hears the page. */
   #numbers() {
-    return this.#curves.map(({ label, times, progress, success }) => {
-      const index = pointAt(times, this.time);
-      return `${label}: progress ${shown(progress[index])}, success ${shown(success[index])}`;
+    return this.#curves.map((curve) => {
+      const index = pointAt(curve.times, this.time) ?? Infinity; // before the first point there is no number
+      return `${curve.label}: ${toldAt(curve, index)}, success ${shown(curve.success[index])}`;
     });
   }
 
