@@ -169,6 +169,9 @@ def serve(
     raise_limit()  # Triton and the gateway inherit it
     folder, more_arguments = _folder_and_arguments(words or (), repository)
     config = _config(config_file, serve=given, gateway=gateway_given)
+    if gateway_given and config.gateway.port is None:
+        option = GatewayBeside.settings()[next(iter(gateway_given))].option
+        raise typer.BadParameter(f"{option} needs --gateway-port, which starts the gateway")
     write_log("rfm-serve", os.environ)
     if accept_known_vulnerabilities and not config.serve.is_loopback:
         logger.warning("%s is no loopback address, and %s", config.serve.host, ACCEPTED_WARNING)

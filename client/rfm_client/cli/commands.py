@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 import shlex
+import time
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
@@ -182,8 +183,10 @@ def status(
 @with_options
 def wait(server: WaitOptions) -> None:
     """Wait until a server has the model ready, or --timeout passes."""
+    started_s = time.monotonic()
     with server.client() as client:
         client.wait_ready(server.timeout_s)
+    typer.echo(f"ready after {time.monotonic() - started_s:.1f} s")
 
 
 @app.command(cls=Command, epilog=EXIT_CODES)
