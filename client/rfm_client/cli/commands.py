@@ -18,6 +18,7 @@ from rfm_client.cli import comparing, documents, scoring
 from rfm_client.cli.command import (
     EXIT_CODES,
     Command,
+    Commands,
     Given,
     add_missing,
     exit_code_of,
@@ -49,8 +50,9 @@ MIN_COMPARED = 2
 
 app = typer.Typer(
     name="rfm-client",
+    cls=Commands,
     help="Scores videos with a served reward model, and shows the state of its server.",
-    epilog=EXIT_CODES,
+    epilog=f"To export and serve models, use rfm on the server: rfm --help\n\n{EXIT_CODES}",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
