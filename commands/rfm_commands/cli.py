@@ -34,7 +34,7 @@ try:
     )  # before the modules below, which import it
 except ModuleNotFoundError:
     raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./apps/gateway .") from None
-from rfm_commands.command import AdminKeyFile, RfmCommand, TritonPath, fail, say
+from rfm_commands.command import AdminKeyFile, RfmCommand, RfmCommands, TritonPath, fail, say
 from rfm_commands.config import Config
 from rfm_commands.demo import demo
 from rfm_commands.models import app as models_app
@@ -48,7 +48,9 @@ logger = logging.getLogger("rfm.serve")
 
 app = typer.Typer(
     name="rfm",
+    cls=RfmCommands,
     help="Reward models for robot learning, served by Triton.",
+    epilog="rfm runs on the server. On every other machine use rfm-client, which scores videos: rfm-client --help",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
@@ -169,6 +171,9 @@ def serve(
     raise_limit()  # Triton and the gateway inherit it
     folder, more_arguments = _folder_and_arguments(words or (), repository)
     config = _config(config_file, serve=given, gateway=gateway_given)
+    if gateway_given and config.gateway.port is None:
+        option = GatewayBeside.settings()[next(iter(gateway_given))].option
+        raise typer.BadParameter(f"{option} needs --gateway-port, which starts the gateway")
     write_log("rfm-serve", os.environ)
     if accept_known_vulnerabilities and not config.serve.is_loopback:
         logger.warning("%s is no loopback address, and %s", config.serve.host, ACCEPTED_WARNING)

@@ -25,6 +25,13 @@ class RfmCommand(command.Command):
     has_codes = False
 
 
+class RfmCommands(command.Commands):
+    """The commands of ``rfm``, which name ``rfm-client`` for the commands that only it has."""
+
+    other_program = "rfm-client"
+    others = ("score", "compare", "status", "wait", "sample", "bench-input", "evaluate")
+
+
 def say(line: str) -> None:
     """Write a line to standard error."""
     command.report(line, RfmCommand.program)

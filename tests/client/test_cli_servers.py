@@ -179,11 +179,17 @@ def test_one_server_that_is_down_does_not_matter(served: Served) -> None:
 
 def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(served: Served) -> None:
     result = ask(served, "wait")
-    assert (result.exit_code, result.output) == (0, "")
+    assert result.exit_code == 0
+    assert re.fullmatch(r"ready after \d+\.\d s\n", result.output)
     url = free_url()
     result = invoke("wait", "--url", url, "--timeout", 0.2)
     assert result.exit_code == ExitCode.DEADLINE
     assert result.stderr == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s\n"
+
+
+def test_python_runs_the_package_as_the_command() -> None:
+    shown = subprocess.run([sys.executable, "-m", "rfm_client", "--version"], capture_output=True, text=True)
+    assert (shown.returncode, shown.stdout.split()[0]) == (0, "rfm-client")
 
 
 def test_an_interrupt_ends_it_without_a_traceback() -> None:

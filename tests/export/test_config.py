@@ -247,6 +247,12 @@ def test_a_gateway_that_would_not_start_is_refused_before_triton_starts(name: st
     assert "nowhere" in result.stderr
 
 
+def test_an_option_of_the_gateway_needs_its_port() -> None:
+    result = invoke("serve", str(REPOSITORY), "--gateway-dataset=nowhere")
+    assert result.exit_code == 2
+    assert "--gateway-dataset needs --gateway-port" in result.stderr
+
+
 def test_a_gateway_before_a_model_that_is_not_there_is_refused_with_those_that_are() -> None:
     result = invoke("serve", str(REPOSITORY), "--gateway-port=8100", "--gateway-model=nope")
     told = "rfm: gateway: model: expected one of rfm, got nope; --gateway-model names another\n"

@@ -49,6 +49,23 @@ def test_no_name_and_no_sentence_is_cut_off(name: str) -> None:
     assert_whole(done.output, COMMANDS[name])
 
 
+def test_a_command_of_the_other_program_is_told_with_that_program() -> None:
+    for program, other in (("rfm", "rfm-client"), ("rfm-client", "rfm")):
+        names = {each.split()[1]: each for each in COMMANDS if each.startswith(f"{other} ")}
+        missing = [name for name in names if f"{program} {name}" not in COMMANDS]
+        assert missing
+        for name in missing:
+            done = CliRunner().invoke(COMMANDS[program], [name, "a.mp4"], env=COMMON, prog_name=program)
+            assert done.exit_code == 2
+            assert f"No such command '{name}': that is `{other} {name}`" in done.stderr
+
+
+def test_the_help_of_each_program_names_the_other() -> None:
+    for program, other in (("rfm", "rfm-client --help"), ("rfm-client", "rfm --help")):
+        shown = CliRunner().invoke(COMMANDS[program], ["--help"], env=COMMON, prog_name=program).output
+        assert other in " ".join(shown.split())
+
+
 def test_options_stand_in_groups_and_an_example_below() -> None:
     shown = CliRunner().invoke(COMMANDS["rfm"], ["serve", "--help"], env=COMMON, prog_name="rfm").output
     places = [

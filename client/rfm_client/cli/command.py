@@ -6,14 +6,14 @@ from __future__ import annotations
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING
 from enum import IntEnum
 from typing import Annotated, Any, Generic, NoReturn, TypeVar, get_args, get_origin
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 from typer.models import OptionInfo
 
 from rfm_client.contract import errors
@@ -145,6 +145,19 @@ class Command(TyperCommand):
         for line in lines:
             report(line, self.program)
         raise typer.Exit(code)
+
+
+class Commands(TyperGroup):
+    """The commands of ``rfm-client``. Names the right program for a command of the other one."""
+
+    other_program = "rfm"
+    others: Collection[str] = ("export", "serve", "demo", "models")
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command. Raises an error of usage that names the other program, where that has it."""
+        if args[0] in self.others and self.get_command(ctx, args[0]) is None:
+            ctx.fail(f"No such command '{args[0]}': that is `{self.other_program} {args[0]}`")
+        return super().resolve_command(ctx, args)
 
 
 def exit_code(error: BaseException) -> ExitCode:

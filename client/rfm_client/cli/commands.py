@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 import shlex
+import time
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +18,7 @@ from rfm_client.cli import comparing, documents, scoring
 from rfm_client.cli.command import (
     EXIT_CODES,
     Command,
+    Commands,
     Given,
     add_missing,
     exit_code_of,
@@ -48,8 +50,9 @@ MIN_COMPARED = 2
 
 app = typer.Typer(
     name="rfm-client",
+    cls=Commands,
     help="Scores videos with a served reward model, and shows the state of its server.",
-    epilog=EXIT_CODES,
+    epilog=f"To export and serve models, use rfm on the server: rfm --help\n\n{EXIT_CODES}",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
@@ -182,8 +185,10 @@ def status(
 @with_options
 def wait(server: WaitOptions) -> None:
     """Wait until a server has the model ready, or --timeout passes."""
+    started_s = time.monotonic()
     with server.client() as client:
         client.wait_ready(server.timeout_s)
+    typer.echo(f"ready after {time.monotonic() - started_s:.1f} s")
 
 
 @app.command(cls=Command, epilog=EXIT_CODES)
