@@ -195,7 +195,7 @@ VERSIONED := $(PROJECTS) CITATION.cff docker/.env.example docker/compose.yaml \
 
 # Write a version into every file that names it: make version VERSION=1.2.3
 version:
-	sed -i "s/$$(sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)/$(VERSION)/g" $(VERSIONED)
+	sed -i "s/$$(sed -n 's/^version = "\(.*\)"/\1/; T; s/[.]/[.]/gp' pyproject.toml)/$(VERSION)/g" $(VERSIONED)
 
 # Format the code.
 format: $(INSTALLED)
