@@ -99,7 +99,7 @@ def test_a_browser_can_open_the_link(link: str, config: GatewayConfig) -> None:
 OF_TRITON = {
     "no connection": (unreachable("grpc://gpu:1", "refused"), "names another with --triton"),
     "no access": (denied("grpc://gpu:1", "401", "a key is missing"), "sets --triton-ca-file, --triton-certificate and"),
-    "another model": (not_served("rfm is unknown", ["toy"]), "names a served model with --model"),
+    "another model": (not_served("rfm", "rfm is unknown", ["toy"]), "names a served model with --model"),
 }
 
 
