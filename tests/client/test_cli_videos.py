@@ -59,7 +59,7 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
     assert sorted(result.stderr.splitlines()) == sorted(  # as they are done
         [
             f"rfm-client: note: {video}: 16 of 32 frames were scored, evenly spaced",
-            f"rfm-client: {missing}: video: expected a file with a video stream, got No such file or directory",
+            f"rfm-client: {missing}: video: expected a video file, got no file of this name",
         ]
     )
     with served.client("http", MODEL) as client:

@@ -144,6 +144,8 @@ def _errors_of(source: str | Path) -> Iterator[None]:
         raise InvalidSampleError.like(error, source=str(source)) from error
     except (import_av().FFmpegError, OSError) as error:
         told = InvalidSampleError.at("video", _EXPECTED, error.strerror or error)
+        if isinstance(error, FileNotFoundError):
+            told = InvalidSampleError.at("video", "a video file", "no file of this name")
         raise InvalidSampleError.like(told, source=str(source)) from error
 
 
