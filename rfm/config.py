@@ -51,7 +51,7 @@ class CheckpointConfig(Settings):
     image_encoder: str | None = setting(None, "Folder or id of ReWiND's image encoder.")
     text_encoder: str | None = setting(None, "Folder or id of ReWiND's text encoder.")
     base_model: str | None = setting(
-        None, "Folder or id of a vision-language checkpoint's base model; else the one that it names."
+        None, "Folder or id of a vision-language checkpoint's base model. Default: as the checkpoint says."
     )
     reward_model: str | None = setting(
         None,
@@ -73,7 +73,7 @@ class CheckpointConfig(Settings):
         "Round the weights of a vision-language model to 8 bits (int8) or 4 bits (nf4), for GPUs of 8 or 12 GB. Scores "
         "are then not the full checkpoint's. Default: as in the checkpoint.",
     )
-    dtype: Dtype | None = setting(None, "Number type of the network; else as checkpoint and device decide.")
+    dtype: Dtype | None = setting(None, "Number type of the network. Default: by checkpoint and device.")
 
     @property
     def torch_dtype(self) -> torch.dtype | None:
@@ -90,37 +90,37 @@ class ExportConfig(CheckpointConfig):
     TITLE: ClassVar[str] = "Export"
     NO_OPTION: ClassVar[Collection[str]] = {"batch_size"}
 
-    name: str = setting(DEFAULT_MODEL, "Model name in the repository; raw frames are scored by NAME_frames.")
+    name: str = setting(DEFAULT_MODEL, "Model name in the repository. NAME_frames scores raw frames.")
     num_gpus: int | None = setting(
-        None, "GPUs, with as many instances on each; else all, or the CPU. 0: the CPU.", least=0, **_OF_A_MACHINE
+        None, "Number of GPUs; 0 means the CPU. Default: all GPUs, or the CPU.", least=0, **_OF_A_MACHINE
     )
     instances: int | None = setting(
         None,
-        "Of each model, on each GPU or on the CPU; else 2 on each GPU of a model that scores embeddings, and 1.",
+        "Instances of each model per GPU, or on the CPU. Default: 2 per GPU for models of embeddings, else 1.",
         least=1,
         **_OF_A_MACHINE,
     )
     torch_threads: int = setting(
-        0, "CPU threads of each instance. 0: the instances of a model share the cores.", least=0, **_OF_A_MACHINE
+        0, "CPU threads per instance; 0 divides the cores among the instances.", least=0, **_OF_A_MACHINE
     )
     max_batch_size: int | None = setting(
-        None, "Most samples of one batch, over all callers. Default: enough to saturate a GPU, at most 64.", **_COUNT
+        None, "Largest batch, over all callers. Default: enough to saturate a GPU, at most 64.", **_COUNT
     )
     token_budget: int = setting(
-        DEFAULT_TOKEN_BUDGET, "Most tokens, with padding, of one forward pass of several samples.", **_COUNT
+        DEFAULT_TOKEN_BUDGET, "Largest forward pass of several samples, in tokens with padding.", **_COUNT
     )
     max_sample_tokens: int = setting(
-        DEFAULT_SAMPLE_TOKENS, "Most tokens of one sample, or of the longest prefix; bounds memory.", **_COUNT
+        DEFAULT_SAMPLE_TOKENS, "Largest sample, or longest prefix, in tokens. Bounds memory.", **_COUNT
     )
     max_queue_size: int | None = setting(
-        None, "Requests that may wait for a model; more are rejected at once. Else any number.", **_COUNT
+        None, "Most requests that wait for a model; others are rejected. Default: no limit.", **_COUNT
     )
     queue_timeout_ms: int | None = setting(
-        None, "Longest that a request waits before it is rejected, if it asks for no less; else any time.", **_COUNT
+        None, "Longest wait of a request before it is rejected. Default: no limit.", **_COUNT
     )
     feature_cache_mib: int = setting(
         DEFAULT_FEATURE_CACHE_MB,
-        "MiB for the features of frames on each device: ReWiND's embeddings, vision towers' features. 0: none.",
+        "Cache of frame features on each device, in MiB; 0 turns it off.",
         least=0,
         most=MAX_INT32,
     )
@@ -153,24 +153,22 @@ class ServeConfig(Settings):
     http_port: int | None = setting(None, f"Triton's HTTP port; else 8000{_OR_MOVED}", **_PORT)
     grpc_port: int | None = setting(None, f"Triton's gRPC port; else 8001{_OR_MOVED}", **_PORT)
     metrics_port: int | None = setting(None, f"Port of Triton's metrics; else 8002{_OR_MOVED}", **_PORT)
-    status_port: int | None = setting(None, "Port of rfm serve's own state: /live, /ready and /metrics.", **_PORT)
+    status_port: int | None = setting(None, "Port of /live, /ready and /metrics of rfm serve.", **_PORT)
     http_threads: int | None = setting(
-        None, "Threads that read HTTP requests; else Triton's choice.", least=1, **_OF_A_MACHINE
+        None, "Threads for HTTP requests. Default: Triton's choice.", least=1, **_OF_A_MACHINE
     )
     grpc_certificate: Path | None = setting(
-        None, "Serve gRPC with TLS, by this certificate (PEM); HTTP then only on 127.0.0.1."
+        None, "Serve gRPC with TLS and this certificate (PEM); HTTP then stays on 127.0.0.1."
     )
     grpc_key: Path | None = setting(None, "The certificate's key (PEM).")
-    grpc_client_ca: Path | None = setting(None, "Authorities (PEM) of gRPC's clients, which then need a certificate.")
-    probe_s: int = setting(2, "Seconds between the probes of a model.", **_COUNT)
+    grpc_client_ca: Path | None = setting(None, "Require client certificates from these authorities (PEM) over gRPC.")
+    probe_s: int = setting(2, "Seconds between two probes of a model.", **_COUNT)
     hang_s: int = setting(
         DEFAULT_HANG_S,
-        "Seconds without progress of a batch after which Triton is started again.",
+        "Restart Triton after N seconds without progress of a batch.",
         **_COUNT,
     )
-    triton_silent_s: int = setting(
-        10, "Seconds without an answer after which Triton, or the gateway, is killed and restarted.", **_COUNT
-    )
+    triton_silent_s: int = setting(10, "Restart a Triton or gateway that does not answer for N seconds.", **_COUNT)
 
     def __post_init__(self) -> None:
         super().__post_init__()

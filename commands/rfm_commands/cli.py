@@ -83,21 +83,21 @@ def export(
     given: Given[ExportConfig],
     repository: Annotated[Path, typer.Option(help="Triton model repository.")],
     source: Annotated[
-        str | None, typer.Argument(metavar="CHECKPOINT", help="As --checkpoint.", show_default=False)
+        str | None, typer.Argument(metavar="CHECKPOINT", help="The same as --checkpoint.", show_default=False)
     ] = None,
     config_file: ConfigFile = None,
     other_machine: Annotated[
-        bool, typer.Option("--other-machine", help="It is served elsewhere: num_gpus may be more than there are here.")
+        bool, typer.Option("--other-machine", help="Export for another machine, which may have more GPUs.")
     ] = False,
     device: Annotated[
         str | None,
         typer.Option(
-            help="Where the scores of export and checkpoint are compared: cpu, cuda, cuda:1. Else the CPU, and for a "
-            "vision-language checkpoint a GPU with room for it."
+            help="Device that compares the scores of export and checkpoint: cpu, cuda, cuda:1. Default: the CPU; for a "
+            "vision-language checkpoint a GPU with enough memory."
         ),
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Write nothing; compare the files with those that would be written.")
+        bool, typer.Option("--check", help="Write nothing; compare the repository with what would be written.")
     ] = False,
     explain: Annotated[
         bool, typer.Option("--explain", help="Write nothing; print the source of each setting of the checkpoint.")
@@ -151,7 +151,7 @@ def serve(
             show_default=False,
         ),
     ] = None,
-    repository: Annotated[Path | None, typer.Option(help="The repository, in the place of FOLDER.")] = None,
+    repository: Annotated[Path | None, typer.Option(help="The repository; the same as FOLDER.")] = None,
     config_file: ConfigFile = None,
     admin_key_file: AdminKeyFile = None,
     accept_known_vulnerabilities: Annotated[

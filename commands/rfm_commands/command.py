@@ -11,10 +11,13 @@ import typer
 from rfm_client.cli import command
 
 AdminKeyFile = Annotated[
-    Path | None, typer.Option(help="File with the server's admin key; else RFM_ADMIN_KEY.", show_default=False)
+    Path | None, typer.Option(help="File with the server's admin key. Default: RFM_ADMIN_KEY.", show_default=False)
 ]
 TritonPath = Annotated[
-    Path | None, typer.Option("--tritonserver", help="tritonserver program; else PATH, else the nvidia-pytriton wheel.")
+    Path | None,
+    typer.Option(
+        "--tritonserver", help="The tritonserver program. Default: from PATH, else from the nvidia-pytriton wheel."
+    ),
 ]
 
 

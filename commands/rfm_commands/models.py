@@ -43,7 +43,7 @@ class AdministeredServer(TlsFiles):
     TITLE: ClassVar[str] = "Server"
 
     url: str = setting("grpc://127.0.0.1:8001", "grpc://host:port of the server, with TLS grpcs://host:port.")
-    admin_key_file: Path | None = setting(None, "File with the server's admin key; else RFM_ADMIN_KEY.")
+    admin_key_file: Path | None = setting(None, "File with the server's admin key. Default: RFM_ADMIN_KEY.")
 
     @contextmanager
     def connected(self) -> Iterator[RepositoryApi]:

@@ -86,7 +86,7 @@ def test_defaults_bounds_and_placeholders_are_as_one_writes_them(name: str) -> N
 DEFAULTS = {
     "rfm-client score": ["default: grpc://localhost:8001; variable: RFM_URL", "default: 60", "default: --subsample"],
     "rfm-client label": ["default: --picture", "default: 4", "variable: RFM_API_KEY_FILE"],
-    "rfm-client wait": ["Seconds to wait. [0.001 to 86400; default: 120]"],
+    "rfm-client wait": ["Time limit, in seconds. [0.001 to 86400; default: 120]"],
     "rfm gateway": ["Port to listen on. [1 to 65535; default: 8000]", "default: --viewer"],
     "rfm serve": ["--gateway-viewer / --gateway-no-viewer", "default: --gateway-viewer", "default: 127.0.0.1"],
     "rfm export": ["[0 to 4096; default: 0]", "[at least 0; default: 256]"],

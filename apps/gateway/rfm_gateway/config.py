@@ -38,34 +38,34 @@ class GatewayConfig(Settings):
 
     TITLE: ClassVar[str] = "Gateway"
 
-    port: int | None = setting(None, "Port to listen on; else there is no gateway.", least=1, most=MAX_PORT)
-    host: str | None = setting(None, "Address to listen on; else that of Triton.")
+    port: int | None = setting(None, "Port of the gateway. Default: no gateway.", least=1, most=MAX_PORT)
+    host: str | None = setting(None, "Address of the gateway. Default: that of Triton.")
     triton: str | None = setting(
         None, "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://; else the one beside it."
     )
-    metrics_url: str | None = setting(None, "Triton's metrics; else those of the Triton beside it.")
-    model: str | None = setting(None, "Name under which the checkpoint was exported; else rfm, or export.name.")
-    api_key_file: Path | None = setting(None, f"File with the key that requests must show; else {KEY_VARIABLE}.")
-    certificate: Path | None = setting(None, "Serve HTTPS with this certificate (PEM), and its key.")
+    metrics_url: str | None = setting(None, "URL of Triton's metrics. Default: those of the Triton beside it.")
+    model: str | None = setting(None, "Model name in the repository. Default: rfm, or export.name.")
+    api_key_file: Path | None = setting(None, f"File with the API key that requests need. Default: {KEY_VARIABLE}.")
+    certificate: Path | None = setting(None, "Serve HTTPS with this certificate (PEM).")
     key: Path | None = setting(None, "The certificate's key (PEM).")
-    triton_ca_file: Path | None = setting(None, "Authorities (PEM) that Triton is trusted by; else the system's.")
-    triton_certificate: Path | None = setting(None, "By which Triton knows the gateway (PEM).")
+    triton_ca_file: Path | None = setting(None, "Certificate authorities (PEM) for Triton. Default: the system's.")
+    triton_certificate: Path | None = setting(None, "Client certificate (PEM) for Triton.")
     triton_key: Path | None = setting(None, "That certificate's key (PEM).")
-    cors_origin: tuple[str, ...] = setting((), "Origin from which browsers may ask. Repeat for more.")
-    allow_host: tuple[str, ...] = setting((), "Host name by which callers may ask without a key. Repeat for more.")
+    cors_origin: tuple[str, ...] = setting((), "Web origin that may send requests. Repeat for more.")
+    allow_host: tuple[str, ...] = setting((), "Host name that callers without a key may use. Repeat for more.")
     allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
     timeout_s: float = setting(
         120.0,
-        "Seconds that a request may take to arrive, then wait, then take to be scored.",
+        "Seconds for each stage of a request: arrival, wait, scoring.",
         least=_SHORTEST_S,
         most=_LONGEST_S,
         flag="--timeout",
     )
     max_body_mib: int = setting(512, "Largest request.", least=1)
-    max_in_flight: int = setting(256, "Evaluations at a time; others wait.", least=1)
-    max_waiting: int = setting(1024, "Evaluations that wait for their turn; more are refused with 503.", least=0)
-    use_frame_steps: bool = setting(False, "Score by prefixes where a request has no field use_frame_steps.")
-    refuse_blank: bool = setting(False, "Refuse black and single-colour frames; else they get a warning.")
+    max_in_flight: int = setting(256, "Most evaluations at a time; others wait.", least=1)
+    max_waiting: int = setting(1024, "Most waiting evaluations; others get 503.", least=0)
+    use_frame_steps: bool = setting(False, "Turn use_frame_steps on for requests without this field.")
+    refuse_blank: bool = setting(False, "Refuse black and single-colour frames instead of warning.")
     viewer: bool = setting(True, "Serve the page in the browser, at /.")
     dataset: tuple[str, ...] = setting((), "LeRobot folder or HDF5 file to show on the page. Repeat for more.")
 
@@ -102,7 +102,7 @@ class GatewayConfig(Settings):
 
     @property
     def checkpoint(self) -> str:
-        """Name under which the checkpoint was exported."""
+        """Model name in the repository."""
         return self.model or DEFAULT_MODEL
 
     def client(self, checkpoint: str | None = None) -> AsyncRewardClient:

@@ -96,44 +96,45 @@ class LabelOptions(Settings):
     )
     formats: Sequence[Format] = setting(
         (),
-        "Files to write; else progress,signals, of an HDF5 file hdf5.",
+        "Output formats. Default: progress,signals (HDF5 datasets: hdf5).",
         flag="--format",
         metavar=",".join(FORMATS),
         parse=_names,
     )
     cameras: Sequence[str] = setting(
-        (), "Cameras to score; else all but depth ones.", metavar="KEY[,KEY...]", parse=_names
+        (), "Cameras to score. Default: all except depth cameras.", metavar="KEY[,KEY...]", parse=_names
     )
-    fuse: Fuse = setting("mean", "How the scores of several cameras are fused.")
-    sampling: Rule | None = setting(
-        None, "Rule by which frame t's prefix is sampled; else that of the checkpoint's training."
-    )
-    frames: int | None = setting(None, "Frames that the rule shows the model; else as many as in training.", least=1)
+    fuse: Fuse = setting("mean", "How to combine the scores of several cameras.")
+    sampling: Rule | None = setting(None, "Sampling rule of each prefix. Default: as in training.")
+    frames: int | None = setting(None, "Frames per prefix. Default: as in training.", least=1)
     progress_rule: ProgressRule | None = setting(
         None,
         "How progress is made of remaining seconds, for a model without progress: "
         "remaining_over_first: 1 - the seconds / those of the episode's first frame.",
     )
     mode: Mode = setting("prefix", "prefix: frame t is scored on the frames up to t. whole: all frames together.")
-    resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
+    resize: bool = setting(False, "Downscale frames to the model's input size before sending.")
     episodes: Sequence[int] | None = setting(
-        None, "Some of the episodes, by number.", metavar="0:100,205", parse=parse_episodes
+        None, "Numbers of the episodes to label.", metavar="0:100,205", parse=parse_episodes
     )
     filter_key: str | None = setting(
         None,
         "Only the episodes of an RLDS split, or of a filter key of robomimic's HDF5 files, such as train or valid.",
         metavar="KEY",
     )
-    limit: int | None = setting(None, "At most so many episodes.", least=1)
+    limit: int | None = setting(None, "Label at most N episodes.", least=1)
     shard: tuple[int, int] | None = setting(
-        None, "Label part I of N alone, from 0; run without it to write the files.", metavar="I/N", parse=parse_shard
+        None,
+        "Label only part I of N, counted from 0. Run without it to write the files.",
+        metavar="I/N",
+        parse=parse_shard,
     )
     parts: str | None = setting(
-        None, "Where finished episodes are kept; else .NAME_parts in the output.", metavar="FOLDER|URL"
+        None, "Folder for finished episodes. Default: .NAME_parts in the output.", metavar="FOLDER|URL"
     )
-    workers: int = setting(DEFAULT_WORKERS, "Episodes under way at a time.", least=1)
-    overwrite: bool = setting(False, "Replace labels of another recipe; those of the same are kept.")
-    verify: bool = setting(False, "Tell videos from others by their SHA-256, not by their size and time of change.")
+    workers: int = setting(DEFAULT_WORKERS, "Episodes to score at a time.", least=1)
+    overwrite: bool = setting(False, "Replace labels made by another recipe.")
+    verify: bool = setting(False, "Detect changed videos by SHA-256 instead of size and mtime.")
     in_place: bool = setting(False, "Write the labels into the HDF5 file itself.")
 
     def __post_init__(self) -> None:
@@ -166,9 +167,11 @@ class RayOptions(Settings):
 
     TITLE: ClassVar[str] = "With --engine ray"
 
-    address: str | None = setting(None, "Ray cluster; else a running cluster, or a new one on this machine.")
-    actors: int = setting(1, "Ray actors, each with a scorer.", least=1)
-    num_gpus_per_actor: float = setting(0.0, "GPUs of its node that a Ray actor takes.", least=0)
+    address: str | None = setting(
+        None, "Address of a Ray cluster. Default: a running one, or a new one on this machine."
+    )
+    actors: int = setting(1, "Number of Ray actors.", least=1)
+    num_gpus_per_actor: float = setting(0.0, "GPUs per Ray actor.", least=0)
 
 
 def chosen_numbers(dataset: Dataset, options: LabelOptions) -> list[int]:

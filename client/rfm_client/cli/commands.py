@@ -162,7 +162,7 @@ def status(
     output: JsonOutput,
     server: StatusOptions,
     metrics_url: Annotated[
-        str | None, typer.Option(help="Where the server shows its metrics; else port 8002 of its host, /metrics.")
+        str | None, typer.Option(help="URL of the server's metrics. Default: /metrics on port 8002 of the same host.")
     ] = None,
 ) -> None:
     """Show the server's models, requests, batches, GPUs and memory."""

@@ -34,7 +34,7 @@ _PICTURES = (".png", ".pdf", ".svg")
 _ENDINGS = {"json": (".json",), "plot": _PICTURES, "strips": _PICTURES, "rrd": (".rrd",)}
 
 
-def timeout_setting(default_s: float, help: str = "Seconds that a request may take.") -> Any:
+def timeout_setting(default_s: float, help: str = "Time limit of a request, in seconds.") -> Any:
     """Return a field for the option ``--timeout``."""
     return setting(default_s, help, flag="--timeout", least=MIN_TIMEOUT_S, most=MAX_TIMEOUT_S)
 
@@ -45,14 +45,12 @@ class CredentialFiles(Settings):
 
     TITLE: ClassVar[str] = "Credentials"
 
-    ca_file: Path | None = setting(None, "Authorities (PEM) to trust; else the system's.", variable="RFM_CA_FILE")
-    client_certificate: Path | None = setting(
-        None, "Certificate that this client shows to the server (PEM).", variable="RFM_CLIENT_CERTIFICATE"
+    ca_file: Path | None = setting(
+        None, "Certificate authorities (PEM) to trust. Default: the system's.", variable="RFM_CA_FILE"
     )
+    client_certificate: Path | None = setting(None, "Client certificate (PEM).", variable="RFM_CLIENT_CERTIFICATE")
     client_key: Path | None = setting(None, "The certificate's key (PEM).", variable="RFM_CLIENT_KEY")
-    api_key_file: Path | None = setting(
-        None, "File with the key that requests show as Bearer.", variable="RFM_API_KEY_FILE"
-    )
+    api_key_file: Path | None = setting(None, "File with the API key.", variable="RFM_API_KEY_FILE")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -79,12 +77,12 @@ class ServerOptions(CredentialFiles):
 
     urls: Texts = setting(
         (DEFAULT_URL,),
-        "grpc://host:8001 or http://host:8000, with TLS grpcs:// or https://. Again for more servers of the same "
+        "grpc://host:8001 or http://host:8000, with TLS grpcs:// or https://. Repeat for more servers of the same "
         "checkpoint.",
         flag="--url",
         variable="RFM_URL",
     )
-    model: str = setting(DEFAULT_MODEL, "Name under which the checkpoint was exported.")
+    model: str = setting(DEFAULT_MODEL, "Model name in the repository.")
     timeout_s: float = timeout_setting(DEFAULT_TIMEOUT_S)
 
     @property
@@ -136,7 +134,7 @@ class StatusOptions(ServerOptions):
 class WaitOptions(ServerOptions):
     """Servers and model to wait for."""
 
-    timeout_s: float = timeout_setting(120.0, "Seconds to wait.")
+    timeout_s: float = timeout_setting(120.0, "Time limit, in seconds.")
 
 
 @dataclass(frozen=True)
@@ -146,10 +144,8 @@ class VideoFiles(Settings):
     TITLE: ClassVar[str] = "Videos"
 
     task: str = setting("", "The task, as a sentence.")
-    resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
-    orient: Orientation = setting(
-        "none", "Turn frames upright before they are scored (see docs/guides/label_a_dataset.md)."
-    )
+    resize: bool = setting(False, "Downscale frames to the model's input size before sending.")
+    orient: Orientation = setting("none", "Turn frames upright first (see docs/guides/label_a_dataset.md).")
     channels: ChannelOrder = setting("rgb", "Channel order in the file; bgr swaps red and blue.")
 
 
@@ -159,17 +155,15 @@ class FrameRate(Settings):
 
     TITLE: ClassVar[str] = FRAMES
 
-    fps: float = setting(3.0, "Take so many frames a second of a video.", least=0.001)
+    fps: float = setting(3.0, "Frames per second to sample.", least=0.001)
 
 
 @dataclass(frozen=True)
 class VideoOptions(FrameRate, VideoFiles):
     """Task of the videos, and choice and size of the frames to send."""
 
-    max_frames: int | None = setting(None, "Score at most so many of these frames, evenly spaced.", least=1)
-    subsample: bool = setting(
-        True, "Score at most as many frames in one pass as the checkpoint was trained on, evenly spaced."
-    )
+    max_frames: int | None = setting(None, "Score at most N evenly spaced frames.", least=1)
+    subsample: bool = setting(True, "Reduce each video to the number of frames of training, evenly spaced.")
 
 
 @dataclass(frozen=True)
@@ -184,12 +178,10 @@ class PrefixOptions(Settings):
         "all frames in one pass.",
         metavar="RULE",
     )
-    frames: int | None = setting(
-        None, "Show the model so many frames of a prefix (with --sampling); else as many as in training.", least=1
-    )
+    frames: int | None = setting(None, "Frames per prefix (with --sampling). Default: as in training.", least=1)
     frame_steps: int = setting(
         0,
-        "Score each frame on its prefix, sampled by the server to so many frames (dense mode); 0: no.",
+        "Dense mode with N frames per prefix; 0 turns it off.",
         least=0,
         most=MAX_FRAME_STEPS,
     )
@@ -227,10 +219,10 @@ class OutputOptions(Settings):
     TITLE: ClassVar[str] = "Outputs"
 
     json: str | None = setting(
-        None, "Write JSON to a .json file; alone or -: print it, and no table.", metavar="[FILE|-]"
+        None, "Write JSON to FILE; without FILE print it instead of the table.", metavar="[FILE|-]"
     )
     plot: Path | None = setting(
-        None, "Draw the curves of all videos in one figure, sized for a paper: .png, .pdf or .svg.", metavar="FILE"
+        None, "Draw all curves in one figure, sized for a paper: .png, .pdf or .svg.", metavar="FILE"
     )
     strips: Path | None = setting(
         None, "Draw frames of each video above its scores: .png, .pdf or .svg.", metavar="FILE"
@@ -240,7 +232,7 @@ class OutputOptions(Settings):
     )
     npy: Path | None = setting(
         None,
-        "Write float32 [T, 2], progress and success: to a .npy file (one video), or one a video to a folder.",
+        "Write progress and success, float32 [T, 2], to a .npy file (one video) or into a folder.",
         metavar="FILE|FOLDER",
     )
 

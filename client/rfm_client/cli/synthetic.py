@@ -48,7 +48,7 @@ def parse_lengths(text: str) -> list[int]:
 
 def num_samples_setting(default: int) -> Any:
     """Return a field for the option ``--num-samples``."""
-    return setting(default, "Samples to make up.", least=1, most=10_000)
+    return setting(default, "Number of samples.", least=1, most=10_000)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class SyntheticSamples(Settings):
         metavar="N|N,M,...|N-M",
         parse=parse_lengths,
     )
-    use_frames: bool = setting(False, "Random frames, also where embeddings would do.")
+    use_frames: bool = setting(False, "Send random frames even if the model takes embeddings.")
     seed: int = setting(0, "Seed of the random numbers.", least=0)
 
     def samples(self, client: RewardClient) -> list[Sample]:
