@@ -38,7 +38,7 @@ Weights: TypeAlias = Literal["int8", "nf4"]
 _COUNT = {"least": 1, "most": MAX_INT32}
 _PORT = {"least": 1, "most": MAX_PORT}
 _OF_A_MACHINE = {"most": MAX_OF_A_MACHINE}
-_OR_MOVED = ", or 10 more while another setting names that port."
+_OR_MOVED = ", or 20 more while another setting names that port."
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.listening import ListenAddress, in_url
 
 PORTS = range(20_000, 32_000)  # below the ports that Linux gives to outgoing connections
-PORT_STEP = 10  # the defaults stay different from each other
+PORT_STEP = 20  # the defaults stay different from each other
 SECURITY_FLOOR = (
     2,
     71,
@@ -63,7 +63,7 @@ class Endpoints:
     def of(cls, config: ServeConfig, gateway_port: int | None = None) -> Endpoints:
         """Return the endpoints of a configuration.
 
-        A port of Triton that is None becomes Triton's default, or 10 more while another setting names that port.
+        A port of Triton that is None becomes Triton's default, or 20 more while another setting names that port.
         """
         named = {config.http_port, config.grpc_port, config.metrics_port, config.status_port, gateway_port}
         defaults = {"http_port": cls.http_port, "grpc_port": cls.grpc_port, "metrics_port": cls.metrics_port}

@@ -151,11 +151,11 @@ def test_options_win_over_the_file(tmp_path: Path) -> None:
 MOVED: dict[str, tuple[dict[str, int], int | None, tuple[int, int, int]]] = {
     "no gateway": ({}, None, (8000, 8001, 8002)),
     "a gateway elsewhere": ({}, 8100, (8000, 8001, 8002)),
-    "a gateway on Triton's HTTP port": ({}, 8000, (8010, 8001, 8002)),
-    "a gateway on Triton's gRPC port": ({}, 8001, (8000, 8011, 8002)),
-    "a gateway on the port of the metrics": ({}, 8002, (8000, 8001, 8012)),
-    "the next one is taken, too": ({"status_port": 8010}, 8000, (8020, 8001, 8002)),
-    "another port of Triton": ({"grpc_port": 8000}, None, (8010, 8000, 8002)),
+    "a gateway on Triton's HTTP port": ({}, 8000, (8020, 8001, 8002)),
+    "a gateway on Triton's gRPC port": ({}, 8001, (8000, 8021, 8002)),
+    "a gateway on the port of the metrics": ({}, 8002, (8000, 8001, 8022)),
+    "the next one is taken, too": ({"status_port": 8020}, 8000, (8040, 8001, 8002)),
+    "another port of Triton": ({"grpc_port": 8000}, None, (8020, 8000, 8002)),
     "given ports stay": ({"http_port": 9000, "grpc_port": 9001, "metrics_port": 9002}, 8000, (9000, 9001, 9002)),
 }
 
@@ -284,7 +284,7 @@ def test_a_gateway_takes_from_the_server_what_its_section_leaves_open(started: A
 
 
 def test_a_gateway_on_a_port_of_triton_asks_triton_where_it_moved(started: Any) -> None:
-    assert started("--gateway-port=8001")["--triton"] == ["grpc://127.0.0.1:8011"]
+    assert started("--gateway-port=8001")["--triton"] == ["grpc://127.0.0.1:8021"]
     result = invoke("serve", str(REPOSITORY), "--gateway-port=8001", "--grpc-port=8001")
     assert result.exit_code == 1
     assert (
@@ -296,7 +296,7 @@ def test_the_fastapi_servers_file_starts_a_gateway_on_its_port(started: Any, tmp
     (tmp_path / "server.yaml").write_text("server_url: 0.0.0.0\nserver_port: 8001\n")
     options = started("--config", str(tmp_path / "server.yaml"))
     assert (options["--host"], options["--port"]) == (["0.0.0.0"], ["8001"])
-    assert options["--triton"] == ["grpc://127.0.0.1:8011"]
+    assert options["--triton"] == ["grpc://127.0.0.1:8021"]
 
 
 WORDS: dict[str, tuple[list[str], str]] = {
