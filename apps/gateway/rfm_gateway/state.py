@@ -33,8 +33,8 @@ MS_PER_S = 1e3
 _REMEDIES = {  # for callers over HTTP, who have no option of the client
     AccessDeniedError: "whoever runs the gateway sets --triton-ca-file, --triton-certificate and --triton-key",
     ModelNotFoundError: "whoever runs the gateway names a served model with --model",
-    ServerUnavailableError: "whoever runs the gateway starts Triton there (rfm serve does so by itself: retry), or names "
-    "another with --triton",
+    ServerUnavailableError: "whoever runs the gateway starts Triton there (rfm serve does so by itself: retry), or "
+    "names another with --triton",
 }
 
 
