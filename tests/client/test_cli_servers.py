@@ -182,9 +182,9 @@ def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(served: Served) 
     assert result.exit_code == 0
     assert re.fullmatch(r"ready after \d+\.\d s\n", result.output)
     url = free_url()
-    result = invoke("wait", "--url", url, "--timeout", 0.2)
+    result = invoke("wait", "--url", url, "--timeout", 1)
     assert result.exit_code == ExitCode.DEADLINE
-    assert result.stderr == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s\n"
+    assert result.stderr == f"rfm-client: {url}: rfm and rfm_frames: not ready within 1 s\n"
 
 
 def test_python_runs_the_package_as_the_command() -> None:
