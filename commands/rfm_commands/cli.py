@@ -7,9 +7,9 @@ import importlib.metadata
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import typer
 
@@ -35,7 +35,7 @@ try:
 except ModuleNotFoundError:
     raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./apps/gateway .") from None
 from rfm_commands.command import AdminKeyFile, RfmCommand, RfmCommands, TritonPath, fail, say
-from rfm_commands.config import Config
+from rfm_commands.config import Config, GatewayBeside
 from rfm_commands.demo import demo
 from rfm_commands.models import app as models_app
 from rfm_commands.rollout import names_of
@@ -129,13 +129,6 @@ def export(
     )
     whose = "the checkpoint's" if settings.weights is None else f"those of the checkpoint in {settings.weights}"
     typer.echo(f"{repository}: {settings.name} version {version}, scores equal to {whose}")
-
-
-@dataclass(frozen=True)
-class GatewayBeside(GatewayConfig):
-    """Settings of a gateway that ``rfm serve`` runs."""
-
-    PREFIX: ClassVar[str] = "gateway-"
 
 
 @app.command(cls=RfmCommand, epilog=SERVE_EXAMPLE)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from rfm.config import ExportConfig, ServeConfig, address_of
 from rfm.plain_yaml import read_yaml
@@ -16,6 +16,14 @@ from rfm_client.contract.settings import ConfigError, Settings
 from rfm_gateway import GatewayConfig
 
 SECTIONS: dict[str, type[Settings]] = {"export": ExportConfig, "serve": ServeConfig, "gateway": GatewayConfig}
+
+
+@dataclass(frozen=True)
+class GatewayBeside(GatewayConfig):
+    """Settings of a gateway that ``rfm serve`` runs."""
+
+    PREFIX: ClassVar[str] = "gateway-"
+
 
 FASTAPI_KEYS = {  # keys of the FastAPI server's file, and their settings here
     "model_path": "export.checkpoint",
@@ -85,8 +93,8 @@ class Config:
 def _with_option(setting: str) -> str:
     """A setting's key in the file, and its option of ``rfm serve``."""
     section, _, key = setting.partition(".")
-    option = SECTIONS[section].settings()[key].option
-    return f"{setting} ({option.replace('--', '--gateway-') if section == 'gateway' else option})"
+    kind = GatewayBeside if section == "gateway" else SECTIONS[section]
+    return f"{setting} ({kind.settings()[key].option})"
 
 
 def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:

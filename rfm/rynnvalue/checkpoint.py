@@ -5,9 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -16,6 +15,7 @@ from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, re
 from rfm.checkpoint.provenance import OF_WEIGHTS, Decision, source_name
 from rfm.checkpoint.weights import read_weights
 from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.pixels import Normalisation
 from rfm.family import Options
 from rfm.rynnvalue.network import Bins, HeadConfig, RynnConfig, RynnNetwork
 from rfm.rynnvalue.predictor import RynnPredictor
@@ -26,8 +26,7 @@ from rfm.vlm.collator import QWEN3
 from rfm.vlm.language import EMBEDDING, REWARD_MODEL, LanguageCheckpoint, processor_name
 from rfm.vlm.language_folder import dtype_of, reward_model_of
 from rfm.vlm.network import build_backbone
-from rfm.vlm.preprocessor import SIZED_BY_PROCESSOR, normalisation_of, patch_px
-from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, read_processor
+from rfm.vlm.processor import PROCESSOR_FOLDER, read_processor
 from rfm.vlm.qwen_checkpoint import SETTINGS, QwenCheckpoint
 from rfm.vlm.rounding import FLAG, decision, read_published, read_unrounded_config, round_layers
 from rfm_client.contract.description import Description
@@ -50,6 +49,8 @@ class RynnCheckpoint(LanguageCheckpoint):
     """
 
     unexpected: tuple[str, ...] = ()
+
+    reads_videos: ClassVar[bool] = False
 
     @property
     def description(self) -> Description:
@@ -74,26 +75,17 @@ class RynnCheckpoint(LanguageCheckpoint):
             f"{name}: not expected, and not used: scores may differ from the original's" for name in self.unexpected
         ]
 
-    @cached_property
-    def collator(self) -> RynnCollator:  # type: ignore[override]  # the prompts of the others have one video
-        """The collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
-        tokenizer, preprocessor = read_processor(self.processor)
-        num_rows = self.config.backbone["text_config"]["vocab_size"]
-        if len(tokenizer) > num_rows:
-            expected = f"a tokenizer of at most {num_rows} tokens, as the embedding"
-            raise CheckpointError.at(f"base model {self.processor}", expected, len(tokenizer))
-        check_tokens(self.config, tokenizer, self.processor, self._value_tokens)
-        where = f"base model {self.processor}: preprocessing of images"
-        normalisation = normalisation_of(preprocessor, SIZED_BY_PROCESSOR, where)
-        patch = patch_px(preprocessor, self.config.backbone["vision_config"], where)
-        limits = {"least_px": self.config.least_px, "most_px": self.config.most_px}
-        collator = RynnCollator(self.config, tokenizer, RynnImages(patch, normalisation, **limits))
-        collator.check_template()
-        return collator
-
     @property
-    def _value_tokens(self) -> dict[str, int]:
+    def own_tokens(self) -> dict[str, int]:
+        """The ids of the value tokens."""
         return {VALUE_TOKEN: self.config.value_token, RELATIVE_TOKEN: self.config.relative_token}
+
+    def make_collator(  # type: ignore[override]  # the prompts of the others have one video
+        self, tokenizer: Any, patch_px: int, normalisation: Normalisation
+    ) -> RynnCollator:
+        """Return the collator with this tokenizer and preprocessing."""
+        limits = {"least_px": self.config.least_px, "most_px": self.config.most_px}
+        return RynnCollator(self.config, tokenizer, RynnImages(patch_px, normalisation, **limits))
 
     def network(self, dtype: torch.dtype) -> RynnNetwork:  # type: ignore[override]  # a network with other heads
         """Return the network, with weights of no use."""

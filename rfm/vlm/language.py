@@ -164,6 +164,13 @@ class LanguageCheckpoint(QwenCheckpoint):
     processor: str | Path
     settings: tuple[Decision, ...] = ()
 
+    reads_videos: ClassVar[bool] = True  # else separate images
+
+    @property
+    def own_tokens(self) -> dict[str, int]:
+        """The ids of tokens that an ordinary Qwen3-VL lacks, by token."""
+        return {}
+
     @property
     def notes(self) -> list[str]:
         """Return no line: no facts of training are known here."""
@@ -181,13 +188,13 @@ class LanguageCheckpoint(QwenCheckpoint):
     @cached_property
     def collator(self) -> LanguageCollator:
         """The collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
-        tokenizer, preprocessor = read_processor(self.processor, videos=True)
+        tokenizer, preprocessor = read_processor(self.processor, videos=self.reads_videos)
         num_rows = self.config.backbone["text_config"]["vocab_size"]
         if len(tokenizer) > num_rows:
             expected = f"a tokenizer of at most {num_rows} tokens, as the embedding"
             raise CheckpointError.at(f"base model {self.processor}", expected, len(tokenizer))
-        check_tokens(self.config, tokenizer, self.processor)
-        where = f"base model {self.processor}: preprocessing of videos"
+        check_tokens(self.config, tokenizer, self.processor, self.own_tokens)
+        where = f"base model {self.processor}: preprocessing of {'videos' if self.reads_videos else 'images'}"
         normalisation = normalisation_of(preprocessor, SIZED_BY_PROCESSOR, where)
         patch = patch_px(preprocessor, self.config.backbone["vision_config"], where)
         collator = self.make_collator(tokenizer, patch, normalisation)

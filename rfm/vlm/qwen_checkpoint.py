@@ -115,8 +115,8 @@ class QwenCheckpoint:
     def check(self) -> None:
         """Raise CheckpointError unless the weights fit the network, before memory is allocated for it."""
         _check_layers(self.config.backbone)
-        with expecting("a backbone that transformers can make", NETWORK_CONFIG), torch.device("meta"):
-            network = self.network(self.config.torch_dtype)
+        with expecting("a backbone that transformers can make", NETWORK_CONFIG):
+            network = self.skeleton()
         fit(network, self.weights)
         check_shapes(network.state_dict(), self.loaded(self.weights))
 

@@ -38,7 +38,7 @@ from rfm_client.frames import BlankFrames, resize_frames
 from rfm_client.options import InvalidValueError
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import require
-from rfm_labels.metadata import REMAINING, SCORES, Columns, Cost
+from rfm_labels.metadata import SCORES, Columns, Cost
 from rfm_labels.options import Watch
 from rfm_labels.plan import Item, Plan, Recipe
 from rfm_labels.scorer import DECISIVE, Scorer
@@ -248,7 +248,7 @@ def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: Dataset
             continue
         _check_numbers(name, scores, episode)
         fuse: Any = np.max if about.mark else getattr(np, recipe.fuse)  # mean, min or max
-        sign = np.float32(-1 if name == REMAINING else 1)  # fewer seconds are better
+        sign = np.float32(1 if about.higher_is_better else -1)  # so that min is the worst camera
         columns[name] = sign * np.asarray(fuse(sign * np.stack(scores), axis=0), np.float32)
         if len(by_camera) > 1:
             columns |= {f"{name}.{camera}": score for camera, score in zip(by_camera, scores, strict=True)}

@@ -213,14 +213,75 @@ class PrefixOptions(Settings):
 
 
 @dataclass(frozen=True)
-class OutputOptions(Settings):
-    """Files of the results. Raises ConfigError, before the first request, for an unusable file."""
+class JsonOutput(Settings):
+    """A file with the results as JSON. Raises ConfigError, before the first request, for an unusable file."""
 
     TITLE: ClassVar[str] = "Outputs"
 
     json: str | None = setting(
         None, "Write JSON to FILE; without FILE print it instead of the table.", metavar="[FILE|-]"
     )
+
+    def __post_init__(self) -> None:
+        for name, value in self._files.items():
+            if value != STANDARD_OUTPUT and Path(value).suffix not in _ENDINGS[name]:
+                instead = " or -" if name == "json" else ""
+                raise ConfigError.at(name, f"a file that ends in {', '.join(_ENDINGS[name])}{instead}", value)
+
+    @property
+    def prints_tables(self) -> bool:
+        """True if tables go to standard output."""
+        return self.json != STANDARD_OUTPUT
+
+    @property
+    def _files(self) -> dict[str, str | Path]:
+        """The files to write, by option."""
+        return {name: value for name in _ENDINGS if (value := getattr(self, name, None)) is not None}
+
+    @property
+    def _folders(self) -> dict[str, Path]:
+        """The folders of the files, by option."""
+        return {name: Path(value).parent for name, value in self._files.items()}
+
+    def make_folders(self) -> None:
+        """Make the files' folders where they are missing. Raises ConfigError if that fails."""
+        for name, folder in self._folders.items():
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigError.at(name, f"a folder at {folder}", error.strerror) from None
+
+    def write_json(self, document: Mapping[str, Any]) -> None:
+        """Write the document to the file or standard output, if --json is given."""
+        if self.json is None:
+            return
+        text = json.dumps(document, indent=2, allow_nan=False)
+        if self.json == STANDARD_OUTPUT:
+            typer.echo(text)
+        else:
+            Path(self.json).write_text(f"{text}\n")
+
+
+@dataclass(frozen=True)
+class PlotOutput(JsonOutput):
+    """Files with a comparison."""
+
+    plot: Path | None = setting(
+        None, "Draw frames of each video above its scores, the best first: .png, .pdf or .svg.", metavar="FILE"
+    )
+
+    def begin(self, videos: Sequence[str]) -> None:
+        """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
+        for name in self._files:
+            if _ENDINGS[name] == _PICTURES and len(videos) > MAX_PICTURED:
+                raise ConfigError.at(name, f"at most {MAX_PICTURED} videos", len(videos))
+        self.make_folders()
+
+
+@dataclass(frozen=True)
+class OutputOptions(PlotOutput):
+    """Files with the scores of videos."""
+
     plot: Path | None = setting(
         None, "Draw all curves in one figure, sized for a paper: .png, .pdf or .svg.", metavar="FILE"
     )
@@ -237,40 +298,22 @@ class OutputOptions(Settings):
     )
 
     def __post_init__(self) -> None:
-        for name, endings in _ENDINGS.items():
-            value = getattr(self, name)
-            if value is None or value == STANDARD_OUTPUT:
-                continue
-            if Path(value).suffix not in endings:
-                instead = " or -" if name == "json" else ""
-                raise ConfigError.at(name, f"a file that ends in {', '.join(endings)}{instead}", value)
+        super().__post_init__()
         if self.npy is not None and not self.npy.is_dir() and self.npy.suffix not in ("", ".npy"):
             raise ConfigError.at("npy", "a .npy file or a folder", self.npy)
 
     @property
-    def prints_tables(self) -> bool:
-        """True if tables go to standard output."""
-        return self.json != STANDARD_OUTPUT
-
-    def make_folders(self) -> None:
-        """Make the files' folders where they are missing. Raises ConfigError if that fails."""
-        folders = {name: Path(value).parent for name in _ENDINGS if (value := getattr(self, name)) is not None}
+    def _folders(self) -> dict[str, Path]:
+        folders = super()._folders
         if self.npy is not None:
             folders["npy"] = self.npy.parent if self.npy.suffix == ".npy" and not self.npy.is_dir() else self.npy
-        for name, folder in folders.items():
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ConfigError.at(name, f"a folder at {folder}", error.strerror) from None
+        return folders
 
     def begin(self, videos: Sequence[str]) -> None:
         """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
-        for name in ("plot", "strips"):
-            if getattr(self, name) is not None and len(videos) > MAX_PICTURED:
-                raise ConfigError.at(name, f"at most {MAX_PICTURED} videos", len(videos))
         if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
             raise ConfigError.at("npy", f"a folder for {len(videos)} videos", self.npy)
-        self.make_folders()
+        super().begin(videos)
 
     def array_files(self, stems: Sequence[str]) -> list[Path]:
         """Return the .npy file of each video; empty without --npy."""
@@ -279,31 +322,3 @@ class OutputOptions(Settings):
         if self.npy.suffix == ".npy":
             return [self.npy]
         return [self.npy / f"{stem}.npy" for stem in stems]
-
-    def write_json(self, document: Mapping[str, Any]) -> None:
-        """Write the document to the file or standard output, if --json is given."""
-        if self.json is None:
-            return
-        text = json.dumps(document, indent=2, allow_nan=False)
-        if self.json == STANDARD_OUTPUT:
-            typer.echo(text)
-        else:
-            Path(self.json).write_text(f"{text}\n")
-
-
-@dataclass(frozen=True)
-class JsonOutput(OutputOptions):
-    """A file with the results as JSON."""
-
-    NO_OPTION: ClassVar[Collection[str]] = {"plot", "strips", "rrd", "npy"}
-
-
-@dataclass(frozen=True)
-class PlotOutput(OutputOptions):
-    """Files with a comparison."""
-
-    NO_OPTION: ClassVar[Collection[str]] = {"strips", "rrd", "npy"}
-
-    plot: Path | None = setting(
-        None, "Draw frames of each video above its scores, the best first: .png, .pdf or .svg.", metavar="FILE"
-    )

@@ -7,6 +7,7 @@ import re
 import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +64,12 @@ class Credentials:
         given = {name.lower(): value for name, value in self.headers.items()}
         return given if self.api_key is None else {**given, AUTHORIZATION: f"Bearer {self.api_key}"}
 
-    @property
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "ssl_context"}  # which no pickle takes
+
+    @cached_property
     def ssl_context(self) -> ssl.SSLContext:
-        """A new TLS context for connections over HTTP. It is not kept, since it cannot be pickled."""
+        """The TLS context for connections over HTTP."""
         if self.ca_file is not None:
             check_authorities(self.ca_file, "ca_file")
         context = ssl.create_default_context(cafile=self.ca_file)

@@ -12,6 +12,7 @@ from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_client.options import ConfigError
 from rfm_labels.datasets.faults import DatasetError
 
+LEAST_SIZE_PX = 8  # of a side; a smaller array of numbers is no picture
 _WORDS = frozenset(
     {"depth", "depths", "disparity", "flow", "instance", "instances", "mask", "masks", "normal", "normals"}
     | {"panoptic", "seg", "segm", "segmentation", "segmentations", "segs", "semantic", "semantics"}

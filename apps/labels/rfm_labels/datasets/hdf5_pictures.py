@@ -14,11 +14,11 @@ import numpy as np
 
 from rfm_client import UInt8Array
 from rfm_client.frames import Picture
+from rfm_labels.datasets.cameras import LEAST_SIZE_PX
 from rfm_labels.datasets.faults import require
 from rfm_labels.datasets.hdf5_contents import members_of
 from rfm_labels.datasets.stored_files import faults_at
 
-_LEAST_SIZE_PX = 8  # a smaller array of numbers is no picture
 _STARTS = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG
 _RAW_SIZES_PX = ((480, 640), (720, 1280))  # RoboMIND's cameras, some of whose frames are pixels between JPEG files
 _RGB_MARK = b"\xff\xfe\x00\x0aXPL-RGB1"  # comment in RoboTwin's JPEG files whose red is red
@@ -145,7 +145,7 @@ def _is_picture(value: Any, are_pictures: bool) -> bool:
         held = value.visititems(lambda _, each: (hasattr(each, "shape") and _is_picture(each, False)) or None)
         return bool(held)
     if len(value.shape) == 3:
-        return all(size >= _LEAST_SIZE_PX for size in value.shape[1:])
+        return all(size >= LEAST_SIZE_PX for size in value.shape[1:])
     return len(value.shape) > 3 or is_encoded(value, are_pictures)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rfm_labels.datasets.cameras import LEAST_SIZE_PX
 from rfm_labels.datasets.faults import DatasetError, require
 
 FEATURES_FILE = "features.json"
@@ -18,7 +19,6 @@ _INFO_FILE = "dataset_info.json"
 _OBSERVATION = "steps/observation/"
 _TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 _COLOURS = "3 channels of uint8"
-_LEAST_SIZE_PX = 8  # a smaller array of numbers is no picture
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _leaves(feature: Any, name: str = "") -> Iterator[tuple[str, Mapping[str, An
 def _shown(name: str, feature: Mapping[str, Any]) -> bool:
     """True for an observation that may be a picture."""
     shape = _shape(feature.get("tensor", {}))
-    is_array = len(shape) in (2, 3) and all(size >= _LEAST_SIZE_PX for size in shape[:2])
+    is_array = len(shape) in (2, 3) and all(size >= LEAST_SIZE_PX for size in shape[:2])
     return name.startswith(_OBSERVATION) and ("image" in feature or "video" in feature or is_array)
 
 
