@@ -30,7 +30,7 @@ from gateway_requests import (
 )
 from gateways import Gateway, running
 from paths import ROOT
-from rfm_gateway.blank_frames import LINE_EVERY_S, WarningLog
+from rfm_gateway.limited_log import PERIOD_S, LimitedLog
 from servers import Served
 from tolerances import TOLERANCE
 
@@ -147,16 +147,16 @@ def test_frames_that_show_nothing_are_refused_where_the_gateway_is_told_so(chang
 
 def test_warnings_of_many_requests_are_one_line_in_ten_seconds(caplog: pytest.LogCaptureFixture) -> None:
     now_s = 0.0
-    log = WarningLog(lambda: now_s)
+    log = LimitedLog(logging.getLogger("rfm_gateway"), 1, "more requests had such samples", lambda: now_s)
     with caplog.at_level(logging.WARNING, "rfm_gateway"):
         for number in range(4):
-            log.write(f"black {number}")
-        now_s = LINE_EVERY_S
-        log.write("black 4")
-        now_s = 2 * LINE_EVERY_S
-        log.write("black 5")
-    counted = "black 4; 3 requests before had such samples, too"
-    assert [record.getMessage() for record in caplog.records] == ["black 0", counted, "black 5"]
+            log.write(f"black {number}".__str__)
+        now_s = PERIOD_S
+        log.write(lambda: "black 4")
+        now_s = 2 * PERIOD_S
+        log.write(lambda: "black 5")
+    lines = ["black 0", "3 more requests had such samples", "black 4", "black 5"]
+    assert [record.getMessage() for record in caplog.records] == lines
 
 
 def test_the_guide_names_each_project_whose_requests_are_sent_and_the_longest_that_it_waits() -> None:

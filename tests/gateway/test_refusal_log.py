@@ -12,7 +12,8 @@ from starlette.responses import JSONResponse
 from gateway_requests import FIRST, NO_KEY, dumped, of_frames, progress
 from gateways import TestClient, inside
 from rfm_client.contract.process_log import LogLines
-from rfm_gateway.refusals import MOST_LINES, PERIOD_S, RefusalLog
+from rfm_gateway.limited_log import PERIOD_S
+from rfm_gateway.refusals import MOST_LINES, RefusalLog
 
 KEY = "open sesame"
 WITH_KEY = {"X-API-Key": KEY}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from reward_models import ROOT
+from reward_models import ROOT, Reference
 from rfm import families
 from rfm.engine import Engine
 from rfm_client import ProgressSample, Trajectory
@@ -38,33 +38,12 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Case:
-    """A request and the answer. file: ``CONFIG/cases/CASE.json``"""
-
-    file: Path
-
-    def __str__(self) -> str:
-        return f"{self.config.name}/{self.file.stem}"
-
-    @property
-    def config(self) -> Path:
-        return self.file.parents[1]
+class Case(Reference):
+    """A request and the answer."""
 
     @property
     def checkpoint(self) -> Path:
         return self.config / "checkpoint"
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        return dict(json.loads((self.config / "config_summary.json").read_text()))
-
-    @property
-    def content(self) -> dict[str, Any]:
-        return dict(json.loads(self.file.read_text()))
-
-    @property
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        return dict(np.load(self.file.with_suffix("").with_suffix(".expected.npz")))
 
     @property
     def attention(self) -> str:

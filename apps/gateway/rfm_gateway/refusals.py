@@ -12,7 +12,9 @@ from typing import Any
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-MOST_LINES, PERIOD_S = 20, 10.0  # lines of a log in each period
+from rfm_gateway.limited_log import LimitedLog
+
+MOST_LINES = 20  # in a period of the log
 _MOST_LETTERS = 500  # of a reason
 _MOST_NAME_LETTERS = 100  # of a path or a program
 
@@ -27,16 +29,14 @@ def asked(scope: Scope) -> str:
 
 
 class RefusalLog:
-    """ASGI middleware that logs a line for each answer of status 400 and above, at most MOST_LINES in PERIOD_S.
+    """ASGI middleware that logs a line for each answer of status 400 and above, within the limits of LimitedLog.
 
-    It tells the number of the others later. The line has the status, ``asked`` and the first reason.
+    The line has the status, ``asked`` and the first reason.
     """
 
     def __init__(self, app: ASGIApp, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._app = app
-        self._clock_s = clock_s
-        self._began_s = float("-inf")  # the period
-        self._num_lines = self._num_left_out = 0
+        self._log = LimitedLog(logger, MOST_LINES, "more requests were refused or failed", clock_s)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a request, and log its refusal."""
@@ -48,21 +48,9 @@ class RefusalLog:
             if message["type"] == "http.response.start":
                 code = message["status"]
             elif code >= 400 and not message.get("more_body"):
-                self._log(code, scope, message.get("body", b""))
+                self._log.write(lambda: f"{code} {asked(scope)}: {_reason(message.get('body', b''))}")
 
         await self._app(scope, receive, send_logged if scope["type"] == "http" else send)
-
-    def _log(self, code: int, scope: Scope, body: bytes) -> None:
-        now_s = self._clock_s()
-        if now_s - self._began_s >= PERIOD_S:
-            if self._num_left_out:
-                logger.warning("%d more requests were refused or failed", self._num_left_out)
-            self._began_s, self._num_lines, self._num_left_out = now_s, 0, 0
-        if self._num_lines == MOST_LINES:
-            self._num_left_out += 1
-            return
-        self._num_lines += 1
-        logger.warning("%d %s: %s", code, asked(scope), _reason(body))
 
 
 def _reason(body: bytes) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -34,10 +35,11 @@ from rfm_client import (
 )
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
-from rfm_gateway.blank_frames import WarningLog, refuse_blank_frames, warning_of
+from rfm_gateway.blank_frames import refuse_blank_frames, warning_of
 from rfm_gateway.body import Batch, BodyLimits
 from rfm_gateway.field_errors import refused
 from rfm_gateway.folder import RequestFiles
+from rfm_gateway.limited_log import LimitedLog
 from rfm_gateway.observe import within
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
@@ -46,6 +48,8 @@ _DESCRIPTIONS = {"robot_description": "robot", "camera_description": "camera"}  
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
 _BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the embedding of the task
+
+logger = logging.getLogger("rfm_gateway")
 
 Text: TypeAlias = Float32Array | InvalidSampleError  # the embedding of a task, or the encoder's error
 
@@ -72,7 +76,7 @@ class Evaluator:
         self._folder = folder
         self._use_frame_steps = use_frame_steps
         self._refuse_blank = refuse_blank
-        self._warnings = WarningLog()
+        self._warnings = LimitedLog(logger, 1, "more requests had such samples")
 
     async def evaluate(self, batch: Batch, request_id: str) -> tuple[schema.EvaluateBatchAnswer, str]:
         """Return the answer to a whole batch, and a warning of samples that show nothing; empty: there are none.
@@ -102,7 +106,7 @@ class Evaluator:
         num_bytes = batch.num_bytes if self._folder is None else None  # files may be large
         samples, warning = await off_loop(num_bytes, conversion.samples, batch)
         if warning:
-            self._warnings.write(warning)
+            self._warnings.write(lambda: warning)
         asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
         flat = chain.from_iterable(asked)
         outcomes = iter(await self._client.evaluate(flat, return_errors=True, request_id=request_id))
