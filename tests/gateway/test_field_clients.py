@@ -145,6 +145,17 @@ def test_frames_that_show_nothing_are_refused_where_the_gateway_is_told_so(chang
     check_refused(response, *((sent(path), re.escape(told)) for path in paths))
 
 
+def test_zeros_that_pad_a_clip_are_scored_with_a_warning_or_refused(gateway: Gateway, changed: Gateway) -> None:
+    whole = filmed(1, 6)
+    padded = whole | {"frames": np.concatenate([whole["frames"][:4], np.zeros_like(whole["frames"][:2])])}
+    response = ask_json(gateway, [progress(whole), progress(padded), of_frames(CAST)])
+    told = "frames of zeros at the end (send the real frames alone, without padding)"
+    warning = f"samples 2: {TOLD}: their scores mean nothing; samples 1: {told}: they are scored as pictures"
+    assert response.headers["X-RFM-Warning"] == warning
+    refusal = re.escape(f"expected pictures that show something, got {told}")
+    check_refused(ask_json(changed, [progress(padded)]), (["samples", 0, "trajectory", "frames"], refusal))
+
+
 def test_warnings_of_many_requests_are_one_line_in_ten_seconds(caplog: pytest.LogCaptureFixture) -> None:
     now_s = 0.0
     log = LimitedLog(logging.getLogger("rfm_gateway"), 1, "more requests had such samples", lambda: now_s)
