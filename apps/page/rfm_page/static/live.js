@@ -2,8 +2,10 @@
 // The tab of running episodes: each with its newest frame, its curve and its numbers, as clients report them.
 
 import { hasKey, KeyWanted, liveNews } from "./api.js";
+import { failure } from "./faults.js";
 import { LiveCard } from "./livecard.js";
 import { cellOf, learn } from "./signals.js";
+import { Place } from "./states.js";
 import { cell, label } from "./table.js";
 import { NONE, shown } from "./text.js";
 
@@ -13,18 +15,19 @@ const ENDED_AT_A_TIME = 12;
 
 export class LiveTab {
   #page;
-  #onError;
+  #failedAnywhere;
+  #errors;
   #cards = new Map();
   #cursor = "";
   #timer = null;
-  #isAway = false;
   #asking = 0; // number of the loop that asks
   #mostEnded = ENDED_AT_A_TIME;
 
-  /** onError(error): something went wrong */
-  constructor(page, { onError }) {
+  /** failedAnywhere(error): shows an error that is one on every tab, and says whether it is */
+  constructor(page, { failedAnywhere }) {
     this.#page = page;
-    this.#onError = onError;
+    this.#failedAnywhere = failedAnywhere;
+    this.#errors = new Place(page["live-errors"]);
     page["live-more"].addEventListener("click", () => {
       this.#mostEnded += ENDED_AT_A_TIME;
       this.#show();
@@ -53,13 +56,11 @@ export class LiveTab {
         const news = await liveNews(this.#cursor);
         if (asking !== this.#asking) return;
         this.#take(news);
-        if (this.#isAway) this.#page.errors.replaceChildren();
-        this.#isAway = false;
+        this.#errors.clear();
       }
     } catch (error) {
       if (asking !== this.#asking) return;
-      this.#isAway = true;
-      this.#onError(error);
+      if (!this.#failedAnywhere(error)) this.#errors.show(failure("The running episodes cannot be shown", error));
       if (error instanceof KeyWanted) return; // it begins again with a key
       after = ASK_AGAIN_AFTER_MS;
     }
