@@ -5,7 +5,7 @@ import { curvesOf, datasets, episodesOf, faultsOf, videoOf } from "./api.js";
 import { Asking } from "./asking.js";
 import { colourName } from "./chart.js";
 import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, WORST_FIRST } from "./episodes.js";
-import { failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
+import { deadLink, failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
 import { Place } from "./states.js";
@@ -24,6 +24,7 @@ const NOTHING = {
 export class DatasetTab {
   #page;
   #onScore;
+  #onShown;
   #failedAnywhere;
   #places;
   #histogram;
@@ -41,14 +42,19 @@ export class DatasetTab {
   #stopping = new AbortController();
   #checking = new AbortController();
   #asking = new Asking((isCurrent) => this.#ask(isCurrent));
+  #wanted = new URLSearchParams(); // what an address says, until the datasets are there
+  #numShown = 0; // of addresses
+  #isShowing = false; // what an address says
   #faults = {}; // by dataset: one look at all videos for each load of the page
 
   /**
    * onScore({ files, task, fps, corrections, origins }): somebody wants an episode scored
+   * onShown(isStep): something else is shown; isStep: Back should lead to what was shown before
    * failedAnywhere(error): shows an error that is one on every tab, and says whether it is
    */
-  constructor(page, { onScore, failedAnywhere }) {
+  constructor(page, { onScore, onShown, failedAnywhere }) {
     this.#page = page;
+    this.#onShown = onShown;
     this.#onScore = onScore;
     this.#failedAnywhere = failedAnywhere;
     const places = { none: "no-datasets", errors: "dataset-errors", hits: "no-hits", episode: "episode-errors" };
@@ -56,13 +62,13 @@ export class DatasetTab {
     this.#histogram = new Histogram(page.histogram);
     const rows = { scroller: page["episode-list"], body: page.episodes, above: page["episodes-above"], below: page["episodes-below"] };
     this.#table = new EpisodeTable(rows, {
-      onWatch: (episode) => this.#watch(episode), chosen: this.#chosen, onChoose: () => this.#showChosen(),
+      onWatch: (episode) => { this.#watch(episode); this.#onShown(true); }, chosen: this.#chosen, onChoose: () => this.#showChosen(),
     });
     const elements = {
       videos: page["episode-videos"], chart: page["episode-chart"], slider: page["episode-time"], button: page["episode-play"],
       told: page["episode-time-told"],
     };
-    this.#timeline = new Timeline(elements, { onThreshold: (value) => this.#cutAt(value) });
+    this.#timeline = new Timeline(elements, { onThreshold: (value) => { this.#cutAt(value); this.#onShown(false); } });
     this.#listen();
   }
 
@@ -71,9 +77,11 @@ export class DatasetTab {
     const on = (name, event, action) => page[name].addEventListener(event, action);
     on("shelf", "submit", (event) => event.preventDefault());
     on("shelf", "change", () => this.#places.errors.clear());
-    on("dataset", "change", () => this.#choose());
-    on("labels", "change", () => this.#load());
-    on("others", "change", () => this.#load());
+    on("shelf", "input", () => this.#onShown(false));
+    on("order", "change", () => this.#onShown(false));
+    on("dataset", "change", () => this.#choose().then(() => this.#onShown(true)));
+    on("labels", "change", () => this.#load().then(() => this.#onShown(true)));
+    on("others", "change", () => this.#load().then(() => this.#onShown(true)));
     on("cutoff", "input", () => this.#cutAt(Number(page.cutoff.value)));
     on("order", "change", () => this.#orderBy(page.order.value, false));
     on("task-part", "input", () => this.#showTable());
@@ -85,6 +93,7 @@ export class DatasetTab {
       head.querySelector("button").addEventListener("click", () => {
         const { order } = head.dataset;
         this.#orderBy(order, page.order.value === order && !this.#isTurned);
+        this.#onShown(false);
       });
     }
     on("choose-shown", "click", () => this.#select(this.#shown.map(({ episode }) => episode)));
@@ -116,12 +125,14 @@ export class DatasetTab {
     if (there.length) this.#places.none.clear();
     else this.#places.none.show(noDataset(() => this.begin()));
     if (there.length && JSON.stringify(there) === JSON.stringify(this.#datasets)) return true; // they are shown
+    this.#wanted = new URLSearchParams(this.params);
     this.#datasets = there;
     const { dataset } = this.#page;
     dataset.replaceChildren(...this.#datasets.map(({ name, kind }, index) => new Option(`${name} (${kind.replace("LeRobot ", "")})`, index)));
     this.#page.datasets.hidden = this.#page["dataset-side"].hidden = !this.#datasets.length;
     this.#page.fold.disabled = !this.#page["dataset-panel"].hidden && !this.#datasets.length;
-    if (this.#datasets.length) await this.#choose();
+    if (this.#datasets.length) await this.show(this.#wanted);
+    this.#onShown(false);
     return this.#datasets.length > 0;
   }
 
@@ -148,11 +159,84 @@ export class DatasetTab {
     return taken.sort((one, other) => one.episode - other.episode);
   }
 
-  async #choose() {
+  /** What an address says of the dataset, the episode and the settings. */
+  get params() {
+    const page = this.#page;
+    if (!this.#datasets.length || this.#isShowing) return [...this.#wanted].filter(([name]) => name !== "tab");
+    const { labels } = this.#datasets[this.#number];
+    const settings = [
+      ["dataset", this.#name(this.#number), ""],
+      ["labels", this.#labels ?? "", labels[0] ?? ""],
+      ["beside", page.others.value, ""],
+      ["cutoff", page.cutoff.value, `${this.#told.threshold}`],
+      ["order", page.order.value, this.#usualOrder],
+      ["turned", this.#isTurned ? "1" : "", ""],
+      ...FILTER_NAMES.map((name) => [name, page[`only-${name}`].checked ? (page[`number-${name}`]?.value ?? "1") : "", ""]),
+      ["contains", page["task-part"].value, ""],
+      ["episode", this.#watched ? `${this.#watched.episode}` : "", ""],
+    ];
+    return settings.filter(([, value, usual]) => value !== usual).map(([name, value]) => [name, value]);
+  }
+
+  /** Shows what an address says; as soon as the datasets are there. */
+  async show(params) {
+    this.#wanted = params;
+    if (!this.#datasets.length) return;
+    this.#isShowing = true;
+    this.#places.errors.clear();
+    const number = (this.#numShown += 1);
+    const page = this.#page;
+    const wanted = params.get("dataset");
+    const index = wanted === null ? 0 : this.#datasets.findIndex((_, each) => this.#name(each) === wanted);
+    const of = [Math.max(index, 0), params.get("labels"), params.get("beside")];
+    if (this.#told === NOTHING || of[0] !== this.#number || (of[1] ?? page.labels.options[0].value) !== page.labels.value
+      || (of[2] ?? "") !== page.others.value) await this.#choose(...of);
+    if (number !== this.#numShown) return; // another address is shown
+    this.#isShowing = false;
+    if (this.#told === NOTHING) return;
+    this.#showSettings(params);
+    if (index < 0) this.#places.errors.show(deadLink(`The dataset ${wanted}`));
+    const episode = index < 0 ? null : params.get("episode");
+    if (episode === `${this.#watched?.episode ?? ""}`) return;
+    const row = this.#episodes.find((each) => `${each.episode}` === episode);
+    if (row) this.#watch(row);
+    else if (this.#watched) this.#leave();
+    if (episode !== null && !row) this.#places.errors.show(deadLink(`Episode ${episode}`));
+  }
+
+  #showSettings(params) {
+    const page = this.#page;
+    for (const name of FILTER_NAMES) {
+      page[`only-${name}`].checked = params.has(name) && !(name === "differ" && !page.others.value);
+      if (params.has(name) && page[`number-${name}`]) page[`number-${name}`].value = params.get(name);
+    }
+    page["task-part"].value = params.get("contains") ?? "";
+    page.order.value = params.get("order") ?? this.#usualOrder;
+    if (!page.order.value) page.order.value = this.#usualOrder; // no such order
+    this.#isTurned = params.has("turned");
+    this.#cutAt(Number(params.get("cutoff") ?? this.#told.threshold));
+  }
+
+  /** The name of a dataset; of the second one of a name with ~2. */
+  #name(number) {
+    const { name } = this.#datasets[number];
+    const before = this.#datasets.slice(0, number).filter((each) => each.name === name).length;
+    return before ? `${name}~${before + 1}` : name;
+  }
+
+  get #usualOrder() {
+    return this.#told.episodes.some(({ final_progress: final }) => final !== undefined) ? WORST_FIRST : PLAIN_ORDER;
+  }
+
+  /** Shows a dataset. chosen, beside: the labels; null: the first, none */
+  async #choose(number = this.#number, chosen = null, beside = null) {
+    this.#page.dataset.value = number;
     const { labels } = this.#datasets[this.#number];
     const options = (none) => [...(none ? [new Option("none", "")] : []), ...labels.map((name) => new Option(name))];
     this.#page.labels.replaceChildren(...options(!labels.length));
     this.#page.others.replaceChildren(...options(true));
+    if (labels.includes(chosen)) this.#page.labels.value = chosen;
+    if (labels.includes(beside)) this.#page.others.value = beside;
     await this.#load();
   }
 
@@ -177,7 +261,7 @@ export class DatasetTab {
     }
     const isLabelled = this.#told.episodes.some(({ final_progress: final }) => final !== undefined);
     page.cutoff.value = this.#told.threshold;
-    page.order.value = isLabelled ? WORST_FIRST : PLAIN_ORDER;
+    page.order.value = this.#usualOrder;
     this.#isTurned = false;
     page["filter-differ"].hidden = !other;
     if (!other) page["only-differ"].checked = false;
@@ -185,7 +269,7 @@ export class DatasetTab {
     page.ends.hidden = !isLabelled;
     this.#showMade();
     this.#cutAt(this.#told.threshold);
-    await this.#check();
+    this.#check();
   }
 
   /** Asks which episodes cannot be labelled now, while the others are shown. */
@@ -259,6 +343,7 @@ export class DatasetTab {
     for (const name of FILTER_NAMES) this.#page[`only-${name}`].checked = false;
     this.#page["task-part"].value = "";
     this.#showTable();
+    this.#onShown(false);
   }
 
   #select(numbers) {
@@ -337,6 +422,7 @@ export class DatasetTab {
   #close() {
     const { episode } = this.#watched;
     this.#leave();
+    this.#onShown(true);
     this.#page.episodes.querySelector(`tr[data-episode="${episode}"] button`)?.focus();
   }
 
@@ -344,7 +430,9 @@ export class DatasetTab {
   #step(direction) {
     const place = this.#shown.findIndex(({ episode }) => episode === this.#watched.episode);
     const next = this.#shown[place + direction];
-    if (next) this.#watch(next);
+    if (!next) return;
+    this.#watch(next);
+    this.#onShown(false);
   }
 
   async #watch(episode) {
@@ -353,6 +441,7 @@ export class DatasetTab {
     const page = this.#page;
     const { signal } = this.#stopping;
     this.#places.episode.clear();
+    this.#places.errors.clear();
     page.episode.hidden = false;
     page.datasets.classList.add("watching");
     this.#table.mark(episode.episode, this.#shown);

@@ -73,6 +73,16 @@ export function noVideo() {
   return { kind: "empty", title: "No videos", text: "This episode has no camera; its curves are below." };
 }
 
+/** A link names a model that is not served. */
+export function otherModel(wanted, chosen) {
+  return { title: `The model ${wanted} is not served here`, text: `The link names it. The model ${chosen} is chosen instead.` };
+}
+
+/** A link names what the server does not show. what: the dataset or episode, as the subject of a sentence */
+export function deadLink(what) {
+  return { title: `${what} is not shown here`, text: "The link leads to another server, or to a dataset that has changed." };
+}
+
 /** Something failed. title: what, as a sentence without a full stop */
 export function failure(title, error, retry = null) {
   const buttons = retry ? [["Try again", retry]] : [];

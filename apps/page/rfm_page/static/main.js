@@ -2,15 +2,17 @@
 // The page: what its controls do.
 
 import { aboutServer, compare, GatewayAway, hasKey, KeyWanted, score, served, ServerError, useKey } from "./api.js";
+import { Address } from "./address.js";
 import { Asking } from "./asking.js";
 import { Curve } from "./curves.js";
 import { DatasetTab } from "./dataset.js";
 import { exampleFiles } from "./examples.js";
-import { failure, noModel, serverAway, tritonAway, useRemedies } from "./faults.js";
+import { failure, noModel, otherModel, serverAway, tritonAway, useRemedies } from "./faults.js";
 import { pngFigure, svgFigure } from "./figure.js";
 import { Legend } from "./legend.js";
 import { LiveTab } from "./live.js";
 import { Queue } from "./queue.js";
+import { Settings } from "./settings.js";
 import { Sidebar } from "./sidebar.js";
 import { copied, Place } from "./states.js";
 import { showTable } from "./table.js";
@@ -32,10 +34,14 @@ const timeline = new Timeline(
 const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurve });
 const sidebar = new Sidebar(page.fold);
 const { videos, chart } = timeline;
-const tabs = new Tabs(["score", "dataset", "live"].map((name) => [page[`${name}-tab`], page[`${name}-panel`]]), shownTab);
+const TABS = ["score", "dataset", "live"];
+const tabs = new Tabs(TABS.map((name) => [page[`${name}-tab`], page[`${name}-panel`]]), shownTab);
 const places = { away: new Place(page.away), errors: new Place(page.errors), served: new Place(page["served-state"]) };
-const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, failedAnywhere });
+const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, onShown: told, failedAnywhere });
 const liveTab = new LiveTab(page, { failedAnywhere });
+const choices = new Settings(page, chooseRule);
+const address = new Address(go);
+let shownIndex = 0; // of the tab
 let curves = [];
 let verdicts = [];
 const gateway = { models: [], rules: [], url: "" };
@@ -98,6 +104,7 @@ async function askServed(isCurrent) {
   page.model.replaceChildren(...gateway.models.map(({ name }) => new Option(name)));
   if (gateway.models.some(({ name }) => name === gateway.model)) page.model.value = gateway.model;
   chooseRule();
+  if (gateway.models.length) warnOfModel(choices.begin());
   page.examples.hidden = !gateway.models.length;
   page.status.textContent = "";
   if (gateway.models.length) places.served.clear();
@@ -146,6 +153,39 @@ function showLimits() {
   page.frames.disabled = !isOpen;
   if (!isOpen) page.frames.value = "";
   page.frames.placeholder = isOpen ? `${model?.max_frames ?? ""} as trained`.trim() : `${rule?.frames ?? "all"}`;
+}
+
+/** Says that a link names a model that is not served. wanted: its name; null: all is well */
+function warnOfModel(wanted) {
+  if (wanted !== null) places.errors.show(otherModel(wanted, page.model.value));
+  videos.correct(correction());
+  showThreshold();
+}
+
+/** What the address of the page is now. */
+function shownParams() {
+  const last = page["live-last"];
+  const ofLive = () => (last.value === last.defaultValue ? [] : [["last", last.value]]);
+  const ofTab = [() => choices.params, () => datasetTab.params, ofLive][shownIndex]();
+  return [...(shownIndex ? [["tab", TABS[shownIndex]]] : []), ...ofTab];
+}
+
+/** Writes into the address what is shown now. isStep: Back leads to what was shown before */
+function told(isStep = false) {
+  if (isStep) address.step(shownParams());
+  else address.correct(shownParams);
+}
+
+/** Shows what an address says. */
+function go(params) {
+  shownIndex = Math.max(TABS.indexOf(params.get("tab")), 0); // so that the tab is no new step
+  tabs.select(shownIndex);
+  if (shownIndex === 0) warnOfModel(choices.show(params));
+  if (shownIndex === 1) datasetTab.show(params);
+  if (shownIndex === 2) {
+    page["live-last"].value = params.get("last") ?? page["live-last"].defaultValue;
+    page["live-last"].dispatchEvent(new Event("input"));
+  }
 }
 
 function settings() {
@@ -362,6 +402,7 @@ function update() {
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
   page.command.textContent = commands(gateway.url, scored, verdicts);
+  told();
   const done = curves.filter(({ state }) => state === "done").length;
   if (curves.length) page.status.textContent = `${done} of ${curves.length} curves are done.`;
   page.chart.setAttribute("aria-label", scored.length
@@ -373,6 +414,9 @@ function update() {
 function shownTab(index) {
   page.fold.disabled = index === 2 || (index === 1 && page["dataset-side"].hidden);
   page.status.textContent = "";
+  const isStep = index !== shownIndex;
+  shownIndex = index;
+  if (isStep) told(true);
   if (index === 0) update();
 }
 
@@ -385,7 +429,12 @@ function listen(element, events) {
   for (const [name, action] of Object.entries(events)) element.addEventListener(name, action);
 }
 
-listen(page.question, { submit: (event) => { event.preventDefault(); scoreAll(); } });
+listen(page.question, {
+  submit: (event) => { event.preventDefault(); scoreAll(); },
+  input: () => told(),
+  change: () => told(),
+});
+listen(page["live-last"], { input: () => told() });
 listen(page["key-form"], { submit: (event) => { event.preventDefault(); useKey(page.key.value.trim()); begin(); } });
 listen(page.files, { change: () => addFiles(page.files.files) });
 listen(page.model, { change: chooseRule });
@@ -420,4 +469,5 @@ listen(document, {
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", update);
 
 showThreshold();
+go(address.params);
 begin();
