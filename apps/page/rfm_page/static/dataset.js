@@ -6,6 +6,7 @@ import { colourName } from "./chart.js";
 import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, WORST_FIRST } from "./episodes.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
+import { DASHES } from "./looks.js";
 import { save } from "./takeaway.js";
 import { cut, shown } from "./text.js";
 import { Timeline } from "./timeline.js";
@@ -368,7 +369,7 @@ function curvesIn({ times_s: times, curves }, file) {
   return curves.map(({ camera, progress, success }, index) => {
     const name = camera ? short(camera) : curves.length > 1 ? "all cameras" : "labels";
     const label = file === null ? name : `${name} (${reward(file)})`;
-    return { index, label, progress, success: success ?? none, times, allTimes: times, isDashed: file !== null };
+    return { index, label, progress, success: success ?? none, times, allTimes: times, dash: file === null ? null : DASHES[1] };
   });
 }
 
@@ -383,10 +384,10 @@ function describe(curves) {
   return told.length ? told.join("; ") : "This episode has no labels.";
 }
 
-function legendItem({ index, label, isDashed }) {
+function legendItem({ index, label, dash }) {
   const item = document.createElement("li");
   const swatch = document.createElement("span");
-  swatch.className = `swatch ${colourName(index)}${isDashed ? " dashed" : ""}`;
+  swatch.className = `swatch ${colourName(index)}${dash ? " dashed" : ""}`;
   item.append(swatch, label);
   return item;
 }

@@ -8,6 +8,7 @@ import { exampleFiles } from "./examples.js";
 import { pngFigure, svgFigure } from "./figure.js";
 import { Legend } from "./legend.js";
 import { LiveTab } from "./live.js";
+import { byQuestion, giveLooks } from "./looks.js";
 import { Queue } from "./queue.js";
 import { Sidebar } from "./sidebar.js";
 import { showTable } from "./table.js";
@@ -15,7 +16,7 @@ import { Tabs } from "./tabs.js";
 import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
 import { learn, toldAt } from "./signals.js";
-import { addVerdict } from "./verdicts.js";
+import { addVerdict, areOneFile, sentenceOf } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
 
@@ -23,9 +24,9 @@ const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((elem
 const queue = new Queue(CURVES_AT_A_TIME);
 const timeline = new Timeline(
   { videos: page.videos, chart: page.chart, slider: page.time, button: page.play, told: page["time-told"] },
-  { changing: { onName: update, onRemove: removeVideo }, onThreshold: dragThreshold },
+  { changing: { onName: showNames, onColour: changed, onRemove: removeVideo }, onThreshold: dragThreshold },
 );
-const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurve });
+const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurves });
 const sidebar = new Sidebar(page.fold);
 const { videos, chart } = timeline;
 const tabs = new Tabs(["score", "dataset", "live"].map((name) => [page[`${name}-tab`], page[`${name}-panel`]]), shownTab);
@@ -35,7 +36,6 @@ let curves = [];
 let verdicts = [];
 let gateway = { models: [], rules: [], url: "" };
 let stopping = new AbortController();
-let numCurves = 0;
 
 async function begin() {
   page.errors.replaceChildren();
@@ -167,11 +167,10 @@ function scoreAll() {
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
-      const curve = new Curve(numCurves, video, { task, ...settings(), orient: video.orient, channels: video.channels });
+      const curve = new Curve(video, { task, ...settings(), orient: video.orient, channels: video.channels });
       if (known.has(curve.identity)) continue;
       curves = curves.filter(({ identity }) => identity !== curve.identity); // one that failed is asked again
       curves.push(curve);
-      numCurves += 1;
       queue.add(() => ask(curve, AbortSignal.any([stopping.signal, curve.leaving.signal])));
     }
   }
@@ -199,6 +198,7 @@ async function comparePair() {
   const [first, second] = videos.all;
   const { model, fps, resize } = settings();
   const { orient, channels } = first;
+  const before = verdicts.length;
   page.errors.replaceChildren();
   page.compare.disabled = true;
   try {
@@ -206,18 +206,26 @@ async function comparePair() {
     for (const name of ["orient", "channels"]) {
       if (second[name] !== first[name]) throw new Error(`${name}: expected the same of both videos, got ${first[name]} and ${second[name]}`);
     }
-    for (const task of tasks()) {
+    const isOneFile = await areOneFile(first.file, second.file);
+    if (isOneFile) tell({ videos: [first, second], answer: null });
+    for (const task of isOneFile ? [] : tasks()) {
       const data = form({ task, model, fps, orient, channels, resize }, { first: first.file, second: second.file });
       const answer = await compare(data, stopping.signal);
-      const verdict = { videos: [first, second], task, model, fps, orient, channels, resize, answer };
-      verdicts.push(verdict);
-      addVerdict(page.pairs, verdict);
-      update();
+      tell({ videos: [first, second], task, model, fps, orient, channels, resize, answer });
     }
   } catch (error) {
     if (!stopping.signal.aborted) failed(error);
   }
   update();
+  if (verdicts.length > before) page.status.textContent = verdicts.slice(before).map(sentenceOf).join(" ");
+}
+
+/** Shows a verdict, and scrolls to it. */
+function tell(verdict) {
+  verdicts.push(verdict);
+  const box = addVerdict(page.pairs, verdict);
+  update();
+  box.scrollIntoView({ block: "nearest" });
 }
 
 function stop() {
@@ -235,7 +243,6 @@ function clear() {
   videos.clear();
   curves = [];
   verdicts = [];
-  numCurves = 0;
   page.pairs.replaceChildren();
   page.errors.replaceChildren();
   page["task-wanted"].textContent = "";
@@ -248,13 +255,23 @@ function removeVideo(video) {
   videos.remove(video);
   for (const curve of curves.filter((each) => each.video === video)) forget(curve);
   verdicts = verdicts.filter((verdict) => !verdict.videos.includes(video));
+  showNames();
+}
+
+/** Shows everything under the names and colours of now. */
+function showNames() {
   page.pairs.replaceChildren();
   for (const verdict of verdicts) addVerdict(page.pairs, verdict);
   update();
 }
 
-function removeCurve(curve) {
-  forget(curve);
+/** The verdicts that the model gave: those on one file twice have no answer. */
+function answered() {
+  return verdicts.filter(({ answer }) => answer);
+}
+
+function removeCurves(gone) {
+  for (const curve of gone) forget(curve);
   update();
 }
 
@@ -266,7 +283,7 @@ function forget(curve) {
 
 /** Shows a curve in another colour or under another name. */
 function changed() {
-  update();
+  showNames();
   chart.redraw();
 }
 
@@ -296,18 +313,20 @@ function update() {
   page.clear.hidden = !videos.all.length;
   page.stage.hidden = !videos.all.length;
   page.numbers.hidden = !curves.length;
+  giveLooks(curves);
   timeline.show(curves);
   legend.show(curves);
-  for (const video of videos.all) videos.mark(video, curves.filter((curve) => curve.video === video));
+  const isByQuestion = byQuestion(curves);
+  for (const video of videos.all) videos.mark(video, isByQuestion ? null : curves.find((curve) => curve.video === video));
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle;
   page.compare.disabled = videos.all.length !== 2 || !page.model.value;
-  page.take.hidden = !scored.length && !verdicts.length;
+  page.take.hidden = !scored.length && !answered().length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
-  page.command.textContent = commands(gateway.url, scored, verdicts);
+  page.command.textContent = commands(gateway.url, scored, answered());
   const done = curves.filter(({ state }) => state === "done").length;
-  if (curves.length) page.status.textContent = `${done} of ${curves.length} curves are done.`;
+  if (curves.length && !page["score-panel"].hidden) page.status.textContent = `${done} of ${curves.length} curves are done.`;
   page.chart.setAttribute("aria-label", scored.length
     ? scored.map((curve) => `${curve.label}: final ${toldAt(curve, -1)}`).join("; ")
     : "No curves yet.");
@@ -349,7 +368,7 @@ listen(page.examples, { click: ({ target }) => {
   if (button) scoreExamples(button.dataset.example.split(" "));
 } });
 listen(page.csv, { click: () => save("curves.csv", csv(curves), "text/csv") });
-listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, verdicts), "application/json") });
+listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, answered()), "application/json") });
 listen(page.png, { click: async () => save("curves.png", await pngFigure(figure())) });
 listen(page.svg, { click: () => save("curves.svg", figure(), "image/svg+xml") });
 listen(page.copy, { click: () => copy(page.command.textContent, "command line is") });
