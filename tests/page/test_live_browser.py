@@ -257,13 +257,14 @@ def test_means_and_success_rate_over_the_last_episodes_and_all_of_them_are_reach
 
 def test_a_chart_and_the_runs_show_returns_and_success_of_ended_episodes(page: Page) -> None:
     """Episode n of 4 pays n, and the last two succeed."""
-    page.browser.write("live-last", "2")
     with LiveView(page.url, name="paid") as view:
         for n in range(4):
             episode = view.episode("go", n)
             episode.add(FRAMES[0], StepScore(0.5, 0.25, n > 1, 0, 3.0))
             episode.pay(n)
             episode.end()
+        page.browser.until("document.querySelector('#live-runs tr')")
+        page.browser.write("live-last", "2")
         told = "paid: return 2.500, success 1.000"
         page.browser.until(f"document.getElementById('live-history').getAttribute('aria-label')?.includes('{told}')")
         row = next(row for row in page.browser.run(RUNS) if row[0] == "paid")

@@ -98,6 +98,7 @@ def page(gateway: Gateway, quiet_browser: Browser, videos: Path) -> Page:
     quiet_browser.driver.execute_cdp_cmd("Storage.clearDataForOrigin", storage)
     quiet_browser.open(gateway.url)
     quiet_browser.write("tasks", TASK)
+    quiet_browser.run("document.getElementById('advanced').open = true")
     quiet_browser.write("fps", str(FPS))
     return Page(gateway, quiet_browser, videos)
 
@@ -420,6 +421,40 @@ def test_videos_and_curves_are_renamed_coloured_and_removed(page: Page) -> None:
     page.browser.all("#videos .remove")[0].click()
     assert captions(page) == ["dropped"]
     assert [row[0] for row in page.browser.cells("#curves tr")] == ["dropped"]
+
+
+def test_what_was_cleared_comes_back(page: Page) -> None:
+    page.score("success", "failure")
+    page.compare()
+    before = page.saved()
+    page.browser["clear"].click()
+    page.browser.until_text("status", "Cleared 2 videos.")
+    assert page.browser.all("#videos video") == []
+    page.browser["undo"].click()
+    assert captions(page) == ["success.mp4", "failure.mp4"]
+    assert page.saved() == before
+    assert page.browser.all("#pairs p")[0].text.startswith("success.mp4 does the task better.")
+    assert not page.browser["undo"].is_displayed()
+
+
+def test_a_video_that_the_browser_cannot_show_tells_whether_it_was_scored(page: Page) -> None:
+    gif = page.videos / "clip.gif"
+    frames = [Image.fromarray(frame) for frame in make_clip("success", Task("red", "bowl"), 1).frames]
+    frames[0].save(gif, save_all=True, append_images=frames[1:])
+    page.browser.drop([gif])
+    told = "This browser cannot show this file, and it was not scored: see the numbers below."
+    page.browser.until(f"document.querySelector('#videos figure p').textContent === '{told}'")
+    assert page.browser.all("#videos figure p")[0].is_displayed()
+    assert "got another kind" in page.browser.cells("#curves tr")[0][-1]
+
+
+def test_the_space_bar_plays_unless_somebody_writes(page: Page) -> None:
+    page.score("success")
+    page.browser["tasks"].send_keys(" ")
+    assert page.browser["play"].text == "Play"
+    page.browser.run("document.activeElement.blur()")
+    ActionChains(page.browser.driver).send_keys(Keys.SPACE).perform()
+    page.browser.until_text("play", "Pause")
 
 
 def test_an_example_is_scored_with_a_click_and_its_command_line_runs(page: Page) -> None:

@@ -58,6 +58,11 @@ export async function curvesOf(number, episode, labels, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}${chosen(labels)}`, { signal })).json();
 }
 
+/** A few points of an episode's curve, and a small picture. */
+export async function previewOf(number, episode, labels, signal) {
+  return (await answer(`viewer/datasets/${number}/episodes/${episode}/preview${chosen(labels)}`, { signal })).json();
+}
+
 /** The video of an episode by one camera, as a Blob: an address of its own could not show the key. */
 export async function videoOf(number, episode, camera, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}/videos/${camera}`, { signal })).blob();

@@ -1,12 +1,14 @@
 // SPDX-License-Identifier: MIT
 // The tab of datasets: how their episodes end, which one wants to see first, one that is watched, some that are taken along.
 
-import { curvesOf, datasets, episodesOf, faultsOf, videoOf } from "./api.js";
+import { curvesOf, datasets, episodesOf, faultsOf, previewOf, videoOf } from "./api.js";
 import { colourName } from "./chart.js";
 import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, WORST_FIRST } from "./episodes.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
+import { onKeys } from "./keys.js";
 import { DASHES } from "./looks.js";
+import { Previews } from "./previews.js";
 import { save } from "./takeaway.js";
 import { cut, shown } from "./text.js";
 import { Timeline } from "./timeline.js";
@@ -24,6 +26,8 @@ export class DatasetTab {
   #onScore;
   #onError;
   #histogram;
+  #previews = new Previews(({ episode }) => previewOf(this.#number, episode, this.#labels, this.#loading.signal));
+  #loading = new AbortController();
   #table;
   #timeline;
   #datasets = [];
@@ -47,7 +51,7 @@ export class DatasetTab {
     this.#histogram = new Histogram(page.histogram);
     const rows = { scroller: page["episode-list"], body: page.episodes, above: page["episodes-above"], below: page["episodes-below"] };
     this.#table = new EpisodeTable(rows, {
-      onWatch: (episode) => this.#watch(episode), chosen: this.#chosen, onChoose: () => this.#showChosen(),
+      previews: this.#previews, onWatch: (episode) => this.#watch(episode), chosen: this.#chosen, onChoose: () => this.#showChosen(),
     });
     const elements = {
       videos: page["episode-videos"], chart: page["episode-chart"], slider: page["episode-time"], button: page["episode-play"],
@@ -87,6 +91,8 @@ export class DatasetTab {
     on("episode-close", "click", () => this.#close());
     on("episode-before", "click", () => this.#step(-1));
     on("episode-after", "click", () => this.#step(1));
+    const keys = { " ": () => page["episode-play"].click(), n: () => this.#step(1), p: () => this.#step(-1), Escape: () => this.#close() };
+    onKeys(keys, () => this.#watched && !page["dataset-panel"].hidden);
   }
 
   /** Asks which datasets there are, and shows the first. */
@@ -139,6 +145,9 @@ export class DatasetTab {
   async #load() {
     this.#leave();
     this.#checking.abort();
+    this.#loading.abort();
+    this.#loading = new AbortController();
+    this.#previews.clear();
     this.#chosen.clear();
     const { signal } = this.#stopping;
     const page = this.#page;

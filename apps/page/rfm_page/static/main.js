@@ -6,6 +6,7 @@ import { Curve } from "./curves.js";
 import { DatasetTab } from "./dataset.js";
 import { exampleFiles } from "./examples.js";
 import { pngFigure, svgFigure } from "./figure.js";
+import { onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
 import { LiveTab } from "./live.js";
 import { byQuestion, giveLooks } from "./looks.js";
@@ -118,6 +119,7 @@ function addFiles(files, about = []) {
     videos.add(file, file.name, corrected, { origin });
   });
   page.files.value = "";
+  page.undo.hidden = true;
   update();
   if (!videos.all.length || !page.model.value) return;
   if (tasks().length) scoreAll();
@@ -251,6 +253,35 @@ function clear() {
   update();
 }
 
+/** Clears the tab, and offers to take that back. */
+function clearForNow() {
+  stop();
+  const gone = { entries: videos.all, curves, verdicts };
+  const text = page.tasks.value;
+  clear();
+  page.status.textContent = `Cleared ${gone.entries.length} ${gone.entries.length === 1 ? "video" : "videos"}.`;
+  page.undo.hidden = false;
+  page.undo.onclick = () => {
+    page.tasks.value ||= text;
+    restore(gone);
+  };
+  page.undo.focus();
+}
+
+/** Brings back what was cleared, beside what has come since. */
+function restore({ entries, curves: old, verdicts: oldVerdicts }) {
+  const again = new Map(entries.map((entry) => {
+    const { file, name, title, colour, origin, orient, channels } = entry;
+    return [entry, videos.add(file, name, { orient, channels }, { origin, title, colour })];
+  }));
+  for (const curve of old) curve.video = again.get(curve.video);
+  for (const verdict of oldVerdicts) verdict.videos = verdict.videos.map((video) => again.get(video));
+  curves.push(...old);
+  verdicts.push(...oldVerdicts);
+  page.undo.hidden = true;
+  showNames();
+}
+
 function removeVideo(video) {
   videos.remove(video);
   for (const curve of curves.filter((each) => each.video === video)) forget(curve);
@@ -317,7 +348,11 @@ function update() {
   timeline.show(curves);
   legend.show(curves);
   const isByQuestion = byQuestion(curves);
-  for (const video of videos.all) videos.mark(video, isByQuestion ? null : curves.find((curve) => curve.video === video));
+  for (const video of videos.all) {
+    const own = curves.filter((curve) => curve.video === video);
+    videos.mark(video, isByQuestion ? null : own[0]);
+    videos.tell(video, own.map(({ state }) => state));
+  }
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle;
   page.compare.disabled = videos.all.length !== 2 || !page.model.value;
@@ -359,7 +394,7 @@ listen(page.model, { change: chooseRule });
 listen(page.rule, { change: showLimits });
 for (const select of [page.orient, page.channels]) listen(select, { change: () => videos.correct(correction()) });
 listen(page.stop, { click: stop });
-listen(page.clear, { click: clear });
+listen(page.clear, { click: clearForNow });
 listen(page.compare, { click: comparePair });
 listen(page.threshold, { input: showThreshold });
 listen(page.tasks, { keydown: (event) => { if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) scoreAll(); } });
@@ -386,5 +421,6 @@ listen(document, {
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", update);
 
+onKeys({ " ": () => page.play.click() }, () => !page["score-panel"].hidden && !page.play.disabled);
 showThreshold();
 begin();

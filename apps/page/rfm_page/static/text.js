@@ -8,6 +8,15 @@ export function shown(value) {
   return value === null || value === undefined ? NONE : value.toFixed(3);
 }
 
+const MOST_DIGITS = 8;
+
+/** A number below a threshold, with as many digits as show that it is below. */
+export function shownBelow(value, threshold) {
+  let digits = 3;
+  while (digits < MOST_DIGITS && Number(value.toFixed(digits)) >= threshold) digits += 1;
+  return value.toFixed(digits);
+}
+
 const FEWEST_LETTERS = 12; // fewer tell nothing
 const BETWEEN_WORDS = /[\s_\-.,:;/]/;
 

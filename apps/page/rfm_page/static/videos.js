@@ -7,6 +7,11 @@ import { nameable, remover } from "./nameable.js";
 const AS_STORED = { orient: "none", channels: "rgb" };
 const MOST_IN_A_ROW = 6; // of more the videos are small, so that all names are to be seen
 const LONG_LETTERS = 14; // a longer name may need two lines
+const UNSHOWN = { // by the state of its curve
+  waiting: "This browser cannot show this file.",
+  done: "This browser cannot show this file. It was scored all the same.",
+  failed: "This browser cannot show this file, and it was not scored: see the numbers below.",
+};
 const NEAR_S = 0.05; // a video that is so near to a time shows it
 const INSIDE_S = 0.001; // behind the begin of a frame, so that rounding does not show the one before
 
@@ -39,12 +44,12 @@ export class Videos {
   /** Shows a file under a name as the model sees it, and gives what is known of it. more: what else is known */
   add(file, name = file.name, correction = AS_STORED, more = {}) {
     const [figure, player, caption, trouble] = ["figure", "video", "figcaption", "p"].map((tag) => document.createElement(tag));
-    const entry = { id: (this.#numAdded += 1), file, name, title: this.#freeTitle(name), figure, player, wanted: null, ...more };
-    Object.assign(entry, { place: this.#freePlace(), colour: null });
+    const entry = { id: (this.#numAdded += 1), file, name, title: this.#freeTitle(name), place: this.#freePlace(), colour: null };
+    Object.assign(entry, { figure, player, trouble, wanted: null, ...more });
     Object.assign(player, { src: URL.createObjectURL(file), muted: true, playsInline: true, preload: "auto" });
     player.setAttribute("aria-label", `Video ${entry.title}`);
     show(entry, correction);
-    trouble.textContent = "This browser cannot show it; its curve counts all the same.";
+    trouble.textContent = UNSHOWN.waiting;
     trouble.hidden = true;
     player.addEventListener("error", () => { trouble.hidden = false; });
     caption.append(...(this.#changing ? this.#controls(entry) : [name]));
@@ -89,6 +94,12 @@ export class Videos {
     if (curve) entry.swatch.value = colourOf(curve);
   }
 
+  /** Says of a video that this browser cannot show whether it was scored. states: of its curves */
+  tell(entry, states) {
+    const state = ["done", "failed"].find((each) => states.includes(each)) ?? "waiting";
+    entry.trouble.textContent = UNSHOWN[state];
+  }
+
   /** Moves all videos to a time, but for `but`. */
   seek(seconds, but = null) {
     for (const entry of this.#entries) {
@@ -120,6 +131,7 @@ export class Videos {
     for (const { player } of this.#entries) URL.revokeObjectURL(player.src);
     this.#entries = [];
     this.#host.replaceChildren();
+    this.#fit();
   }
 
   /** What changes the colour and the title of a video, and what removes it. */
