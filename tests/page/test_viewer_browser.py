@@ -249,13 +249,14 @@ def test_a_file_and_its_copy_are_one_file(page: Page) -> None:
 def test_what_is_missing_or_broken_is_named_and_the_others_are_scored(page: Page) -> None:
     submit = page.browser.all("#question .first")[0]
     submit.click()
-    assert page.browser["errors"].text == "video: expected a file, got none: drop one"
+    assert page.browser["files-wanted"].text == "Choose a video, or drop one on the page."
     page.browser.write("tasks", " ")
     page.drop("broken", "success")
     page.browser.until_text("task-wanted", "What is the robot to do? Type it, then press Score.")
     assert page.browser.run("return document.activeElement.id") == "tasks"
+    assert page.browser["files-wanted"].text == ""
     submit.click()
-    assert page.browser["errors"].text == "task: expected a sentence, got none"
+    assert page.browser["task-wanted"].text == "What is the robot to do? Type it, then press Score."
     assert page.browser.cells("#curves tr") == []
     page.browser.write("tasks", TASK)
     submit.click()
@@ -263,8 +264,10 @@ def test_what_is_missing_or_broken_is_named_and_the_others_are_scored(page: Page
     page.browser.until_text("status", "1 of 2 curves are done.")
     kinds = "MP4, MOV, WebM, Matroska, Ogg or AVI"
     told = f"video: expected a file of the kind {kinds}, got another kind (broken.mp4)"
-    page.browser.until_text("errors", f"broken.mp4: {told}")
+    page.browser.until_text("errors", f"broken.mp4 could not be scored\n{told}")
     assert [row[-1] for row in page.browser.cells("#curves tr")] == [told, "done"]
+    page.browser.all("#videos .remove")[0].click()
+    assert page.browser["errors"].text == ""
 
 
 SIZES = ((1440, 900), (1024, 700))

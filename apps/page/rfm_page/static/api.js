@@ -4,6 +4,14 @@
 /** An answer that wants the gateway's key. */
 export class KeyWanted extends Error {}
 
+/** No answer: the gateway is away. */
+export class GatewayAway extends Error {}
+
+/** The gateway answers, but cannot do it now: Triton is not ready, too slow, or refuses the gateway. */
+export class ServerError extends Error {}
+
+const OF_SERVER = [502, 503, 504];
+
 let key = "";
 
 /** From now on, requests show this key. */
@@ -14,6 +22,11 @@ export function useKey(text) {
 /** Whether requests show a key. */
 export function hasKey() {
   return key !== "";
+}
+
+/** What the gateway tells without Triton: the names of scores, and the command lines that mend faults. */
+export async function aboutServer() {
+  return (await answer("viewer/server")).json();
 }
 
 /** Which models are served, and what may be asked of them. */
@@ -31,7 +44,7 @@ export async function score(form, signal, onEvent) {
   const response = await answer("viewer/score", { method: "POST", body: form, signal });
   let isOver = false;
   for await (const [name, document] of events(response.body)) {
-    if (name === "failed") throw new Error(document.detail);
+    if (name === "failed") throw new (document.is_servers ? ServerError : Error)(document.detail);
     isOver ||= name === "done";
     onEvent(name, document);
   }
@@ -94,11 +107,12 @@ async function answer(path, options = {}) {
     response = await fetch(path, { ...options, headers });
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new Error(`gateway: expected an answer, got none (${error.message})`);
+    throw new GatewayAway(`gateway: expected an answer, got none (${error.message})`);
   }
   if (response.ok) return response;
   const reason = await reasonOf(response);
-  throw response.status === 401 ? new KeyWanted(reason) : new Error(reason);
+  if (response.status === 401) throw new KeyWanted(reason);
+  throw new (OF_SERVER.includes(response.status) ? ServerError : Error)(reason);
 }
 
 async function reasonOf(response) {

@@ -2,13 +2,16 @@
 // The tab of datasets: how their episodes end, which one wants to see first, one that is watched, some that are taken along.
 
 import { curvesOf, datasets, episodesOf, faultsOf, previewOf, videoOf } from "./api.js";
+import { Asking } from "./asking.js";
 import { colourName } from "./chart.js";
 import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, WORST_FIRST } from "./episodes.js";
+import { failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
 import { onKeys } from "./keys.js";
 import { DASHES } from "./looks.js";
 import { Previews } from "./previews.js";
+import { Place } from "./states.js";
 import { save } from "./takeaway.js";
 import { cut, shown } from "./text.js";
 import { Timeline } from "./timeline.js";
@@ -24,7 +27,8 @@ const NOTHING = {
 export class DatasetTab {
   #page;
   #onScore;
-  #onError;
+  #failedAnywhere;
+  #places;
   #histogram;
   #previews = new Previews(({ episode }) => previewOf(this.#number, episode, this.#labels, this.#loading.signal));
   #loading = new AbortController();
@@ -41,13 +45,19 @@ export class DatasetTab {
   #watched = null;
   #stopping = new AbortController();
   #checking = new AbortController();
+  #asking = new Asking((isCurrent) => this.#ask(isCurrent));
   #faults = {}; // by dataset: one look at all videos for each load of the page
 
-  /** onScore({ files, task, fps, corrections, origins }): somebody wants an episode scored; onError(error): something went wrong */
-  constructor(page, { onScore, onError }) {
+  /**
+   * onScore({ files, task, fps, corrections, origins }): somebody wants an episode scored
+   * failedAnywhere(error): shows an error that is one on every tab, and says whether it is
+   */
+  constructor(page, { onScore, failedAnywhere }) {
     this.#page = page;
     this.#onScore = onScore;
-    this.#onError = onError;
+    this.#failedAnywhere = failedAnywhere;
+    const places = { none: "no-datasets", errors: "dataset-errors", hits: "no-hits", episode: "episode-errors" };
+    this.#places = Object.fromEntries(Object.entries(places).map(([name, id]) => [name, new Place(page[id])]));
     this.#histogram = new Histogram(page.histogram);
     const rows = { scroller: page["episode-list"], body: page.episodes, above: page["episodes-above"], below: page["episodes-below"] };
     this.#table = new EpisodeTable(rows, {
@@ -65,7 +75,7 @@ export class DatasetTab {
     const page = this.#page;
     const on = (name, event, action) => page[name].addEventListener(event, action);
     on("shelf", "submit", (event) => event.preventDefault());
-    on("shelf", "change", () => page.errors.replaceChildren());
+    on("shelf", "change", () => this.#places.errors.clear());
     on("dataset", "change", () => this.#choose());
     on("labels", "change", () => this.#load());
     on("others", "change", () => this.#load());
@@ -95,19 +105,31 @@ export class DatasetTab {
     onKeys(keys, () => this.#watched && !page["dataset-panel"].hidden);
   }
 
-  /** Asks which datasets there are, and shows the first. */
-  async begin() {
+  /** Asks which datasets there are until there is one, and shows the first. */
+  begin() {
+    this.#asking.begin();
+  }
+
+  async #ask(isCurrent) {
+    let there;
     try {
-      this.#datasets = await datasets();
+      there = await datasets();
     } catch (error) {
-      this.#onError(error);
-      return;
+      if (!isCurrent() || this.#failedAnywhere(error)) return true; // the page begins again
+      this.#places.none.show(failure("The datasets cannot be listed", error, () => this.begin()));
+      return false;
     }
+    if (!isCurrent()) return true;
+    if (there.length) this.#places.none.clear();
+    else this.#places.none.show(noDataset(() => this.begin()));
+    if (there.length && JSON.stringify(there) === JSON.stringify(this.#datasets)) return true; // they are shown
+    this.#datasets = there;
     const { dataset } = this.#page;
     dataset.replaceChildren(...this.#datasets.map(({ name, kind }, index) => new Option(`${name} (${kind.replace("LeRobot ", "")})`, index)));
     this.#page.datasets.hidden = this.#page["dataset-side"].hidden = !this.#datasets.length;
-    this.#page["no-datasets"].hidden = this.#datasets.length > 0;
+    this.#page.fold.disabled = !this.#page["dataset-panel"].hidden && !this.#datasets.length;
     if (this.#datasets.length) await this.#choose();
+    return this.#datasets.length > 0;
   }
 
   get #number() {
@@ -148,6 +170,7 @@ export class DatasetTab {
     this.#loading.abort();
     this.#loading = new AbortController();
     this.#previews.clear();
+    this.#places.errors.clear();
     this.#chosen.clear();
     const { signal } = this.#stopping;
     const page = this.#page;
@@ -160,7 +183,7 @@ export class DatasetTab {
     } catch (error) {
       if (signal.aborted) return;
       [this.#told, this.#others] = [NOTHING, null];
-      this.#onError(error);
+      this.#failed("errors", "The dataset cannot be shown", error, () => this.#load());
     }
     const isLabelled = this.#told.episodes.some(({ final_progress: final }) => final !== undefined);
     page.cutoff.value = this.#told.threshold;
@@ -185,8 +208,12 @@ export class DatasetTab {
       for (const row of told.episodes) row.fault = faults[row.episode] ?? null;
       this.#judge();
     } catch (error) {
-      if (!signal.aborted) this.#onError(error);
+      if (!signal.aborted) this.#failed("errors", "The videos of the episodes could not be checked", error, () => this.#check());
     }
+  }
+
+  #failed(place, title, error, retry) {
+    if (!this.#failedAnywhere(error)) this.#places[place].show(failure(title, error, retry));
   }
 
   /** Judges all episodes by another threshold. */
@@ -218,6 +245,7 @@ export class DatasetTab {
     const page = this.#page;
     const filters = FILTER_NAMES.filter((name) => page[`only-${name}`].checked).map((name) => this.#filter(name));
     this.#shown = sorted(kept(this.#episodes, filters, page["task-part"].value), page.order.value, this.#isTurned);
+    this.#showNoHits();
     this.#table.show(this.#shown, this.#threshold);
     page["shown-told"].textContent = `${this.#shown.length} of ${this.#episodes.length}`;
     for (const head of page["episode-list"].querySelectorAll("th[data-order]")) {
@@ -227,6 +255,20 @@ export class DatasetTab {
     }
     if (this.#watched) this.#table.mark(this.#watched.episode, this.#shown);
     this.#showChosen();
+  }
+
+  /** Says why no episode is listed. */
+  #showNoHits() {
+    const { hits, errors } = this.#places;
+    if (this.#shown.length || !errors.isEmpty) hits.clear();
+    else hits.show(this.#episodes.length ? noHit(this.#episodes.length, () => this.#clearFilters()) : noEpisode());
+    this.#page["episode-list"].hidden = !this.#shown.length;
+  }
+
+  #clearFilters() {
+    for (const name of FILTER_NAMES) this.#page[`only-${name}`].checked = false;
+    this.#page["task-part"].value = "";
+    this.#showTable();
   }
 
   #select(numbers) {
@@ -320,7 +362,7 @@ export class DatasetTab {
     this.#watched = { ...episode, files: [] };
     const page = this.#page;
     const { signal } = this.#stopping;
-    page.errors.replaceChildren();
+    this.#places.episode.clear();
     page.episode.hidden = false;
     page.datasets.classList.add("watching");
     this.#table.mark(episode.episode, this.#shown);
@@ -334,7 +376,7 @@ export class DatasetTab {
     try {
       await this.#fetch(episode, signal);
     } catch (error) {
-      if (!signal.aborted) this.#onError(error);
+      if (!signal.aborted) this.#failed("episode", `Episode ${episode.episode} cannot be shown`, error, () => this.#watch(episode));
     }
   }
 
@@ -350,6 +392,7 @@ export class DatasetTab {
     this.#page["episode-legend"].replaceChildren(...curves.map(legendItem));
     const blobs = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
+    if (!cameras.length) this.#places.episode.show(noVideo());
     const { name } = this.#datasets[this.#number];
     cameras.forEach((camera, index) => {
       const file = `${name}_episode_${`${episode}`.padStart(6, "0")}.${short(camera)}.mp4`;

@@ -3,9 +3,11 @@
 
 import { hasKey, KeyWanted, liveNews } from "./api.js";
 import { colourName } from "./chart.js";
+import { failure } from "./faults.js";
 import { History, mean } from "./history.js";
 import { LiveCard, titleOfRun } from "./livecard.js";
 import { cellOf, learn } from "./signals.js";
+import { Place } from "./states.js";
 import { cell, label, named } from "./table.js";
 import { NONE, shown } from "./text.js";
 
@@ -15,20 +17,21 @@ const ENDED_AT_A_TIME = 24;
 
 export class LiveTab {
   #page;
-  #onError;
+  #failedAnywhere;
+  #errors;
   #cards = new Map();
   #history;
   #runs = []; // their places are those of their colours
   #cursor = "";
   #timer = null;
-  #isAway = false;
   #asking = 0; // number of the loop that asks
   #mostEnded = ENDED_AT_A_TIME;
 
-  /** onError(error): something went wrong */
-  constructor(page, { onError }) {
+  /** failedAnywhere(error): shows an error that is one on every tab, and says whether it is */
+  constructor(page, { failedAnywhere }) {
     this.#page = page;
-    this.#onError = onError;
+    this.#failedAnywhere = failedAnywhere;
+    this.#errors = new Place(page["live-errors"]);
     this.#history = new History(page["live-history"]);
     page["live-more"].addEventListener("click", () => {
       this.#mostEnded += ENDED_AT_A_TIME;
@@ -58,13 +61,11 @@ export class LiveTab {
         const news = await liveNews(this.#cursor);
         if (asking !== this.#asking) return;
         this.#take(news);
-        if (this.#isAway) this.#page.errors.replaceChildren();
-        this.#isAway = false;
+        this.#errors.clear();
       }
     } catch (error) {
       if (asking !== this.#asking) return;
-      this.#isAway = true;
-      this.#onError(error);
+      if (!this.#failedAnywhere(error)) this.#errors.show(failure("The running episodes cannot be shown", error));
       if (error instanceof KeyWanted) return; // it begins again with a key
       after = ASK_AGAIN_AFTER_MS;
     }

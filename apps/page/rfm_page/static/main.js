@@ -1,10 +1,12 @@
 // SPDX-License-Identifier: MIT
 // The page: what its controls do.
 
-import { compare, KeyWanted, score, served, useKey } from "./api.js";
+import { aboutServer, compare, GatewayAway, hasKey, KeyWanted, score, served, ServerError, useKey } from "./api.js";
+import { Asking } from "./asking.js";
 import { Curve } from "./curves.js";
 import { DatasetTab } from "./dataset.js";
 import { exampleFiles } from "./examples.js";
+import { failure, noModel, serverAway, tritonAway, useRemedies } from "./faults.js";
 import { pngFigure, svgFigure } from "./figure.js";
 import { onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
@@ -12,6 +14,7 @@ import { LiveTab } from "./live.js";
 import { byQuestion, giveLooks } from "./looks.js";
 import { Queue } from "./queue.js";
 import { Sidebar } from "./sidebar.js";
+import { copied, Place } from "./states.js";
 import { showTable } from "./table.js";
 import { Tabs } from "./tabs.js";
 import { Timeline } from "./timeline.js";
@@ -20,6 +23,7 @@ import { learn, toldAt } from "./signals.js";
 import { addVerdict, areOneFile, sentenceOf } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
+const TASK_WANTED = "What is the robot to do? Type it, then press Score.";
 
 const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((element) => [element.id, element]));
 const queue = new Queue(CURVES_AT_A_TIME);
@@ -31,48 +35,102 @@ const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurv
 const sidebar = new Sidebar(page.fold);
 const { videos, chart } = timeline;
 const tabs = new Tabs(["score", "dataset", "live"].map((name) => [page[`${name}-tab`], page[`${name}-panel`]]), shownTab);
-const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, onError: failed });
-const liveTab = new LiveTab(page, { onError: failed });
+const places = { away: new Place(page.away), errors: new Place(page.errors), served: new Place(page["served-state"]) };
+const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, failedAnywhere });
+const liveTab = new LiveTab(page, { failedAnywhere });
 let curves = [];
 let verdicts = [];
-let gateway = { models: [], rules: [], url: "" };
+const gateway = { models: [], rules: [], url: "" };
 let stopping = new AbortController();
 
-async function begin() {
-  page.errors.replaceChildren();
+const askingServer = new Asking(askServer);
+const askingModels = new Asking(askServed);
+
+/** Asks what is there; again until the server answers, and then until there is something to show. */
+function begin() {
+  askingServer.begin();
+}
+
+/** Begins the tabs as soon as the server answers. Says whether it does, or a key is wanted first. */
+async function askServer(isCurrent) {
+  let about;
+  try {
+    about = await aboutServer();
+  } catch (error) {
+    if (isCurrent()) showAnywhere(error);
+    return isCurrent() && error instanceof KeyWanted; // the page begins again with a key
+  }
+  learn(about.scores); // before a tab draws a curve
+  if (!isCurrent()) return true;
+  if (!gateway.rules.length) offer(about);
+  useRemedies(about.remedies);
+  places.away.clear();
+  page["key-form"].hidden = true;
   datasetTab.begin();
   liveTab.begin();
-  try {
-    gateway = await served();
-  } catch (error) {
-    page.status.textContent = "";
-    failed(error);
-    return;
-  }
-  learn(gateway.scores);
-  page["key-form"].hidden = true;
-  page.model.replaceChildren(...gateway.models.map(({ name }) => new Option(name)));
+  if (!gateway.models.length) askingModels.begin();
+  return true;
+}
+
+/** Offers the choices of this server. */
+function offer(about) {
+  Object.assign(gateway, about);
   page.rule.replaceChildren(...gateway.rules.map(({ name }) => new Option(name)));
   page.orient.replaceChildren(...gateway.orientations.map((name) => new Option(name === "none" ? "as stored" : name, name)));
   page.channels.replaceChildren(...gateway.channel_orders.map((name) => new Option(name.toUpperCase(), name)));
   videos.correct(correction());
   page.fps.value = gateway.fps;
+}
+
+/** Asks which models are served, and offers them. Says whether there is one. */
+async function askServed(isCurrent) {
+  let answer;
+  try {
+    answer = await served();
+  } catch (error) {
+    if (!isCurrent()) return true;
+    page.status.textContent = "";
+    if (failedAnywhere(error)) return true; // the page begins again
+    places.served.show(tritonAway(error, () => askingModels.begin()));
+    return false;
+  }
+  if (!isCurrent()) return true;
+  Object.assign(gateway, answer);
+  page.model.replaceChildren(...gateway.models.map(({ name }) => new Option(name)));
   if (gateway.models.some(({ name }) => name === gateway.model)) page.model.value = gateway.model;
   chooseRule();
   page.examples.hidden = !gateway.models.length;
-  const none = "model: expected one that scores frames of videos, got none";
-  page.status.textContent = gateway.models.length ? "" : none;
+  page.status.textContent = "";
+  if (gateway.models.length) places.served.clear();
+  else places.served.show(noModel(() => askingModels.begin()));
+  return gateway.models.length > 0;
 }
 
-/** Shows an error, and the form for the key if that is what is wrong. */
-function failed(error) {
+/** Shows on every tab that a key is wanted, or that the server is away. Says whether one of them is so. */
+function showAnywhere(error) {
   if (error instanceof KeyWanted) {
+    page["key-wrong"].textContent = hasKey() ? "This is not the key. Type it again." : "";
     page["key-form"].hidden = false;
     page.key.focus();
-  }
-  const line = document.createElement("p");
-  line.textContent = error.message;
-  page.errors.replaceChildren(line);
+    page.key.select();
+    page.status.textContent = "";
+    places.away.clear();
+  } else if (error instanceof GatewayAway) {
+    places.away.show(serverAway(error, begin));
+    places.served.clear();
+  } else return false;
+  return true;
+}
+
+/** Shows what is wrong on every tab, and begins again when the server is back. Says whether something of that kind is wrong. */
+function failedAnywhere(error) {
+  if (error instanceof GatewayAway) askingServer.begin();
+  return showAnywhere(error);
+}
+
+/** Shows on the tab of videos what went wrong. */
+function failed(error, title = "That did not work", retry = null) {
+  if (!failedAnywhere(error)) places.errors.show(failure(title, error, retry));
 }
 
 /** Chooses the rule of the model's training. */
@@ -129,7 +187,7 @@ function addFiles(files, about = []) {
 /** Asks for the task of videos that are there without one. */
 function askForTask() {
   sidebar.open();
-  page["task-wanted"].textContent = "What is the robot to do? Type it, then press Score.";
+  page["task-wanted"].textContent = TASK_WANTED;
   page.tasks.focus();
 }
 
@@ -148,24 +206,19 @@ async function scoreExamples(names) {
     const { files, origins, task } = await exampleFiles(names);
     page.tasks.value = task;
     addFiles(files, origins.map((origin) => ({ origin })));
+    places.errors.clear();
   } catch (error) {
-    failed(error);
+    failed(error, "The example could not be loaded", () => scoreExamples(names));
   }
 }
 
 /** Asks about each video and task that was not yet asked about with these settings. */
 function scoreAll() {
-  page.errors.replaceChildren();
-  const missing = [
-    [!videos.all.length, "video: expected a file, got none: drop one"],
-    [!tasks().length, "task: expected a sentence, got none"],
-    [!page.model.value, "model: expected one that is served, got none"],
-  ].find(([isMissing]) => isMissing);
-  if (missing) {
-    failed(new Error(missing[1]));
-    return;
-  }
-  page["task-wanted"].textContent = "";
+  places.errors.clear();
+  page["files-wanted"].textContent = videos.all.length ? "" : "Choose a video, or drop one on the page.";
+  page["task-wanted"].textContent = tasks().length ? "" : TASK_WANTED;
+  if (!page.model.value) askingModels.begin(); // the page says why there is none
+  if (!videos.all.length || !tasks().length || !page.model.value) return;
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
@@ -191,7 +244,7 @@ async function ask(curve, signal) {
   } catch (error) {
     curve.state = "failed";
     curve.error = signal.aborted ? "stopped" : error.message;
-    if (!signal.aborted) failed(error instanceof KeyWanted ? error : new Error(`${video.name}: ${error.message}`));
+    if (!signal.aborted) failed(error, `${video.name} could not be scored`, error instanceof ServerError ? scoreAll : null);
   }
   setTimeout(update); // when the queue knows, too
 }
@@ -201,7 +254,7 @@ async function comparePair() {
   const { model, fps, resize } = settings();
   const { orient, channels } = first;
   const before = verdicts.length;
-  page.errors.replaceChildren();
+  places.errors.clear();
   page.compare.disabled = true;
   try {
     if (!tasks().length) throw new Error("task: expected a sentence, got none");
@@ -216,7 +269,7 @@ async function comparePair() {
       tell({ videos: [first, second], task, model, fps, orient, channels, resize, answer });
     }
   } catch (error) {
-    if (!stopping.signal.aborted) failed(error);
+    if (!stopping.signal.aborted) failed(error, "The videos could not be compared", comparePair);
   }
   update();
   if (verdicts.length > before) page.status.textContent = verdicts.slice(before).map(sentenceOf).join(" ");
@@ -246,8 +299,8 @@ function clear() {
   curves = [];
   verdicts = [];
   page.pairs.replaceChildren();
-  page.errors.replaceChildren();
-  page["task-wanted"].textContent = "";
+  places.errors.clear();
+  page["files-wanted"].textContent = page["task-wanted"].textContent = "";
   page.status.textContent = "";
   timeline.moveTo(0);
   update();
@@ -310,6 +363,7 @@ function removeCurves(gone) {
 function forget(curve) {
   curve.leaving.abort();
   curves = curves.filter((each) => each !== curve);
+  if (!curves.some(({ error }) => error)) places.errors.clear();
 }
 
 /** Shows a curve in another colour or under another name. */
@@ -341,6 +395,8 @@ function figure() {
 function update() {
   const scored = curves.filter(({ times }) => times.length);
   page.empty.hidden = videos.all.length > 0;
+  page["served-state"].classList.toggle("whole", !videos.all.length);
+  if (videos.all.length) page["files-wanted"].textContent = "";
   page.clear.hidden = !videos.all.length;
   page.stage.hidden = !videos.all.length;
   page.numbers.hidden = !curves.length;
@@ -369,18 +425,14 @@ function update() {
 
 /** The settings belong to the tabs that have some, and what is said of curves to the first. */
 function shownTab(index) {
-  page.fold.disabled = index === 2;
+  page.fold.disabled = index === 2 || (index === 1 && page["dataset-side"].hidden);
   page.status.textContent = "";
   if (index === 0) update();
 }
 
-async function copy(text, name) {
-  try {
-    await navigator.clipboard.writeText(text);
-    page.status.textContent = `The ${name} copied.`;
-  } catch { // there is none where the page comes over plain HTTP from another machine
-    failed(new Error("clipboard: expected leave to write to it, got none: mark the text and copy it"));
-  }
+async function copy(text, name, element) {
+  const isCopied = await copied(text, element);
+  page.status.textContent = isCopied ? `The ${name} copied.` : "The browser lets no page copy here: press Ctrl+C.";
 }
 
 function listen(element, events) {
@@ -406,9 +458,9 @@ listen(page.csv, { click: () => save("curves.csv", csv(curves), "text/csv") });
 listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, answered()), "application/json") });
 listen(page.png, { click: async () => save("curves.png", await pngFigure(figure())) });
 listen(page.svg, { click: () => save("curves.svg", figure(), "image/svg+xml") });
-listen(page.copy, { click: () => copy(page.command.textContent, "command line is") });
-listen(page["use-copy"], { click: () => copy(datasetTab.words, "words are") });
-listen(page["live-copy"], { click: () => copy(page["live-code"].textContent, "lines are") });
+listen(page.copy, { click: () => copy(page.command.textContent, "command line is", page.command) });
+listen(page["use-copy"], { click: () => copy(datasetTab.words, "words are", page["use-words"]) });
+listen(page["live-copy"], { click: () => copy(page["live-code"].textContent, "lines are", page["live-code"]) });
 listen(document, {
   dragover: (event) => { event.preventDefault(); page.dropping.hidden = false; },
   dragleave: (event) => { if (!event.relatedTarget) page.dropping.hidden = true; },
