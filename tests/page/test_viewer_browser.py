@@ -460,6 +460,19 @@ def test_the_space_bar_plays_unless_somebody_writes(page: Page) -> None:
     page.browser.until_text("play", "Pause")
 
 
+def test_a_slow_upload_tells_how_far_it_is_and_then_the_curve_comes(page: Page) -> None:
+    link = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 20_000}  # bytes a second
+    page.browser.driver.execute_cdp_cmd("Network.enable", {})
+    page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link)
+    try:
+        page.drop("large")
+        page.browser.until("/ Uploading: [1-9]\\d? %\\.$/.test(document.getElementById('status').textContent)")
+        assert page.browser.cells("#curves tr")[0][-1].startswith("uploading, ")
+        page.browser.until_text("status", "1 of 1 curves are done.")
+    finally:
+        page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link | {"uploadThroughput": -1})
+
+
 def test_an_example_is_scored_with_a_click_and_its_command_line_runs(page: Page) -> None:
     page.browser.write("tasks", "")
     page.browser.write("fps", "3")

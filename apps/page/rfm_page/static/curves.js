@@ -23,6 +23,7 @@ export class Curve {
   state = "waiting";
   error = null;
   version = null;
+  sentPercent = null;
   numFrames = null;
   sampledFrames = null;
   blank = null; // what the frames show, if nothing
@@ -56,6 +57,20 @@ export class Curve {
 
   get label() {
     return `${this.name}: ${this.title ?? `${this.task} (${this.model}, ${this.sampling})`}`;
+  }
+
+  /** Takes the share of the video that has been sent. Says whether that is news. */
+  takeSent(share) {
+    const percent = Math.floor(100 * share);
+    if (percent === this.sentPercent) return false;
+    this.sentPercent = percent;
+    this.state = percent < 100 ? `uploading, ${percent} %` : "sent";
+    return true;
+  }
+
+  /** Whether the video is on the way. */
+  get isUploading() {
+    return this.state.startsWith("uploading");
   }
 
   /** Takes an event of the gateway. */

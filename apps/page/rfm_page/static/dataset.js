@@ -399,7 +399,7 @@ export class DatasetTab {
       this.#watched.files.push(new File([blobs[index]], file, { type: blobs[index].type }));
       const title = unused[index] ? `${short(camera)} (${unused[index]}: not scored)` : short(camera);
       const video = this.#timeline.videos.add(this.#watched.files.at(-1), title, corrections[index]);
-      this.#timeline.videos.mark(video, curves.filter(({ label }) => label === short(camera)));
+      this.#timeline.videos.mark(video, curves.find(({ label }) => label === short(camera)));
     });
     this.#page["score-episode"].disabled = unused.every(Boolean) || !this.#told.has_stored_pixels; // of no camera, too
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();

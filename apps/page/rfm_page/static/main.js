@@ -240,7 +240,7 @@ async function ask(curve, signal) {
     await score(form(fields, { video: video.file }), signal, (name, document) => {
       curve.take(name, document);
       update();
-    });
+    }, (share) => curve.takeSent(share) && update());
   } catch (error) {
     curve.state = "failed";
     curve.error = signal.aborted ? "stopped" : error.message;
@@ -417,10 +417,16 @@ function update() {
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
   page.command.textContent = commands(gateway.url, scored, answered());
   const done = curves.filter(({ state }) => state === "done").length;
-  if (curves.length && !page["score-panel"].hidden) page.status.textContent = `${done} of ${curves.length} curves are done.`;
+  if (curves.length && !page["score-panel"].hidden) page.status.textContent = `${done} of ${curves.length} curves are done.${uploading()}`;
   page.chart.setAttribute("aria-label", scored.length
     ? scored.map((curve) => `${curve.label}: final ${toldAt(curve, -1)}`).join("; ")
     : "No curves yet.");
+}
+
+/** How much of the videos that are on the way has been sent, in words. */
+function uploading() {
+  const percents = curves.filter(({ isUploading }) => isUploading).map(({ sentPercent }) => sentPercent);
+  return percents.length ? ` Uploading: ${Math.floor(percents.reduce((sum, each) => sum + each) / percents.length)} %.` : "";
 }
 
 /** The settings belong to the tabs that have some, and what is said of curves to the first. */

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // The videos of the page, which move together: one time for all of them.
 
-import { colourOf } from "./chart.js";
+import { colourName, colourOf } from "./chart.js";
 import { nameable, remover } from "./nameable.js";
 
 const AS_STORED = { orient: "none", channels: "rgb" };
@@ -52,7 +52,9 @@ export class Videos {
     trouble.textContent = UNSHOWN.waiting;
     trouble.hidden = true;
     player.addEventListener("error", () => { trouble.hidden = false; });
-    caption.append(...(this.#changing ? this.#controls(entry) : [name]));
+    entry.swatch = document.createElement(this.#changing ? "input" : "span");
+    Object.assign(entry.swatch, { className: "swatch", hidden: true });
+    caption.append(entry.swatch, ...(this.#changing ? this.#controls(entry) : [name]));
     player.addEventListener("play", () => this.#follow(entry));
     player.addEventListener("seeked", () => this.#arrived(entry));
     figure.append(caption, player, trouble);
@@ -91,7 +93,9 @@ export class Videos {
   /** Shows the colour of a video's curves; null: they have several. */
   mark(entry, curve) {
     entry.swatch.hidden = !curve;
-    if (curve) entry.swatch.value = colourOf(curve);
+    if (!curve) return;
+    if (this.#changing) entry.swatch.value = colourOf(curve);
+    else entry.swatch.style.background = `var(--${colourName(curve.index)})`;
   }
 
   /** Says of a video that this browser cannot show whether it was scored. states: of its curves */
@@ -143,20 +147,19 @@ export class Videos {
       this.#changing.onName();
     });
     const away = remover(() => this.#changing.onRemove(entry));
-    const swatch = document.createElement("input");
-    Object.assign(swatch, { type: "color", className: "swatch", hidden: true });
+    const { swatch } = entry;
+    swatch.type = "color";
     swatch.addEventListener("input", () => {
       entry.colour = swatch.value;
       this.#changing.onColour();
     });
-    entry.swatch = swatch;
     const write = () => {
       title.show(entry.title, entry.name);
       away.setAttribute("aria-label", `Remove ${entry.title}`);
       swatch.setAttribute("aria-label", `Colour of ${entry.title}`);
     };
     write();
-    return [swatch, title.element, away];
+    return [title.element, away];
   }
 
   #move(entry, seconds) {
