@@ -2,6 +2,9 @@
 // What curves look like: a colour for each video, and a line for each question, so that no two look alike.
 
 import { questionsOf } from "./curves.js";
+import { svgElement } from "./svg.js";
+
+const SAMPLE_PX = 32; // length of the line in a legend
 
 /** Lines: lengths of strokes and gaps; the first one is solid. */
 export const DASHES = [null, [8, 4], [2, 3], [12, 3, 2, 3], [5, 2], [16, 4]];
@@ -25,12 +28,8 @@ export function byQuestion(curves, questions = questionsOf(curves)) {
 
 /** A piece of a line as a picture, in the colour of the text around it. */
 export function sampleOf(dash) {
-  const space = "http://www.w3.org/2000/svg";
-  const [svg, line] = ["svg", "line"].map((name) => document.createElementNS(space, name));
-  for (const [name, value] of Object.entries({ width: 32, height: 4, "aria-hidden": "true" })) svg.setAttribute(name, value);
-  const look = { x2: 32, y1: 2, y2: 2, stroke: "currentColor", "stroke-width": 2, "stroke-dasharray": (dash ?? []).join(" ") };
-  for (const [name, value] of Object.entries(look)) line.setAttribute(name, value);
-  svg.setAttribute("class", "sample");
-  svg.append(line);
+  const svg = svgElement("svg", { class: "sample", width: SAMPLE_PX, height: 4, "aria-hidden": "true" });
+  const look = { stroke: "currentColor", "stroke-width": 2, "stroke-dasharray": (dash ?? []).join(" ") };
+  svg.append(svgElement("line", { x2: SAMPLE_PX, y1: 2, y2: 2, ...look }));
   return svg;
 }

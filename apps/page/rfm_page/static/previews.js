@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: MIT
 // What each row of a table shows of its episode: the first frame, and the curve of progress.
 
+import { svgElement } from "./svg.js";
+
 const AT_A_TIME = 2;
 const REST_MS = 120; // rows that are scrolled past are not asked about
 const MOST_KNOWN = 2000;
@@ -69,11 +71,7 @@ function draw({ picture: jpeg, progress }, picture, curve) {
 export function blank() {
   const picture = document.createElement("img");
   Object.assign(picture, { alt: "", className: "thumb" });
-  const space = "http://www.w3.org/2000/svg";
-  const [curve, line] = ["svg", "polyline"].map((name) => document.createElementNS(space, name));
-  for (const [name, value] of Object.entries({ class: "spark", width: WIDTH, height: HEIGHT, "aria-hidden": "true" })) {
-    curve.setAttribute(name, value);
-  }
-  curve.append(line);
+  const curve = svgElement("svg", { class: "spark", width: WIDTH, height: HEIGHT, "aria-hidden": "true" });
+  curve.append(svgElement("polyline", {}));
   return { picture, curve };
 }
