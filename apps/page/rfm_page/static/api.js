@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: MIT
 // Asks the gateway. Every error is an Error whose message reads `where: expected X, got Y`.
 
+import { send } from "./upload.js";
+
 /** An answer that wants the gateway's key. */
 export class KeyWanted extends Error {}
 
@@ -39,9 +41,9 @@ export async function compare(form, signal) {
   return (await answer("viewer/compare", { method: "POST", body: form, signal })).json();
 }
 
-/** Scores a video, and calls `onEvent(name, document)` with each event as it comes. */
-export async function score(form, signal, onEvent) {
-  const response = await answer("viewer/score", { method: "POST", body: form, signal });
+/** Scores a video, and calls `onEvent(name, document)` with each event as it comes, and before `onSent(share)` while the video leaves. */
+export async function score(form, signal, onEvent, onSent) {
+  const response = await answer("viewer/score", { body: form, signal }, (path, options) => send(path, options, onSent));
   let isOver = false;
   for await (const [name, document] of events(response.body)) {
     if (name === "failed") throw new (document.is_servers ? ServerError : Error)(document.detail);
@@ -71,6 +73,11 @@ export async function curvesOf(number, episode, labels, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}${chosen(labels)}`, { signal })).json();
 }
 
+/** A few points of an episode's curve, and a small picture. */
+export async function previewOf(number, episode, labels, signal) {
+  return (await answer(`viewer/datasets/${number}/episodes/${episode}/preview${chosen(labels)}`, { signal })).json();
+}
+
 /** The video of an episode by one camera, as a Blob: an address of its own could not show the key. */
 export async function videoOf(number, episode, camera, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}/videos/${camera}`, { signal })).blob();
@@ -95,11 +102,11 @@ function chosen(labels) {
   return labels === null ? "" : `?labels=${encodeURIComponent(labels)}`;
 }
 
-async function answer(path, options = {}) {
+async function answer(path, options = {}, ask = fetch) {
   const headers = key ? { "X-API-Key": key } : {};
   let response;
   try {
-    response = await fetch(path, { ...options, headers });
+    response = await ask(path, { ...options, headers });
   } catch (error) {
     if (error.name === "AbortError") throw error;
     throw new GatewayAway(`gateway: expected an answer, got none (${error.message})`);

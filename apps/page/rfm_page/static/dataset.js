@@ -1,13 +1,16 @@
 // SPDX-License-Identifier: MIT
 // The tab of datasets: how their episodes end, which one wants to see first, one that is watched, some that are taken along.
 
-import { curvesOf, datasets, episodesOf, faultsOf, videoOf } from "./api.js";
+import { curvesOf, datasets, episodesOf, faultsOf, previewOf, videoOf } from "./api.js";
 import { Asking } from "./asking.js";
 import { colourName } from "./chart.js";
 import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, WORST_FIRST } from "./episodes.js";
 import { deadLink, failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
+import { onKeys } from "./keys.js";
+import { DASHES } from "./looks.js";
+import { Previews } from "./previews.js";
 import { Place } from "./states.js";
 import { save } from "./takeaway.js";
 import { cut, shown } from "./text.js";
@@ -28,6 +31,8 @@ export class DatasetTab {
   #failedAnywhere;
   #places;
   #histogram;
+  #previews = new Previews(({ episode }) => previewOf(this.#number, episode, this.#labels, this.#loading.signal));
+  #loading = new AbortController();
   #table;
   #timeline;
   #datasets = [];
@@ -62,7 +67,10 @@ export class DatasetTab {
     this.#histogram = new Histogram(page.histogram);
     const rows = { scroller: page["episode-list"], body: page.episodes, above: page["episodes-above"], below: page["episodes-below"] };
     this.#table = new EpisodeTable(rows, {
-      onWatch: (episode) => { this.#watch(episode); this.#onShown(true); }, chosen: this.#chosen, onChoose: () => this.#showChosen(),
+      previews: this.#previews,
+      onWatch: (episode) => { this.#watch(episode); this.#onShown(true); },
+      chosen: this.#chosen,
+      onChoose: () => this.#showChosen(),
     });
     const elements = {
       videos: page["episode-videos"], chart: page["episode-chart"], slider: page["episode-time"], button: page["episode-play"],
@@ -105,6 +113,8 @@ export class DatasetTab {
     on("episode-close", "click", () => this.#close());
     on("episode-before", "click", () => this.#step(-1));
     on("episode-after", "click", () => this.#step(1));
+    const keys = { " ": () => page["episode-play"].click(), n: () => this.#step(1), p: () => this.#step(-1), Escape: () => this.#close() };
+    onKeys(keys, () => this.#watched && !page["dataset-panel"].hidden);
   }
 
   /** Asks which datasets there are until there is one, and shows the first. */
@@ -244,6 +254,9 @@ export class DatasetTab {
   async #load() {
     this.#leave();
     this.#checking.abort();
+    this.#loading.abort();
+    this.#loading = new AbortController();
+    this.#previews.clear();
     this.#places.errors.clear();
     this.#chosen.clear();
     const { signal } = this.#stopping;
@@ -478,7 +491,7 @@ export class DatasetTab {
       this.#watched.files.push(new File([blobs[index]], file, { type: blobs[index].type }));
       const title = unused[index] ? `${short(camera)} (${unused[index]}: not scored)` : short(camera);
       const video = this.#timeline.videos.add(this.#watched.files.at(-1), title, corrections[index]);
-      this.#timeline.videos.mark(video, curves.filter(({ label }) => label === short(camera)));
+      this.#timeline.videos.mark(video, curves.find(({ label }) => label === short(camera)));
     });
     this.#page["score-episode"].disabled = unused.every(Boolean) || !this.#told.has_stored_pixels; // of no camera, too
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
@@ -500,7 +513,7 @@ function curvesIn({ times_s: times, curves }, file) {
   return curves.map(({ camera, progress, success }, index) => {
     const name = camera ? short(camera) : curves.length > 1 ? "all cameras" : "labels";
     const label = file === null ? name : `${name} (${reward(file)})`;
-    return { index, label, progress, success: success ?? none, times, allTimes: times, isDashed: file !== null };
+    return { index, label, progress, success: success ?? none, times, allTimes: times, dash: file === null ? null : DASHES[1] };
   });
 }
 
@@ -515,10 +528,10 @@ function describe(curves) {
   return told.length ? told.join("; ") : "This episode has no labels.";
 }
 
-function legendItem({ index, label, isDashed }) {
+function legendItem({ index, label, dash }) {
   const item = document.createElement("li");
   const swatch = document.createElement("span");
-  swatch.className = `swatch ${colourName(index)}${isDashed ? " dashed" : ""}`;
+  swatch.className = `swatch ${colourName(index)}${dash ? " dashed" : ""}`;
   item.append(swatch, label);
   return item;
 }

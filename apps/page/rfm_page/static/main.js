@@ -9,8 +9,10 @@ import { DatasetTab } from "./dataset.js";
 import { exampleFiles } from "./examples.js";
 import { failure, noModel, otherModel, serverAway, tritonAway, useRemedies } from "./faults.js";
 import { pngFigure, svgFigure } from "./figure.js";
+import { onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
 import { LiveTab } from "./live.js";
+import { byQuestion, giveLooks } from "./looks.js";
 import { Queue } from "./queue.js";
 import { Settings } from "./settings.js";
 import { Sidebar } from "./sidebar.js";
@@ -20,7 +22,7 @@ import { Tabs } from "./tabs.js";
 import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
 import { learn, toldAt } from "./signals.js";
-import { addVerdict } from "./verdicts.js";
+import { addVerdict, areOneFile, sentenceOf } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
 const TASK_WANTED = "What is the robot to do? Type it, then press Score.";
@@ -29,9 +31,9 @@ const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((elem
 const queue = new Queue(CURVES_AT_A_TIME);
 const timeline = new Timeline(
   { videos: page.videos, chart: page.chart, slider: page.time, button: page.play, told: page["time-told"] },
-  { changing: { onName: update, onRemove: removeVideo }, onThreshold: dragThreshold },
+  { changing: { onName: showNames, onColour: changed, onRemove: removeVideo }, onThreshold: dragThreshold },
 );
-const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurve });
+const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurves });
 const sidebar = new Sidebar(page.fold);
 const { videos, chart } = timeline;
 const TABS = ["score", "dataset", "live"];
@@ -46,7 +48,6 @@ let curves = [];
 let verdicts = [];
 const gateway = { models: [], rules: [], url: "" };
 let stopping = new AbortController();
-let numCurves = 0;
 
 const askingServer = new Asking(askServer);
 const askingModels = new Asking(askServed);
@@ -216,6 +217,7 @@ function addFiles(files, about = []) {
     videos.add(file, file.name, corrected, { origin });
   });
   page.files.value = "";
+  page.undo.hidden = true;
   update();
   if (!videos.all.length || !page.model.value) return;
   if (tasks().length) scoreAll();
@@ -260,11 +262,10 @@ function scoreAll() {
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
-      const curve = new Curve(numCurves, video, { task, ...settings(), orient: video.orient, channels: video.channels });
+      const curve = new Curve(video, { task, ...settings(), orient: video.orient, channels: video.channels });
       if (known.has(curve.identity)) continue;
       curves = curves.filter(({ identity }) => identity !== curve.identity); // one that failed is asked again
       curves.push(curve);
-      numCurves += 1;
       queue.add(() => ask(curve, AbortSignal.any([stopping.signal, curve.leaving.signal])));
     }
   }
@@ -279,7 +280,7 @@ async function ask(curve, signal) {
     await score(form(fields, { video: video.file }), signal, (name, document) => {
       curve.take(name, document);
       update();
-    });
+    }, (share) => curve.takeSent(share) && update());
   } catch (error) {
     curve.state = "failed";
     curve.error = signal.aborted ? "stopped" : error.message;
@@ -292,6 +293,7 @@ async function comparePair() {
   const [first, second] = videos.all;
   const { model, fps, resize } = settings();
   const { orient, channels } = first;
+  const before = verdicts.length;
   places.errors.clear();
   page.compare.disabled = true;
   try {
@@ -299,18 +301,26 @@ async function comparePair() {
     for (const name of ["orient", "channels"]) {
       if (second[name] !== first[name]) throw new Error(`${name}: expected the same of both videos, got ${first[name]} and ${second[name]}`);
     }
-    for (const task of tasks()) {
+    const isOneFile = await areOneFile(first.file, second.file);
+    if (isOneFile) tell({ videos: [first, second], answer: null });
+    for (const task of isOneFile ? [] : tasks()) {
       const data = form({ task, model, fps, orient, channels, resize }, { first: first.file, second: second.file });
       const answer = await compare(data, stopping.signal);
-      const verdict = { videos: [first, second], task, model, fps, orient, channels, resize, answer };
-      verdicts.push(verdict);
-      addVerdict(page.pairs, verdict);
-      update();
+      tell({ videos: [first, second], task, model, fps, orient, channels, resize, answer });
     }
   } catch (error) {
     if (!stopping.signal.aborted) failed(error, "The videos could not be compared", comparePair);
   }
   update();
+  if (verdicts.length > before) page.status.textContent = verdicts.slice(before).map(sentenceOf).join(" ");
+}
+
+/** Shows a verdict, and scrolls to it. */
+function tell(verdict) {
+  verdicts.push(verdict);
+  const box = addVerdict(page.pairs, verdict);
+  update();
+  box.scrollIntoView({ block: "nearest" });
 }
 
 function stop() {
@@ -328,7 +338,6 @@ function clear() {
   videos.clear();
   curves = [];
   verdicts = [];
-  numCurves = 0;
   page.pairs.replaceChildren();
   places.errors.clear();
   page["files-wanted"].textContent = page["task-wanted"].textContent = "";
@@ -337,17 +346,56 @@ function clear() {
   update();
 }
 
+/** Clears the tab, and offers to take that back. */
+function clearForNow() {
+  stop();
+  const gone = { entries: videos.all, curves, verdicts };
+  const text = page.tasks.value;
+  clear();
+  page.status.textContent = `Cleared ${gone.entries.length} ${gone.entries.length === 1 ? "video" : "videos"}.`;
+  page.undo.hidden = false;
+  page.undo.onclick = () => {
+    page.tasks.value ||= text;
+    restore(gone);
+  };
+  page.undo.focus();
+}
+
+/** Brings back what was cleared, beside what has come since. */
+function restore({ entries, curves: old, verdicts: oldVerdicts }) {
+  const again = new Map(entries.map((entry) => {
+    const { file, name, title, colour, origin, orient, channels } = entry;
+    return [entry, videos.add(file, name, { orient, channels }, { origin, title, colour })];
+  }));
+  for (const curve of old) curve.video = again.get(curve.video);
+  for (const verdict of oldVerdicts) verdict.videos = verdict.videos.map((video) => again.get(video));
+  curves.push(...old);
+  verdicts.push(...oldVerdicts);
+  page.undo.hidden = true;
+  showNames();
+}
+
 function removeVideo(video) {
   videos.remove(video);
   for (const curve of curves.filter((each) => each.video === video)) forget(curve);
   verdicts = verdicts.filter((verdict) => !verdict.videos.includes(video));
+  showNames();
+}
+
+/** Shows everything under the names and colours of now. */
+function showNames() {
   page.pairs.replaceChildren();
   for (const verdict of verdicts) addVerdict(page.pairs, verdict);
   update();
 }
 
-function removeCurve(curve) {
-  forget(curve);
+/** The verdicts that the model gave: those on one file twice have no answer. */
+function answered() {
+  return verdicts.filter(({ answer }) => answer);
+}
+
+function removeCurves(gone) {
+  for (const curve of gone) forget(curve);
   update();
 }
 
@@ -360,7 +408,7 @@ function forget(curve) {
 
 /** Shows a curve in another colour or under another name. */
 function changed() {
-  update();
+  showNames();
   chart.redraw();
 }
 
@@ -392,22 +440,34 @@ function update() {
   page.clear.hidden = !videos.all.length;
   page.stage.hidden = !videos.all.length;
   page.numbers.hidden = !curves.length;
+  giveLooks(curves);
   timeline.show(curves);
   legend.show(curves);
-  for (const video of videos.all) videos.mark(video, curves.filter((curve) => curve.video === video));
+  const isByQuestion = byQuestion(curves);
+  for (const video of videos.all) {
+    const own = curves.filter((curve) => curve.video === video);
+    videos.mark(video, isByQuestion ? null : own[0]);
+    videos.tell(video, own.map(({ state }) => state));
+  }
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle;
   page.compare.disabled = videos.all.length !== 2 || !page.model.value;
-  page.take.hidden = !scored.length && !verdicts.length;
+  page.take.hidden = !scored.length && !answered().length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
-  page.command.textContent = commands(gateway.url, scored, verdicts);
+  page.command.textContent = commands(gateway.url, scored, answered());
   told();
   const done = curves.filter(({ state }) => state === "done").length;
-  if (curves.length) page.status.textContent = `${done} of ${curves.length} curves are done.`;
+  if (curves.length && !page["score-panel"].hidden) page.status.textContent = `${done} of ${curves.length} curves are done.${uploading()}`;
   page.chart.setAttribute("aria-label", scored.length
     ? scored.map((curve) => `${curve.label}: final ${toldAt(curve, -1)}`).join("; ")
     : "No curves yet.");
+}
+
+/** How much of the videos that are on the way has been sent, in words. */
+function uploading() {
+  const percents = curves.filter(({ isUploading }) => isUploading).map(({ sentPercent }) => sentPercent);
+  return percents.length ? ` Uploading: ${Math.floor(percents.reduce((sum, each) => sum + each) / percents.length)} %.` : "";
 }
 
 /** The settings belong to the tabs that have some, and what is said of curves to the first. */
@@ -441,7 +501,7 @@ listen(page.model, { change: chooseRule });
 listen(page.rule, { change: showLimits });
 for (const select of [page.orient, page.channels]) listen(select, { change: () => videos.correct(correction()) });
 listen(page.stop, { click: stop });
-listen(page.clear, { click: clear });
+listen(page.clear, { click: clearForNow });
 listen(page.compare, { click: comparePair });
 listen(page.threshold, { input: showThreshold });
 listen(page.tasks, { keydown: (event) => { if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) scoreAll(); } });
@@ -450,7 +510,7 @@ listen(page.examples, { click: ({ target }) => {
   if (button) scoreExamples(button.dataset.example.split(" "));
 } });
 listen(page.csv, { click: () => save("curves.csv", csv(curves), "text/csv") });
-listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, verdicts), "application/json") });
+listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, answered()), "application/json") });
 listen(page.png, { click: async () => save("curves.png", await pngFigure(figure())) });
 listen(page.svg, { click: () => save("curves.svg", figure(), "image/svg+xml") });
 listen(page.copy, { click: () => copy(page.command.textContent, "command line is", page.command) });
@@ -468,6 +528,7 @@ listen(document, {
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", update);
 
+onKeys({ " ": () => page.play.click() }, () => !page["score-panel"].hidden && !page.play.disabled);
 showThreshold();
 go(address.params);
 begin();
