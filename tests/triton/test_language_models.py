@@ -446,6 +446,7 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
     assert "In s, in place of progress: seconds that remain until the task is done." in " ".join(done.output.split())
     with running(asked.endpoints, tmp_path, "rynn") as gateway:
         page.open(gateway.url)
+        page.run("document.getElementById('advanced').open = true")
         Select(page["rule"]).select_by_visible_text("rint_pad")
         for name, text in {"tasks": TASK, "fps": "0.5", "frames": "4"}.items():
             page.write(name, text)
@@ -468,10 +469,10 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
         with asked.client("rynn") as client, LiveView(gateway.url, name="run") as view:
             episode = client.episode(TASK, score="remaining_s", live=view)
             left_s = f"{episode.add(frame).more_scores['remaining_s']:.3f} s"
-        card = "[...document.querySelectorAll('#live-episodes dl div')].map((each) => each.textContent)"
+        card = "[...document.querySelectorAll('.live dl div')].map((each) => each.textContent)"
         page.until(f"{card}.includes('Remaining{left_s}')")
-        assert page.cells("#live-runs tr")[0][4] == f"{left_s} remaining"
-        assert f"final remaining {left_s}" in str(page["live-episodes"].get_attribute("innerHTML"))
+        poll(lambda: page.cells("#live-runs tr")[0][5] == f"{left_s} remaining")
+        assert f"final remaining {left_s}" in str(page["live-panel"].get_attribute("innerHTML"))
 
 
 def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path) -> None:
