@@ -26,6 +26,7 @@ from rfm_client.cli.command import (
     usage_errors,
     with_options,
 )
+from rfm_client.cli.next_steps import steps_with_server
 from rfm_client.cli.options import (
     CredentialFiles,
     JsonOutput,
@@ -36,6 +37,7 @@ from rfm_client.cli.options import (
     StatusOptions,
     VideoOptions,
     WaitOptions,
+    check_folder,
 )
 from rfm_client.cli.show import StreamedTable, in_place_of_progress, print_tables, scores_table, status_tables
 from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames, write_perf_analyzer_input
@@ -165,12 +167,17 @@ def status(
         str | None, typer.Option(help="URL of the server's metrics. Default: /metrics on port 8002 of the same host.")
     ] = None,
 ) -> None:
-    """Show the server's models, requests, batches, GPUs and memory."""
+    """Show the server's models, requests, batches, GPUs and memory.
+
+    Triton counts since the model was loaded, warm-up included; a model counts callers' samples since Triton started.
+    Failed requests got an error. Refused samples cannot be scored, and the caller has to mend them. queue ms is the
+    mean wait of a request for its turn.
+    """
     from rfm_client.transport.status import ServerStatus
 
     if metrics_url is not None and len(server.urls) > 1:
         raise typer.BadParameter("--metrics-url needs a single --url")
-    output.make_folders()
+    output.check_folders()
     with usage_errors("--url"):
         statuses = [
             ServerStatus.read(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=server.credentials)
@@ -178,6 +185,8 @@ def status(
         ]
     if output.prints_tables:
         print_tables(*(table for status in statuses for table in status_tables(status)))
+        if ready := next((status for status in statuses if status.ready), None):
+            typer.echo(steps_with_server(ready.url, ready.checkpoints))
     output.write_json(documents.status_document(statuses))
 
 
@@ -199,7 +208,7 @@ def sample(
     server: ServerOptions,
 ) -> None:
     """Score synthetic samples, to check that the server answers. Their scores mean nothing."""
-    output.make_folders()
+    output.check_folders()
     with server.connected() as client:
         samples = synthetic.samples(client)
         outcomes = client.evaluate(samples, return_errors=True)
@@ -226,7 +235,8 @@ def bench_input(
 
     It prints a perf_analyzer command that sends them.
     """
-    output.parent.mkdir(parents=True, exist_ok=True)
+    with usage_errors("--output"):
+        check_folder("output", output.parent)
     with server.connected() as client:
         samples = synthetic.samples(client)
     write_perf_analyzer_input(output, samples)

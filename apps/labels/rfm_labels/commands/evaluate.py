@@ -57,7 +57,7 @@ def evaluate(
     """
     from rfm_labels import DatasetError, evaluate_labels, find_label_files, read_outcomes
 
-    output.make_folders()
+    output.check_folders()
     files = labels or find_label_files(dataset)
     if not files:
         expected = "label files, NAME_progress.parquet or in HDF5 (rfm-client label), or --labels"
