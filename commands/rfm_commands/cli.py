@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from rfm.checkpoint.provenance import table
 from rfm.config import ExportConfig, ServeConfig
 from rfm.launch.admin_key import take_key
 from rfm.launch.endpoints import Endpoints
-from rfm.launch.installation import find_installation
+from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.triton_server import TritonServer, short_spin
 from rfm.supervise.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm_client.cli.command import Given, add_missing, with_options
@@ -36,9 +37,10 @@ except ModuleNotFoundError:
     raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./apps/gateway .") from None
 from rfm_commands.command import AdminKeyFile, RfmCommand, RfmCommands, TritonPath, fail, say
 from rfm_commands.config import Config, GatewayBeside
-from rfm_commands.demo import demo
 from rfm_commands.models import app as models_app
 from rfm_commands.rollout import names_of
+from rfm_commands.serve_screen import ServeScreen, log_file, opened
+from rfm_commands.try_video import try_video
 
 ACCEPTED_WARNING = "a Triton with known remote vulnerabilities is accepted: use NVIDIA's container 26.07 or newer"
 EXPORT_EXAMPLE = "\b\nExample:\n  rfm export org/name --repository my_models --config serve.yaml"
@@ -154,6 +156,13 @@ def serve(
         ),
     ] = False,
     tritonserver: TritonPath = None,
+    triton_log: Annotated[
+        Path | None,
+        typer.Option(
+            help="File for the lines of Triton and the models. Default: standard error; in a terminal, "
+            "~/.local/state/rfm/triton-PORT.log."
+        ),
+    ] = None,
 ) -> None:
     """Run tritonserver on a model repository until a signal stops it.
 
@@ -170,29 +179,34 @@ def serve(
     write_log("rfm-serve", os.environ)
     if accept_known_vulnerabilities and not config.serve.is_loopback:
         logger.warning("%s is no loopback address, and %s", config.serve.host, ACCEPTED_WARNING)
-    server = TritonServer(
-        folder,
-        Endpoints.of(config.serve, config.gateway.port),
-        find_installation(tritonserver),
-        http_threads=config.serve.http_threads,
-        admin_key=take_key(admin_key_file, os.environ),
-        accepts_known_vulnerabilities=accept_known_vulnerabilities,
-        more_arguments=more_arguments,
-        hang_s=config.serve.hang_s,
-    )
-    supervisor = Supervisor(
-        server,
-        gateway=None if config.gateway.port is None else _gateway_beside(server, config),
-        status_port=config.serve.status_port,
-        probe_s=config.serve.probe_s,
-        hang_s=config.serve.hang_s,
-        triton_silent_s=config.serve.triton_silent_s,
-    )
-    try:
-        supervisor.run()
-    except CrashLoopError as error:  # as the lines about the faults before it
-        logger.error("%s", error)
-        raise typer.Exit(1) from None
+    endpoints = Endpoints.of(config.serve, config.gateway.port)
+    log = log_file(triton_log, endpoints.http_port, os.environ)
+    with opened(log) as lines:
+        server = TritonServer(
+            folder,
+            endpoints,
+            find_installation(tritonserver),
+            http_threads=config.serve.http_threads,
+            log=lines,
+            admin_key=take_key(admin_key_file, os.environ),
+            accepts_known_vulnerabilities=accept_known_vulnerabilities,
+            more_arguments=more_arguments,
+            hang_s=config.serve.hang_s,
+        )
+        beside = None if config.gateway.port is None else _beside(server, config)
+        screen = ServeScreen(folder, endpoints, beside, log) if log is not None and sys.stderr.isatty() else None
+        supervisor = Supervisor(
+            server,
+            gateway=None if beside is None else _gateway_process(beside, config),
+            status_port=config.serve.status_port,
+            probe_s=config.serve.probe_s,
+            hang_s=config.serve.hang_s,
+            triton_silent_s=config.serve.triton_silent_s,
+            tell_ready=None if screen is None else screen.show_ready,
+        )
+        if screen is not None:
+            screen.show_start()
+        _run(supervisor, log)
 
 
 app.command(cls=RfmCommand)(gateway)
@@ -202,7 +216,7 @@ try:
     app.command(cls=RfmCommand)(label)
 except ModuleNotFoundError as error:
     add_missing(app, "label", f"{error.name} is not installed", "labels", "rfm")
-app.command(cls=RfmCommand)(demo)
+app.command("try", cls=RfmCommand)(try_video)
 app.add_typer(models_app, name="models")
 
 
@@ -214,8 +228,19 @@ def _folder_and_arguments(words: Sequence[str], repository: Path | None) -> tupl
     return (repository, words) if repository is not None else (Path(str(folder)), words[1:])
 
 
-def _gateway_beside(server: TritonServer, config: Config) -> GatewayProcess:
-    gateway = _beside(server, config)
+def _run(supervisor: Supervisor, log: Path | None) -> None:
+    try:
+        supervisor.run()
+    except ServerStartError as error:
+        if log is not None:
+            say(f"the lines of Triton and the models are in {log}")
+        if not isinstance(error, CrashLoopError):
+            raise
+        logger.error("%s", error)  # as the lines about the faults before it
+        raise typer.Exit(1) from None
+
+
+def _gateway_process(gateway: GatewayConfig, config: Config) -> GatewayProcess:
     assert gateway.host is not None and gateway.port is not None  # completed
     address = from_here(gateway.host), gateway.port
     return GatewayProcess(gateway_command(gateway), address, config.serve.triton_silent_s)

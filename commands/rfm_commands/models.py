@@ -18,8 +18,9 @@ import typer
 
 from rfm.launch.admin_key import take_key
 from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
-from rfm_client.cli.command import Given, with_options
+from rfm_client.cli.command import Given, usage_errors, with_options
 from rfm_client.cli.options import CredentialFiles
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.settings import setting
 from rfm_commands.command import RfmCommand
 from rfm_commands.rollout import Rollout, check_files, models_of, previous_version
@@ -42,16 +43,23 @@ class AdministeredServer(TlsFiles):
 
     TITLE: ClassVar[str] = "Server"
 
-    url: str = setting("grpc://127.0.0.1:8001", "grpc://host:port of the server, with TLS grpcs://host:port.")
+    url: str = setting(
+        "grpc://127.0.0.1:8001", "grpc://host:port of the server, with TLS grpcs://host:port.", variable="RFM_URL"
+    )
     admin_key_file: Path | None = setting(None, "File with the server's admin key. Default: RFM_ADMIN_KEY.")
 
     @contextmanager
     def connected(self) -> Iterator[RepositoryApi]:
         """Yield the server's repository API. Raises InvalidValueError, RepositoryApiError."""
         if self.credentials.uses_tls and not self.url.startswith(SECURE):
-            raise RepositoryApiError.at("url", f"{SECURE}host:port with certificates", self.url)
+            raise RepositoryApiError.at("--url", f"{SECURE}host:port with certificates", self.url)
         options = self.credentials.grpc_options(self.url.partition(":")[0])
-        with RepositoryApi(self.url, take_key(self.admin_key_file, os.environ), options) as api:
+        key = take_key(self.admin_key_file, os.environ)
+        with usage_errors("--url"):
+            if len(self.url.split()) > 1:
+                raise InvalidValueError(f"expected one server, got {self.url}")
+            server = RepositoryApi(self.url, key, options)
+        with server as api:
             yield api
 
 

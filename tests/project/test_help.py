@@ -60,6 +60,11 @@ def test_a_command_of_the_other_program_is_told_with_that_program() -> None:
             assert f"No such command '{name}': that is `{other} {name}`" in done.stderr
 
 
+def test_a_renamed_command_is_told_with_the_new_name() -> None:
+    done = CliRunner().invoke(COMMANDS["rfm"], ["demo", "--video", "a.mp4"], env=COMMON, prog_name="rfm")
+    assert (done.exit_code, done.stderr.splitlines()[-1]) == (2, "Error: No such command 'demo': it is now `rfm try`")
+
+
 def test_the_help_of_each_program_names_the_other() -> None:
     for program, other in (("rfm", "rfm-client --help"), ("rfm-client", "rfm --help")):
         shown = CliRunner().invoke(COMMANDS[program], ["--help"], env=COMMON, prog_name=program).output
@@ -90,7 +95,7 @@ DEFAULTS = {
     "rfm gateway": ["Port to listen on. [1 to 65535; default: 8000]", "default: --viewer"],
     "rfm serve": ["--gateway-viewer / --gateway-no-viewer", "default: --gateway-viewer", "default: 127.0.0.1"],
     "rfm export": ["[0 to 4096; default: 0]", "[at least 0; default: 256]"],
-    "rfm demo": ["[default: model_repository]", "[default: demo_output]"],
+    "rfm try": ["[default: model_repository]", "[default: demo_output]"],
 }
 
 

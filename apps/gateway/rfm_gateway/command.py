@@ -71,6 +71,7 @@ def gateway(config: GatewayOptions) -> None:
         port=address.port,
         access_log=False,
         log_config=None,
+        log_level="warning",
         http=Connection,
         limit_concurrency=most_connections(raise_limit()),
         timeout_keep_alive=KEEP_ALIVE_S,

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING
 from enum import IntEnum
-from typing import Annotated, Any, Generic, NoReturn, TypeVar, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Generic, NoReturn, TypeVar, get_args, get_origin
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -151,12 +151,15 @@ class Commands(TyperGroup):
     """The commands of ``rfm-client``. Names the right program for a command of the other one."""
 
     other_program = "rfm"
-    others: Collection[str] = ("export", "serve", "demo", "models")
+    others: Collection[str] = ("export", "serve", "try", "models")
+    renamed: ClassVar[Mapping[str, str]] = {}  # commands of earlier versions, with the names of today
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command. Raises an error of usage that names the other program, where that has it."""
+        """Find the command. Raises an error of usage with the right name, or the program that has the command."""
         if args[0] in self.others and self.get_command(ctx, args[0]) is None:
             ctx.fail(f"No such command '{args[0]}': that is `{self.other_program} {args[0]}`")
+        if args[0] in self.renamed:
+            ctx.fail(f"No such command '{args[0]}': it is now `{ctx.info_name} {self.renamed[args[0]]}`")
         return super().resolve_command(ctx, args)
 
 
