@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +26,7 @@ from rfm_client.cli.command import Given, add_missing, with_options
 from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import from_here
 from rfm_client.contract.process_log import write_log
+from rfm_client.contract.settings import ConfigError
 
 try:
     from rfm_gateway import (
@@ -36,7 +38,7 @@ try:
 except ModuleNotFoundError:
     raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./apps/gateway .") from None
 from rfm_commands.command import AdminKeyFile, RfmCommand, RfmCommands, TritonPath, fail, say
-from rfm_commands.config import Config, GatewayBeside
+from rfm_commands.config import Config, GatewayBeside, named_as_typed
 from rfm_commands.models import app as models_app
 from rfm_commands.rollout import names_of
 from rfm_commands.serve_screen import ServeScreen, log_file, opened
@@ -193,7 +195,7 @@ def serve(
             more_arguments=more_arguments,
             hang_s=config.serve.hang_s,
         )
-        beside = None if config.gateway.port is None else _beside(server, config)
+        beside = None if config.gateway.port is None else _beside(server, config, gateway_given)
         screen = ServeScreen(folder, endpoints, beside, log) if log is not None and sys.stderr.isatty() else None
         supervisor = Supervisor(
             server,
@@ -225,7 +227,10 @@ def _folder_and_arguments(words: Sequence[str], repository: Path | None) -> tupl
     folder = words[0] if words and not words[0].startswith("-") else None
     if (folder is None) == (repository is None):
         raise typer.BadParameter(f"give FOLDER or --repository{', not both' * (folder is not None)}")
-    return (repository, words) if repository is not None else (Path(str(folder)), words[1:])
+    arguments = words if folder is None else words[1:]
+    if wrong := [word for word in arguments if not word.startswith("-")]:
+        raise typer.BadParameter(f"expected one FOLDER, and after it -- --OPTION=VALUE, got {' '.join(wrong)}")
+    return (Path(str(folder)) if repository is None else repository), arguments
 
 
 def _run(supervisor: Supervisor, log: Path | None) -> None:
@@ -246,7 +251,7 @@ def _gateway_process(gateway: GatewayConfig, config: Config) -> GatewayProcess:
     return GatewayProcess(gateway_command(gateway), address, config.serve.triton_silent_s)
 
 
-def _beside(server: TritonServer, config: Config) -> GatewayConfig:
+def _beside(server: TritonServer, config: Config, given: Given[GatewayBeside]) -> GatewayConfig:
     """The gateway's configuration, completed from the server's and checked: the gateway could start now."""
     gateway, endpoints = config.gateway, server.endpoints
     behind = replace(endpoints, host=from_here(endpoints.host))
@@ -259,6 +264,8 @@ def _beside(server: TritonServer, config: Config) -> GatewayConfig:
     )
     try:
         check_gateway(filled, os.environ)
+    except ConfigError as error:
+        fail(str(error.named(partial(named_as_typed, "gateway", given)) if error.where in filled.settings() else error))
     except (OSError, ValueError) as error:
         fail(f"gateway: {error}")
     names = names_of(server.repository)

@@ -70,7 +70,7 @@ class AdministeredRepository(AdministeredServer):
     repository: Path = setting(..., "The repository that the server reads.")
 
 
-ExportedName = Annotated[str, typer.Argument(help="As in rfm export --name.")]
+ExportedName = Annotated[str, typer.Argument(metavar="NAME", help="As in rfm export --name.")]
 
 
 @app.callback()
@@ -117,7 +117,7 @@ def unload(name: ExportedName, server: AdministeredRepository) -> None:
 @with_options
 def rollout(
     name: ExportedName,
-    version: Annotated[int, typer.Argument(help="The version folder to serve.")],
+    version: Annotated[int, typer.Argument(metavar="VERSION", help="The version folder to serve.")],
     server: AdministeredRepository,
 ) -> None:
     """Serve another version of NAME without losing a request.

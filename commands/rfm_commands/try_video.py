@@ -27,7 +27,7 @@ EXPORTED = Path("my_models")  # where the user could export the checkpoint
 
 @with_options
 def try_video(
-    video: Annotated[Path, typer.Argument(help="Video file to score.")],
+    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="Video file to score.")],
     task: Annotated[str, typer.Option(help="The task, as a sentence.")],
     rate: FrameRate,
     given: Given[CheckpointConfig],

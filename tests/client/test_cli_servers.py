@@ -223,11 +223,11 @@ USAGE: dict[str, tuple[list[str], str]] = {
     ),
     "key before": (
         ["--api-key-file", "/nowhere", "status"],
-        "Invalid value for '--api-key-file': expected a text file, got [Errno 2]",
+        "Invalid value for '--api-key-file': expected a text file, got /nowhere: No such file or directory",
     ),
     "key after": (
         ["status", "--api-key-file", "/nowhere"],
-        "Invalid value for '--api-key-file': expected a text file, got [Errno 2]",
+        "Invalid value for '--api-key-file': expected a text file, got /nowhere: No such file or directory",
     ),
     "seconds": (["wait", "--timeout", "0"], "'--timeout': expected at least 0.001, got 0.0"),
     "picture": (["score", "a.mp4", "--plot", "a.gif"], "expected a file that ends in .png, .pdf, .svg, got a.gif"),

@@ -243,7 +243,7 @@ def test_a_gateway_that_would_not_start_is_refused_before_triton_starts(name: st
     words = [f"--gateway-{each}=nowhere" for each in (name, other) if each]
     result = invoke("serve", str(REPOSITORY), "--gateway-port=8100", *words)
     assert result.exit_code == 1
-    assert result.stderr.startswith("rfm: gateway: ")
+    assert result.stderr.startswith(f"rfm: --gateway-{name}: expected ")
     assert "nowhere" in result.stderr
 
 

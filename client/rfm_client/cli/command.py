@@ -18,10 +18,14 @@ from typer.models import OptionInfo
 
 from rfm_client.contract import errors
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of
+from rfm_client.contract.triton import FEWER_FRAMES
 
 STANDARD_OUTPUT = "-"
 
 S = TypeVar("S", bound=Settings)
+
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # click's, or that of typer's own copy of click
+_EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number", "float_parsing": "a number"}
 
 
 class Given(dict[str, Any], Generic[S]):
@@ -79,6 +83,13 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
             command(**values)
         except ConfigError as error:
             raise _named(error, {each.name: each.option for some in options.values() for each in some}) from None
+        except errors.LocatedError as error:  # of what an option names: a server, a dataset
+            place, _, name = error.where.rpartition(": ")
+            typed = {each.name: each.option for some in options.values() for each in some if _key(each) in context.obj}
+            typed |= {option.strip("-").replace("-", "_"): option for option in typed.values()}
+            if name not in typed or name == "frames":  # those of a sample
+                raise
+            raise error.like(error, where=": ".join(filter(None, [place, typed[name]]))) from None
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -105,7 +116,12 @@ class Command(TyperCommand):
         try:
             return super().parse_args(ctx, completed)
         except typer.BadParameter as error:
-            error.message = error.message.removeprefix("Value error, ")  # by pydantic, with which typer validates
+            error.message = _in_plain_words(error)
+            raise
+        except _UsageError as error:
+            if unknown := getattr(error, "option_name", ""):
+                same = _same_words(unknown, [option for each in self.params for option in each.opts])
+                vars(error)["possibilities"] = same or vars(error)["possibilities"]
             raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
@@ -141,7 +157,7 @@ class Command(TyperCommand):
             code, lines = ExitCode.FAILED, [missing_package(error)]
         except (errors.LocatedError, errors.RewardError, OSError) as error:
             code = exit_code(error) if self.has_codes else ExitCode.FAILED
-            lines = str(error).split("\n")
+            lines = told(error).split("\n")
         for line in lines:
             report(line, self.program)
         raise typer.Exit(code)
@@ -161,6 +177,13 @@ class Commands(TyperGroup):
         if args[0] in self.renamed:
             ctx.fail(f"No such command '{args[0]}': it is now `{ctx.info_name} {self.renamed[args[0]]}`")
         return super().resolve_command(ctx, args)
+
+
+def told(error: Exception) -> str:
+    """Return the message for a command's user, who knows options and no arguments of Python functions."""
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error).replace(FEWER_FRAMES, "leave --no-subsample out, or score prefixes (--frame-steps, --sampling)")
 
 
 def exit_code(error: BaseException) -> ExitCode:
@@ -201,6 +224,21 @@ def missing_package(error: ImportError) -> str:
     if "pip install" in str(error):
         return str(error)
     return f'{error}: pip install "./client[cli]"'
+
+
+def _in_plain_words(error: typer.BadParameter) -> str:
+    """The message of an invalid value, without the words of pydantic, with which typer validates."""
+    details = getattr(error.__cause__, "errors", list)()
+    expected = _EXPECTED.get(details[0]["type"]) if details else None
+    if expected is None:
+        return error.message.removeprefix("Value error, ")
+    return f"expected {expected}, got {details[0]['input']!r}"
+
+
+def _same_words(option: str, options: Sequence[str]) -> list[str]:
+    """The options with the words of this one in another order."""
+    words = sorted(option.strip("-").split("-"))
+    return [each for each in options if sorted(each.strip("-").split("-")) == words]
 
 
 def _named(error: ConfigError, options: Mapping[str, str]) -> Exception:

@@ -42,10 +42,11 @@ from rfm_client.cli.options import (
 from rfm_client.cli.show import StreamedTable, in_place_of_progress, print_tables, scores_table, status_tables
 from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames, write_perf_analyzer_input
 from rfm_client.contract.addresses import split_url
-from rfm_client.contract.errors import RewardError
+from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.settings import ConfigError
+from rfm_client.contract.triton import FEWER_FRAMES
 from rfm_client.plot import save
 
 MIN_COMPARED = 2
@@ -195,8 +196,13 @@ def status(
 def wait(server: WaitOptions) -> None:
     """Wait until a server has the model ready, or --timeout passes."""
     started_s = time.monotonic()
-    with server.client() as client:
-        client.wait_ready(server.timeout_s)
+    try:
+        with server.client() as client:
+            client.wait_ready(server.timeout_s)
+    except DeadlineExceededError:
+        where, remedy = ", ".join(server.urls), "rfm-client status shows what it does; rfm serve starts one"
+        expected = f"{where}: expected {server.model} to be ready within {server.timeout_s:g} s, got no such answer"
+        raise DeadlineExceededError(f"{expected}: {remedy}") from None
     typer.echo(f"ready after {time.monotonic() - started_s:.1f} s")
 
 
@@ -215,7 +221,8 @@ def sample(
     failures = [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
     for index, outcome in enumerate(outcomes):
         if isinstance(outcome, RewardError):
-            report(f"samples[{index}]: {outcome}")
+            remedy = f"; {FEWER_FRAMES}"  # for videos; here --num-frames decides
+            report(f"samples[{index}]: {str(outcome).replace(remedy, '')}")
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if output.prints_tables and rows:
         of = "frames" if are_frames(samples) else "embeddings"

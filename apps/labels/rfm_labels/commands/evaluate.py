@@ -58,6 +58,8 @@ def evaluate(
     from rfm_labels import DatasetError, evaluate_labels, find_label_files, read_outcomes
 
     output.check_folders()
+    if not dataset.exists():
+        raise DatasetError.at(dataset, "a labelled dataset", "no file or folder of this name")
     files = labels or find_label_files(dataset)
     if not files:
         expected = "label files, NAME_progress.parquet or in HDF5 (rfm-client label), or --labels"
