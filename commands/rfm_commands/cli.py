@@ -22,7 +22,7 @@ from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.triton_server import TritonServer, short_spin
 from rfm.supervise.supervisor import CrashLoopError, GatewayProcess, Supervisor
-from rfm_client.cli.command import Given, add_missing, with_options
+from rfm_client.cli.command import MOST_COLUMNS, Given, add_missing, with_options
 from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import from_here
 from rfm_client.contract.process_log import write_log
@@ -45,8 +45,6 @@ from rfm_commands.serve_screen import ServeScreen, log_file, opened
 from rfm_commands.try_video import try_video
 
 ACCEPTED_WARNING = "a Triton with known remote vulnerabilities is accepted: use NVIDIA's container 26.07 or newer"
-EXPORT_EXAMPLE = "\b\nExample:\n  rfm export org/name --repository my_models --config serve.yaml"
-SERVE_EXAMPLE = "\b\nExample:\n  rfm serve my_models --gateway-port 8100 -- --log-verbose=1"
 
 logger = logging.getLogger("rfm.serve")
 
@@ -58,7 +56,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MOST_COLUMNS},
 )
 
 ConfigFile = Annotated[
@@ -81,7 +79,7 @@ def rfm(
     """Reward models for robot learning, served by Triton."""
 
 
-@app.command(cls=RfmCommand, epilog=EXPORT_EXAMPLE)
+@app.command(cls=RfmCommand)
 @with_options
 def export(
     given: Given[ExportConfig],
@@ -107,7 +105,10 @@ def export(
         bool, typer.Option("--explain", help="Write nothing; print the source of each setting of the checkpoint.")
     ] = False,
 ) -> None:
-    """Write a checkpoint into a model repository, as a new version."""
+    """Write a checkpoint into a model repository, as a new version.
+
+    Example: rfm export org/name --repository my_models
+    """
     import rfm_export
 
     if source is not None:
@@ -135,7 +136,7 @@ def export(
     typer.echo(f"{repository}: {settings.name} version {version}, scores equal to {whose}")
 
 
-@app.command(cls=RfmCommand, epilog=SERVE_EXAMPLE)
+@app.command(cls=RfmCommand)
 @with_options
 def serve(
     given: Given[ServeConfig],
@@ -171,6 +172,8 @@ def serve(
     With --gateway-port it also runs a gateway, and watches both.
 
     Only requests with the admin key can change its models, logging and tracing; without an admin key, no request can.
+
+    Example: rfm serve my_models --gateway-port 8100
     """
     raise_limit()  # Triton and the gateway inherit it
     folder, more_arguments = _folder_and_arguments(words or (), repository)

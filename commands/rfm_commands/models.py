@@ -18,7 +18,7 @@ import typer
 
 from rfm.launch.admin_key import take_key
 from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
-from rfm_client.cli.command import Given, usage_errors, with_options
+from rfm_client.cli.command import CommandGroup, Given, usage_errors, with_options
 from rfm_client.cli.options import CredentialFiles
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.settings import setting
@@ -27,7 +27,7 @@ from rfm_commands.rollout import Rollout, check_files, models_of, previous_versi
 
 SECURE = "grpcs://"
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(cls=CommandGroup, no_args_is_help=True)
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,10 @@ def models(files: Given[TlsFiles]) -> None:
 @app.command("list", cls=RfmCommand)
 @with_options
 def list_models(server: AdministeredServer) -> None:
-    """List the versions of each model, with state and reason."""
+    """List the versions of each model, with state and reason.
+
+    Example: rfm models list --admin-key-file admin.key
+    """
     with server.connected() as api:
         rows = [_row(entry) for entry in api.index()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -93,7 +96,10 @@ def list_models(server: AdministeredServer) -> None:
 @app.command(cls=RfmCommand)
 @with_options
 def load(name: ExportedName, server: AdministeredRepository) -> None:
-    """Serve NAME, a new or unloaded model, as configured."""
+    """Serve NAME, a new or unloaded model, as configured.
+
+    Example: rfm models load rfm --repository my_models
+    """
     with server.connected() as api:
         models = models_of(server.repository, name)
         check_files(server.repository, dict.fromkeys(models))
@@ -105,7 +111,10 @@ def load(name: ExportedName, server: AdministeredRepository) -> None:
 @app.command(cls=RfmCommand)
 @with_options
 def unload(name: ExportedName, server: AdministeredRepository) -> None:
-    """Stop serving NAME after the answers to requests in flight. Its files stay."""
+    """Stop serving NAME after the answers to requests in flight. Its files stay.
+
+    Example: rfm models unload rfm --repository my_models
+    """
     with server.connected() as api:
         for model in reversed(models_of(server.repository, name)):
             api.unload(model)
@@ -123,6 +132,8 @@ def rollout(
     """Serve another version of NAME without losing a request.
 
     The new version is loaded beside the old version, probed, then served alone. If it fails, the old version stays.
+
+    Example: rfm models rollout rfm 2 --repository my_models
     """
     with server.connected() as api:
         _roll_out(server, name, api, version)
@@ -131,7 +142,10 @@ def rollout(
 @app.command(cls=RfmCommand)
 @with_options
 def rollback(name: ExportedName, server: AdministeredRepository) -> None:
-    """Serve the previous version of NAME, as rollout does."""
+    """Serve the previous version of NAME, as rollout does.
+
+    Example: rfm models rollback rfm --repository my_models
+    """
     with server.connected() as api:
         _roll_out(server, name, api, previous_version(server.repository, name, api))
 

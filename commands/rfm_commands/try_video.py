@@ -37,7 +37,7 @@ def try_video(
 ) -> None:
     """Serve a checkpoint, score one video, plot, and stop.
 
-    Example: rfm try video.mp4 --task "put the block in the bowl" --checkpoint org/name
+    Example: rfm try video.mp4 --task "open the drawer" --checkpoint org/name
     """
     try:
         import av  # noqa: F401  ``read_video`` needs it

@@ -38,6 +38,8 @@ def gateway(config: GatewayOptions) -> None:
 
     For a Triton that runs already. `rfm serve --gateway-port` starts Triton and gateway together, and restarts both.
     `rfm gateway` and `rfm-client gateway` are the same command; the second needs no PyTorch.
+
+    Example: rfm-client gateway --triton grpc://localhost:8001 --port 8100
     """
     try:
         import uvicorn

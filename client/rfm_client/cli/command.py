@@ -21,6 +21,8 @@ from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, 
 from rfm_client.contract.triton import FEWER_FRAMES
 
 STANDARD_OUTPUT = "-"
+LAST = ("Server", "Credentials")  # sections of a command's help
+MOST_COLUMNS = 110  # of a help text, in a terminal as wide
 
 S = TypeVar("S", bound=Settings)
 
@@ -132,18 +134,7 @@ class Command(TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write sections for the arguments, the command's own options, and each group of settings."""
-        sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx)
-            if record is not None:
-                is_argument = parameter.param_type_name == "argument"
-                record = (_argument(parameter), record[1]) if is_argument else record
-                title = "Arguments" if is_argument else getattr(parameter, "rich_help_panel", None) or "Options"
-                sections.setdefault(title, []).append(record)
-        for title, records in sections.items():
-            if records:
-                with formatter.section(title):
-                    formatter.write_dl(records)
+        _write_options(self, ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command, and report an error, each of its lines with the name of the program."""
@@ -163,7 +154,16 @@ class Command(TyperCommand):
         raise typer.Exit(code)
 
 
-class Commands(TyperGroup):
+class CommandGroup(TyperGroup):
+    """Commands, which stand before the options in the help."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands, then the options."""
+        self.format_commands(ctx, formatter)
+        _write_options(self, ctx, formatter)
+
+
+class Commands(CommandGroup):
     """The commands of ``rfm-client``. Names the right program for a command of the other one."""
 
     other_program = "rfm"
@@ -317,6 +317,26 @@ def _set_placeholder(hint: Any) -> None:
     for mark in get_args(hint)[1:]:
         if isinstance(mark, OptionInfo) and mark.metavar is None:
             mark.metavar = placeholder_of(get_args(hint)[0])
+
+
+def _write_options(command: Any, ctx: Any, formatter: Any) -> None:
+    """Write a section for each group of parameters: needed ones first in it, servers and credentials last."""
+    sections: dict[str, list[tuple[str, str]]] = {}
+    for parameter in sorted(command.get_params(ctx), key=lambda each: not each.required):
+        record = parameter.get_help_record(ctx)
+        if record is not None:
+            is_argument = parameter.param_type_name == "argument"
+            record = (_argument(parameter), record[1]) if is_argument else record
+            title = "Arguments" if is_argument else getattr(parameter, "rich_help_panel", None) or "Options"
+            sections.setdefault(title, []).append(record)
+    for title in sorted(sections, key=_place):
+        with formatter.section(title):
+            formatter.write_dl(sections[title])
+
+
+def _place(title: str) -> int:
+    """The place of a section: 1 for those of settings, in their order."""
+    return {"Arguments": -1, "Options": 0, **{title: 2 + place for place, title in enumerate(LAST)}}.get(title, 1)
 
 
 def _argument(parameter: Any) -> str:

@@ -17,6 +17,7 @@ import typer
 from rfm_client.cli import comparing, documents, scoring
 from rfm_client.cli.command import (
     EXIT_CODES,
+    MOST_COLUMNS,
     Command,
     Commands,
     Given,
@@ -59,7 +60,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MOST_COLUMNS},
 )
 
 _APPLICATIONS = {"evaluate": "labels", "gateway": "gateway", "label": "labels"}  # the packages of commands
@@ -94,7 +95,10 @@ def score(
     output: OutputOptions,
     server: ServerOptions,
 ) -> None:
-    """Score each frame of one or more videos: progress and success. A failed video does not stop the others."""
+    """Score each frame of one or more videos: progress and success. A failed video does not stop the others.
+
+    Example: rfm-client score video.mp4 --task "put the block in the bowl"
+    """
     output.begin(videos)
     if prefix.sampling is not None and video.max_frames is not None:
         raise ConfigError.of_two("sampling", "conflicts with", "max_frames")
@@ -141,6 +145,8 @@ def compare(
 
     Every two videos are compared in both orders. The rank follows the mean probability of winning against the others.
     A video has no rank ("?") if the orders disagree about one of its pairs. The table also shows progress at the end.
+
+    Example: rfm-client compare a.mp4 b.mp4 --task "put the block in the bowl"
     """
     if len(videos) < MIN_COMPARED:
         raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
@@ -173,6 +179,8 @@ def status(
     Triton counts since the model was loaded, warm-up included; a model counts callers' samples since Triton started.
     Failed requests got an error. Refused samples cannot be scored, and the caller has to mend them. queue ms is the
     mean wait of a request for its turn.
+
+    Example: rfm-client status --url grpc://gpu-box:8001
     """
     from rfm_client.transport.status import ServerStatus
 
@@ -194,7 +202,10 @@ def status(
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def wait(server: WaitOptions) -> None:
-    """Wait until a server has the model ready, or --timeout passes."""
+    """Wait until a server has the model ready, or --timeout passes.
+
+    Example: rfm-client wait --timeout 600
+    """
     started_s = time.monotonic()
     try:
         with server.client() as client:
@@ -213,7 +224,10 @@ def sample(
     output: JsonOutput,
     server: ServerOptions,
 ) -> None:
-    """Score synthetic samples, to check that the server answers. Their scores mean nothing."""
+    """Score synthetic samples, to check that the server answers. Their scores mean nothing.
+
+    Example: rfm-client sample --num-samples 8
+    """
     output.check_folders()
     with server.connected() as client:
         samples = synthetic.samples(client)
@@ -241,6 +255,8 @@ def bench_input(
     """Write synthetic samples as input of Triton's perf_analyzer.
 
     It prints a perf_analyzer command that sends them.
+
+    Example: rfm-client bench-input --output samples.json
     """
     with usage_errors("--output"):
         check_folder("output", output.parent)

@@ -153,7 +153,7 @@ class VideoFiles(Settings):
 
     TITLE: ClassVar[str] = "Videos"
 
-    task: str = setting("", "The task, as a sentence.")
+    task: str = setting("", "The task, as a sentence. Required, except for embeddings with a task.")
     resize: bool = setting(False, "Downscale frames to the model's input size before sending.")
     orient: Orientation = setting("none", "Turn frames upright first (see docs/guides/label_a_dataset.md).")
     channels: ChannelOrder = setting("rgb", "Channel order in the file; bgr swaps red and blue.")

@@ -54,6 +54,8 @@ def evaluate(
     """Compare reward models by their labels of one dataset.
 
     With outcomes, successes and failures are told apart. Labels are those of `rfm-client label --name NAME`.
+
+    Example: rfm-client evaluate my_dataset --outcome outcomes.csv
     """
     from rfm_labels import DatasetError, evaluate_labels, find_label_files, read_outcomes
 

@@ -135,6 +135,8 @@ def label(
     The label files have the forms that training code reads, such as LeRobot's.
 
     Run the same command again to label the missing episodes.
+
+    Example: rfm-client label my_dataset --url grpc://gpu-box:8001
     """
 
     @contextmanager
