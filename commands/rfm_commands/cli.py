@@ -237,10 +237,11 @@ def _folder_and_arguments(words: Sequence[str], repository: Path | None) -> tupl
 
 
 def _run(supervisor: Supervisor, log: Path | None) -> None:
+    size = 0 if log is None else log.stat().st_size
     try:
         supervisor.run()
     except ServerStartError as error:
-        if log is not None:
+        if log is not None and log.stat().st_size > size:
             say(f"the lines of Triton and the models are in {log}")
         if not isinstance(error, CrashLoopError):
             raise

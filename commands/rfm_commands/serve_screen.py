@@ -66,8 +66,9 @@ class ServeScreen:
     _began_s: float = field(default_factory=time.monotonic)
 
     def show_start(self) -> None:
-        """Say what is loading."""
-        self._show(f"loading {', '.join(models_in(self.repository)) or 'no model'} from {self.repository} ...")
+        """Say what is loading; nothing if there is no model, which the server reports."""
+        if models := models_in(self.repository):
+            self._show(f"loading {', '.join(models)} from {self.repository} ...")
 
     def show_ready(self) -> None:
         """Show the addresses, models and device, and what to try next."""

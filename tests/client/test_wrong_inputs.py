@@ -91,6 +91,9 @@ USAGE = {
     "rfm-client bench-input --output nowhere/a.json": (
         "Invalid value for '--output': expected a folder at nowhere, got none: mkdir -p nowhere"
     ),
+    "rfm-client --task x score a.mp4": (
+        "No such option: --task: it stands after the command, as in rfm-client score --task"
+    ),
     "rfm-client stauts": "No such command 'stauts'. Did you mean 'status'?",
     "rfm-client serve my_models": "No such command 'serve': that is `rfm serve`",
     "rfm-client gateway": "Missing option '--triton'.",

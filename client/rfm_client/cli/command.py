@@ -157,6 +157,19 @@ class Command(TyperCommand):
 class CommandGroup(TyperGroup):
     """Commands, which stand before the options in the help."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the words before the command. An error about an option of a command says where that stands."""
+        try:
+            return super().parse_args(ctx, args)
+        except _UsageError as error:
+            option = vars(error).get("option_name", "")
+            owners = [name for name, each in self.commands.items() if any(option in one.opts for one in each.params)]
+            if owners:
+                vars(error)["message"] += (
+                    f": it stands after the command, as in {ctx.command_path} {owners[0]} {option}"
+                )
+            raise
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the commands, then the options."""
         self.format_commands(ctx, formatter)
