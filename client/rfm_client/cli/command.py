@@ -16,18 +16,14 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import OptionInfo
 
+from rfm_client.cli.help_sections import argument_name, write_options
+from rfm_client.cli.messages import UsageError, in_plain_words, same_words, told
 from rfm_client.contract import errors
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of
-from rfm_client.contract.triton import FEWER_FRAMES
 
 STANDARD_OUTPUT = "-"
-LAST = ("Server", "Credentials")  # sections of a command's help
-MOST_COLUMNS = 110  # of a help text, in a terminal as wide
 
 S = TypeVar("S", bound=Settings)
-
-_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # click's, or that of typer's own copy of click
-_EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number", "float_parsing": "a number"}
 
 
 class Given(dict[str, Any], Generic[S]):
@@ -118,23 +114,23 @@ class Command(TyperCommand):
         try:
             return super().parse_args(ctx, completed)
         except typer.BadParameter as error:
-            error.message = _in_plain_words(error)
+            error.message = in_plain_words(error)
             raise
-        except _UsageError as error:
+        except UsageError as error:
             if unknown := getattr(error, "option_name", ""):
-                same = _same_words(unknown, [option for each in self.params for option in each.opts])
+                same = same_words(unknown, [option for each in self.params for option in each.opts])
                 vars(error)["possibilities"] = same or vars(error)["possibilities"]
             raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the words of the usage line: an argument's name, in brackets if it may be left out."""
         arguments = [each for each in self.get_params(ctx) if each.param_type_name == "argument"]
-        names = [_argument(each) if each.required else f"[{_argument(each)}]" for each in arguments]
+        names = [argument_name(each) if each.required else f"[{argument_name(each)}]" for each in arguments]
         return [*([self.options_metavar] if self.options_metavar else []), *names]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write sections for the arguments, the command's own options, and each group of settings."""
-        _write_options(self, ctx, formatter)
+        write_options(self, ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command, and report an error, each of its lines with the name of the program."""
@@ -161,7 +157,7 @@ class CommandGroup(TyperGroup):
         """Parse the words before the command. An error about an option of a command says where that stands."""
         try:
             return super().parse_args(ctx, args)
-        except _UsageError as error:
+        except UsageError as error:
             option = vars(error).get("option_name", "")
             owners = [name for name, each in self.commands.items() if any(option in one.opts for one in each.params)]
             if owners:
@@ -173,7 +169,7 @@ class CommandGroup(TyperGroup):
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the commands, then the options."""
         self.format_commands(ctx, formatter)
-        _write_options(self, ctx, formatter)
+        write_options(self, ctx, formatter)
 
 
 class Commands(CommandGroup):
@@ -190,13 +186,6 @@ class Commands(CommandGroup):
         if args[0] in self.renamed:
             ctx.fail(f"No such command '{args[0]}': it is now `{ctx.info_name} {self.renamed[args[0]]}`")
         return super().resolve_command(ctx, args)
-
-
-def told(error: Exception) -> str:
-    """Return the message for a command's user, who knows options and no arguments of Python functions."""
-    if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename}: {error.strerror}"
-    return str(error).replace(FEWER_FRAMES, "leave --no-subsample out, or score prefixes (--frame-steps, --sampling)")
 
 
 def exit_code(error: BaseException) -> ExitCode:
@@ -237,21 +226,6 @@ def missing_package(error: ImportError) -> str:
     if "pip install" in str(error):
         return str(error)
     return f'{error}: pip install "./client[cli]"'
-
-
-def _in_plain_words(error: typer.BadParameter) -> str:
-    """The message of an invalid value, without the words of pydantic, with which typer validates."""
-    details = getattr(error.__cause__, "errors", list)()
-    expected = _EXPECTED.get(details[0]["type"]) if details else None
-    if expected is None:
-        return error.message.removeprefix("Value error, ")
-    return f"expected {expected}, got {details[0]['input']!r}"
-
-
-def _same_words(option: str, options: Sequence[str]) -> list[str]:
-    """The options with the words of this one in another order."""
-    words = sorted(option.strip("-").split("-"))
-    return [each for each in options if sorted(each.strip("-").split("-")) == words]
 
 
 def _named(error: ConfigError, options: Mapping[str, str]) -> Exception:
@@ -330,30 +304,6 @@ def _set_placeholder(hint: Any) -> None:
     for mark in get_args(hint)[1:]:
         if isinstance(mark, OptionInfo) and mark.metavar is None:
             mark.metavar = placeholder_of(get_args(hint)[0])
-
-
-def _write_options(command: Any, ctx: Any, formatter: Any) -> None:
-    """Write a section for each group of parameters: needed ones first in it, servers and credentials last."""
-    sections: dict[str, list[tuple[str, str]]] = {}
-    for parameter in sorted(command.get_params(ctx), key=lambda each: not each.required):
-        record = parameter.get_help_record(ctx)
-        if record is not None:
-            is_argument = parameter.param_type_name == "argument"
-            record = (_argument(parameter), record[1]) if is_argument else record
-            title = "Arguments" if is_argument else getattr(parameter, "rich_help_panel", None) or "Options"
-            sections.setdefault(title, []).append(record)
-    for title in sorted(sections, key=_place):
-        with formatter.section(title):
-            formatter.write_dl(sections[title])
-
-
-def _place(title: str) -> int:
-    """The place of a section: 1 for those of settings, in their order."""
-    return {"Arguments": -1, "Options": 0, **{title: 2 + place for place, title in enumerate(LAST)}}.get(title, 1)
-
-
-def _argument(parameter: Any) -> str:
-    return str(parameter.metavar or parameter.name.upper())
 
 
 def _shown(default: Any) -> str:

@@ -17,7 +17,6 @@ import typer
 from rfm_client.cli import comparing, documents, scoring
 from rfm_client.cli.command import (
     EXIT_CODES,
-    MOST_COLUMNS,
     Command,
     Commands,
     Given,
@@ -27,6 +26,7 @@ from rfm_client.cli.command import (
     usage_errors,
     with_options,
 )
+from rfm_client.cli.help_sections import MOST_COLUMNS
 from rfm_client.cli.next_steps import steps_with_server
 from rfm_client.cli.options import (
     CredentialFiles,

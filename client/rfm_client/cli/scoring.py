@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package, told
+from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package
+from rfm_client.cli.messages import told
 from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.show import at_end, number
