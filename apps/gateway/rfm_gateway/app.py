@@ -64,7 +64,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None, started_by: st
 
     Raises OSError for a missing folder, ValueError for a malformed URL or an unusable file.
     """
-    folder = None if config.allow_folder is None else config.allow_folder.resolve(strict=True)
+    folder = config.resolved_folder
     client, metrics = config.client(), GatewayMetrics()
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
     state = TritonState(client, config)

@@ -39,6 +39,8 @@ def gateway(config: GatewayOptions) -> None:
 
     For a Triton that runs already. `rfm serve --gateway-port` starts Triton and gateway together, and restarts both.
     `rfm gateway` and `rfm-client gateway` are the same command; the second needs no PyTorch.
+
+    Example: rfm-client gateway --triton grpc://localhost:8001 --port 8100
     """
     try:
         import uvicorn
@@ -72,6 +74,7 @@ def gateway(config: GatewayOptions) -> None:
         port=address.port,
         access_log=False,
         log_config=None,
+        log_level="warning",
         http=Connection,
         limit_concurrency=most_connections(raise_limit()),
         timeout_keep_alive=KEEP_ALIVE_S,

@@ -179,8 +179,8 @@ def chosen_numbers(dataset: Dataset, options: LabelOptions) -> list[int]:
     known = set(dataset.numbers)
     wanted = sorted(known) if options.episodes is None else sorted(set(options.episodes))
     missing = [number for number in wanted if number not in known]
-    got = f"{', '.join(map(str, missing[:5])) or 'none'}; it has {listed(sorted(known))}"
-    require("episodes", bool(wanted) and not missing, f"some of the {len(known)} of the dataset", got)
+    got = f"{listed(missing) or 'none'}; it has {listed(sorted(known))}"
+    require("episodes", bool(wanted) and not missing, f"some of the dataset's {len(known)} episodes", got)
     if options.filter_key is not None:
         keys = ", ".join(dataset.filter_keys)
         is_known = options.filter_key in dataset.filter_keys

@@ -65,7 +65,8 @@ class Recipe:
         try:
             sampling = Sampling.of(rule, options.frames, checkpoint.max_frames, trained_padding=padding)
         except InvalidValueError as error:
-            told = f"{error.problem}: name them (--frames), or show all (--sampling all)"
+            remedy = "leave --frames out" if rule == "all" else "name them (--frames), or show all (--sampling all)"
+            told = f"{error.problem}: {remedy}"
             raise InvalidSampleError(told, error.where) from error
         return cls(
             checkpoint,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client score``: read trajectories from files, score them, show each result as soon as it arrives."""
+"""``rfm-client score``: read trajectories from files, score them, show the results in the order of the files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package
+from rfm_client.cli.messages import told
 from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.show import at_end, number
@@ -148,19 +149,17 @@ class SourceScorer:
     _gone: RewardError | None = None
 
     def score_all(self, names: Sequence[str], tell: Tell) -> list[Outcome]:
-        """Return the outcomes of all sources, in order. ``tell`` takes each outcome as it arrives."""
+        """Return the outcomes of all sources, in order. ``tell`` takes each when all before it have arrived."""
         with ThreadPoolExecutor(WORKERS) as pool, _progress_bar(len(names)) as advance:
             try:
-                numbers: dict[Future[Outcome], int] = {
-                    pool.submit(self.outcome, number, name): number for number, name in enumerate(names)
-                }
-                for future in as_completed(numbers):
-                    tell(numbers[future], future.result())
+                futures = [pool.submit(self.outcome, number, name) for number, name in enumerate(names)]
+                for number, future in enumerate(futures):
+                    tell(number, future.result())
                     advance()
             except BaseException:  # an interrupt, or a full disk: no other source shall begin
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
-        return [future.result() for future in numbers]
+        return [future.result() for future in futures]
 
     def outcome(self, number: int, name: str) -> Outcome:
         """Return the scores of a source, or the reason of its failure."""
@@ -177,7 +176,7 @@ class SourceScorer:
         except (RewardError, OSError) as error:
             if isinstance(error, InvalidSampleError) and error.source == name:  # which the report names
                 error.source = ""
-            return Failed(name, error, str(error), is_server_gone=self._is_server_gone(error))
+            return Failed(name, error, told(error), is_server_gone=self._is_server_gone(error))
         if self.record is not None:
             self.record(number, source, result)
         return Scored(

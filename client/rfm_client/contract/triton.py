@@ -7,6 +7,7 @@ real Triton say each of its phrases.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Collection
 from typing import Any, TypeAlias, TypeVar
@@ -47,6 +48,7 @@ RESTRICTED = "is restricted, expecting header"  # the API needs a key
 _NO_CONNECTION = re.compile(  # gRPC's own words: nothing was sent
     "failed to connect|connections to all backends failing|errors resolving|resolution failed"
 )
+_REASON = re.compile(r"(?:: |\[)((?:Connection|Domain name|Name|No route|Network)[\w ]+)\]?$")  # of a libc or gRPC
 _PROXY_ALONE = "http2 header with status: 502"  # a proxy answered: the server behind it did not
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or a proxy's
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
@@ -58,7 +60,7 @@ _NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
 _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as ``LocatedError`` writes them
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
 
-_FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
+FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
 _START = "start the server there (rfm serve), or give the URL of one that runs"
 _NO_PROXY = "unset that variable, or add the server's host to no_proxy"
 _NAME = "give the checkpoint's name with model (--model)"
@@ -81,7 +83,7 @@ def invalid_sample(text: str) -> errors.InvalidSampleError:
         return errors.InvalidSampleError(text)
     where, expected, got = fields.groups()
     has_too_many = where.endswith(NUM_FRAMES) and expected.startswith("at most ")
-    return errors.InvalidSampleError.at(where, expected, got, _FEWER_FRAMES if has_too_many else "")
+    return errors.InvalidSampleError.at(where, expected, got, FEWER_FRAMES if has_too_many else "")
 
 
 def error_from(
@@ -110,7 +112,8 @@ def error_from(
             case "ClientResponseError":
                 return errors.InferenceFailedError(f"{url}: no answer of an HTTP server: {type(raised).__name__}")
             case "ClientConnectorError" | "OSError" | "EOFError" | "HTTPException":
-                return unreachable(url, str(raised) or type(raised).__name__)
+                number = getattr(raised, "errno", None) or 0
+                return unreachable(url, os.strerror(number) if number > 0 else str(raised) or type(raised).__name__)
             case "ClientError":  # aiohttp's, after the request was sent
                 lost = unreachable(url, str(raised) or type(raised).__name__)
                 lost.may_have_ended_server = True
@@ -180,6 +183,8 @@ def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
 
 def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.ServerUnavailableError:
     """Return the error of a failed connection to the server, or to its proxy."""
+    told = _REASON.search(reason)
+    reason = told[1] if told else reason
     if proxy is None:
         return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", _START)
     fault = f"{url}: no connection through {proxy}: {reason}"
