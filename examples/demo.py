@@ -11,18 +11,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import numpy as np
 import typer
 
 from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
 from rfm_client.cli.next_steps import next_steps, steps_with_server
 from rfm_client.cli.pictures import Panel, plot
+from rfm_client.cli.scoring import checkpoint_of, heading
 from rfm_client.cli.show import print_tables, scores_table
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.frames.inputs import load_trajectory
 from rfm_commands.try_video import steps_without_server
 from toy_world import Clip, Task, make_clip
-from toy_world.video import write_video
+from toy_world.video import FPS, write_video
 
 TASK, OTHER_TASK = Task("red", "bowl"), Task("green", "plate")
 REPOSITORY = Path(__file__).parents[1] / "model_repository"
@@ -88,16 +90,17 @@ def show_clips(url: str, trajectories: Sequence[Trajectory], picture: Path) -> N
     }
     with RewardClient(url) as client:
         results = client.evaluate(list(samples.values()))
+        checkpoint = checkpoint_of(client, success)
     answers = dict(zip(samples, results, strict=True))
     print_tables(scores_table(f'"{success.task}"', list(answers.items())))
     panels = [
-        Panel.of(name, answers[name], sample.trajectory.frames)
+        Panel.of(name, answers[name], sample.trajectory.frames, np.arange(sample.trajectory.num_frames) / FPS)
         for name, sample in samples.items()
         if isinstance(sample, ProgressSample)
     ]
     preference, same, different = results[-3:]
     title = (
-        f'"{success.task}"\nP(success preferred to failure) {preference.preference:.3f}      '
+        f"{heading(success.task, [checkpoint])}\nP(success preferred to failure) = {preference.preference:.3f}; "
         f"similarity of two successes {same.similarity:.1f}, of success and another task {different.similarity:.1f}"
     )
     plot(picture, panels, title, columns=2)

@@ -78,14 +78,17 @@ def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str
     frames: uint8 [T, H, W, 3], T frames of H x W pixels, evenly thinned if the checkpoint takes fewer
     """
     from rfm_client.cli.pictures import Panel, plot
+    from rfm_client.cli.scoring import checkpoint_of, heading
     from rfm_client.frames.video import frame_times_s
 
     with RewardClient(endpoints.grpc_url) as client:
-        result = client.progress(Trajectory(frames=frames, task=task), subsample=True)
+        trajectory = Trajectory(frames=frames, task=task)
+        result = client.progress(trajectory, subsample=True)
+        title = heading(task, [checkpoint_of(client, trajectory)])
     if len(result.progress) < len(frames):
         typer.echo(f"{video.name}: {len(result.progress)} of {len(frames)} frames, evenly, are scored")
     print_tables(scores_table(f'"{task}"', [(video.name, result)]))
-    plot(picture, [Panel.of(f'"{task}"', result, frames, frame_times_s(video, len(frames)))])
+    plot(picture, [Panel.of(video.name, result, frames, frame_times_s(video, len(frames)))], title)
     typer.echo(f"The curves are in {picture}.")
 
 

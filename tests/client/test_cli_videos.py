@@ -63,6 +63,7 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
     with served.client("http", MODEL) as client:
         filmed = client.progress(load_trajectory(video, task=TASK, fps=10), subsample=True)
         embedded = client.progress(seen)
+        sources = {client.model_info(frames=frames).source: None for frames in (True, False)}
 
     document = json.loads(target.read_text())
     assert document["servers"] == [served.url("http"), served.url("grpc")]
@@ -90,12 +91,13 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
     assert array.dtype == np.float32
     np.testing.assert_array_equal(array, np.float32([first["progress"], first["success"]]).T)
     times_s = [EVENLY / clip.FPS, None]
-    figure = plot_scores([filmed, embedded], ["clip.mp4", "embeddings.npz"], title=f'"{TASK}"', times_s=times_s)
+    title = f'"{TASK}"\n{", ".join(map(str, sources))}'
+    figure = plot_scores([filmed, embedded], ["clip.mp4", "embeddings.npz"], title=title, times_s=times_s)
     save(figure, tmp_path / "own.png")
     with Image.open(plotted) as drawn, Image.open(tmp_path / "own.png") as own:
         assert np.abs(np.asarray(drawn, np.int16) - np.asarray(own)).max() <= SHADES
     with Image.open(tmp_path / "strips.png") as strips:
-        assert strips.width == 2000
+        assert strips.width == 1400
 
 
 OPTIONS: dict[str, tuple[list[object], dict[str, Any]]] = {

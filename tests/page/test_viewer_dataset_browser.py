@@ -305,13 +305,21 @@ def test_selected_episodes_are_taken_along(page: Page) -> None:
     others = [number for number in everything if number not in (2, 7)]
     for use, ending, away in (("delete", "cleaned", [2, 7]), ("keep", "kept", others)):
         Select(page.browser["use"]).select_by_value(use)
-        words = shlex.split(page.browser["use-words"].text)
-        options = dict(zip(words[1::2], words[2::2], strict=True))
-        assert words[0] == "lerobot-edit-dataset"
-        assert (options["--repo_id"], options["--root"]) == ("toy_v30_many", "toy_v30_many")
-        assert (options["--new_repo_id"], options["--new_root"]) == (f"toy_v30_many_{ending}",) * 2
-        assert options["--operation.type"] == "delete_episodes"
-        assert json.loads(options["--operation.episode_indices"]) == away
+        lines = page.browser["use-words"].text.splitlines()
+        assert [lines[0][:13], lines[2][:13]] == ["# LeRobot 0.5", "# LeRobot 0.4"]
+        home, *older = shlex.split(lines[3].removeprefix("# "))
+        assert home == "HF_LEROBOT_HOME=."
+        target = f"toy_v30_many_{ending}"
+        for words, roots in (
+            (shlex.split(lines[1]), {"--root": "toy_v30_many", "--new_root": target}),
+            (older, {}),
+        ):
+            assert words[0] == "lerobot-edit-dataset"
+            options = dict(zip(words[1::2], words[2::2], strict=True))
+            assert json.loads(options.pop("--operation.episode_indices")) == away
+            told = {"--repo_id": "toy_v30_many", "--new_repo_id": target, "--operation.type": "delete_episodes"}
+            assert options == {**told, **roots}
+        assert lines[4].endswith(f"label {target} again")
     page.browser["choose-none"].click()
     page.browser.write("task-part", "green")
     page.browser["choose-shown"].click()

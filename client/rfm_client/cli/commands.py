@@ -129,7 +129,8 @@ def score(
     if output.strips is not None and scored:
         from rfm_client.cli.pictures import plot
 
-        plot(output.strips, [outcome.panel for outcome in scored])
+        title = scoring.heading(video.task, [outcome.checkpoint for outcome in scored])
+        plot(output.strips, [outcome.panel for outcome in scored], title)
     raise typer.Exit(scoring.exit_code_of_outcomes(outcomes))
 
 
@@ -153,6 +154,7 @@ def compare(
     output.begin(videos)
     with server.connected() as client:
         comparison = comparing.compare(client, videos, video)
+        checkpoint = scoring.checkpoint_of(client, comparison.sources[0].trajectory)
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
         _report_blank(source.name, source.blank)
@@ -162,7 +164,7 @@ def compare(
     if output.plot is not None:
         from rfm_client.cli.pictures import plot
 
-        plot(output.plot, comparison.panels(), title=f'"{video.task}"' if video.task else None)
+        plot(output.plot, comparison.panels(), scoring.heading(video.task, [checkpoint]))
 
 
 @app.command(cls=Command, epilog=EXIT_CODES)

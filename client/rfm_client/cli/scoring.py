@@ -7,7 +7,7 @@ import itertools
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -97,12 +97,14 @@ class Source:
 class Scored:
     """A source's scores.
 
+    checkpoint: as in ``checkpoint_of``
     num_frames: frames that were read
     times_s: float64 [T], times of the T scored frames; None: unknown
     blank: as in ``Source``
     """
 
     name: str
+    checkpoint: str
     result: ProgressResult
     num_frames: int
     times_s: Times | None
@@ -171,6 +173,7 @@ class SourceScorer:
             if self._gone is not None:
                 return Failed(name, self._gone, NOT_ASKED, is_server_gone=True)
             result = _evaluate(self.client, ProgressSample(source.trajectory), self.video, self.prefix)
+            checkpoint = checkpoint_of(self.client, source.trajectory)
         except ImportError as error:
             return Failed(name, error, missing_package(error))
         except (RewardError, OSError) as error:
@@ -181,10 +184,11 @@ class SourceScorer:
             self.record(number, source, result)
         return Scored(
             name=name,
+            checkpoint=checkpoint,
             result=result,
             num_frames=source.trajectory.num_frames,
             times_s=source.times_of(result),
-            panel=source.panel(f'{PurePath(name).name}: "{self.video.task}"', result),
+            panel=source.panel(PurePath(name).name, result),
             took_s=time.monotonic() - started_s,
             blank=source.blank,
         )
@@ -262,6 +266,17 @@ def _evaluate(
     return cast(ProgressResult, with_frame_indices(told, fit.frame_indices))
 
 
+def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:
+    """Return the source of the checkpoint that scores the trajectory, else the model's name."""
+    info = client.model_info(frames=trajectory.frames is not None)
+    return info.source or info.name
+
+
+def heading(task: str, checkpoints: Iterable[str]) -> str:
+    """Return the title of a figure: the task, and below it the checkpoints."""
+    return "\n".join([*[f'"{task}"'] * (not is_blank(task)), ", ".join(dict.fromkeys(checkpoints))])
+
+
 def figure(scored: Sequence[Scored], task: str) -> Figure:
     """Return one figure with the curves of these sources. Raises ImportError without matplotlib."""
     files = [PurePath(each.name).name for each in scored]
@@ -269,7 +284,7 @@ def figure(scored: Sequence[Scored], task: str) -> Figure:
     return plot_scores(
         [each.result for each in scored],
         files if is_unique else [each.name for each in scored],
-        title=f'"{task}"' if task else None,
+        title=heading(task, [each.checkpoint for each in scored]),
         times_s=[each.times_s for each in scored],
     )
 

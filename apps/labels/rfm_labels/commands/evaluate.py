@@ -74,7 +74,7 @@ def evaluate(
     if output.plot is not None:
         from rfm_labels.pictures import draw_evaluation
 
-        draw_evaluation(output.plot, comparison)
+        draw_evaluation(output.plot, comparison, files)
 
 
 def _print_tables(comparison: LabelComparison) -> None:

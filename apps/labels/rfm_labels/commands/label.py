@@ -317,7 +317,7 @@ class LabelCommand:
             source = Path(self.source)
             of_file = f"{dataset_stem(source)}." if source.suffix.lower() in SUFFIXES else ""
             picture = (self.labels.output or beside) / f"{of_file}{self.labels.name}_summary.png"
-            draw_summary(picture, summary)
+            draw_summary(picture, summary, file)
             typer.echo(f"{picture}")
 
     def _dataset(self) -> Dataset:

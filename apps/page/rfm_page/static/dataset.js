@@ -377,7 +377,7 @@ export class DatasetTab {
     const dataset = this.#datasets[this.#number];
     const all = this.#episodes.map(({ episode }) => episode);
     this.#words = dataset ? lerobotWords(page.use.value, dataset, numbers, all) : "";
-    page["use-words"].textContent = cut(this.#words, MOST_LETTERS);
+    page["use-words"].textContent = this.#words.split("\n").map((line) => cut(line, MOST_LETTERS)).join("\n");
   }
 
   #json() {

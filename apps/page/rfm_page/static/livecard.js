@@ -18,7 +18,7 @@ export class LiveCard {
   #id;
   #mostPoints;
   #about = {};
-  #curve = { index: 0, successIndex: 1, times: [], progress: [], success: [] };
+  #curve = { index: 0, successIndex: 2, times: [], progress: [], success: [] };
   #newest = null;
   #heardMs = 0;
   #frame = null;
@@ -105,7 +105,7 @@ export class LiveCard {
     const [leading = "progress"] = Object.keys(instead);
     const news = { times: steps, progress, success, ...instead };
     const joined = Object.entries(news).map(([name, values]) => [name, most([...(old[name] ?? []), ...values])]);
-    this.#curve = { index: 0, successIndex: 1, leading, ...Object.fromEntries(joined) };
+    this.#curve = { index: 0, successIndex: 2, leading, ...Object.fromEntries(joined) };
     this.#about = about;
     this.#newest = newest;
     this.#frame = frame;
