@@ -252,8 +252,7 @@ class _Conversion:
 
 
 def _frame_steps(frames: ModelInfo | None) -> int:
-    is_of_seconds = frames is not None and "remaining_s" in frames.scores
-    return FRAME_STEPS_OF_SECONDS if is_of_seconds else FRAME_STEPS
+    return FRAME_STEPS if frames is None or frames.has_progress else FRAME_STEPS_OF_SECONDS
 
 
 def _check_descriptions(given: schema.TrajectoryInput, model: ModelInfo) -> None:
