@@ -63,6 +63,7 @@ class RynnCheckpoint(LanguageCheckpoint):
             has_progress=False,
             more_scores=("remaining_s", "relative_s", "entropy"),
             asks_in_words=True,
+            reads_descriptions=self.config.use_meta,
             keeps_features=True,
             uses_graphs=self.config.attention == "causal",  # else the groups need a mask
             is_large=True,
