@@ -63,6 +63,7 @@ class RynnCheckpoint(LanguageCheckpoint):
             has_progress=False,
             more_scores=("remaining_s", "relative_s", "entropy"),
             asks_in_words=True,
+            reads_descriptions=self.config.use_meta,
             keeps_features=True,
             uses_graphs=self.config.attention == "causal",  # else the groups need a mask
             is_large=True,
@@ -130,7 +131,7 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnC
     fields = read.fields()
     told = {name: value for name, value in content.items() if name not in PUBLISHED and "value_token_id" not in name}
     backbone = backbone_config({**told, "model_type": QWEN3}, file)
-    tensors, _ = read_published(folder, read_unrounded_config(backbone, file))
+    tensors, _ = read_published(folder, read_unrounded_config(backbone, file), MODEL_TYPE)
     weights = {name: each for name, each in renamed(tensors, QWEN_NAMES).items() if not UNUSED.fullmatch(name)}
     rows = _rows(backbone, weights, file)
     processor = options.base_model or folder

@@ -36,6 +36,7 @@ class VlmPredictor:
 
     works_ahead = True
     has_progress = True
+    reads_descriptions = False
     makes_trees: ClassVar[bool] = True  # of prefixes, whose common beginnings are computed once
 
     def __init__(

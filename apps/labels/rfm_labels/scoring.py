@@ -231,7 +231,7 @@ def episode_scores(
             else:
                 first = next(chunks)
                 with memory.holding(first[0].nbytes * count):
-                    result = _scores(_held(first, chunks, task, count), scorer, recipe, go_on)
+                    result = _scores(_held(first, chunks, task, count, recipe), scorer, recipe, go_on)
             by_camera.setdefault(camera, []).append(result)
     highest = {camera: frames.highest for camera, frames in shown.items()}
     blank = {camera: value for camera, value in highest.items() if value is not None}
@@ -291,13 +291,14 @@ def _joined(parts: Sequence[Trajectory]) -> Trajectory:
     return Trajectory(video_embeddings=embeddings, text_embedding=parts[0].text_embedding)
 
 
-def _held(first: UInt8Array, others: Iterator[UInt8Array], task: str, count: int) -> Trajectory:
+def _held(first: UInt8Array, others: Iterator[UInt8Array], task: str, count: int, recipe: Recipe) -> Trajectory:
     frames = np.empty((count, *first.shape[1:]), np.uint8)
     start = 0
     for chunk in itertools.chain([first], others):
         frames[start : start + len(chunk)] = chunk
         start += len(chunk)
-    return Trajectory(frames=frames, task=task)
+    described = {name: getattr(recipe, name) for name in ("robot_description", "camera_description")}
+    return Trajectory(frames=frames, task=task, **described)
 
 
 def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:

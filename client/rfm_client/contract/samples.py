@@ -24,6 +24,7 @@ NamedFrame: TypeAlias = tuple[bytes, npt.NDArray[Any]]  # a frame's digest, and 
 
 MIN_FRAME_STEPS = 2  # a prefix sampled to a single frame is no trajectory
 MAX_FRAME_STEPS = 4096  # more frames than any checkpoint takes
+DESCRIPTION_FIELDS = ("robot_description", "camera_description")
 _PLAIN_NUMBERS = ("I", "F")  # Pillow's modes of depth pictures, which no conversion makes a colour picture
 
 
@@ -35,6 +36,8 @@ class Trajectory:
     video_embeddings: float32 [T, D], in place of ``frames``
     text_embedding: float32 [Dt], embedding of the task, for ``video_embeddings``
     task: a sentence, for ``frames``
+    robot_description, camera_description: for ``frames``, the words for the robot and the camera in RynnValue's prompt;
+        if either is given, they replace both of the export; empty: none
     named: in place of ``frames``, on a server: the digest of each frame with its pixels, uint8 [H, W, 3], or with its
         embedding, float32 [D], which the encoders kept
 
@@ -45,6 +48,8 @@ class Trajectory:
     video_embeddings: Float32Array | None = None
     text_embedding: Float32Array | None = None
     task: str = ""
+    robot_description: str = ""
+    camera_description: str = ""
     named: tuple[NamedFrame, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -53,6 +58,11 @@ class Trajectory:
             got = "both" if given else "neither"
             raise InvalidSampleError.at("trajectory", "either frames or video_embeddings", got)
         check_task(self.task)
+        for name in DESCRIPTION_FIELDS:
+            check_text(name, getattr(self, name))
+        if self.video_embeddings is not None and any(self.descriptions):
+            expected = "none with video_embeddings"
+            raise InvalidSampleError.at(" or ".join(DESCRIPTION_FIELDS), expected, str(self.descriptions))
         if self.frames is not None and self.text_embedding is not None:
             raise InvalidSampleError.at("text_embedding", "None with frames, which go with task", "an embedding")
         if self.frames is not None:
@@ -77,6 +87,11 @@ class Trajectory:
         array = self.video_embeddings if self.frames is None else self.frames
         assert array is not None  # named frames are not one array
         return array
+
+    @property
+    def descriptions(self) -> tuple[str, str]:
+        """The descriptions of robot and camera."""
+        return self.robot_description, self.camera_description
 
     @property
     def num_frames(self) -> int:
@@ -168,10 +183,15 @@ def check_frame_steps(steps: Any) -> None:
 
 def check_task(task: Any) -> None:
     """Raise InvalidSampleError unless ``task`` is text that UTF-8 can encode."""
-    if not isinstance(task, str):
-        raise InvalidSampleError.at("task", "str", type(task).__name__)
-    if any(0xD800 <= ord(character) <= 0xDFFF for character in task):
-        raise InvalidSampleError.at("task", "text that UTF-8 can encode", "a lone surrogate")
+    check_text("task", task)
+
+
+def check_text(where: str, text: Any) -> None:
+    """Raise InvalidSampleError unless ``text`` is text that UTF-8 can encode."""
+    if not isinstance(text, str):
+        raise InvalidSampleError.at(where, "str", type(text).__name__)
+    if any(0xD800 <= ord(character) <= 0xDFFF for character in text):
+        raise InvalidSampleError.at(where, "text that UTF-8 can encode", "a lone surrogate")
 
 
 def stackable(trajectories: Sequence[Trajectory]) -> list[list[Trajectory]]:

@@ -15,7 +15,7 @@ from urllib.parse import urljoin
 
 from rfm_client.contract import errors
 from rfm_client.contract.names import frames_name
-from rfm_client.contract.wire import NUM_FRAMES, SECOND_FRAMES
+from rfm_client.contract.wire import DESCRIPTIONS, NUM_FRAMES, SECOND_FRAMES
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 
@@ -55,7 +55,17 @@ _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed
 _WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not make
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
 )
-_NO_SECOND_FRAMES = re.compile(rf"expected \d+ inputs but got .*'{SECOND_FRAMES}'|unexpected .*input '{SECOND_FRAMES}'")
+_NO_INPUT = re.compile(
+    rf"(?:expected \d+ inputs but got .*|unexpected .*input )'(?P<name>{SECOND_FRAMES}|{DESCRIPTIONS})'"
+)
+# What a model without an optional input is sent it for, and the remedy.
+_WITHOUT = {
+    SECOND_FRAMES: ("a model that takes pairs of two frame sizes", "export it again, or resize a trajectory"),
+    DESCRIPTIONS: (
+        "a model whose prompt names robot and camera, such as RynnValue",
+        "leave out robot_description and camera_description, or export a RynnValue again",
+    ),
+}
 _NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
 _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as ``LocatedError`` writes them
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
@@ -138,10 +148,11 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
     shape = _WRONG_SHAPE.search(text)
     if shape is not None:
         return errors.InvalidSampleError.at(shape["name"], f"[{shape['expected']}]", f"[{shape['got']}]")
-    if _NO_SECOND_FRAMES.search(text):
-        expected = "a model that takes pairs of two frame sizes"
-        got, remedy = "one that was exported before there was this input", "export it again, or resize a trajectory"
-        return errors.InvalidSampleError.at(SECOND_FRAMES, expected, got, remedy)
+    without = _NO_INPUT.search(text)
+    if without is not None:
+        expected, remedy = _WITHOUT[without["name"]]
+        got = "another, or one that was exported before there was this input"
+        return errors.InvalidSampleError.at(without["name"], expected, got, remedy)
     if PROCESS_ENDED in text and "Stub process" in text:
         return errors.ProcessEndedError(text)
     if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: a retry may succeed

@@ -22,6 +22,7 @@ from rfm_client.contract.samples import (
     stackable,
 )
 from rfm_client.contract.wire.specs import (
+    DESCRIPTIONS,
     DIGEST_BYTES,
     FRAME_DIGESTS,
     FRAME_STEPS,
@@ -66,6 +67,7 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
         tensors[name] = pad_stack([[trajectory.positions for trajectory in row] for row in rows])
     if has_frames:
         tensors[TASK] = np.array([[text.task.encode()] for text in texts], np.object_)
+        tensors |= _descriptions([text.descriptions for text in texts])
     else:
         embeddings = [text.text_embedding for text in texts if text.text_embedding is not None]
         tensors[TEXT_EMBEDDING] = embeddings[0][np.newaxis] if len(embeddings) == 1 else np.stack(embeddings)
@@ -105,11 +107,17 @@ def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | No
     return _decode_rows(tensors, kept, _decode_encoder_sample)
 
 
-def encode_refs(videos: Sequence[Sequence[bytes]], tasks: Sequence[str], sent: Sequence[UInt8Array]) -> Tensors:
+def encode_refs(
+    videos: Sequence[Sequence[bytes]],
+    tasks: Sequence[str],
+    sent: Sequence[UInt8Array],
+    descriptions: Sequence[tuple[str, str]] = (),
+) -> Tensors:
     """Return one request for the progress of videos whose frames are named by their digests.
 
     videos, tasks: the digests of the frames of each video, and its task
     sent: frames that the model may lack, uint8 [H, W, 3] of one size; empty: it has all frames
+    descriptions: of robot and camera, for each video; empty: those of the export
     """
     count = len(videos)
     num_rows = -(-len(sent) // count)
@@ -125,6 +133,7 @@ def encode_refs(videos: Sequence[Sequence[bytes]], tasks: Sequence[str], sent: S
         FRAMES: frames,
         FRAME_DIGESTS: pad_stack(digests),
         TASK: np.array([[task.encode()] for task in tasks], np.object_),
+        **_descriptions(descriptions),
     }
 
 
@@ -137,6 +146,13 @@ def encode_trajectories(encoded: Sequence[EncoderSample], num_positions: int, ou
         TEXT_EMBEDDING: np.stack([text for text in texts if text is not None]),
     }
     return {name: embeddings[name] for name in outputs}
+
+
+def _descriptions(descriptions: Sequence[tuple[str, str]]) -> Tensors:
+    """Return the optional tensor of the descriptions, unless all are empty."""
+    if not any(map(any, descriptions)):
+        return {}
+    return {DESCRIPTIONS: np.array([[text.encode() for text in each] for each in descriptions], np.object_)}
 
 
 def _lengths(sample: Sample) -> tuple[int, int]:
@@ -197,10 +213,12 @@ def _decode_encoder_sample(row: Row, known: Known) -> EncoderSample:
 
 
 def _trajectory(row: Row, positions: npt.NDArray[Any], known: Known) -> Trajectory:
-    if FRAME_DIGESTS in row:
-        return Trajectory(named=_named([bytes(digest) for digest in positions], known), task=_task(row))
     if FRAMES in row:
-        return Trajectory(frames=positions, task=_task(row))
+        shown: dict[str, Any] = {"frames": positions}
+        if FRAME_DIGESTS in row:
+            shown = {"named": _named([bytes(digest) for digest in positions], known)}
+        robot, camera = (_text(row, DESCRIPTIONS, place) for place in (0, 1)) if DESCRIPTIONS in row else ("", "")
+        return Trajectory(**shown, task=_text(row, TASK), robot_description=robot, camera_description=camera)
     return Trajectory(video_embeddings=positions, text_embedding=row[TEXT_EMBEDDING])
 
 
@@ -237,9 +255,9 @@ def _unpadded(row: Row, name: str, total: int) -> npt.NDArray[Any]:
     return positions[:total]
 
 
-def _task(row: Row) -> str:
-    raw = row[TASK][0]
+def _text(row: Row, name: str, place: int = 0) -> str:
+    raw = row[name][place]
     try:
         return raw.decode() if isinstance(raw, bytes) else str(raw)
     except UnicodeDecodeError:
-        raise InvalidSampleError.at(TASK, "UTF-8 text", "other bytes") from None
+        raise InvalidSampleError.at(name, "UTF-8 text", "other bytes") from None

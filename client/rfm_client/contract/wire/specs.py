@@ -27,6 +27,7 @@ FRAMES = "frames"
 SECOND_FRAMES = "second_frames"
 FRAME_DIGESTS = "frame_digests"
 TASK = "task"
+DESCRIPTIONS = "descriptions"
 
 PROGRESS = "progress"
 SUCCESS = "success"
@@ -75,6 +76,7 @@ _FRAMES_SPECS = (
     TensorSpec(TASK, "BYTES", (1,)),
 )
 _DIGESTS_SPEC = TensorSpec(FRAME_DIGESTS, "UINT8", (VARIABLE, DIGEST_BYTES), ragged=True, optional=True)
+_DESCRIPTIONS_SPEC = TensorSpec(DESCRIPTIONS, "BYTES", (2,), optional=True)
 
 
 def frame_digest(frame: UInt8Array) -> bytes:
@@ -90,9 +92,14 @@ def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
     return (*_QUESTION_SPECS, video, TensorSpec(TEXT_EMBEDDING, "FP32", (text_dim,)))
 
 
-def frame_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
-    """Return the inputs of a model that scores raw frames; ``by_digest``: with the digests of frames."""
-    return (*_QUESTION_SPECS, *_FRAMES_SPECS, *([_DIGESTS_SPEC] if by_digest else []))
+def frame_inputs(*, by_digest: bool = False, described: bool = False) -> tuple[TensorSpec, ...]:
+    """Return the inputs of a model that scores raw frames.
+
+    by_digest: with the digests of frames
+    described: with descriptions of robot and camera
+    """
+    more = [*([_DESCRIPTIONS_SPEC] if described else []), *([_DIGESTS_SPEC] if by_digest else [])]
+    return (*_QUESTION_SPECS, *_FRAMES_SPECS, *more)
 
 
 def encoder_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
