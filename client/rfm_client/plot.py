@@ -78,7 +78,9 @@ def plot_scores(
                 colour, line = _COLOURS[number % len(_COLOURS)], _LINES[number // len(_COLOURS)]
                 marker = "o" if len(x) == 1 else ""  # a point alone makes no line
                 label = _shortened(names[number]) if score == result.leading else None
-                ax.plot(x, getattr(result, score), color=colour, linestyle=line, marker=marker, lw=1.2, label=label)
+                values = getattr(result, score)
+                known = ~np.isnan(values)  # the line passes over frames without an answer
+                ax.plot(x[known], values[known], color=colour, linestyle=line, marker=marker, lw=1.2, label=label)
             about = FRAME_SCORES[score]
             ax.set(ylabel=about.title(score), **({} if None in about.bounds else {"ylim": (-0.02, 1.02)}))
         axes[-1].set_xlabel("time (s)" if has_times else "frame")

@@ -23,14 +23,14 @@ from rfm.checkpoint.content import CheckpointError, is_there, read_json, shown
 from rfm.checkpoint.provenance import HUB_FOLDER
 from rfm.engine.device import memory_errors
 from rfm.engine.execution import Execution
-from rfm.engine.predictor import RowScores
+from rfm.engine.predictor import RowScores, no_success
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.images import QwenImages
 from rfm.vlm.language import LanguageCollator, LanguageConfig
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.qwen import Indices, KeyValues, next_hidden_state
 from rfm.vlm.row import VlmRow
-from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError
+from rfm_client.contract import FrameScores, InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.samples import Float32Array
 
 NOT_FINITE = -1  # instead of a token: some of its logits are not finite
@@ -65,6 +65,7 @@ class WritingCollator(LanguageCollator):
 
     config: Any
     digits: Sequence[int] = ()
+    makes_trees = False  # an answer is written behind each conversation
 
     def __init__(self, config: WritingConfig, tokenizer: Any, images: QwenImages, draft: str) -> None:
         super().__init__(config, tokenizer, images)
@@ -117,7 +118,6 @@ class WritingPredictor(VlmPredictor):
     """
 
     collator: WritingCollator
-    makes_trees = False  # an answer is written behind each conversation
     expected: str
 
     def read(
@@ -214,6 +214,12 @@ class WritingPredictor(VlmPredictor):
         """Cache the features of a pass, if all are finite."""
         if made is None or bool(made.isfinite().all()):
             self._keep(rows, batch.layout, made)
+
+
+def progress_of(score: float) -> RowScores:
+    """Return the scores of a row whose answer holds one number."""
+    progress = np.array([score])
+    return RowScores([FrameScores(progress=progress, success=no_success(progress))])
 
 
 def unread(expected: str, text: str) -> InvalidSampleError:

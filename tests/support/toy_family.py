@@ -104,6 +104,7 @@ class ToyPredictor:
     network: Redness
     works_ahead: bool = False
     has_progress: bool = True
+    reads_views: bool = False
     has_success: bool = True
 
     def rows(self, sample: Sample) -> list[list[np.ndarray]]:

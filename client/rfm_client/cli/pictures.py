@@ -108,9 +108,15 @@ def _draw(part: SubFigure, panel: Panel) -> None:
         if np.isnan(scores).all():
             handles += own.plot([], [], color=colour, label=f"{name}: not predicted")
         else:
-            label = FRAME_SCORES[name].title(name)
+            label, known = FRAME_SCORES[name].title(name), ~np.isnan(scores)
             handles += own.plot(
-                panel.positions, scores, color=colour, linestyle=line, marker=marker, markersize=4, label=label
+                np.asarray(panel.positions)[known],
+                scores[known],
+                color=colour,
+                linestyle=line,
+                marker=marker,
+                markersize=4,
+                label=label,
             )
     axes.set(xlabel="time (s)" if panel.unit == "s" else "frame")
     if leading.unit:

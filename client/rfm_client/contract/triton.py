@@ -14,7 +14,7 @@ from urllib.parse import urljoin
 
 from rfm_client.contract import errors
 from rfm_client.contract.names import frames_name
-from rfm_client.contract.wire import NUM_FRAMES, SECOND_FRAMES
+from rfm_client.contract.wire import GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 
@@ -54,6 +54,10 @@ _WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not m
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
 )
 _NO_SECOND_FRAMES = re.compile(rf"expected \d+ inputs but got .*'{SECOND_FRAMES}'|unexpected .*input '{SECOND_FRAMES}'")
+_NO_VIEWS = re.compile(
+    r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*input )"
+    rf"'(?P<name>{'|'.join((*VIEWS, GOAL))})'"
+)
 _NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
 _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as ``LocatedError`` writes them
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
@@ -139,6 +143,9 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
         expected = "a model that takes pairs of two frame sizes"
         got, remedy = "one that was exported before there was this input", "export it again, or resize a trajectory"
         return errors.InvalidSampleError.at(SECOND_FRAMES, expected, got, remedy)
+    if (views := _NO_VIEWS.search(text)) is not None:
+        expected = "a model that reads views and a goal (Robo-Dopamine)"
+        return errors.InvalidSampleError.at(views["name"], expected, "one that reads the frames of one camera")
     if PROCESS_ENDED in text and "Stub process" in text:
         return errors.ProcessEndedError(text)
     if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: a retry may succeed
