@@ -91,7 +91,9 @@ def plot_scores(
                 colour, line = colours[number % len(colours)], _LINES[number // len(colours)]
                 marker = "o" if len(x) == 1 else ""  # a point alone makes no line
                 label = _shortened(names[number]) if score == result.leading else None
-                ax.plot(x, getattr(result, score), color=colour, linestyle=line, marker=marker, label=label)
+                values = getattr(result, score)
+                known = ~np.isnan(values)  # the line passes over frames without an answer
+                ax.plot(x[known], values[known], color=colour, linestyle=line, marker=marker, label=label)
             about = FRAME_SCORES[score]
             ax.set_ylabel(about.title(score))
             if None not in about.bounds:

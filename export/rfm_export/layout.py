@@ -113,8 +113,11 @@ def generated_models(description: Description, encoders: Description | None, ver
     # A frame reference needs the cache that holds the frame, but Triton chooses the instance: so only one may exist.
     has_one_cache = cache_mib > 0 and version.num_gpus <= 1
     outputs = wire.score_outputs(description.progress_bins, description.more_scores)
-    of_frames = wire.frame_inputs(by_digest=keeps and has_one_cache, described=description.reads_descriptions)
-    inputs = of_frames if widths is None else wire.embedding_inputs(*widths)
+    has_digests = keeps and has_one_cache
+    inputs = wire.frame_inputs(
+        by_digest=has_digests, described=description.reads_descriptions, with_views=description.reads_views
+    )
+    inputs = inputs if widths is None else wire.embedding_inputs(*widths)
     scorer = Interface(scorer_name(description, name), inputs, outputs, description)
     version = replace(version, settings=settings)
     models = [_python_model(scorer, "rfm", version, _warmups(description), keeps=keeps)]

@@ -6,29 +6,26 @@ L tokens. Source: ``rynn_value`` of ``alibaba-damo-academy/RynnValue``.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from rfm.checkpoint.content import CheckpointError
 from rfm.engine.predictor import check_type
 from rfm.rynnvalue.batch import RynnBatch
 from rfm.rynnvalue.network import RynnConfig
 from rfm.vlm.collator import IMAGE_PAD, VISION_END, VISION_START, VlmCollator, video_of
-from rfm.vlm.images import MERGE, QwenImages, check_aspect, scaled_in_integers
+from rfm.vlm.images import BoundedImages
 from rfm.vlm.leaves import Leaf, fits
 from rfm.vlm.prompts import KEPT_TEXTS
 from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees
 from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import ProgressSample, Sample
-from rfm_client.contract.samples import DESCRIPTION_FIELDS, UInt8Array
+from rfm_client.contract.samples import DESCRIPTION_FIELDS
 
 VALUE_TOKEN, RELATIVE_TOKEN = "<value>", "<relative_value>"
 IMAGE = VISION_START + IMAGE_PAD + VISION_END
@@ -47,31 +44,6 @@ BEHIND_FRAMES = (
     "- Success: whether the agent has completed the task (Yes/No)."
     "Analysis: \n"
 )
-
-
-@dataclass(frozen=True)
-class RynnImages(QwenImages):
-    """The preprocessing of frames: each is an image within a number of pixels."""
-
-    least_px: int = field(kw_only=True)
-    most_px: int = field(kw_only=True)
-
-    def images_to_size(self, frames: UInt8Array) -> Tensor:
-        """Resize frames to separate images: uint8 [T, H, W, 3] -> [T, H', W', 3]."""
-        pixels = torch.from_numpy(frames if frames.flags.writeable else frames.copy())
-        return scaled_in_integers(pixels, self._image_size(frames.shape[1], frames.shape[2]))
-
-    def _image_size(self, height: int, width: int) -> tuple[int, int]:
-        check_aspect(height, width)
-        factor = self.patch_px * MERGE
-        rows, columns = (round(side / factor) * factor for side in (height, width))
-        if rows * columns > self.most_px:
-            scale = math.sqrt(height * width / self.most_px)
-            rows, columns = (max(factor, math.floor(side / scale / factor) * factor) for side in (height, width))
-        elif rows * columns < self.least_px:
-            scale = math.sqrt(self.least_px / (height * width))
-            rows, columns = (math.ceil(side * scale / factor) * factor for side in (height, width))
-        return rows, columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +76,9 @@ class RynnCollator(VlmCollator):
     """
 
     config: RynnConfig  # type: ignore[assignment]  # not a VlmConfig, whose heads differ
-    images: RynnImages
+    images: BoundedImages
 
-    def __init__(self, config: RynnConfig, tokenizer: Any, images: RynnImages) -> None:
+    def __init__(self, config: RynnConfig, tokenizer: Any, images: BoundedImages) -> None:
         super().__init__(config, tokenizer, images)  # type: ignore[arg-type]  # not a VlmConfig
         self._around_frames = lru_cache(KEPT_TEXTS)(self._rendered)
 

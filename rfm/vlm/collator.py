@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -48,6 +48,8 @@ class VlmCollator:
     tokenizer: the base model's, with the checkpoint's special tokens and a chat template
     images: the backbone's preprocessing
     """
+
+    makes_trees: ClassVar[bool] = True  # of prefixes, whose common beginnings are computed once
 
     def __init__(self, config: VlmConfig, tokenizer: Any, images: QwenImages) -> None:
         self.config = config

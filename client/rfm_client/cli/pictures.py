@@ -211,8 +211,9 @@ def _draw_curves(axes: Axes, panel: Panel) -> None:
         if np.isnan(scores).all():
             handles += own.plot([], [], color=COLOURS[name], label=f"{name}: not predicted")
         else:
-            label = FRAME_SCORES[name].title(name)
-            handles += own.plot(panel.positions, scores, color=COLOURS[name], marker="o", label=label, clip_on=False)
+            label, known = FRAME_SCORES[name].title(name), ~np.isnan(scores)
+            positions = np.asarray(panel.positions)[known]
+            handles += own.plot(positions, scores[known], color=COLOURS[name], marker="o", label=label, clip_on=False)
             if name == "success":
                 label = f"threshold {SUCCESS_THRESHOLD}"
                 handles.append(own.axhline(SUCCESS_THRESHOLD, **THRESHOLD, label=label))

@@ -15,7 +15,7 @@ from urllib.parse import urljoin
 
 from rfm_client.contract import errors
 from rfm_client.contract.names import frames_name
-from rfm_client.contract.wire import DESCRIPTIONS, NUM_FRAMES, SECOND_FRAMES
+from rfm_client.contract.wire import DESCRIPTIONS, GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 
@@ -56,8 +56,10 @@ _WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not m
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
 )
 _NO_INPUT = re.compile(
-    rf"(?:expected \d+ inputs but got .*|unexpected .*input )'(?P<name>{SECOND_FRAMES}|{DESCRIPTIONS})'"
+    r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*input )"
+    rf"'(?P<name>{'|'.join((SECOND_FRAMES, DESCRIPTIONS, *VIEWS, GOAL))})'"
 )
+_OF_VIEWS = ("a model that reads views and a goal, such as Robo-Dopamine", "leave out views and goal")
 # What a model without an optional input is sent it for, and the remedy.
 _WITHOUT = {
     SECOND_FRAMES: ("a model that takes pairs of two frame sizes", "export it again, or resize a trajectory"),
@@ -65,6 +67,7 @@ _WITHOUT = {
         "a model whose prompt names robot and camera, such as RynnValue",
         "leave out robot_description and camera_description, or export a RynnValue again",
     ),
+    **dict.fromkeys((*VIEWS, GOAL), _OF_VIEWS),
 }
 _NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
 _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as ``LocatedError`` writes them

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -27,6 +28,7 @@ from rfm_client.contract.wire.specs import (
     FRAME_DIGESTS,
     FRAME_STEPS,
     FRAMES,
+    GOAL,
     NUM_FRAMES,
     SAMPLE_TYPE,
     SECOND_FRAMES,
@@ -34,6 +36,7 @@ from rfm_client.contract.wire.specs import (
     TEXT_EMBEDDING,
     UNKNOWN_FRAMES,
     VIDEO_EMBEDDINGS,
+    VIEWS,
     SampleType,
     Tensors,
     encoder_inputs,
@@ -54,7 +57,10 @@ _SAMPLE_TYPES = {
 
 
 def encode_samples(samples: Sequence[Sample]) -> Tensors:
-    """Return one request. Apart from time, all first trajectories need one shape, and all second trajectories, too."""
+    """Return one request. Apart from time, all first trajectories need one shape, and all second trajectories, too.
+
+    All samples need the same views and goal, of the same shapes, or none.
+    """
     tensors: Tensors = {
         SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
         NUM_FRAMES: np.array([_lengths(sample) for sample in samples], np.int32),
@@ -65,6 +71,10 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
     arrays = zip(*(stackable(sample.trajectories) for sample in samples), strict=True)
     for name, rows in zip((FRAMES, SECOND_FRAMES) if has_frames else (VIDEO_EMBEDDINGS,), arrays, strict=False):
         tensors[name] = pad_stack([[trajectory.positions for trajectory in row] for row in rows])
+    views = zip(*(text.views for text in texts), strict=True)
+    tensors |= {name: pad_stack([[view] for view in rows]) for name, rows in zip(VIEWS, views, strict=False)}
+    if texts[0].goal is not None:
+        tensors[GOAL] = np.stack([text.goal for text in texts if text.goal is not None])
     if has_frames:
         tensors[TASK] = np.array([[text.task.encode()] for text in texts], np.object_)
         tensors |= _descriptions([text.descriptions for text in texts])
@@ -194,7 +204,13 @@ def _decode_sample(row: Row, known: Known) -> Sample:
         if lengths[0] < 1 or lengths[1] != 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
         positions, _ = _positions(row, lengths)
-        return ProgressSample(_trajectory(row, positions, known), frame_steps)
+        views = tuple(_unpadded(row, name, lengths[0]) for name in VIEWS if name in row)
+        trajectory = _trajectory(row, positions, known)
+        if views or GOAL in row:
+            trajectory = replace(trajectory, views=views, goal=row.get(GOAL))
+        return ProgressSample(trajectory, frame_steps)
+    if given := [name for name in (*VIEWS, GOAL) if name in row]:
+        raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {given[0]}", SampleType(sample_type).name.lower())
     if FRAME_DIGESTS in row:
         raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {FRAME_DIGESTS}", SampleType(sample_type).name.lower())
     if min(lengths) < 1:
