@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
+from urllib.parse import urlencode
 
 import numpy as np
 import pytest
@@ -335,6 +336,22 @@ def test_the_threshold_is_dragged_in_the_chart(page: Page) -> None:
     value = float(page.browser["threshold"].get_attribute("value"))
     first = np.flatnonzero(np.array(video["success"]) >= value)[0]
     assert page.browser.cells("#curves tr")[0][7] == f"{first / FPS:.2f} s"
+
+
+def test_a_link_has_the_settings_and_says_if_its_model_is_not_served(page: Page) -> None:
+    asked = {"rule": "linspace_trunc", "frames": "4", "fps": "5", "orient": "rotate90", "threshold": "0.7"}
+    link = f"task=go&{urlencode(asked)}"
+    page.browser.driver.get("about:blank")
+    page.browser.open(f"{page.gateway.url}/#{link}")
+    page.browser.until("document.getElementById('advanced').open")
+    assert {name: page.browser[name].get_attribute("value") for name in asked} == asked
+    assert page.browser["tasks"].get_attribute("value") == "go"
+    assert page.browser["errors"].text == ""
+    page.browser.write("fps", "2")
+    poll(lambda: page.browser.run("return location.hash") == f"#{link.replace('fps=5', 'fps=2')}")
+    page.browser.driver.get("about:blank")
+    page.browser.open(f"{page.gateway.url}/#model=gone")
+    assert page.browser["errors"].text.startswith("The model gone is not served here")
 
 
 def legend(page: Page) -> list[str]:

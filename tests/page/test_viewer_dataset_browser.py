@@ -390,7 +390,7 @@ def test_ten_thousand_episodes_are_a_few_rows_of_the_document(
         assert numbers[-1] == NUM_LARGE - 1
         page.browser["choose-shown"].click()
         assert page.browser["chosen-told"].text == f"{NUM_LARGE} episodes selected"
-        assert len(page.browser["use-words"].text) == 400
+        assert 390 < len(page.browser["use-words"].text) <= 400  # cut between numbers
         for name in ("clipboard-read", "clipboard-write"):
             granted = {"origin": page.url, "permission": {"name": name}, "setting": "granted"}
             page.browser.driver.execute_cdp_cmd("Browser.setPermission", granted)
@@ -445,10 +445,10 @@ def test_keys_play_the_episode_step_to_the_next_and_close_it(page: Page) -> None
 
     press(Keys.SPACE)
     page.browser.until_text("episode-play", "Pause")
-    press("n")
-    page.browser.until_text("episode-title", f"Episode {second}")
-    press("p")
-    page.browser.until_text("episode-title", f"Episode {first}")
+    for key, episode in (("n", second), ("p", first)):
+        press(key)
+        page.browser.until_text("episode-title", f"Episode {episode}")
+        page.browser.until(f"document.querySelectorAll('{VIDEOS}').length === 2 && {ARE_THERE}")
     page.browser.write("task-part", "n")
     assert page.browser["episode-title"].text == f"Episode {first}"
     page.browser.run("document.activeElement.blur()")
@@ -466,6 +466,7 @@ def test_each_row_has_the_first_frame_and_the_curve(page: Page) -> None:
     )
     for episode, text in points:
         labels = columns_of(page.folders[BRIGHT], int(episode))["progress_sparse"]
+        labels = labels[np.linspace(0, len(labels) - 1, min(32, len(labels))).round().astype(int)]
         heights = [float(point.split(",")[1]) for point in text.split()]
         assert heights == pytest.approx([1 + (1 - value) * 18 for value in labels], abs=0.06)
 

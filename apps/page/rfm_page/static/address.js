@@ -6,11 +6,12 @@ const AFTER_MS = 250; // browsers refuse more than some changes a second, and sl
 
 export class Address {
   #timer = null;
+  #late = null; // what a timer will do
 
   /** onGo(params): somebody goes back, goes forth, or types an address */
   constructor(onGo) {
     addEventListener("popstate", () => {
-      clearTimeout(this.#timer);
+      this.#forget();
       onGo(this.params);
     });
   }
@@ -22,13 +23,26 @@ export class Address {
   /** Tells soon what is shown then, in place of what was shown. paramsOf(): what is shown */
   correct(paramsOf) {
     clearTimeout(this.#timer);
-    this.#timer = setTimeout(() => this.#write(paramsOf(), "replaceState"), AFTER_MS);
+    this.#late = () => this.#write(paramsOf(), "replaceState");
+    this.#timer = setTimeout(() => this.settle(), AFTER_MS);
+  }
+
+  /** Tells at once what would be told soon. */
+  settle() {
+    clearTimeout(this.#timer);
+    this.#late?.();
+    this.#late = null;
   }
 
   /** Tells what is shown now; Back leads to what was shown before. */
   step(params) {
-    clearTimeout(this.#timer);
+    this.#forget();
     this.#write(params, "pushState");
+  }
+
+  #forget() {
+    clearTimeout(this.#timer);
+    this.#late = null;
   }
 
   #write(params, how) {

@@ -140,7 +140,7 @@ export class DatasetTab {
     const { dataset } = this.#page;
     dataset.replaceChildren(...this.#datasets.map(({ name, kind }, index) => new Option(`${name} (${kind.replace("LeRobot ", "")})`, index)));
     this.#page.datasets.hidden = this.#page["dataset-side"].hidden = !this.#datasets.length;
-    this.#page.fold.disabled = !this.#page["dataset-panel"].hidden && !this.#datasets.length;
+    if (!this.#page["dataset-panel"].hidden) this.#page.fold.disabled = !this.#datasets.length;
     if (this.#datasets.length) await this.show(this.#wanted);
     this.#onShown(false);
     return this.#datasets.length > 0;

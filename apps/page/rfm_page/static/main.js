@@ -475,6 +475,7 @@ function shownTab(index) {
   page.fold.disabled = index === 2 || (index === 1 && page["dataset-side"].hidden);
   page.status.textContent = "";
   const isStep = index !== shownIndex;
+  if (isStep) address.settle(); // of the tab that was shown
   shownIndex = index;
   if (isStep) told(true);
   if (index === 0) update();

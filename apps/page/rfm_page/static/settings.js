@@ -50,6 +50,7 @@ export class Settings {
       if (name === "rule") control.dispatchEvent(new Event("change"));
     }
     this.#page.resize.checked = this.#wanted.has(RESIZE);
+    if (this.params.some(([name]) => name !== TASK)) this.#page.advanced.open = true; // nobody scores with others unseen
     return wanted === null || wanted === this.#page.model.value ? null : wanted;
   }
 }

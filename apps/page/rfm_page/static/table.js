@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // The curves as a table: what was asked, and how each ends.
 
-import { colourOf } from "./chart.js";
+import { colourName } from "./chart.js";
 import { cellOf, leadingOf } from "./signals.js";
 import { cut, NONE, shown } from "./text.js";
 
@@ -38,7 +38,7 @@ export function named(curve, name) {
   const swatch = document.createElement("span");
   header.scope = "row";
   swatch.className = "swatch";
-  swatch.style.background = colourOf(curve);
+  swatch.style.background = curve.colour ?? `var(--${colourName(curve.index)})`; // of either theme
   header.title = name;
   header.append(swatch, cut(name, NAME_LETTERS));
   return header;

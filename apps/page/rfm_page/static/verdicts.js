@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // Which of two videos does a task better: the model is asked in both orders, and both answers are shown.
 
-import { colourOf } from "./chart.js";
+import { colourName } from "./chart.js";
 import { shown } from "./text.js";
 
 const CHUNK_BYTES = 4 * 2 ** 20;
@@ -42,7 +42,7 @@ function answersOf(videos, { orders }) {
     [ofFirst, 1 - ofFirst].forEach((share, place) => {
       const part = bar.appendChild(document.createElement("span"));
       part.style.width = `${100 * share}%`;
-      part.style.background = colourOf({ colour: videos[place].colour, index: videos[place].place });
+      part.style.background = videos[place].colour ?? `var(--${colourName(videos[place].place)})`;
     });
     item.prepend(bar);
     list.append(item);
