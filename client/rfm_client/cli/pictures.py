@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MOST_FRAMES, FEWEST_FRAMES = 8, 5  # of a strip
-EVEN_ENOUGH = 1.3  # largest gap between frames of a strip, as a multiple of the smallest
+ALL_FRAMES = 10  # that a strip may show, if they are all frames of the trajectory
+MOST_FRAMES, FEWEST_FRAMES = 8, 5  # of a strip of a longer one
+EVEN_ENOUGH = 1.4  # largest gap between frames of a strip, as a multiple of the smallest
 WIDTH_IN = 7.0  # of a page
 COLUMN_WIDTH_IN = 4.8  # of panels side by side
 
@@ -81,7 +82,8 @@ class Panel:
 def _evenly(positions: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
     """Return the indices of frames for a strip: as many as lie at even distances, the first and the last included."""
     best, least = np.arange(len(positions)), np.inf
-    for count in range(MOST_FRAMES, FEWEST_FRAMES - 1, -1):
+    counts = range(MOST_FRAMES, FEWEST_FRAMES - 1, -1)
+    for count in (*[len(positions)] * (len(positions) <= ALL_FRAMES), *counts):
         targets = np.linspace(positions[0], positions[-1], count)
         shown = np.unique(np.abs(positions - targets[:, None]).argmin(axis=1))
         gaps = np.diff(positions[shown])
