@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import typer
 
@@ -22,7 +23,7 @@ def told(error: Exception) -> str:
 
 def in_plain_words(error: typer.BadParameter) -> str:
     """Return the message of an invalid value without the words of pydantic, with which typer validates."""
-    details = getattr(error.__cause__, "errors", list)()
+    details: list[Any] = getattr(error.__cause__, "errors", list)()
     expected = _EXPECTED.get(details[0]["type"]) if details else None
     if expected is None:
         return error.message.removeprefix("Value error, ")
