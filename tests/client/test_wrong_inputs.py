@@ -140,10 +140,6 @@ FAILURES = {
     "rfm-client status --url http://localhost:1": (
         *(3, f"http://localhost:1: no connection: Connection refused: {STARTED}"),
     ),
-    f"rfm-client wait --timeout 0.1 --url {NOBODY}": (
-        *(4, f"{NOBODY}: expected rfm to be ready within 0.1 s, got no such answer: "),
-        "rfm-client status shows what it does; rfm serve starts one",
-    ),
     "rfm-client evaluate nope": (1, "nope: expected a labelled dataset, got no file or folder of this name"),
     "rfm-client evaluate dataset": (
         1,

@@ -76,7 +76,7 @@ TEXTS: dict[str, tuple[str, Any]] = {
     "a field": ("samples[1].task: expected text, got 1", ("samples[1].task", "text", "1", "")),
     "too many frames": (
         "num_frames: expected at most 16, got 17",
-        ("num_frames", "at most 16", "17", triton._FEWER_FRAMES),
+        ("num_frames", "at most 16", "17", triton.FEWER_FRAMES),
     ),
     "other text": ("no reason given", ("", "", "", "")),
 }

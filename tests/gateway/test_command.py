@@ -48,7 +48,7 @@ def test_the_key_is_that_of_the_file_or_else_of_the_variable(tmp_path: Path) -> 
 
 NO_KEY = "'--api-key-file': expected a key, here or in RFM_GATEWAY_API_KEY, got no character"
 BAD_OPTIONS = {
-    "--triton localhost:8001": "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
+    "--triton localhost:8001": "'--triton': expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
     "--allow-folder nowhere": "No such file or directory",
     "--api-key-file nowhere": "'--api-key-file': expected a text file, got",
     f"--api-key-file {os.devnull}": NO_KEY,

@@ -70,7 +70,7 @@ def test_faults_of_several_episodes_have_a_line_each(tmp_path: Path, output: Pat
             ],
         )
     result = own(root, *ENGINE, "--task-column", "subtask", "--output", output)
-    assert (result.exit_code, "task_column: expected one of task_index, got 'subtask'" in result.stderr) == (1, True)
+    assert (result.exit_code, "--task-column: expected one of task_index, got 'subtask'" in result.stderr) == (1, True)
 
 
 @pytest.mark.triton

@@ -212,10 +212,12 @@ def wait(server: WaitOptions) -> None:
     try:
         with server.client() as client:
             client.wait_ready(server.timeout_s)
-    except DeadlineExceededError:
-        where, remedy = ", ".join(server.urls), "rfm-client status shows what it does; rfm serve starts one"
-        expected = f"{where}: expected {server.model} to be ready within {server.timeout_s:g} s, got no such answer"
-        raise DeadlineExceededError(f"{expected}: {remedy}") from None
+    except DeadlineExceededError as error:
+        servers = ", ".join(server.urls)
+        problem = str(error) if server.urls[0] in str(error) else f"{servers}: {error}"
+        raise DeadlineExceededError(
+            f"{problem}: start a server there (rfm serve), or wait longer (--timeout)"
+        ) from None
     typer.echo(f"ready after {time.monotonic() - started_s:.1f} s")
 
 
