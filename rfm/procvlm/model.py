@@ -95,7 +95,7 @@ class ProcVlmCheckpoint(ImagesCheckpoint):
     made_of = ProcVlmConfig
     made_for = ProcVlmPredictor
     of_user: ClassVar[dict[str, type]] = {"max_new_tokens": int}
-    notes: ClassVar[list[str]] = [UNVERIFIED]  # type: ignore[misc]  # a line for each export
+    notes: ClassVar[list[str]] = [UNVERIFIED]  # a line for each export
 
     @property
     def description(self) -> Description:
