@@ -223,3 +223,22 @@ def test_an_export_gives_the_same_scores_and_takes_another_mode(tmp_path: Path) 
     np.testing.assert_array_equal(before.progress, after.progress)
     changed = families.load(tmp_path / "saved", reward_model="robodopamine,mode=mean")
     assert {each.name: each.source for each in changed.decisions()}["mode"] == "--as"
+
+
+def test_cached_features_give_the_same_scores() -> None:
+    case, execution = case_named("backward_T5"), Execution()
+    checkpoint = families.load(CHECKPOINT, reward_model=case.said)
+    cached = Engine.of(checkpoint, feature_cache_mib=64)
+    (expected,), (first,) = case.engine().evaluate([case.sample]), cached.evaluate([case.sample])
+    (again,) = cached.evaluate([case.sample], execution)
+    assert isinstance(expected, ProgressResult), expected
+    for result in (first, again):
+        np.testing.assert_array_equal(result.progress, expected.progress)
+    assert execution.num_encoded == 0
+    assert execution.num_found > 0
+
+
+def test_the_work_grows_with_the_number_of_questions() -> None:
+    checkpoint = families.load(CHECKPOINT, reward_model="robodopamine,mode=mean")
+    short, long = (checkpoint.flop(ProgressSample(Trajectory(frames=FRONT[[0] * count], task="t"))) for count in (2, 3))
+    assert 1.9 < long / short < 2.1  # twice as many questions
