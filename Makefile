@@ -194,8 +194,7 @@ lock:
 
 PROJECTS := pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.toml)
 VERSIONED := $(PROJECTS) CITATION.cff docker/.env.example docker/compose.yaml \
-  docker/kubernetes/kserve/kustomization.yaml $(wildcard docker/kubernetes/overlays/*/kustomization.yaml) docs/guides/deploy.md \
-  docs/guides/gpu_box.md
+  docker/kubernetes/kserve/kustomization.yaml $(wildcard docker/kubernetes/overlays/*/kustomization.yaml) docs/guides/deploy.md
 
 # Write a version into every file that names it: make version VERSION=1.2.3
 version:

@@ -1,13 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""A MkDocs hook that replaces links to files outside ``docs/`` by their names, since the site lacks those files."""
+"""A MkDocs hook: README.md is the home page, and links to files outside ``docs/`` show the names of these files."""
 
 from __future__ import annotations
 
 import re
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+README = Path(__file__).parents[1] / "README.md"
+RELATIVE = re.compile(r"\]\((?!\w+:|#)")
 LINK = re.compile(r"\[([^\]]+)\]\(((?:\.\./)+[^)#\s]+)(?:#[^)\s]*)?\)")
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add README.md as the home page."""
+    from mkdocs.structure.files import File
+
+    home = RELATIVE.sub("](../", README.read_text()).replace("](../docs/", "](")
+    files.append(File.generated(config, "index.md", content=home))
+    return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:

@@ -22,7 +22,7 @@ PORT_STEP = 20  # the defaults stay different from each other
 SECURITY_FLOOR = (
     2,
     71,
-)  # NVIDIA's container 26.07; earlier versions have remote vulnerabilities: docs/guides/secure.md
+)  # NVIDIA's container 26.07; earlier versions have remote vulnerabilities: docs/guides/deploy.md, "Ports"
 
 _given: deque[int] = deque(maxlen=256)  # ports whose servers may not listen yet
 

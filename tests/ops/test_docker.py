@@ -323,7 +323,7 @@ def test_every_service_is_confined(name: str) -> None:
 @pytest.mark.parametrize(("profile", "name"), [("gpu", "server"), ("cpu", "server-cpu")])
 def test_the_repository_that_the_guide_exports_is_served_unless_another_is_named(profile: str, name: str) -> None:
     """With the profile gpu, on the GPU."""
-    guide = (ROOT / "docs" / "guides" / "gpu_box.md").read_text()
+    guide = (ROOT / "docs" / "guides" / "deploy.md").read_text()
     for variables, source in (({}, "/srv/rfm/my_models"), ({"RFM_MODELS": "../model_repository"}, REPOSITORY)):
         service = composed(profile, **variables)["services"][name]
         (volume,) = service["volumes"]

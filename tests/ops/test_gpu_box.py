@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The guide "GPU box": the commands make keys and a certificate, and a real nginx serves with the guide's file."""
+"""The guide "Deploy a server": the commands make keys and a certificate, and a real nginx serves with the guide's file."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from tolerances import TOLERANCE
 
 pytestmark = pytest.mark.slow
 
-GUIDE = (ROOT / "docs" / "guides" / "gpu_box.md").read_text()
+GUIDE = (ROOT / "docs" / "guides" / "deploy.md").read_text()
 UNIT_FILE = ROOT / "docker" / "systemd" / "rfm-serve.service"
 BIN = Path(sys.executable).parent
 NAME, IP = "localhost", "127.0.0.1"  # the box, as clients call it in these tests

@@ -24,6 +24,7 @@ from click import Command, Context, Parameter
 from typer.main import get_command
 
 import clip
+import hdf5_writers
 import toy_dataset
 from in_process import rfm_app, rfm_client_app
 from labelling import LEROBOT
@@ -93,6 +94,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     )
     (tmp_path / "outcomes.csv").write_text(f"episode,success\n{outcomes}")
     toy_dataset.write(tmp_path / "demo_output" / "toy", clips=2)
+    hdf5_writers.write_aloha(tmp_path / "aloha_folder" / "episode_0.hdf5", {"top": hdf5_writers.video(4)})
+    maniskill = tmp_path / "trajectory.rgb.pd_ee_delta_pose.physx_cpu.h5"
+    hdf5_writers.write_maniskill(maniskill, {0: {"base_camera": hdf5_writers.video(4)}})
     np.savez(tmp_path / "episode.npz", frames=pictures(0), task="stack the cups")
     monkeypatch.chdir(tmp_path)
     return tmp_path
