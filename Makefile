@@ -214,10 +214,14 @@ model_repository: $(INSTALLED)
 	  --checkpoint build/demo_checkpoint/checkpoint \
 	  --image-encoder build/demo_checkpoint/image_encoder --text-encoder build/demo_checkpoint/text_encoder
 
+CHECK_PYTHON = 'import sys; own = sys.version_info[:2]; sys.exit("make: expected Python 3.10, 3.11 or 3.12, got %d.%d:" % own \
+  + " make $(MAKECMDGOALS) PYTHON=python3.12" if not (3, 10) <= own <= (3, 12) else 0)'
+
 $(VENV):
 	mkdir -p $@
 
 $(INSTALLED): pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.toml) constraints.txt | $(VENV)
+	@$(PYTHON) -c $(CHECK_PYTHON)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \

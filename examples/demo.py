@@ -11,17 +11,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import numpy as np
 import typer
-from rich.console import Console
 
 from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
+from rfm_client.cli.next_steps import next_steps, steps_with_server
 from rfm_client.cli.pictures import Panel, plot
-from rfm_client.cli.show import scores_table
+from rfm_client.cli.scoring import checkpoint_of, heading
+from rfm_client.cli.show import print_tables, scores_table
+from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.frames.inputs import load_trajectory
-from rfm_commands.demo import show_metrics
+from rfm_commands.try_video import steps_without_server
 from toy_world import Clip, Task, make_clip
-from toy_world.video import write_video
+from toy_world.video import FPS, write_video
 
 TASK, OTHER_TASK = Task("red", "bowl"), Task("green", "plate")
 REPOSITORY = Path(__file__).parents[1] / "model_repository"
@@ -51,20 +54,20 @@ class Clips(NamedTuple):
 def demo(
     url: Annotated[str | None, typer.Option(help="A server that runs, instead of the repository's.")] = None,
     repository: Annotated[Path, typer.Option(help="Triton model repository.")] = REPOSITORY,
-    seed: Annotated[int, typer.Option(help="Of the clips.")] = 2_000_000,
+    seed: Annotated[int, typer.Option(help="Seed of the clips.")] = 2_000_000,
     output: Annotated[Path, typer.Option(help="Folder for picture, clips and log.")] = Path("demo_output"),
 ) -> None:
     """Show progress, success, preference and similarity of toy-world clips in a table and a picture. Keep the clips."""
     output.mkdir(parents=True, exist_ok=True)
-    console = Console()
     trajectories = [filmed(clip, output / f"{name}.mp4") for name, clip in Clips.of(seed)._asdict().items()]
     if url is not None:
-        show_clips(url, trajectories, output / "rewards.png", console)
+        show_clips(url, trajectories, output / "rewards.png")
+        steps = steps_with_server(url, [DEFAULT_MODEL])
     else:
         with stopped_by_signals(), temporary_server(repository, output / "tritonserver.log") as endpoints:
-            show_clips(endpoints.grpc_url, trajectories, output / "rewards.png", console)
-            show_metrics(endpoints, console)
-    console.print(f"the clips as videos: {output}/*.mp4")
+            show_clips(endpoints.grpc_url, trajectories, output / "rewards.png")
+        steps = next_steps(*steps_without_server(_short(repository), output / "success.mp4", TASK.sentence()))
+    typer.echo(f"The curves are in {output / 'rewards.png'}, the clips in {output}/*.mp4.\n{steps}")
 
 
 def filmed(clip: Clip, file: Path) -> Trajectory:
@@ -73,7 +76,7 @@ def filmed(clip: Clip, file: Path) -> Trajectory:
     return load_trajectory(file, task=clip.task.sentence())
 
 
-def show_clips(url: str, trajectories: Sequence[Trajectory], picture: Path, console: Console) -> None:
+def show_clips(url: str, trajectories: Sequence[Trajectory], picture: Path) -> None:
     """Score the clips, in the order of ``Clips``, with one call. Print a table and draw a picture."""
     success, failure, rewound, wrong, second = trajectories
     samples: dict[str, Sample] = {
@@ -87,20 +90,25 @@ def show_clips(url: str, trajectories: Sequence[Trajectory], picture: Path, cons
     }
     with RewardClient(url) as client:
         results = client.evaluate(list(samples.values()))
+        checkpoint = checkpoint_of(client, success)
     answers = dict(zip(samples, results, strict=True))
-    console.print(scores_table(f'"{success.task}", asked at {url}', list(answers.items())))
+    print_tables(scores_table(f'"{success.task}"', list(answers.items())))
     panels = [
-        Panel.of(name, answers[name], sample.trajectory.frames)
+        Panel.of(name, answers[name], sample.trajectory.frames, np.arange(sample.trajectory.num_frames) / FPS)
         for name, sample in samples.items()
         if isinstance(sample, ProgressSample)
     ]
     preference, same, different = results[-3:]
     title = (
-        f'"{success.task}"\nP(success preferred to failure) {preference.preference:.3f}      '
+        f"{heading(success.task, [checkpoint])}\nP(success preferred to failure) = {preference.preference:.3f}; "
         f"similarity of two successes {same.similarity:.1f}, of success and another task {different.similarity:.1f}"
     )
     plot(picture, panels, title, columns=2)
-    console.print(f"picture: {picture}")
+
+
+def _short(folder: Path) -> Path:
+    """The folder as one would type it here."""
+    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
 if __name__ == "__main__":

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import typer
-from rich.console import Console
 
 from demo_evaluation.figures import Figure, figures
 from demo_evaluation.questions import HeldOut, noise_samples
 from rfm_client import Result, RewardClient, RewardError, Sample
-from rfm_client.cli.show import table
+from rfm_client.cli.show import print_tables, table
 
 Evaluate: TypeAlias = Callable[[Sequence[Sample]], Sequence[Result | RewardError]]
 REQUEST_SAMPLES = 64
@@ -42,7 +41,7 @@ def evaluate(
     with _evaluator(repository, url, checkpoint, output.parent) as ask:
         results, of_noise = _results(ask, held_out.samples()), _results(ask, noise_samples())
     found = figures(held_out, results, of_noise)
-    Console().print(table(f"{held_out.num_clips} held-out clips", ("figure", "value", "bound", ""), _rows(found)))
+    print_tables(table(f"{held_out.num_clips} held-out clips", ("figure", "value", "bound", ""), _rows(found)))
     record = {"clips": held_out.num_clips, "seed": seed, "figures": {each.name: each.value for each in found}}
     output.write_text(json.dumps(record, indent=1) + "\n")
     if not all(each.holds for each in found):

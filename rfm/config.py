@@ -157,11 +157,6 @@ class ServeConfig(Settings):
     http_threads: int | None = setting(
         None, "Threads for HTTP requests. Default: Triton's choice.", least=1, **_OF_A_MACHINE
     )
-    grpc_certificate: Path | None = setting(
-        None, "Serve gRPC with TLS and this certificate (PEM); HTTP then stays on 127.0.0.1."
-    )
-    grpc_key: Path | None = setting(None, "The certificate's key (PEM).")
-    grpc_client_ca: Path | None = setting(None, "Require client certificates from these authorities (PEM) over gRPC.")
     probe_s: int = setting(2, "Seconds between two probes of a model.", **_COUNT)
     hang_s: int = setting(
         DEFAULT_HANG_S,
@@ -169,6 +164,11 @@ class ServeConfig(Settings):
         **_COUNT,
     )
     triton_silent_s: int = setting(10, "Restart a Triton or gateway that does not answer for N seconds.", **_COUNT)
+    grpc_certificate: Path | None = setting(
+        None, "Serve gRPC with TLS and this certificate (PEM); HTTP then stays on 127.0.0.1."
+    )
+    grpc_key: Path | None = setting(None, "The certificate's key (PEM).")
+    grpc_client_ca: Path | None = setting(None, "Require client certificates from these authorities (PEM) over gRPC.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -28,7 +28,15 @@ __all__ = [
 ]
 
 # Packages in the order in which they are tried. ReWiND comes last: its first checkpoints do not name their network.
-FAMILIES = ("rfm.topreward", "rfm.roboreward", "rfm.rynnvalue", "rfm.vlm", "rfm.rewind")
+FAMILIES = (
+    "rfm.topreward",
+    "rfm.roboreward",
+    "rfm.robodopamine",
+    "rfm.procvlm",
+    "rfm.rynnvalue",
+    "rfm.vlm",
+    "rfm.rewind",
+)
 
 
 def named(package: str) -> Family:

@@ -34,8 +34,11 @@ def read_yaml(file: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> An
             return reading.construct_document(node)
         finally:
             reading.dispose()
+    except yaml.MarkedYAMLError as error:
+        place = "" if error.problem_mark is None else f" in line {error.problem_mark.line + 1}"
+        raise ValueError(f"a mistake{place} ({error.problem or error.context})") from error
     except _MISREAD as error:
-        raise ValueError(str(error) or type(error).__name__) from error
+        raise ValueError(" ".join(str(error).split()) or type(error).__name__) from error
 
 
 def _num_values(node: yaml.Node, known: dict[int, int | None]) -> int:

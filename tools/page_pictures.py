@@ -41,7 +41,7 @@ def score(gateway: Gateway, browser: Browser, folder: Path) -> None:
         clip.write(folder / f"{name}.mp4", make_clip(kind, TASK, SEEDS[kind]).frames, FPS)
     browser.open(gateway.url)
     browser.write("tasks", TASK.sentence())
-    browser.write("fps", str(FPS))
+    browser.run("document.getElementById('fps').value = arguments[0]", FPS)  # it is under Advanced
     page = test_viewer_browser.Page(gateway, browser, folder)
     page.score("success", "failure")
     browser["time"].send_keys(*[Keys.ARROW_RIGHT] * 12)

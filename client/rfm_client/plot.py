@@ -6,13 +6,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.checks import require
-from rfm_client.contract.results import FRAME_SCORES, FrameScores
+from rfm_client.contract.results import FRAME_SCORES, SUCCESS_THRESHOLD, FrameScores
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,16 +20,25 @@ if TYPE_CHECKING:
 __all__ = ["plot_scores", "save"]
 
 MAX_CURVES = 40  # colours times line styles
-DOTS_PER_IN = 200
+STYLE = ("default", "rfm_client.figure")  # figure.mplstyle has colours, fonts and lines of every figure
+COLOURS = {"progress": "C0", "success": "C2", "remaining_s": "C3"}  # of a score where a figure shows one trajectory
+THRESHOLD: dict[str, Any] = {
+    "color": "#75808a",
+    "linestyle": ":",
+    "linewidth": 0.9,
+    "zorder": 1,
+}  # the line at which success counts
+FAINT = "#4d5761"  # words of less weight
+GRID: dict[str, Any] = {"color": "#dde2e6", "linewidth": 0.5, "zorder": 0}
+BOUNDS = (-0.03, 1.03)  # of an axis from 0 to 1
 
 _WIDTH_IN = 3.5  # a column of two
-_HEIGHT_IN = 1.8
-_SUCCESS_IN = 0.9
-_LINE_IN = 0.17  # a line of text
+_HEIGHT_IN = 1.5
+_SUCCESS_IN = 0.7
+_LINE_IN = 0.15  # a line of text
 _LONGEST = 44  # characters of a name that a column has room for
-_COLOURS = tuple(f"C{index}" for index in range(10))
+_SHORT = 20  # characters, so that two names fit side by side
 _LINES = ("-", "--", "-.", ":")
-_STYLE = {"font.size": 8, "axes.titlesize": 8, "text.parse_math": False, "axes.grid": True, "grid.alpha": 0.3}
 
 
 def plot_scores(
@@ -43,7 +52,8 @@ def plot_scores(
 
     Models that predict another score in place of progress, such as remaining seconds, have an axis in its unit.
 
-    It is light, whatever style is set, and 3.5 inches wide. ``save`` writes it.
+    It is light, whatever style is set, and 3.5 inches wide. A dotted line marks a success of 0.5. ``save`` writes it.
+    ``matplotlib.style.use("rfm_client.figure")`` gives other figures the same style.
 
     names: of the curves, in the legend; long names lose their middle
     times_s: for each result float64 [T], the times of its T scored frames; the axis counts frames if one is unknown
@@ -68,33 +78,43 @@ def plot_scores(
     has_success = not all(np.isnan(result.success).all() for result in results)
     scores = [*dict.fromkeys(result.leading for result in results), *["success"] * has_success]
     heights_in = [_SUCCESS_IN if score == "success" else _HEIGHT_IN for score in scores]
-    with matplotlib.style.context(["default", _STYLE]):
-        figure = Figure(figsize=(_WIDTH_IN, sum(heights_in) + _LINE_IN * (len(results) + 2)), layout="constrained")
+    with matplotlib.style.context([*STYLE]):
+        colours = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]  # "C0" would be of a later style
+        columns = 2 if max(map(len, names)) <= _SHORT else 1
+        lines_in = _LINE_IN * (-(-len(results) // columns) + 3 + (title or "").count("\n"))
+        figure = Figure(figsize=(_WIDTH_IN, sum(heights_in) + lines_in), layout="constrained")
         axes = figure.subplots(len(heights_in), 1, sharex=True, squeeze=False, height_ratios=heights_in)[:, 0]
         for ax, score in zip(axes, scores, strict=True):
             for number, (result, x) in enumerate(zip(results, positions, strict=True)):
                 if score not in ("success", result.leading):
                     continue
-                colour, line = _COLOURS[number % len(_COLOURS)], _LINES[number // len(_COLOURS)]
+                colour, line = colours[number % len(colours)], _LINES[number // len(colours)]
                 marker = "o" if len(x) == 1 else ""  # a point alone makes no line
                 label = _shortened(names[number]) if score == result.leading else None
-                ax.plot(x, getattr(result, score), color=colour, linestyle=line, marker=marker, lw=1.2, label=label)
+                values = getattr(result, score)
+                known = ~np.isnan(values)  # the line passes over frames without an answer
+                ax.plot(x[known], values[known], color=colour, linestyle=line, marker=marker, label=label)
             about = FRAME_SCORES[score]
-            ax.set(ylabel=about.title(score), **({} if None in about.bounds else {"ylim": (-0.02, 1.02)}))
+            ax.set_ylabel(about.title(score))
+            if None not in about.bounds:
+                ax.set(ylim=BOUNDS, yticks=(0, 0.5, 1))
+            if score == "success":
+                ax.axhline(SUCCESS_THRESHOLD, **THRESHOLD)
+        figure.align_ylabels(axes)
         axes[-1].set_xlabel("time (s)" if has_times else "frame")
         if title is not None:
-            figure.suptitle(title, fontsize=9, wrap=True)
-        figure.legend(loc="outside lower left", fontsize=7, frameon=False)
+            figure.suptitle(title, x=0.01, ha="left", fontsize=8, wrap=True)
+        figure.legend(loc="outside lower left", ncols=columns)
     return figure
 
 
 def save(figure: Figure, file: Path | str) -> None:
     """Write a figure in the format of the file's suffix, such as .png (200 dots an inch), .pdf or .svg."""
-    import matplotlib
+    import matplotlib.style
 
-    with matplotlib.rc_context({"pdf.fonttype": 42}), warnings.catch_warnings():  # TrueType, which journals accept
+    with matplotlib.style.context([*STYLE]), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # letters that the font lacks are drawn as boxes
-        figure.savefig(file, dpi=DOTS_PER_IN)
+        figure.savefig(file)
 
 
 def _shortened(name: str) -> str:

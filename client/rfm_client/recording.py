@@ -75,7 +75,8 @@ class Recording(Closing):
             for position, index in enumerate(scores.scored_frames.tolist()):
                 self._set_time(index, times_s)
                 for curve, values in curves.items():
-                    self._log((*entity, curve), self._rerun.Scalars(float(values[position])))
+                    if not np.isnan(values[position]):  # else the model did not answer about the frame
+                        self._log((*entity, curve), self._rerun.Scalars(float(values[position])))
 
     def close(self) -> None:
         """Write the rest to the file."""

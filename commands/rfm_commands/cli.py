@@ -6,8 +6,10 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,13 +19,15 @@ from rfm.checkpoint.provenance import table
 from rfm.config import ExportConfig, ServeConfig
 from rfm.launch.admin_key import take_key
 from rfm.launch.endpoints import Endpoints
-from rfm.launch.installation import find_installation
+from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.triton_server import TritonServer, short_spin
 from rfm.supervise.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm_client.cli.command import Given, add_missing, with_options
+from rfm_client.cli.help_sections import MOST_COLUMNS
 from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import from_here
 from rfm_client.contract.process_log import write_log
+from rfm_client.contract.settings import ConfigError
 
 try:
     from rfm_gateway import (
@@ -35,14 +39,13 @@ try:
 except ModuleNotFoundError:
     raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./apps/gateway .") from None
 from rfm_commands.command import AdminKeyFile, RfmCommand, RfmCommands, TritonPath, fail, say
-from rfm_commands.config import Config, GatewayBeside
-from rfm_commands.demo import demo
+from rfm_commands.config import Config, GatewayBeside, named_as_typed
 from rfm_commands.models import app as models_app
 from rfm_commands.rollout import names_of
+from rfm_commands.serve_screen import ServeScreen, log_file, opened
+from rfm_commands.try_video import try_video
 
 ACCEPTED_WARNING = "a Triton with known remote vulnerabilities is accepted: use NVIDIA's container 26.07 or newer"
-EXPORT_EXAMPLE = "\b\nExample:\n  rfm export org/name --repository my_models --config serve.yaml"
-SERVE_EXAMPLE = "\b\nExample:\n  rfm serve my_models --gateway-port 8100 -- --log-verbose=1"
 
 logger = logging.getLogger("rfm.serve")
 
@@ -54,7 +57,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MOST_COLUMNS},
 )
 
 ConfigFile = Annotated[
@@ -77,7 +80,7 @@ def rfm(
     """Reward models for robot learning, served by Triton."""
 
 
-@app.command(cls=RfmCommand, epilog=EXPORT_EXAMPLE)
+@app.command(cls=RfmCommand)
 @with_options
 def export(
     given: Given[ExportConfig],
@@ -103,7 +106,10 @@ def export(
         bool, typer.Option("--explain", help="Write nothing; print the source of each setting of the checkpoint.")
     ] = False,
 ) -> None:
-    """Write a checkpoint into a model repository, as a new version."""
+    """Write a checkpoint into a model repository, as a new version.
+
+    Example: rfm export org/name --repository my_models
+    """
     import rfm_export
 
     if source is not None:
@@ -131,7 +137,7 @@ def export(
     typer.echo(f"{repository}: {settings.name} version {version}, scores equal to {whose}")
 
 
-@app.command(cls=RfmCommand, epilog=SERVE_EXAMPLE)
+@app.command(cls=RfmCommand)
 @with_options
 def serve(
     given: Given[ServeConfig],
@@ -154,12 +160,21 @@ def serve(
         ),
     ] = False,
     tritonserver: TritonPath = None,
+    triton_log: Annotated[
+        Path | None,
+        typer.Option(
+            help="File for the lines of Triton and the models. Default: standard error; in a terminal, "
+            "~/.local/state/rfm/triton-PORT.log."
+        ),
+    ] = None,
 ) -> None:
     """Run tritonserver on a model repository until a signal stops it.
 
     With --gateway-port it also runs a gateway, and watches both.
 
     Only requests with the admin key can change its models, logging and tracing; without an admin key, no request can.
+
+    Example: rfm serve my_models --gateway-port 8100
     """
     raise_limit()  # Triton and the gateway inherit it
     folder, more_arguments = _folder_and_arguments(words or (), repository)
@@ -170,29 +185,34 @@ def serve(
     write_log("rfm-serve", os.environ)
     if accept_known_vulnerabilities and not config.serve.is_loopback:
         logger.warning("%s is no loopback address, and %s", config.serve.host, ACCEPTED_WARNING)
-    server = TritonServer(
-        folder,
-        Endpoints.of(config.serve, config.gateway.port),
-        find_installation(tritonserver),
-        http_threads=config.serve.http_threads,
-        admin_key=take_key(admin_key_file, os.environ),
-        accepts_known_vulnerabilities=accept_known_vulnerabilities,
-        more_arguments=more_arguments,
-        hang_s=config.serve.hang_s,
-    )
-    supervisor = Supervisor(
-        server,
-        gateway=None if config.gateway.port is None else _gateway_beside(server, config),
-        status_port=config.serve.status_port,
-        probe_s=config.serve.probe_s,
-        hang_s=config.serve.hang_s,
-        triton_silent_s=config.serve.triton_silent_s,
-    )
-    try:
-        supervisor.run()
-    except CrashLoopError as error:  # as the lines about the faults before it
-        logger.error("%s", error)
-        raise typer.Exit(1) from None
+    endpoints = Endpoints.of(config.serve, config.gateway.port)
+    log = log_file(triton_log, endpoints.http_port, os.environ)
+    with opened(log) as lines:
+        server = TritonServer(
+            folder,
+            endpoints,
+            find_installation(tritonserver),
+            http_threads=config.serve.http_threads,
+            log=lines,
+            admin_key=take_key(admin_key_file, os.environ),
+            accepts_known_vulnerabilities=accept_known_vulnerabilities,
+            more_arguments=more_arguments,
+            hang_s=config.serve.hang_s,
+        )
+        beside = None if config.gateway.port is None else _beside(server, config, gateway_given)
+        screen = ServeScreen(folder, endpoints, beside, log) if log is not None and sys.stderr.isatty() else None
+        supervisor = Supervisor(
+            server,
+            gateway=None if beside is None else _gateway_process(beside, config),
+            status_port=config.serve.status_port,
+            probe_s=config.serve.probe_s,
+            hang_s=config.serve.hang_s,
+            triton_silent_s=config.serve.triton_silent_s,
+            tell_ready=None if screen is None else screen.show_ready,
+        )
+        if screen is not None:
+            screen.show_start()
+        _run(supervisor, log)
 
 
 app.command(cls=RfmCommand)(gateway)
@@ -202,7 +222,7 @@ try:
     app.command(cls=RfmCommand)(label)
 except ModuleNotFoundError as error:
     add_missing(app, "label", f"{error.name} is not installed", "labels", "rfm")
-app.command(cls=RfmCommand)(demo)
+app.command("try", cls=RfmCommand)(try_video)
 app.add_typer(models_app, name="models")
 
 
@@ -211,17 +231,32 @@ def _folder_and_arguments(words: Sequence[str], repository: Path | None) -> tupl
     folder = words[0] if words and not words[0].startswith("-") else None
     if (folder is None) == (repository is None):
         raise typer.BadParameter(f"give FOLDER or --repository{', not both' * (folder is not None)}")
-    return (repository, words) if repository is not None else (Path(str(folder)), words[1:])
+    arguments = words if folder is None else words[1:]
+    if wrong := [word for word in arguments if not word.startswith("-")]:
+        raise typer.BadParameter(f"expected one FOLDER, and after it -- --OPTION=VALUE, got {' '.join(wrong)}")
+    return (Path(str(folder)) if repository is None else repository), arguments
 
 
-def _gateway_beside(server: TritonServer, config: Config) -> GatewayProcess:
-    gateway = _beside(server, config)
+def _run(supervisor: Supervisor, log: Path | None) -> None:
+    size = 0 if log is None else log.stat().st_size
+    try:
+        supervisor.run()
+    except ServerStartError as error:
+        if log is not None and log.stat().st_size > size:
+            say(f"the lines of Triton and the models are in {log}")
+        if not isinstance(error, CrashLoopError):
+            raise
+        logger.error("%s", error)  # as the lines about the faults before it
+        raise typer.Exit(1) from None
+
+
+def _gateway_process(gateway: GatewayConfig, config: Config) -> GatewayProcess:
     assert gateway.host is not None and gateway.port is not None  # completed
     address = from_here(gateway.host), gateway.port
     return GatewayProcess(gateway_command(gateway), address, config.serve.triton_silent_s)
 
 
-def _beside(server: TritonServer, config: Config) -> GatewayConfig:
+def _beside(server: TritonServer, config: Config, given: Given[GatewayBeside]) -> GatewayConfig:
     """The gateway's configuration, completed from the server's and checked: the gateway could start now."""
     gateway, endpoints = config.gateway, server.endpoints
     behind = replace(endpoints, host=from_here(endpoints.host))
@@ -234,6 +269,8 @@ def _beside(server: TritonServer, config: Config) -> GatewayConfig:
     )
     try:
         check_gateway(filled, os.environ)
+    except ConfigError as error:
+        fail(str(error.named(partial(named_as_typed, "gateway", given)) if error.where in filled.settings() else error))
     except (OSError, ValueError) as error:
         fail(f"gateway: {error}")
     names = names_of(server.repository)

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any, ClassVar
@@ -86,15 +87,24 @@ class Config:
             try:
                 changed[section] = replace(getattr(self, section), **values)
             except ConfigError as error:
-                raise error.named(f"{section}.{{}}".format) from None
+                named = [*values, error.other] if error.where in values else values
+                raise error.named(partial(named_as_typed, section, named)) from None
         return replace(self, **changed)
+
+
+def named_as_typed(section: str, options: Collection[str], name: str) -> str:
+    """Return the option of a setting that is one of ``options``, for another the key in the file."""
+    return _kind(section).settings()[name].option if name in options else f"{section}.{name}"
+
+
+def _kind(section: str) -> type[Settings]:
+    return GatewayBeside if section == "gateway" else SECTIONS[section]
 
 
 def _with_option(setting: str) -> str:
     """A setting's key in the file, and its option of ``rfm serve``."""
     section, _, key = setting.partition(".")
-    kind = GatewayBeside if section == "gateway" else SECTIONS[section]
-    return f"{setting} ({kind.settings()[key].option})"
+    return f"{setting} ({_kind(section).settings()[key].option})"
 
 
 def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:

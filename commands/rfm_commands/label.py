@@ -40,6 +40,8 @@ def label(
     """Label every frame of a dataset in this process, without Triton.
 
     `rfm-client label` writes the same files by asking running servers.
+
+    Example: rfm label my_dataset --checkpoint org/name --device cuda
     """
     checkpoint = LabellingCheckpoint(**given)
     options = {**dict.fromkeys(_ALWAYS_TOLD), **given}

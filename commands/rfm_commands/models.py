@@ -18,15 +18,16 @@ import typer
 
 from rfm.launch.admin_key import take_key
 from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
-from rfm_client.cli.command import Given, with_options
+from rfm_client.cli.command import CommandGroup, Given, usage_errors, with_options
 from rfm_client.cli.options import CredentialFiles
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.settings import setting
 from rfm_commands.command import RfmCommand
 from rfm_commands.rollout import Rollout, check_files, models_of, previous_version
 
 SECURE = "grpcs://"
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(cls=CommandGroup, no_args_is_help=True)
 
 
 @dataclass(frozen=True)
@@ -42,16 +43,23 @@ class AdministeredServer(TlsFiles):
 
     TITLE: ClassVar[str] = "Server"
 
-    url: str = setting("grpc://127.0.0.1:8001", "grpc://host:port of the server, with TLS grpcs://host:port.")
+    url: str = setting(
+        "grpc://127.0.0.1:8001", "grpc://host:port of the server, with TLS grpcs://host:port.", variable="RFM_URL"
+    )
     admin_key_file: Path | None = setting(None, "File with the server's admin key. Default: RFM_ADMIN_KEY.")
 
     @contextmanager
     def connected(self) -> Iterator[RepositoryApi]:
         """Yield the server's repository API. Raises InvalidValueError, RepositoryApiError."""
         if self.credentials.uses_tls and not self.url.startswith(SECURE):
-            raise RepositoryApiError.at("url", f"{SECURE}host:port with certificates", self.url)
+            raise RepositoryApiError.at("--url", f"{SECURE}host:port with certificates", self.url)
         options = self.credentials.grpc_options(self.url.partition(":")[0])
-        with RepositoryApi(self.url, take_key(self.admin_key_file, os.environ), options) as api:
+        key = take_key(self.admin_key_file, os.environ)
+        with usage_errors("--url"):
+            if len(self.url.split()) > 1:
+                raise InvalidValueError(f"expected one server, got {self.url}")
+            server = RepositoryApi(self.url, key, options)
+        with server as api:
             yield api
 
 
@@ -62,7 +70,7 @@ class AdministeredRepository(AdministeredServer):
     repository: Path = setting(..., "The repository that the server reads.")
 
 
-ExportedName = Annotated[str, typer.Argument(help="As in rfm export --name.")]
+ExportedName = Annotated[str, typer.Argument(metavar="NAME", help="As in rfm export --name.")]
 
 
 @app.callback()
@@ -74,7 +82,10 @@ def models(files: Given[TlsFiles]) -> None:
 @app.command("list", cls=RfmCommand)
 @with_options
 def list_models(server: AdministeredServer) -> None:
-    """List the versions of each model, with state and reason."""
+    """List the versions of each model, with state and reason.
+
+    Example: rfm models list --admin-key-file admin.key
+    """
     with server.connected() as api:
         rows = [_row(entry) for entry in api.index()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -85,7 +96,10 @@ def list_models(server: AdministeredServer) -> None:
 @app.command(cls=RfmCommand)
 @with_options
 def load(name: ExportedName, server: AdministeredRepository) -> None:
-    """Serve NAME, a new or unloaded model, as configured."""
+    """Serve NAME, a new or unloaded model, as configured.
+
+    Example: rfm models load rfm --repository my_models
+    """
     with server.connected() as api:
         models = models_of(server.repository, name)
         check_files(server.repository, dict.fromkeys(models))
@@ -97,7 +111,10 @@ def load(name: ExportedName, server: AdministeredRepository) -> None:
 @app.command(cls=RfmCommand)
 @with_options
 def unload(name: ExportedName, server: AdministeredRepository) -> None:
-    """Stop serving NAME after the answers to requests in flight. Its files stay."""
+    """Stop serving NAME after the answers to requests in flight. Its files stay.
+
+    Example: rfm models unload rfm --repository my_models
+    """
     with server.connected() as api:
         for model in reversed(models_of(server.repository, name)):
             api.unload(model)
@@ -109,12 +126,14 @@ def unload(name: ExportedName, server: AdministeredRepository) -> None:
 @with_options
 def rollout(
     name: ExportedName,
-    version: Annotated[int, typer.Argument(help="The version folder to serve.")],
+    version: Annotated[int, typer.Argument(metavar="VERSION", help="The version folder to serve.")],
     server: AdministeredRepository,
 ) -> None:
     """Serve another version of NAME without losing a request.
 
     The new version is loaded beside the old version, probed, then served alone. If it fails, the old version stays.
+
+    Example: rfm models rollout rfm 2 --repository my_models
     """
     with server.connected() as api:
         _roll_out(server, name, api, version)
@@ -123,7 +142,10 @@ def rollout(
 @app.command(cls=RfmCommand)
 @with_options
 def rollback(name: ExportedName, server: AdministeredRepository) -> None:
-    """Serve the previous version of NAME, as rollout does."""
+    """Serve the previous version of NAME, as rollout does.
+
+    Example: rfm models rollback rfm --repository my_models
+    """
     with server.connected() as api:
         _roll_out(server, name, api, previous_version(server.repository, name, api))
 

@@ -113,7 +113,11 @@ def generated_models(description: Description, encoders: Description | None, ver
     # A frame reference needs the cache that holds the frame, but Triton chooses the instance: so only one may exist.
     has_one_cache = cache_mib > 0 and version.num_gpus <= 1
     outputs = wire.score_outputs(description.progress_bins, description.more_scores)
-    inputs = wire.frame_inputs(by_digest=keeps and has_one_cache) if widths is None else wire.embedding_inputs(*widths)
+    has_digests = keeps and has_one_cache
+    inputs = wire.frame_inputs(
+        by_digest=has_digests, described=description.reads_descriptions, with_views=description.reads_views
+    )
+    inputs = inputs if widths is None else wire.embedding_inputs(*widths)
     scorer = Interface(scorer_name(description, name), inputs, outputs, description)
     version = replace(version, settings=settings)
     models = [_python_model(scorer, "rfm", version, _warmups(description), keeps=keeps)]
@@ -126,8 +130,8 @@ def generated_models(description: Description, encoders: Description | None, ver
     encoder = Interface(encoder_name(name), inputs, wire.encoder_outputs(*widths), encodes)
     of_encoder = replace(version, settings=replace(settings, instances=1)) if cache_mib else version
     models.append(_python_model(encoder, "rfm_encoder", of_encoder, [_encoder_warmup()], keeps=True))
-    of_frames = replace(description, video_dim=None, text_dim=None, frame_size=encoders.frame_size)
-    frames = Interface(frames_name(name), wire.frame_inputs(by_digest=has_one_cache), outputs, of_frames)
+    with_frames = replace(description, video_dim=None, text_dim=None, frame_size=encoders.frame_size)
+    frames = Interface(frames_name(name), wire.frame_inputs(by_digest=has_one_cache), outputs, with_frames)
     return [*models, GeneratedModel(ensemble_config(frames, settings, version.number, encoder, scorer), version.number)]
 
 

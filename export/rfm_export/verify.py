@@ -185,7 +185,7 @@ def largest_difference(
     scored = [map(trajectory_scores, pair) for pair in pairs]
     frames = [frame for before, after in scored for frame in zip(before.values(), after.values(), strict=True)]
     of_frames = [[getattr(each, score) for each in pair] for pair in frames]
-    return max((float(np.abs(after - before).max()) for before, after in of_frames), default=0.0)
+    return max((float(np.nanmax(np.abs(after - before))) for before, after in of_frames), default=0.0)
 
 
 def verify_graphs(make: Callable[[], Engine], description: Description, say: Say) -> None:

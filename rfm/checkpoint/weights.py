@@ -61,7 +61,6 @@ _NETWORKS = {
     "qwen2_5_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.gate_proj\."),
     "qwen3_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.linear_fc1\."),
 }
-_ON = {"rynn_value_lang": "qwen3_vl"}  # names of networks on a backbone
 _MAY_BE_ZERO = re.compile(r"(progress|preference|success|similarity)_head\.|.*\.lora_[AB]\.")  # before training
 _STRIP = (
     "import sys, safetensors.torch as s; prefix, target, *files = sys.argv[1:]; "
@@ -70,9 +69,10 @@ _STRIP = (
 )
 
 
-def read_weights(folder: Path) -> dict[str, Tensor]:
+def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tensor]:
     """Return all tensors of model.safetensors, or of its shards, without the prefixes of wrappers.
 
+    model_type: in config.json, of a network that contains one of the known networks; None: it is a known one
     Raises CheckpointError.
     """
     check_one_form(folder)
@@ -84,19 +84,18 @@ def read_weights(folder: Path) -> dict[str, Tensor]:
         refuse_pickles(folder, WEIGHTS, PICKLE_STEM)
         got = cut(", ".join(sorted(path.name for path in folder.iterdir()))) or "nothing"
         raise CheckpointError.at(folder, f"{WEIGHTS} or {WEIGHTS_INDEX}", f"{got}: {_below(folder)}")
-    _check_network(folder, weights)
+    _check_network(folder, weights, model_type)
     return _unwrapped(weights, files, folder / WEIGHTS)
 
 
-def _check_network(folder: Path, names: Iterable[str]) -> None:
+def _check_network(folder: Path, names: Iterable[str], model_type: str | None) -> None:
     """Raise CheckpointError if config.json is of another network than the weights, as some trainers write it."""
     file = folder / NETWORK_CONFIG
     content = read_json(file) if is_there(file) else {}
     stated = content.get("model_type")
-    backbone = _ON.get(stated, stated) if isinstance(stated, str) else stated
     found = next((kind for name in names for kind, own in _NETWORKS.items() if own.search(name)), None)
     is_first = stated is None and found == next(iter(_NETWORKS))  # the first ReWiND checkpoints state nothing
-    if found is None or "type" in content or is_first or backbone == found:  # ``type``: of LeRobot
+    if found is None or "type" in content or is_first or stated in (found, model_type):  # ``type``: of LeRobot
         return
     got = "none" if stated is None else shown(stated)
     expected = f"{found}, by the names of the weights"

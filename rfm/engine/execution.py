@@ -31,6 +31,7 @@ class Execution:
     cache_bytes: size of the cached features; None: no cache
     out_of_memory_count: forward passes that did not fit in memory and were tried again in halves
     num_unclear: written answers whose score is unclear
+    num_unreadable: written answers without a score
     on_forward: called after each forward pass, even if it did not fit in memory
     """
 
@@ -43,6 +44,7 @@ class Execution:
     cache_bytes: int | None = None
     out_of_memory_count: int = 0
     num_unclear: int = 0
+    num_unreadable: int = 0
     on_forward: Callable[[], None] = field(default=lambda: None, compare=False, repr=False)
 
     def run(

@@ -18,8 +18,8 @@ def finite(outcomes: Sequence[Result | RewardError], *, lacks: Collection[str]) 
 
     lacks: scores that the network does not predict, which are NaN then
 
-    Logits of progress are not checked: RoboReward has none for an answer without a digit, and progress shows the
-    others' faults.
+    Frames that the model does not answer about are not checked. Neither are logits of progress: RoboReward has none for
+    an answer without a digit, and progress shows the others' faults.
     """
     scores = [[] if isinstance(each, RewardError) else list(_scores(each, lacks)) for each in outcomes]
     of_all = [array for of_one in scores for array in of_one]
@@ -37,6 +37,9 @@ def _scores(result: Result, lacks: Collection[str]) -> Iterator[npt.NDArray[Any]
     if of_pair := answer(result):
         yield np.array([*of_pair.values()], np.float32)
     for scores in trajectory_scores(result).values():
+        known = scores.is_answered
+        if not known[-1]:  # a model that skips frames answers about the last
+            yield np.array([np.nan])
         for name, array in scores.arrays.items():
             if not FRAME_SCORES[name].is_per_bin and name not in lacks:
-                yield array
+                yield array[known]

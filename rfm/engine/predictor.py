@@ -43,6 +43,14 @@ class Predictor(Protocol[Row, Batch]):
         """False if the network does not predict success, which is NaN then."""
 
     @property
+    def reads_descriptions(self) -> bool:
+        """True if the network reads descriptions of robot and camera."""
+
+    @property
+    def reads_views(self) -> bool:
+        """True if the network reads views of further cameras and a goal."""
+
+    @property
     def works_ahead(self) -> bool:
         """True if ``work_ahead`` takes enough time to be worth a thread."""
 

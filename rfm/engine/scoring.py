@@ -33,7 +33,7 @@ from rfm_client.contract import (
     Sample,
     SimilarityResult,
 )
-from rfm_client.contract.samples import EncoderSample, with_trajectories
+from rfm_client.contract.samples import DESCRIPTION_FIELDS, EncoderSample, with_trajectories
 
 Outcome: TypeAlias = Result | RewardError
 
@@ -173,7 +173,14 @@ class Engine:
     def _prepared(self, sample: Sample, embedded_sample: Sample | RewardError) -> Prepared:
         if isinstance(embedded_sample, RewardError):
             return Prepared(sample, embedded_sample)
+        if not self.predictor.reads_views and any(each.has_views for each in sample.trajectories):
+            expected = "none (this checkpoint reads the frames of one camera)"
+            return Prepared(sample, InvalidSampleError.at("views, goal", expected, "views or a goal"))
         try:
+            if any(sample.trajectories[0].descriptions) and not self.predictor.reads_descriptions:
+                expected = "none, as the prompt of this checkpoint names neither robot nor camera"
+                got = str(sample.trajectories[0].descriptions)
+                raise InvalidSampleError.at(" or ".join(DESCRIPTION_FIELDS), expected, got)
             rows = self.predictor.rows(embedded_sample)
         except RewardError as error:
             return Prepared(sample, error)

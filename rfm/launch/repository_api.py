@@ -20,7 +20,7 @@ from rfm.launch.admin_key import VARIABLE, grpc_metadata
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.checks import require
-from rfm_client.contract.errors import LocatedError
+from rfm_client.contract.errors import LocatedError, ServerUnavailableError
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.wire import Tensors
 
@@ -135,6 +135,9 @@ class RepositoryApi:
                 got = "another" if self._headers else "none"
                 expected = f"that of the server at {self._url} (--admin-key-file or {VARIABLE})"
                 raise RepositoryApiError.at("admin key", expected, got) from None
+            no_connection = triton.error_from(error, self._url)
+            if isinstance(no_connection, ServerUnavailableError) and no_connection.remedy:
+                raise RepositoryApiError(str(no_connection)) from error
             is_server_s = str(error.status()) in _OF_SERVER
             raise RepositoryApiError(f"{self._url}: {message}" if is_server_s else message) from error
 

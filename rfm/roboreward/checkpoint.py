@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
-from rfm.checkpoint.provenance import HUB_FOLDER, Decision
+from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json
+from rfm.checkpoint.provenance import Decision
 from rfm.checkpoint.run_config import find_run_config
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.pixels import Normalisation
@@ -21,17 +21,11 @@ from rfm.vlm.collator import QWEN3
 from rfm.vlm.images import QwenImages
 from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork
 from rfm.vlm.language_folder import LanguageFolder, reward_model_of
+from rfm.vlm.written import GENERATION_CONFIG, is_named, stops_of
 from rfm_client.contract.description import Description
 
 WRITTEN, EXPECTED = "roboreward", "roboreward-expected"  # of ``--as``
 REWARD_MODELS = (WRITTEN, EXPECTED)
-GENERATION_CONFIG = "generation_config.json"
-# Keys of GENERATION_CONFIG without effect on the likeliest token.
-_IDLE = {
-    "_from_model_config", "bos_token_id", "do_sample", "eos_token_id", "max_length", "max_new_tokens", "pad_token_id",
-    "temperature", "top_k", "top_p", "transformers_version", "use_cache",
-}  # fmt: skip
-_NEUTRAL = {"repetition_penalty": 1.0, "no_repeat_ngram_size": 0, "num_beams": 1, "min_length": 0}
 
 
 @dataclass(frozen=True)
@@ -75,8 +69,7 @@ def reads(folder: Path) -> bool:
     if reward_model_of(folder) is not None:
         return reward_model_of(folder) == RoboRewardConfig.reward_model
     content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
-    names = [folder.resolve().name, *(part for part in folder.parts if part.startswith(HUB_FOLDER))]
-    has_name = any("roboreward" in name.lower() for name in names)
+    has_name = is_named(folder, "roboreward")
     return has_name and content.get("model_type") == QWEN3 and find_run_config(folder) is None
 
 
@@ -89,7 +82,7 @@ def load(folder: Path, options: Options) -> RoboRewardCheckpoint:
     is_export = config is not None
     if config is None:
         files = replace(files, dtype=Decision("dtype", "bfloat16", "upstream: always"))
-        config = RoboRewardConfig(**files.made_of, stops=_stops(folder), is_expected=name == EXPECTED)
+        config = RoboRewardConfig(**files.made_of, stops=stops_of(folder), is_expected=name == EXPECTED)
     elif name is not None and config.is_expected != (name == EXPECTED):
         raise CheckpointError.at("--as", "the reward model of this export", name, "export the checkpoint again")
     if options.strict_answers and not config.is_expected:
@@ -108,20 +101,3 @@ def load(folder: Path, options: Options) -> RoboRewardCheckpoint:
     checkpoint = RoboRewardCheckpoint(config, files.weights, files.processor, (*files.decisions(config), *told))
     checkpoint.check()
     return checkpoint
-
-
-def _stops(folder: Path) -> tuple[int, ...]:
-    """Return the tokens that end an answer. Raises CheckpointError for settings that change the likeliest token."""
-    file = folder / GENERATION_CONFIG
-    if not is_there(file):
-        raise CheckpointError.at(file, "the file", "none", "copy it from the checkpoint as it was published")
-    content = read_json(file)
-    for key in sorted(content.keys() - _IDLE):
-        if key not in _NEUTRAL or content[key] not in (None, _NEUTRAL[key]):
-            expected = f"{_NEUTRAL[key]}" if key in _NEUTRAL else "no such key"
-            raise CheckpointError.at(f"{file}: {key}", expected, shown(content[key]), "remove it")
-    stops = content.get("eos_token_id")
-    found = stops if isinstance(stops, list) else [stops]
-    if not found or not all(type(token) is int for token in found):
-        raise CheckpointError.at(f"{file}: eos_token_id", "ids of tokens", shown(stops))
-    return tuple(found)

@@ -6,20 +6,17 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import group_times
 from rfm.vlm.images import QwenImages
-from rfm.vlm.language import LanguageCollator, LanguageConfig
 from rfm.vlm.row import VlmRow
 from rfm.vlm.video import VlmVideo
+from rfm.vlm.written import WritingCollator, WritingConfig
 from rfm_client.contract.samples import UInt8Array
 
 PROMPT = """Given the task, assign a discrete progress score reward (1,2,3,4,5) for the robot in the video in the format: ANSWER: <score>
@@ -42,40 +39,27 @@ _NUMBER = re.compile(r"[+-]?\d+(?:[.,/:-]\d+)*%?")
 
 
 @dataclass(frozen=True)
-class RoboRewardConfig(LanguageConfig):
+class RoboRewardConfig(WritingConfig):
     """The configuration of RoboReward.
 
-    stops: ids of the tokens that end an answer
-    max_new_tokens: most tokens of an answer
     is_expected: the answer is not written: its expected value over the five digits is the score
     strict_answers: an unclear answer is an error; else its score is marked
     """
 
-    stops: tuple[int, ...]
-    max_new_tokens: int = 128
     is_expected: bool = False
     strict_answers: bool = False
 
     reward_model: ClassVar[str] = "roboreward"
 
 
-class RoboRewardCollator(LanguageCollator):
-    """The collator of RoboReward: one conversation about all frames, in dense mode one for each prefix.
+class RoboRewardCollator(WritingCollator):
+    """The collator of RoboReward: one conversation about all frames, in dense mode one for each prefix."""
 
-    draft: int64 [N], the tokens with which a written answer usually begins
-    """
-
-    config: RoboRewardConfig  # type: ignore[assignment]  # no heads, so no VlmConfig
+    config: RoboRewardConfig
 
     def __init__(self, config: RoboRewardConfig, tokenizer: Any, images: QwenImages) -> None:
-        super().__init__(config, tokenizer, images)
-        self._before_answer = self._chat.tokens(BEFORE_ANSWER)
-        self.draft = self._before_answer[:0] if config.is_expected else self._before_answer
-
-    @cached_property
-    def digits(self) -> list[int]:
-        """The tokens of SCORES."""
-        return [int(self.tokenizer.convert_tokens_to_ids(str(score))) for score in SCORES]
+        super().__init__(config, tokenizer, images, "" if config.is_expected else BEFORE_ANSWER)
+        self.digits = [int(tokenizer.convert_tokens_to_ids(str(score))) for score in SCORES]
 
     def example(self) -> str:
         """Return the prompt of an example task, with VIDEO in the place of the video."""
@@ -84,32 +68,9 @@ class RoboRewardCollator(LanguageCollator):
     def prompts(self, video: VlmVideo, task: str) -> list[VlmRow]:
         """Return the conversations about a video. Raises InvalidSampleError for frames that cannot be resized."""
         text = self.template(PROMPT.replace("{task}", task), add_generation_prompt=True)
-        more = self._before_answer if self.config.is_expected else ()
+        more = self._chat.tokens(BEFORE_ANSWER) if self.config.is_expected else ()
         times_s = group_times(self.grid(video).groups)
         return [self.row(video, text, shown, times_s, more) for shown in video.conversations]
-
-    def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> VlmBatch:
-        """Return the batch of conversations with the draft behind each.
-
-        length: as in ``VlmCollator.collate``
-        The queries are the last token of each conversation and the tokens of the draft.
-        """
-        batch = super().collate([self._drafted(row) for row in rows], length)
-        back = torch.arange(-len(self.draft), 1)
-        return replace(
-            batch,
-            query_rows=batch.query_rows.repeat_interleave(len(back)),
-            query_tokens=(batch.query_tokens[:, None] + back).flatten(),
-        )
-
-    def _drafted(self, row: VlmRow) -> VlmRow:
-        at = row.position_ids[:, -1:] + 1 + np.arange(len(self.draft))
-        return replace(
-            row,
-            input_ids=np.concatenate([row.input_ids, self.draft]),
-            position_ids=np.concatenate([row.position_ids, at], axis=1),
-            query=row.num_tokens + len(self.draft) - 1,
-        )
 
     def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
         frames = [as_jpeg(video.frames[index]) for index in needed]

@@ -19,13 +19,15 @@ from rfm.engine.pixels import Normalisation
 from rfm.family import Options
 from rfm.rynnvalue.network import Bins, HeadConfig, RynnConfig, RynnNetwork
 from rfm.rynnvalue.predictor import RynnPredictor
-from rfm.rynnvalue.prompts import RELATIVE_TOKEN, VALUE_TOKEN, RynnCollator, RynnImages
+from rfm.rynnvalue.prompts import RELATIVE_TOKEN, VALUE_TOKEN, RynnCollator
 from rfm.rynnvalue.settings import PUBLISHED, Settings
 from rfm.vlm.backbone import QWEN_NAMES, UNUSED, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
+from rfm.vlm.images import BoundedImages
 from rfm.vlm.language import EMBEDDING, REWARD_MODEL, LanguageCheckpoint, processor_name
 from rfm.vlm.language_folder import dtype_of, reward_model_of
 from rfm.vlm.network import build_backbone
+from rfm.vlm.preprocessor import pixel_limits
 from rfm.vlm.processor import PROCESSOR_FOLDER, read_processor
 from rfm.vlm.qwen_checkpoint import SETTINGS, QwenCheckpoint
 from rfm.vlm.rounding import FLAG, decision, read_published, read_unrounded_config, round_layers
@@ -36,7 +38,6 @@ REWARD_MODELS = (NAME,)
 MODEL_TYPE = "rynn_value_lang"
 TRAINED_FRAMES = 8
 _OF_USER = {"robot": str, "camera": str}  # settings that ``--as`` takes
-_LIMITS = ("shortest_edge", "longest_edge")
 _EXAMPLE = f"--as '{NAME},robot=a Franka single-arm robot,camera=the main right camera'"
 _OF_BACKBONE = "model."  # begins the names of the backbone's weights
 
@@ -63,6 +64,7 @@ class RynnCheckpoint(LanguageCheckpoint):
             has_progress=False,
             more_scores=("remaining_s", "relative_s", "entropy"),
             asks_in_words=True,
+            reads_descriptions=self.config.use_meta,
             keeps_features=True,
             uses_graphs=self.config.attention == "causal",  # else the groups need a mask
             is_large=True,
@@ -85,7 +87,7 @@ class RynnCheckpoint(LanguageCheckpoint):
     ) -> RynnCollator:
         """Return the collator with this tokenizer and preprocessing."""
         limits = {"least_px": self.config.least_px, "most_px": self.config.most_px}
-        return RynnCollator(self.config, tokenizer, RynnImages(patch_px, normalisation, **limits))
+        return RynnCollator(self.config, tokenizer, BoundedImages(patch_px, normalisation, **limits))
 
     def network(self, dtype: torch.dtype) -> RynnNetwork:  # type: ignore[override]  # a network with other heads
         """Return the network, with weights of no use."""
@@ -130,7 +132,7 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnC
     fields = read.fields()
     told = {name: value for name, value in content.items() if name not in PUBLISHED and "value_token_id" not in name}
     backbone = backbone_config({**told, "model_type": QWEN3}, file)
-    tensors, _ = read_published(folder, read_unrounded_config(backbone, file))
+    tensors, _ = read_published(folder, read_unrounded_config(backbone, file), MODEL_TYPE)
     weights = {name: each for name, each in renamed(tensors, QWEN_NAMES).items() if not UNUSED.fullmatch(name)}
     rows = _rows(backbone, weights, file)
     processor = options.base_model or folder
@@ -140,7 +142,7 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnC
     meta = _meta(options, use_meta=fields["use_meta"])
     base = Decision("base_model", source_name(processor), "--base-model" if options.base_model else "the checkpoint")
     dtype = dtype_of(backbone, file)
-    limits = _limits(preprocessor, processor)
+    limits = pixel_limits(preprocessor, f"base model {processor}")
     config = RynnConfig(
         backbone=backbone,
         dtype=dtype.value,
@@ -212,11 +214,3 @@ def _meta(options: Options, *, use_meta: bool) -> list[Decision]:
         expected = "robot=..., camera=... or both, which the prompt of this checkpoint names"
         raise CheckpointError.at("--as", expected, "neither", f"for example {_EXAMPLE}")
     return [Decision(name, given.get(name), "--as" if name in given else "default: not named") for name in _OF_USER]
-
-
-def _limits(preprocessor: Mapping[str, Any], processor: str | Path) -> dict[str, int]:
-    """Return the least and most pixels of a frame."""
-    size = preprocessor.get("size")
-    if not isinstance(size, Mapping) or not all(type(size.get(edge)) is int for edge in _LIMITS):
-        raise CheckpointError.at(f"base model {processor}: size", " and ".join(_LIMITS), shown(size))
-    return dict(zip(("least_px", "most_px"), (size[edge] for edge in _LIMITS), strict=True))

@@ -25,6 +25,11 @@ class RynnPredictor(VlmPredictor):
     collator: RynnCollator
     has_progress = False
 
+    @property
+    def reads_descriptions(self) -> bool:  # type: ignore[override]  # by the configuration
+        """True if the prompt names robot and camera."""
+        return self._config.use_meta
+
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: Any, execution: Execution) -> list[RowScores | RewardError]:
         """Run one forward pass; return each row's scores."""

@@ -6,33 +6,32 @@ L tokens. Source: ``rynn_value`` of ``alibaba-damo-academy/RynnValue``.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from rfm.checkpoint.content import CheckpointError
 from rfm.engine.predictor import check_type
 from rfm.rynnvalue.batch import RynnBatch
 from rfm.rynnvalue.network import RynnConfig
 from rfm.vlm.collator import IMAGE_PAD, VISION_END, VISION_START, VlmCollator, video_of
-from rfm.vlm.images import MERGE, QwenImages, check_aspect, scaled_in_integers
+from rfm.vlm.images import BoundedImages
 from rfm.vlm.leaves import Leaf, fits
 from rfm.vlm.prompts import KEPT_TEXTS
 from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees
 from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import ProgressSample, Sample
-from rfm_client.contract.samples import UInt8Array
+from rfm_client.contract.samples import DESCRIPTION_FIELDS
 
 VALUE_TOKEN, RELATIVE_TOKEN = "<value>", "<relative_value>"
 IMAGE = VISION_START + IMAGE_PAD + VISION_END
 END_OF_TURN = "<|im_end|>"
+META = ("The agent is {}.", "The observation is captured from {}.")  # robot and camera
+UNDESCRIBED = ("", "")
 BEFORE_FRAMES = (
     "The agent is performing the following task: {task}."
     "Question: For each frame after the first, what is the time delta from the previous frame?"
@@ -45,31 +44,6 @@ BEHIND_FRAMES = (
     "- Success: whether the agent has completed the task (Yes/No)."
     "Analysis: \n"
 )
-
-
-@dataclass(frozen=True)
-class RynnImages(QwenImages):
-    """The preprocessing of frames: each is an image within a number of pixels."""
-
-    least_px: int = field(kw_only=True)
-    most_px: int = field(kw_only=True)
-
-    def images_to_size(self, frames: UInt8Array) -> Tensor:
-        """Resize frames to separate images: uint8 [T, H, W, 3] -> [T, H', W', 3]."""
-        pixels = torch.from_numpy(frames if frames.flags.writeable else frames.copy())
-        return scaled_in_integers(pixels, self._image_size(frames.shape[1], frames.shape[2]))
-
-    def _image_size(self, height: int, width: int) -> tuple[int, int]:
-        check_aspect(height, width)
-        factor = self.patch_px * MERGE
-        rows, columns = (round(side / factor) * factor for side in (height, width))
-        if rows * columns > self.most_px:
-            scale = math.sqrt(height * width / self.most_px)
-            rows, columns = (max(factor, math.floor(side / scale / factor) * factor) for side in (height, width))
-        elif rows * columns < self.least_px:
-            scale = math.sqrt(self.least_px / (height * width))
-            rows, columns = (math.ceil(side * scale / factor) * factor for side in (height, width))
-        return rows, columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +76,9 @@ class RynnCollator(VlmCollator):
     """
 
     config: RynnConfig  # type: ignore[assignment]  # not a VlmConfig, whose heads differ
-    images: RynnImages
+    images: BoundedImages
 
-    def __init__(self, config: RynnConfig, tokenizer: Any, images: RynnImages) -> None:
+    def __init__(self, config: RynnConfig, tokenizer: Any, images: BoundedImages) -> None:
         super().__init__(config, tokenizer, images)  # type: ignore[arg-type]  # not a VlmConfig
         self._around_frames = lru_cache(KEPT_TEXTS)(self._rendered)
 
@@ -116,7 +90,7 @@ class RynnCollator(VlmCollator):
 
     def example(self) -> str:
         """Return the prompt of an example task with two frames."""
-        before, behind = self._around_frames("TASK")
+        before, behind = self._around_frames("TASK", UNDESCRIBED)
         relative, value = RELATIVE_TOKEN * self.config.relative_copies, VALUE_TOKEN * self.config.value_copies
         return before + IMAGE + value + IMAGE + relative + value + behind
 
@@ -126,8 +100,10 @@ class RynnCollator(VlmCollator):
         assert isinstance(sample, ProgressSample)  # by check_type
         (trajectory,) = sample.trajectories
         self._check_task(trajectory.task)
+        for name, text in zip(DESCRIPTION_FIELDS, trajectory.descriptions, strict=True):
+            self._check_special_tokens(name, text)
         video = video_of(trajectory, sample.frame_steps)
-        conversation = self.conversation(video, trajectory.task)
+        conversation = self.conversation(video, trajectory.task, trajectory.descriptions)
         read = conversation.groups[-1:] if sample.frame_steps else conversation.groups
         of_prefixes = video.conversations if sample.frame_steps else [None]
         if self.config.attention == "causal":
@@ -136,9 +112,12 @@ class RynnCollator(VlmCollator):
         rows = [_bare(bare, video, picked) for picked in of_prefixes]
         return [_with_groups(row, groups) for row in trees(rows, self.visual_pad, are_images=True)]
 
-    def conversation(self, video: VlmVideo, task: str) -> Conversation:
-        """Return the whole conversation about ``video.num_shown`` frames."""
-        before, behind = (self._chat.tokens(text) for text in self._around_frames(task))
+    def conversation(self, video: VlmVideo, task: str, descriptions: tuple[str, str] = UNDESCRIBED) -> Conversation:
+        """Return the whole conversation about ``video.num_shown`` frames.
+
+        descriptions: of robot and camera, as in ``Trajectory``
+        """
+        before, behind = (self._chat.tokens(text) for text in self._around_frames(task, descriptions))
         start, pad, end = map(self.tokenizer.convert_tokens_to_ids, (VISION_START, IMAGE_PAD, VISION_END))
         frame = np.array([start, *[pad] * self.grid(video).tokens_per_group, end])
         relative = np.full(self.config.relative_copies, self.config.relative_token)
@@ -166,19 +145,23 @@ class RynnCollator(VlmCollator):
         values, relatives = ((ids == token).sum() for token in (self.config.value_token, self.config.relative_token))
         return int(values) // self.config.value_copies, int(relatives) // self.config.relative_copies
 
-    def _rendered(self, task: str) -> tuple[str, str]:
+    def _rendered(self, task: str, descriptions: tuple[str, str]) -> tuple[str, str]:
         """Return the text before the first frame, and behind the value tokens of the last."""
-        before, _, behind = self._template(task).partition(IMAGE)
+        before, _, behind = self._template(task, descriptions).partition(IMAGE)
         return before, behind.rpartition(END_OF_TURN)[0]
 
-    def _template(self, task: str) -> str:
-        before = self._meta() + BEFORE_FRAMES.replace("{task}", task)
+    def _template(self, task: str, descriptions: tuple[str, str] = UNDESCRIBED) -> str:
+        before = self._meta(descriptions) + BEFORE_FRAMES.replace("{task}", task)
         content = [{"type": "text", "text": before}, {"type": "image"}, {"type": "text", "text": BEHIND_FRAMES}]
         return str(self.tokenizer.apply_chat_template([{"role": "user", "content": content}], tokenize=False))
 
-    def _meta(self) -> str:
-        told = {"The agent is {}.": self.config.robot, "The observation is captured from {}.": self.config.camera}
-        return " ".join(text.format(of) for text, of in told.items() if of is not None) if self.config.use_meta else ""
+    def _meta(self, descriptions: tuple[str, str]) -> str:
+        """Return the sentences about robot and camera: the sample's, if it describes either, else the export's."""
+        given = (
+            [text or None for text in descriptions] if any(descriptions) else [self.config.robot, self.config.camera]
+        )
+        told = [text.format(of) for text, of in zip(META, given, strict=True) if of is not None]
+        return " ".join(told) if self.config.use_meta else ""
 
 
 def _causal(

@@ -8,7 +8,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext, suppress
 from functools import partial
 from types import FrameType
@@ -135,6 +135,7 @@ class Supervisor:
     gateway: a gateway beside the server; None: no gateway
     status_port: port of the status server, on Triton's host; None: no status server
     probe_s, hang_s, triton_silent_s: see TritonWatch
+    tell_ready: tells the user that all models are ready for the first time; None: a line in the log
     """
 
     def __init__(
@@ -146,9 +147,11 @@ class Supervisor:
         probe_s: float,
         hang_s: float,
         triton_silent_s: float,
+        tell_ready: Callable[[], None] | None = None,
     ) -> None:
         self._server = server
         self._gateway = gateway
+        self._tell_ready = tell_ready or self._log_ready
         self._status_port = status_port
         self._status = Status()
         self._new_watch = partial(
@@ -203,11 +206,14 @@ class Supervisor:
         if self._is_to_stop.is_set():
             return
         if self._served is None:
-            ends = self._server.endpoints
-            urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
-            logger.info("ready: %s at %s", ", ".join(self._server.models), urls)
+            self._tell_ready()
         self._back_off.started()
         self._watch = self._new_watch(served=self._served or {})
+
+    def _log_ready(self) -> None:
+        ends = self._server.endpoints
+        urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
+        logger.info("ready: %s at %s", ", ".join(self._server.models), urls)
 
     def _look(self) -> None:
         """Restart Triton or the gateway if it ended or has a fault. Raises CrashLoopError."""

@@ -28,13 +28,14 @@ FRAMES, RETRIES = "frames_total", "out_of_memory_retries_total"
 BATCH_SAMPLES, BATCH_PADDING = "batch_samples", "batch_padding_ratio"
 COLLATE_SECONDS, FORWARD_SECONDS = "collate_seconds", "forward_seconds"
 ENCODED, FOUND, MISSED = "frames_encoded_total", "feature_cache_hits_total", "feature_cache_misses_total"
-UNCLEAR = "unclear_answers_total"
+UNCLEAR, UNREADABLE = "unclear_answers_total", "unreadable_answers_total"
 PASSES = "forward_passes_total"  # shows progress, by which ``rfm serve`` tells a long batch from a hang
 
 _TOTALS = {
     FRAMES: "Frames scored.",
     RETRIES: "Forward passes that ran out of memory and were repeated in halves.",
     UNCLEAR: "Written answers whose score is unclear.",
+    UNREADABLE: "Written answers without a score, each an error.",
     ENCODED: "Frames that went through an encoder or a vision tower.",
     FOUND: "Distinct frames of a batch whose features were in the cache.",
     PASSES: "Forward passes, and batches begun.",
@@ -94,6 +95,7 @@ class InstanceMetrics:
             self._totals[FRAMES] += sum(request.num_frames for request in counted if request.outcome == SCORED)
             self._totals[RETRIES] += execution.out_of_memory_count
             self._totals[UNCLEAR] += execution.num_unclear if counted else 0
+            self._totals[UNREADABLE] += execution.num_unreadable if counted else 0
             self._totals[ENCODED] += execution.num_encoded
             self._totals[FOUND] += execution.num_found
             if execution.cache_bytes is not None:

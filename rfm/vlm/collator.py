@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -48,6 +48,8 @@ class VlmCollator:
     tokenizer: the base model's, with the checkpoint's special tokens and a chat template
     images: the backbone's preprocessing
     """
+
+    makes_trees: ClassVar[bool] = True  # of prefixes, whose common beginnings are computed once
 
     def __init__(self, config: VlmConfig, tokenizer: Any, images: QwenImages) -> None:
         self.config = config
@@ -151,9 +153,12 @@ class VlmCollator:
         """Raise InvalidSampleError for an empty task or special tokens in it: a task is data."""
         if not task.strip():
             raise InvalidSampleError.at("task", "a task sentence", repr(task))
+        self._check_special_tokens("task", task)
+
+    def _check_special_tokens(self, where: str, text: str) -> None:
         for token in self._special_tokens:
-            if token in task:
-                raise InvalidSampleError.at("task", "text without the model's special tokens", repr(token))
+            if token in text:
+                raise InvalidSampleError.at(where, "text without the model's special tokens", repr(token))
 
     def to_size(
         self, video: VlmVideo, cache: FeatureCache[Any] | None = None, threads: FrameThreads = IN_TURN

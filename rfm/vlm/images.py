@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -166,6 +166,31 @@ class QwenImages:
     def grid(self, groups: int, height: int, width: int) -> Grid:
         """Return the grid of ``groups`` temporal patches of this size in pixels."""
         return Grid(groups, height // self.patch_px, width // self.patch_px)
+
+
+@dataclass(frozen=True)
+class BoundedImages(QwenImages):
+    """The preprocessing of separate images by transformers' processor: each within a number of pixels."""
+
+    least_px: int = field(kw_only=True)
+    most_px: int = field(kw_only=True)
+
+    def images_to_size(self, frames: UInt8Array) -> Tensor:
+        """Resize frames to separate images: uint8 [T, H, W, 3] -> [T, H', W', 3]."""
+        pixels = torch.from_numpy(frames if frames.flags.writeable else frames.copy())
+        return scaled_in_integers(pixels, self._image_size(frames.shape[1], frames.shape[2]))
+
+    def _image_size(self, height: int, width: int) -> tuple[int, int]:
+        check_aspect(height, width)
+        factor = self.patch_px * MERGE
+        rows, columns = (round(side / factor) * factor for side in (height, width))
+        if rows * columns > self.most_px:
+            scale = math.sqrt(height * width / self.most_px)
+            rows, columns = (max(factor, math.floor(side / scale / factor) * factor) for side in (height, width))
+        elif rows * columns < self.least_px:
+            scale = math.sqrt(self.least_px / (height * width))
+            rows, columns = (math.ceil(side * scale / factor) * factor for side in (height, width))
+        return rows, columns
 
 
 def scaled_video(video: Tensor, size: tuple[int, int]) -> Tensor:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An ordinary Qwen3-VL with its language head, for reward models that are asked in words: TOPReward and RoboReward.
+"""An ordinary Qwen-VL with its language head, for reward models that are asked in words.
 
 B conversations of L tokens, D width, V rows of the language head, Q queries: tokens whose successor is asked for.
 """
@@ -33,7 +33,7 @@ from rfm.vlm.collator import (
 )
 from rfm.vlm.images import MERGE, QwenImages
 from rfm.vlm.network import BackboneConfig, build_backbone, qwen_states
-from rfm.vlm.preprocessor import SIZED_BY_PROCESSOR, normalisation_of, patch_px
+from rfm.vlm.preprocessor import SIZED_BY_PROCESSOR, normalisation_of, patch_px, without_limits
 from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, read_processor
 from rfm.vlm.qwen import Box, KeyValues, positions
 from rfm.vlm.qwen_checkpoint import QwenCheckpoint
@@ -195,6 +195,7 @@ class LanguageCheckpoint(QwenCheckpoint):
             raise CheckpointError.at(f"base model {self.processor}", expected, len(tokenizer))
         check_tokens(self.config, tokenizer, self.processor, self.own_tokens)
         where = f"base model {self.processor}: preprocessing of {'videos' if self.reads_videos else 'images'}"
+        preprocessor = preprocessor if self.reads_videos else without_limits(preprocessor)
         normalisation = normalisation_of(preprocessor, SIZED_BY_PROCESSOR, where)
         patch = patch_px(preprocessor, self.config.backbone["vision_config"], where)
         collator = self.make_collator(tokenizer, patch, normalisation)

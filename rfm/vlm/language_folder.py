@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read the files of a Qwen3-VL with its language head: of Hugging Face, or of an export."""
+"""Read the files of a Qwen-VL with its language head: of Hugging Face, or of an export."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, re
 from rfm.checkpoint.provenance import OF_WEIGHTS, Decision, source_name
 from rfm.checkpoint.weights import read_weights
 from rfm.family import Options, Weights
-from rfm.vlm.backbone import QWEN_NAMES, Renames, backbone_config, renamed
+from rfm.vlm.backbone import QWEN_2_5, QWEN_NAMES, Renames, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
 from rfm.vlm.language import EMBEDDING, HEAD, REWARD_MODEL, LanguageConfig
 from rfm.vlm.processor import PROCESSOR_FOLDER
@@ -27,13 +27,15 @@ from rfm.vlm.video_prompt import WRAPPED, decided
 _NAMES: Renames = ((r"^model\.lm_head\.", "lm_head."), *QWEN_NAMES)
 _TIED = "tie_word_embeddings"
 _BASE_MODEL = "--base-model"
+ONLY_QWEN3 = {QWEN3: "Qwen3-VL"}
+ANY_QWEN = {QWEN_2_5: "Qwen2.5-VL", **ONLY_QWEN3}
 
 Config = TypeVar("Config", bound=LanguageConfig)
 
 
 @dataclass(frozen=True)
 class LanguageFolder:
-    """The files of a Qwen3-VL: of Hugging Face, or of an export.
+    """The files of a Qwen-VL: of Hugging Face, or of an export.
 
     backbone: as ``BackboneConfig``'s
     settings: this project's settings, in an export; None: the folder is no export
@@ -54,13 +56,16 @@ class LanguageFolder:
     rounded: tuple[Weights, str] | None = None
 
     @classmethod
-    def read(cls, folder: Path, options: Options) -> LanguageFolder:
-        """Read the folder. Raises CheckpointError if it is no Qwen3-VL with a language head."""
+    def read(cls, folder: Path, options: Options, backbones: Mapping[str, str] = ONLY_QWEN3) -> LanguageFolder:
+        """Read the folder. Raises CheckpointError if it is no Qwen-VL with a language head.
+
+        backbones: names for the user of the networks that are read, by model_type
+        """
         file = folder / NETWORK_CONFIG
         content = read_json(file)
-        if content.get("model_type") != QWEN3:
-            got = shown(content.get("model_type"))
-            raise CheckpointError.at(f"{file}: model_type", f"{QWEN3}, of an ordinary Qwen3-VL", got)
+        if content.get("model_type") not in backbones:
+            expected = " or ".join(f"{kind}, of an ordinary {name}" for kind, name in backbones.items())
+            raise CheckpointError.at(f"{file}: model_type", expected, shown(content.get("model_type")))
         settings = content.pop(SETTINGS, None)
         backbone = backbone_config(content, file)
         is_nf4 = read_unrounded_config(backbone, file)
@@ -112,13 +117,14 @@ class LanguageFolder:
     def decisions(self, config: LanguageConfig) -> tuple[Decision, ...]:
         """Return the source of the settings that all reward models of a Qwen3-VL share."""
         head, why = ("own", OF_WEIGHTS) if HEAD in self.weights else ("tied to the embedding", NETWORK_CONFIG)
-        shared = [self.base_model, self.dtype, self.video_prompt]
+        shared = [self.base_model, self.dtype, *([] if config.multi_image else [self.video_prompt])]
         if self.settings is not None:
-            told = {"base_model": config.base_model_id, "dtype": config.dtype, "video_prompt": config.video_prompt}
+            told = {"base_model": config.base_model_id, "dtype": config.dtype}
+            told |= {} if config.multi_image else {"video_prompt": config.video_prompt}
             shared = [Decision(name, value, NETWORK_CONFIG) for name, value in told.items()]
             shared[:1] = [self.base_model] if self.base_model.source == _BASE_MODEL else shared[:1]
         return (
-            Decision("backbone", QWEN3, NETWORK_CONFIG),
+            Decision("backbone", self.backbone["model_type"], NETWORK_CONFIG),
             *shared,
             Decision("language_head", head, f"{why}: {HEAD if why == OF_WEIGHTS else _TIED}"),
             Decision("rows_of_the_language_head", self.backbone["text_config"]["vocab_size"], OF_WEIGHTS),

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +36,8 @@ class VlmPredictor:
 
     works_ahead = True
     has_progress = True
-    makes_trees: ClassVar[bool] = True  # of prefixes, whose common beginnings are computed once
+    reads_descriptions = False
+    reads_views = False
 
     def __init__(
         self, network: Any, collator: VlmCollator, device: torch.device, cache: FeatureCache[Any] | None = None
@@ -68,7 +69,7 @@ class VlmPredictor:
         if longest > self._max_tokens:
             expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"
             raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
-        if not self.makes_trees:
+        if not self.collator.makes_trees:
             return rows
         return trees(rows, self.collator.visual_pad, are_images=self.collator.config.multi_image)
 

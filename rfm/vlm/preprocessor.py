@@ -122,6 +122,26 @@ def normalisation_of(settings: Settings, neutral: Settings, where: object) -> No
     return Normalisation(mean, std)
 
 
+def pixel_limits(settings: Settings, where: object) -> dict[str, int]:
+    """Return the least and most pixels of an image, ``least_px`` and ``most_px``. Raises CheckpointError.
+
+    ``min_pixels`` and ``max_pixels``, where they are stated, take the place of ``size``, as in transformers.
+    """
+    size = settings.get("size")
+    stated = {**size} if isinstance(size, Mapping) else {}
+    found: dict[str, Any] = {}
+    for name, edge, own in (("least_px", "shortest_edge", "min_pixels"), ("most_px", "longest_edge", "max_pixels")):
+        found[name] = stated.get(edge) if settings.get(own) is None else settings[own]
+    if not all(type(value) is int for value in found.values()):
+        raise CheckpointError.at(f"{where}: size", "shortest_edge and longest_edge", shown(size))
+    return found
+
+
+def without_limits(settings: Settings) -> dict[str, Any]:
+    """Return the settings without those that ``pixel_limits`` reads."""
+    return {name: value for name, value in settings.items() if name not in ("min_pixels", "max_pixels")}
+
+
 def patch_px(settings: Settings, vision: Settings, where: object) -> int:
     """Return the side of a patch, which preprocessor and vision tower must state alike. Raises CheckpointError."""
     expected, stated = vision["patch_size"], settings.get("patch_size")

@@ -35,13 +35,14 @@ def read_unrounded_config(backbone: dict[str, Any], file: Path) -> bool:
     return is_nf4
 
 
-def read_published(folder: Path, is_nf4: bool) -> tuple[dict[str, Tensor], int]:
+def read_published(folder: Path, is_nf4: bool, model_type: str | None = None) -> tuple[dict[str, Tensor], int]:
     """Return a folder's tensors, and the number of weights in NF4. Those of layers stay in NF4, others are decoded.
 
     is_nf4: True if config.json says that some are in NF4
+    model_type: as in ``read_weights``
     Raises CheckpointError.
     """
-    tensors = read_weights(folder)
+    tensors = read_weights(folder, model_type)
     num_nf4 = dequantize(tensors, may_be_rounded)
     quantized = next((name for name in tensors if QUANTIZED.search(name)), None)
     if quantized is not None:

@@ -27,6 +27,7 @@ def flop(config: BackboneConfig, collator: VlmCollator, sample: Sample) -> float
     counts = {name: weights.numel() for name, weights in backbone.named_parameters() if _EMBEDDING not in name}
     of_vision = sum(count for name, count in counts.items() if name.startswith(_VISION))
     num_patches = sum(collator.num_patches(video) for video in videos)
-    rows = trees(rows, collator.visual_pad, are_images=collator.config.multi_image)
+    if collator.makes_trees:
+        rows = trees(rows, collator.visual_pad, are_images=collator.config.multi_image)
     num_tokens = sum(row.cost for row in rows)
     return 2.0 * (of_vision * num_patches + (sum(counts.values()) - of_vision) * num_tokens)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,11 @@ def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_p
     panels = [Panel.of("costs $5_$ 漢字", told, frames), Panel.of("[embeddings]", told)]
     plot(tmp_path / "plot.svg", panels, title="both")
     drawn = (tmp_path / "plot.svg").read_text()
-    assert drawn.count("<image") == 8
+    corners = re.findall(r'id="image[^>]* x="([\d.]+)" y="[^"]*" width="([\d.]+)"', drawn)
+    middles = np.array([float(x) + float(width) / 2 for x, width in corners])
+    frames_shown = (middles - middles[0]) / (middles[-1] - middles[0]) * 11
+    np.testing.assert_allclose(frames_shown, [0, 2, 4, 7, 9, 11], atol=0.02)  # they stand at their times
+    assert (np.diff(middles) >= float(corners[0][1])).all()
 
 
 ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int] | None, list[str]]] = {
@@ -79,7 +84,7 @@ def test_a_comparison_names_no_winner_where_the_orders_disagree(
         {order: PreferenceResult(preference=each, first=scores, second=scores) for order, each in preferences.items()},
     )
     assert (comparison.ranks, comparison.ranking) == (ranks, ranking)
-    videos, pairs = ([list(column.cells) for column in shown.columns] for shown in comparison.tables()[:2])
+    videos, pairs = ([list(column.cells) for column in shown.wide.columns] for shown in comparison.tables()[:2])
     assert [str(cell) for cell in videos[1]] == [str(ranks[index] or "?") for index in ranking or range(len(ranks))]
     assert [str(cell) for cell in pairs[-1]] == answers
     assert comparison.tables()[2:] == [LEGEND] * (ranking is None)

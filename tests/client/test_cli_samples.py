@@ -49,7 +49,7 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
             for name in ("first", "second") if kind == "preference" else ("reference", "other"):
                 assert_scores(answer[name], getattr(scores, name))
 
-    target = tmp_path / "new" / "folder" / "input.json"
+    target = tmp_path / "input.json"
     result = ask(served, "bench-input", *words, "--output", target)
     name = f"{MODEL}_frames" if use_frames else MODEL
     command = f"perf_analyzer -m {name} -i grpc -u {served.url('grpc').removeprefix('grpc://')} --input-data {target}"

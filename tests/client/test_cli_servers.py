@@ -217,14 +217,17 @@ USAGE: dict[str, tuple[list[str], str]] = {
     "url": (["sample", "--url", "localhost:8001"], f"Invalid value for '--url': {URL}"),
     "port of a url": (["status", "--url", "http://localhost:99999"], URL),
     "json over a video": (["score", "--json", "a.mp4", "b.mp4"], "expected a file that ends in .json or -, got a.mp4"),
-    "json nowhere": (["status", "--json", "/dev/null/a.json"], "'--json': expected a folder at /dev/null, got "),
+    "json nowhere": (
+        ["status", "--json", "/dev/null/a.json"],
+        "'--json': expected a folder at /dev/null, got none: mkdir -p /dev/null",
+    ),
     "key before": (
         ["--api-key-file", "/nowhere", "status"],
-        "Invalid value for '--api-key-file': expected a text file, got [Errno 2]",
+        "Invalid value for '--api-key-file': expected a text file, got /nowhere: No such file or directory",
     ),
     "key after": (
         ["status", "--api-key-file", "/nowhere"],
-        "Invalid value for '--api-key-file': expected a text file, got [Errno 2]",
+        "Invalid value for '--api-key-file': expected a text file, got /nowhere: No such file or directory",
     ),
     "seconds": (["wait", "--timeout", "0"], "'--timeout': expected at least 0.001, got 0.0"),
     "picture": (["score", "a.mp4", "--plot", "a.gif"], "expected a file that ends in .png, .pdf, .svg, got a.gif"),

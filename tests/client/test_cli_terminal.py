@@ -43,13 +43,22 @@ def shown(endpoints: Endpoints, *asked: object, code: ExitCode = ExitCode.OK) ->
     return {word for line in lines for word in line.split()}, lines
 
 
-def test_the_state_of_a_server_fits_a_terminal_and_says_what_its_words_mean(demo_server: Endpoints) -> None:
+def test_the_state_of_a_server_fits_a_terminal_and_ends_with_what_to_try_next(demo_server: Endpoints) -> None:
     words, lines = shown(demo_server, "status", "--metrics-url", demo_server.metrics_url)
     heads = {"model", "v", "state", "requests", "failed", "refused", "pending", "batches", "samples", "queue", "ms"}
     assert heads | {"rfm", "rfm_encoder", "rfm_frames"} <= words
     told = " ".join(" ".join(lines).split())
-    assert "failed: answered with an error;" in told
-    assert "refused: samples that cannot be scored, the caller's fault" in told
+    url = demo_server.grpc_url
+    assert f"rfm-client score VIDEO --task TASK --url {url}" in told
+    assert f"rfm-client gateway --port 8100 --triton {url}" in told
+    assert "http://localhost:8100/" in told
+
+
+def test_a_wide_terminal_is_used(demo_server: Endpoints) -> None:
+    asked = ("status", "--metrics-url", demo_server.metrics_url, "--url", demo_server.grpc_url)
+    _, lines = on_terminal(*asked, width=150)
+    heads = [line.split("  ") for line in lines if line.strip().startswith("model ")]
+    assert heads[0][-4:-1] == ["requests since load", "failed since load", "refused since start"]
 
 
 def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(demo_server: Endpoints, videos: list[Path]) -> None:

@@ -140,7 +140,7 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_options_win_over_the_file(tmp_path: Path) -> None:
     config = read(tmp_path, SECTIONED).with_options(serve={"http_port": 9000}, gateway={"timeout_s": 5.0})
     assert (config.serve.http_port, config.serve.host, config.gateway.timeout_s) == (9000, "127.0.0.1", 5.0)
-    with pytest.raises(ConfigError, match=r"^gateway\.key needs gateway\.certificate$"):
+    with pytest.raises(ConfigError, match=r"^--gateway-key needs --gateway-certificate$"):
         config.with_options(gateway={"key": Path("key.pem")})
     with pytest.raises(
         ConfigError, match=r"^serve\.grpc_port .* and gateway\.port .*: expected different ports, got 9001 "
@@ -243,7 +243,7 @@ def test_a_gateway_that_would_not_start_is_refused_before_triton_starts(name: st
     words = [f"--gateway-{each}=nowhere" for each in (name, other) if each]
     result = invoke("serve", str(REPOSITORY), "--gateway-port=8100", *words)
     assert result.exit_code == 1
-    assert result.stderr.startswith("rfm: gateway: ")
+    assert result.stderr.startswith(f"rfm: --gateway-{name}: expected ")
     assert "nowhere" in result.stderr
 
 

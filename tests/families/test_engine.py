@@ -35,6 +35,7 @@ class Pipelined:
     """A predictor whose forward waits until the next batch has been collated."""
 
     has_progress = has_success = True
+    reads_views = False
 
     def __init__(self, batches: int) -> None:
         self.collated = [threading.Event() for _ in range(batches)]
@@ -83,6 +84,7 @@ class Fixed:
     """A predictor of given scores, a sample a row."""
 
     has_progress = True
+    reads_views = False
 
     def __init__(self, scores: Sequence[RowScores], *, has_success: bool = True) -> None:
         self.scores, self.has_success = iter(scores), has_success

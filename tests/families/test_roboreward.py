@@ -20,10 +20,11 @@ from reward_models import Reference, references
 from rfm import families
 from rfm.engine import Engine, Execution
 from rfm.families import CheckpointError
-from rfm.roboreward.predictor import RoboRewardPredictor, WrittenAnswer
+from rfm.roboreward.predictor import RoboRewardPredictor
 from rfm.roboreward.prompts import as_jpeg, is_unclear, parsed
 from rfm.vlm.qwen import ROOM
 from rfm.vlm.row import VlmRow
+from rfm.vlm.written import WrittenAnswer
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,

@@ -19,7 +19,7 @@ from rfm.engine import Engine, Execution
 from rfm.families import CheckpointError
 from rfm.rynnvalue.network import Bins, entropy
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressResult, ProgressSample, Trajectory, UInt8Array
-from rynnvalue import CASES, FOLDER, ISOLATED, RELATIVE_TOLERANCE, USUAL, Case, Meta, engine_of, said
+from rynnvalue import CASES, FOLDER, ISOLATED, OTHERS, RELATIVE_TOLERANCE, USUAL, Asked, Case, Meta, engine_of, said
 from tolerances import BATCHED_VLM_TOLERANCE
 
 ISOLATED_CONFIG, CAUSAL_CONFIG = "bro_symlog_bf16_tied", "bro_quantile_fp32_tied"
@@ -28,11 +28,8 @@ UNSAID: Meta = (None, None)
 TASK = "put the red block in the bowl"
 
 
-def by_meta(case: Case) -> dict[Meta, list[Any]]:
-    groups: dict[Meta, list[Any]] = {}
-    for asked in case.asked():
-        groups.setdefault(asked.meta, []).append(asked)
-    return groups
+def text_of(asked: Asked) -> tuple[str, tuple[str, str]]:
+    return asked.sample.trajectory.task, asked.sample.trajectory.descriptions
 
 
 def check_seconds(got: Any, expected: npt.NDArray[Any]) -> None:
@@ -42,24 +39,24 @@ def check_seconds(got: Any, expected: npt.NDArray[Any]) -> None:
 @pytest.mark.reference
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_seconds_are_those_of_the_original_code(case: Case) -> None:
-    for meta, group in by_meta(case).items():
-        results = case.engine(meta).evaluate([asked.sample for asked in group])
-        for asked, result in zip(group, results, strict=True):
-            assert isinstance(result, ProgressResult), result
-            assert np.isnan(result.progress).all()
-            assert np.isnan(result.success).all()
-            assert result.relative_s is not None
-            seconds = case.expected(asked.prefix, "value.pred_value")
-            relative = case.expected(asked.prefix, "relative.pred_value") if len(seconds) > 1 else np.zeros(0)
-            if asked.sample.frame_steps:  # the arrays are those of the last prefix
-                check_seconds(result.remaining_s[-1:], seconds[-1:])
-                check_seconds(result.relative_s[-1:], relative[-1:])
-                continue
-            check_seconds(result.remaining_s, seconds)
-            check_seconds(result.relative_s, np.concatenate([[0], relative]))
-            if case.attention == ISOLATED and case.summary["dtype"] == "float32":  # entropies of no other are stored
-                expected = case.expected(asked.prefix, "value.entropy")
-                np.testing.assert_allclose(result.entropy, expected, rtol=0, atol=1e-3)
+    asked_of_case = case.asked()
+    results = case.engine.evaluate([asked.sample for asked in asked_of_case])
+    for asked, result in zip(asked_of_case, results, strict=True):
+        assert isinstance(result, ProgressResult), result
+        assert np.isnan(result.progress).all()
+        assert np.isnan(result.success).all()
+        assert result.relative_s is not None
+        seconds = case.expected(asked.prefix, "value.pred_value")
+        relative = case.expected(asked.prefix, "relative.pred_value") if len(seconds) > 1 else np.zeros(0)
+        if asked.sample.frame_steps:  # the arrays are those of the last prefix
+            check_seconds(result.remaining_s[-1:], seconds[-1:])
+            check_seconds(result.relative_s[-1:], relative[-1:])
+            continue
+        check_seconds(result.remaining_s, seconds)
+        check_seconds(result.relative_s, np.concatenate([[0], relative]))
+        if case.attention == ISOLATED and case.summary["dtype"] == "float32":  # entropies of no other are stored
+            expected = case.expected(asked.prefix, "value.entropy")
+            np.testing.assert_allclose(result.entropy, expected, rtol=0, atol=1e-3)
 
 
 @pytest.mark.reference
@@ -71,7 +68,7 @@ def test_seconds_are_those_of_the_original_code(case: Case) -> None:
 def test_each_step_has_the_seconds_of_the_original_server(case: Case) -> None:
     response = case.content["response"]["outputs_progress"]["progress_pred"]
     for asked, potentials in zip(case.asked(), response, strict=True):
-        (result,) = case.engine(asked.meta).evaluate([asked.sample])
+        (result,) = case.engine.evaluate([asked.sample])
         assert isinstance(result, ProgressResult)
         if case.summary["dtype"] == "float32":
             check_seconds(-np.asarray(result.remaining_s), np.array(potentials))
@@ -83,9 +80,9 @@ def test_each_step_has_the_seconds_of_the_original_server(case: Case) -> None:
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_tokens_positions_and_groups_are_those_of_the_original_code(case: Case) -> None:
     for asked in case.asked():
-        collator = case.engine(asked.meta).predictor.collator
+        collator = case.engine.predictor.collator
         (video, *_) = collator.rows(asked.sample)[0].videos
-        conversation, arrays = collator.conversation(video, asked.sample.trajectory.task), case.arrays
+        conversation, arrays = collator.conversation(video, *text_of(asked)), case.arrays
         np.testing.assert_array_equal(conversation.input_ids, arrays[f"{asked.prefix}input_ids"][0])
         np.testing.assert_array_equal(conversation.position_ids, arrays[f"{asked.prefix}position_ids"])
         np.testing.assert_array_equal(conversation.slots, arrays[f"{asked.prefix}pred_slot_id"][0])
@@ -99,9 +96,9 @@ def test_tokens_see_those_that_they_see_in_the_original_code(case: Case) -> None
     for asked in case.asked():
         if (stored := case.arrays.get(f"{asked.prefix}visible_packbits")) is None:
             continue
-        predictor = case.engine(asked.meta).predictor
+        predictor = case.engine.predictor
         rows = predictor.rows(asked.sample)
-        conversation = predictor.collator.conversation(rows[0].videos[0], asked.sample.trajectory.task)
+        conversation = predictor.collator.conversation(rows[0].videos[0], *text_of(asked))
         length = len(conversation.input_ids)
         expected = np.unpackbits(stored)[: length**2].reshape(length, length).astype(bool)
         end = conversation.groups[-1][-1][1]
@@ -126,7 +123,7 @@ def visible(predictor: Any, rows: Any, slots: npt.NDArray[Any]) -> npt.NDArray[A
 def test_frames_have_the_original_s_pixels(case: Case) -> None:
     for index, asked in enumerate(case.asked()):
         told = case.content["samples"][index]
-        predictor = case.engine(asked.meta).predictor
+        predictor = case.engine.predictor
         rows = predictor.rows(asked.sample)[-1:]
         pixels = predictor.collate(rows).pixels.inputs(torch.device("cpu"), torch.float32)["pixel_values"]
         grid = predictor.collator.grid(rows[0].videos[0])
@@ -171,8 +168,8 @@ def noise(num_frames: int, height: int = 24, width: int = 40, seed: int = 0) -> 
     return np.random.default_rng(seed).integers(0, 256, (num_frames, height, width, 3), np.uint8)
 
 
-def progress(frames: UInt8Array, task: str = TASK, frame_steps: int = 0) -> ProgressSample:
-    return ProgressSample(Trajectory(frames=frames, task=task), frame_steps)
+def progress(frames: UInt8Array, task: str = TASK, frame_steps: int = 0, **described: str) -> ProgressSample:
+    return ProgressSample(Trajectory(frames=frames, task=task, **described), frame_steps)
 
 
 def engine(name: str) -> Engine:
@@ -195,6 +192,30 @@ def test_a_mixed_batch_gives_the_answers_of_single_samples(name: str) -> None:
         for score in ("remaining_s", "relative_s", "entropy"):
             got, wanted = getattr(together, score), getattr(expected, score)
             np.testing.assert_allclose(got, wanted, rtol=BATCHED_VLM_TOLERANCE, atol=BATCHED_VLM_TOLERANCE)
+
+
+def test_a_sample_s_descriptions_replace_both_of_the_export() -> None:
+    robot, camera = USUAL
+    usual, other = engine(CAUSAL_CONFIG), engine_of(FOLDER / CAUSAL_CONFIG / "checkpoint", OTHERS)
+    described = [progress(noise(3), robot_description=robot, camera_description=camera), progress(noise(3))]
+    both, own = scored(other, *described)
+    (expected,) = scored(usual, described[1])
+    np.testing.assert_allclose(both.remaining_s, expected.remaining_s, rtol=1e-5)
+    assert np.abs(np.subtract(own.remaining_s, expected.remaining_s)).max() > 1e-2
+    (camera_alone,) = scored(other, progress(noise(3), camera_description=camera))
+    (expected,) = scored(engine_of(FOLDER / CAUSAL_CONFIG / "checkpoint", (None, camera)), described[1])
+    np.testing.assert_allclose(camera_alone.remaining_s, expected.remaining_s, rtol=1e-5)
+
+
+def test_descriptions_that_a_prompt_cannot_take_are_refused() -> None:
+    (refused,) = engine_of(NO_META, UNSAID).evaluate([progress(noise(2), robot_description="an arm")])
+    with pytest.raises(InvalidSampleError, match="camera_description: expected none, as the prompt of this checkpoint"):
+        raise refused
+    (refused,) = engine(CAUSAL_CONFIG).evaluate([progress(noise(2), camera_description="the <value> camera")])
+    with pytest.raises(InvalidSampleError, match="camera_description: expected text without the model's special token"):
+        raise refused
+    with pytest.raises(InvalidSampleError, match="robot_description: expected str, got int"):
+        progress(noise(2), robot_description=7)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", [ISOLATED_CONFIG, CAUSAL_CONFIG])

@@ -245,7 +245,10 @@ def test_the_run_tells_what_was_decided_and_by_whom(output: Path) -> None:
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a camera that is not there": ({"cameras": ("top",)}, f"cameras: expected some of {FRONT}, {WRIST}, got 'top'"),
-    "an episode that is not there": ({"episodes": [3, 8]}, "episodes: expected some of the 8 of the dataset, got 8"),
+    "an episode that is not there": (
+        {"episodes": [3, 8]},
+        "episodes: expected some of the dataset's 8 episodes, got 8",
+    ),
     "a whole episode that is too long": (
         {"mode": "whole"},
         "episode 2: expected at most 16 frames, as the checkpoint takes, got 53: use mode prefix and a rule with a",

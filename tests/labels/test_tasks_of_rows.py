@@ -245,7 +245,7 @@ def test_episode_numbers_may_have_gaps(tmp_path: Path, output: Path) -> None:
         told, first = dataset.episode(new), whole.episode(old)
         assert (told.task, told.num_frames, told.first_index) == (first.task, first.num_frames, first.first_index)
         np.testing.assert_array_equal(list(dataset.frames(told, WRIST)), list(whole.frames(first, WRIST)))
-    with pytest.raises(DatasetError, match="expected some of the 3 of the dataset, got 11; it has 10,20,340020"):
+    with pytest.raises(DatasetError, match="expected some of the dataset's 3 episodes, got 11; it has 10,20,340020"):
         label(dataset, BrightnessScorer(), LabelOptions(output=output, episodes=[10, 11]))
 
 

@@ -57,6 +57,7 @@ ALERTS = load_rules("alerts")
 DASHBOARD: Json = json.loads((GRAFANA / "dashboards" / "rfm.json").read_text())
 ROWS = [panel for panel in DASHBOARD["panels"] if panel["type"] == "row"]
 PANELS = [panel for panel in DASHBOARD["panels"] if panel["type"] != "row"]
+VARIABLES = [variable for variable in DASHBOARD["templating"]["list"] if variable["type"] == "query"]
 QUERIES = [
     pytest.param(target["expr"], id=f"{panel['title']} {target['refId']}")
     for panel in PANELS
@@ -107,6 +108,7 @@ def prometheus(folder: Path, port: int, targets: dict[str, str]) -> Iterator[Mon
         f"--config.file={write_configuration(folder, targets)}",
         f"--storage.tsdb.path={folder / 'data'}",
         f"--web.listen-address=127.0.0.1:{port}",
+        f"--web.user-assets={RUNBOOKS.parent}",
     ]
     url = f"http://127.0.0.1:{port}"
     with (folder / "prometheus.log").open("wb") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
@@ -210,17 +212,29 @@ def test_rules_do_on_made_up_series_what_they_should(name: str) -> None:
 def test_every_alert_says_what_to_do(rule: Json) -> None:
     assert rule["labels"]["severity"] in ("critical", "warning")
     assert rule["for"]
-    assert {"summary", "description", "runbook"} == rule["annotations"].keys()
-    file, _, anchor = rule["annotations"]["runbook"].partition("#")
-    assert ROOT / file == RUNBOOKS
-    assert anchor == rule["alert"].lower()
+    assert {"summary", "description", "runbook_url"} == rule["annotations"].keys()
+    assert rule["annotations"]["runbook_url"] == f"{{{{ $externalURL }}}}/user/operate.md#:~:text={rule['alert']}"
     assert f"\n### {rule['alert']}\n" in RUNBOOKS.read_text()
+
+
+def test_the_dashboard_begins_with_models_restarts_and_alerts_which_link_to_their_runbooks(
+    monitored: Monitored,
+) -> None:
+    order = sorted(PANELS, key=lambda panel: (panel["gridPos"]["y"], panel["gridPos"]["x"]))
+    assert [panel["title"] for panel in order[:3]] == ["Models ready", "Restarts", "Alerts"]
+    (column,) = order[2]["fieldConfig"]["overrides"]
+    (link,) = column["properties"][0]["value"]
+    assert (column["matcher"]["options"], link["url"]) == ("alertname", "${runbooks}#:~:text=${__value.text}")
+    (runbooks,) = (each["query"] for each in DASHBOARD["templating"]["list"] if each["name"] == "runbooks")
+    served = httpx.get(monitored.url + httpx.URL(runbooks).path)
+    assert served.headers["content-type"].startswith("text/")
+    assert served.text == RUNBOOKS.read_text()
 
 
 def test_grafana_finds_its_data_source_where_the_dashboard_looks_for_it() -> None:
     (source,) = yaml.safe_load((GRAFANA / "provisioning/datasources/prometheus.yml").read_text())["datasources"]
     assert source["jsonData"]["timeInterval"] == "15s"  # as Prometheus scrapes
-    for part in (*PANELS, *DASHBOARD["templating"]["list"]):
+    for part in (*PANELS, *VARIABLES):
         assert part["datasource"] == {"type": "prometheus", "uid": source["uid"]}
 
 
@@ -263,7 +277,7 @@ def test_every_query_of_the_dashboard_gives_data(monitored: Monitored, expressio
         wait_for(lambda: monitored.query(expression))
 
 
-@pytest.mark.parametrize("variable", DASHBOARD["templating"]["list"], ids=lambda variable: variable["name"])
+@pytest.mark.parametrize("variable", VARIABLES, ids=lambda variable: variable["name"])
 def test_every_variable_of_the_dashboard_has_values(monitored: Monitored, variable: Json) -> None:
     series, label = re.fullmatch(r"label_values\((.*), (\w+)\)", variable["query"]["query"]).groups()  # type: ignore[union-attr]
     expected = {"model": {"rfm", "rfm_encoder", "rfm_frames"}, "version": {"1"}}[label]

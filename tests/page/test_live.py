@@ -18,7 +18,7 @@ from gateway_requests import failure
 from gateways import TestClient, inside, running
 from live_reports import Json, episode, identity, jpeg, picture, report, step
 from rfm_client.episodes import StepScore
-from rfm_page.live import FORGOTTEN_AFTER_S, MOST_BODY_BYTES, MOST_EPISODES, LiveEpisodes, LiveReport
+from rfm_page.live import FORGOTTEN_AFTER_S, MOST_BODY_BYTES, MOST_ENDED, MOST_EPISODES, LiveEpisodes, LiveReport
 from rfm_rl import LiveView, live
 from servers import Endpoints
 
@@ -211,6 +211,32 @@ def test_a_silent_episode_is_forgotten_and_an_end_or_a_frame_makes_none() -> Non
     taken(episodes, report(episode(3, ended=True), **{identity(3): jpeg(picture())}))
     assert [each["id"] for each in episodes.since("")["episodes"]] == [identity(2)]
     assert episodes.frame(identity(1)) is episodes.frame(identity(3)) is None
+
+
+def test_how_episodes_ended_is_kept_by_run_and_changes_with_late_rewards() -> None:
+    episodes = LiveEpisodes()
+    taken(episodes, report(episode(1, step(0, 0.5), step(1, 0.75, succeeded=True), ended=True)))
+    first = episodes.since("")
+    result = {"id": identity(1), "run": "run", "number": 1, "total_reward": None, "leading": "progress", "value": 0.75}
+    assert first["ended"] == [{**result, "success": 0.5, "succeeded": True, "num_steps": 2}]
+    taken(episodes, report(episode(2, step(0, None, instead={"remaining_s": 3.0}), name="other", ended=True)))
+    taken(episodes, report(episode(3, step(0), ended=True)))
+    second = episodes.since(first["cursor"])
+    found = [(end["run"], end["number"], end["leading"], end["value"]) for end in second["ended"]]
+    assert found == [("other", 1, "remaining_s", 3.0), ("run", 2, "progress", 0.25)]
+    taken(episodes, report(episode(1, reward=0.5, total_reward=1.5)))
+    third = episodes.since(second["cursor"])
+    assert [(end["number"], end["total_reward"]) for end in third["ended"]] == [(1, 1.5)]
+    assert (of(third, 1)["reward"], of(third, 1)["total_reward"]) == (0.5, 1.5)
+
+
+def test_more_episodes_end_than_are_kept_and_their_numbers_go_on() -> None:
+    episodes = LiveEpisodes()
+    for number in range(MOST_ENDED + 2):
+        taken(episodes, report(episode(number, step(0), ended=True)))
+    answer = episodes.since("")
+    assert len(answer["episodes"]) == MOST_EPISODES
+    assert [end["number"] for end in answer["ended"]] == list(range(3, MOST_ENDED + 3))
 
 
 def test_a_whole_report_of_the_client_is_within_the_limits() -> None:

@@ -44,7 +44,7 @@ import("/viewer/chart.js").then(({ Chart }) => {
 """
 CARDS = """
 const text = (card, tag) => card.querySelector(tag).textContent;
-return [...document.querySelectorAll("#live-episodes article")]
+return [...document.querySelectorAll(".live article")]
   .filter((card) => text(card, "h2").startsWith(arguments[0] + ","))
   .map((card) => ({
     title: text(card, "h2"), state: text(card, ".state"), task: card.querySelectorAll("p")[1].textContent,
@@ -53,7 +53,7 @@ return [...document.querySelectorAll("#live-episodes article")]
   }));
 """
 PICTURES = """
-return [...document.querySelectorAll("#live-episodes article")]
+return [...document.querySelectorAll(".live article")]
   .filter((card) => card.querySelector("h2").textContent.startsWith(arguments[0] + ","))
   .map((card) => card.querySelector("img"))
   .filter((image) => !image.hidden && image.complete && image.naturalWidth);
@@ -243,7 +243,7 @@ def test_means_and_success_rate_over_the_last_episodes_and_all_of_them_are_reach
         def expected(last: int) -> list[str]:
             rate = f"{100 * np.mean(succeeded[-last:]):.0f} %"
             steps = np.mean(np.arange(1, 31)[-last:])
-            return ["0", "30", rate, number(float(np.mean(progress[-last:]))), "0.250", f"{steps:.1f}"]
+            return ["0", "30", rate, "-", number(float(np.mean(progress[-last:]))), "0.250", f"{steps:.1f}"]
 
         poll(lambda: row() == expected(20))
         page.browser.write("live-last", "5")
@@ -253,6 +253,37 @@ def test_means_and_success_rate_over_the_last_episodes_and_all_of_them_are_reach
         while page.browser["live-more"].is_displayed():
             page.browser["live-more"].click()
         assert len(page.cards("means")) == 30
+
+
+def test_a_chart_and_the_runs_show_returns_and_success_of_ended_episodes(page: Page) -> None:
+    """Episode n of 4 pays n, and the last two succeed."""
+    with LiveView(page.url, name="paid") as view:
+        for n in range(4):
+            episode = view.episode("go", n)
+            episode.add(FRAMES[0], StepScore(0.5, 0.25, n > 1, 0, 3.0))
+            episode.pay(n)
+            episode.end()
+        page.browser.until("document.querySelector('#live-runs tr')")
+        page.browser.write("live-last", "2")
+        told = "paid: return 2.500, success 1.000"
+        page.browser.until(f"document.getElementById('live-history').getAttribute('aria-label')?.includes('{told}')")
+        row = next(row for row in page.browser.run(RUNS) if row[0] == "paid")
+        assert (row[3], row[4]) == ("100 %", "2.500")
+
+
+def test_an_ended_episode_is_a_small_picture_that_opens(page: Page) -> None:
+    with LiveView(page.url, name="small") as view:
+        episode = view.episode("go")
+        episode.add(FRAMES[0], SCORE)
+        episode.pay(0.5)
+        page.shows("small", {"Reward": "0.500", "Return": "0.500"})
+        episode.end()
+        page.shows("small", {"state": "ended, no success"})
+        chart = "document.querySelector('#live-ended article .chart')"
+        assert page.browser.run(f"return {chart}.clientHeight") == 0
+        page.browser.all("#live-ended button")[0].click()
+        assert page.browser.run(f"return {chart}.clientHeight") > 0
+        assert page.browser.all("#live-ended button")[0].get_attribute("aria-expanded") == "true"
 
 
 def test_progress_and_success_have_one_colour_each_and_numbers_at_the_pointer(page: Page) -> None:
@@ -322,7 +353,7 @@ def test_a_page_without_key_asks_for_it_and_goes_on_with_a_gateway_that_comes_ba
                 browser.all("#key-form button")[0].click()
             page.shows(name, {"Step": "0"})
             poll(lambda name=name: page.has_pictures(name, FRAMES[0]))  # type: ignore[misc]
-            browser.until_text("errors", "")
+            browser.until_text("away", "")
             assert "api_key=" in browser.run("return document.getElementById('live-code').textContent")
-        told = browser.until("document.getElementById('errors').textContent")
-        assert told.startswith("gateway: expected an answer, got none")
+        told = browser.until("document.getElementById('away').textContent")
+        assert told.startswith("The server does not answer")

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gateways import TestClient, inside
+from gateways import GatewayConfig, TestClient, create_app, inside
 from paths import ROOT
 from rfm_client.frames import read_video
 from toy_world import Task, make_clip
@@ -66,6 +66,21 @@ def test_no_viewer_turns_the_page_off() -> None:
         for path in ("/viewer/score", "/live/reports"):
             assert gateway.post(path).status_code == 404
         assert gateway.get("/docs").status_code == 200
+
+
+STARTED = {
+    "rfm serve": "rfm serve my_models --gateway-port 8100 --gateway-dataset my_dataset",
+    "rfm-client gateway": "rfm-client gateway --triton grpc://127.0.0.1:1 --port 8100 --dataset my_dataset",
+}
+
+
+@pytest.mark.parametrize(("started_by", "command"), STARTED.items(), ids=STARTED)
+def test_the_command_that_adds_a_dataset_has_the_options_of_the_one_that_started_the_gateway(
+    started_by: str, command: str
+) -> None:
+    app = create_app(GatewayConfig(triton="grpc://127.0.0.1:1", port=8100), started_by=started_by)
+    with TestClient(app, "http://127.0.0.1") as gateway:
+        assert gateway.get("/viewer/server").json()["remedies"]["dataset"] == command
 
 
 WITHOUT_LABELS = """

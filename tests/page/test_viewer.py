@@ -17,7 +17,7 @@ from gateway_requests import ENCODERS, TINY, VLM, Triton, check_refused, failure
 from gateways import Gateway, poll, running
 from rfm_client.frames import Rule
 from tolerances import TOLERANCE
-from viewer_requests import COMPARE, SCORE, SERVED, by_command_line, curve_of, events, post
+from viewer_requests import COMPARE, SCORE, SERVED, SERVER, by_command_line, curve_of, events, post
 
 pytestmark = pytest.mark.triton
 
@@ -36,8 +36,10 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_models_that_score_frames_are_offered(tiny: Gateway, encoders: Gateway) -> None:
     served = requests.get(f"{encoders.url}/{SERVED}").json()
     assert [model["name"] for model in served["models"]] == [ENCODERS, VLM]
-    assert (served["model"], served["url"], served["fps"]) == (ENCODERS, encoders.triton_url, 3.0)
-    frames = {rule["name"]: rule["frames"] for rule in served["rules"]}
+    assert served["model"] == ENCODERS
+    server = requests.get(f"{encoders.url}/{SERVER}").json()
+    assert (server["url"], server["fps"]) == (encoders.triton_url, 3.0)
+    frames = {rule["name"]: rule["frames"] for rule in server["rules"]}
     assert frames == {
         rule: 16 if rule.startswith("rewind") else None if rule == "all" else "any" for rule in get_args(Rule)
     }

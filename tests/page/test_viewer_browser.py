@@ -98,6 +98,7 @@ def page(gateway: Gateway, quiet_browser: Browser, videos: Path) -> Page:
     quiet_browser.driver.execute_cdp_cmd("Storage.clearDataForOrigin", storage)
     quiet_browser.open(gateway.url)
     quiet_browser.write("tasks", TASK)
+    quiet_browser.run("document.getElementById('advanced').open = true")
     quiet_browser.write("fps", str(FPS))
     return Page(gateway, quiet_browser, videos)
 
@@ -220,28 +221,42 @@ def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
         preference = by_command_line(page.videos, f"{command} --json pair.json")["preference"]
         assert order["preference"] == pytest.approx(preference, abs=TOLERANCE)
         assert float(line.rpartition(" ")[2]) == pytest.approx(preference, abs=SHOWN + TOLERANCE)
-    assert page.browser.all("#pairs p")[0].text == "Both orders agree: success.mp4 is better."
+    assert page.browser.all("#pairs p")[0].text == "success.mp4 does the task better. Both orders agree."
     assert (answer["verdict"], answer["orders_agree"]) == ("first", True)
 
 
-def test_a_video_is_no_better_than_its_copy(page: Page) -> None:
+def test_the_verdict_is_in_view_and_in_the_status_line(page: Page) -> None:
+    with page.browser.window(1440, 900):
+        page.score("success", "failure")
+        page.compare()
+        assert page.browser["status"].text == "success.mp4 does the task better."
+        assert page.browser["status"].aria_role == "status"
+        script = "return document.querySelector('#pairs .verdict').getBoundingClientRect().toJSON()"
+        box = page.browser.run(script)
+        assert 0 <= box["top"] < box["bottom"] <= 900
+
+
+def test_a_file_and_its_copy_are_one_file(page: Page) -> None:
     page.score("success", "copy")
-    answer = page.compare()
-    assert answer["verdict"] is None
-    why = "both are exactly 0.5" if answer["orders_agree"] else "the orders disagree"
-    assert page.browser.all("#pairs p")[0].text == f"No answer: {why}."
+    page.browser["compare"].click()
+    told = "success.mp4 and copy.mp4 are one file, so neither is better."
+    page.browser.until_text("status", told)
+    assert page.browser.all("#pairs p")[0].text == told
+    assert page.saved()["comparisons"] == []
+    assert "compare" not in page.browser["command"].text
 
 
 def test_what_is_missing_or_broken_is_named_and_the_others_are_scored(page: Page) -> None:
     submit = page.browser.all("#question .first")[0]
     submit.click()
-    assert page.browser["errors"].text == "video: expected a file, got none: drop one"
+    assert page.browser["files-wanted"].text == "Choose a video, or drop one on the page."
     page.browser.write("tasks", " ")
     page.drop("broken", "success")
     page.browser.until_text("task-wanted", "What is the robot to do? Type it, then press Score.")
     assert page.browser.run("return document.activeElement.id") == "tasks"
+    assert page.browser["files-wanted"].text == ""
     submit.click()
-    assert page.browser["errors"].text == "task: expected a sentence, got none"
+    assert page.browser["task-wanted"].text == "What is the robot to do? Type it, then press Score."
     assert page.browser.cells("#curves tr") == []
     page.browser.write("tasks", TASK)
     submit.click()
@@ -249,8 +264,10 @@ def test_what_is_missing_or_broken_is_named_and_the_others_are_scored(page: Page
     page.browser.until_text("status", "1 of 2 curves are done.")
     kinds = "MP4, MOV, WebM, Matroska, Ogg or AVI"
     told = f"video: expected a file of the kind {kinds}, got another kind (broken.mp4)"
-    page.browser.until_text("errors", f"broken.mp4: {told}")
+    page.browser.until_text("errors", f"broken.mp4 could not be scored\n{told}")
     assert [row[-1] for row in page.browser.cells("#curves tr")] == [told, "done"]
+    page.browser.all("#videos .remove")[0].click()
+    assert page.browser["errors"].text == ""
 
 
 SIZES = ((1440, 900), (1024, 700))
@@ -269,12 +286,12 @@ def test_videos_and_chart_are_in_view_without_scrolling(page: Page, size: tuple[
         page.score("success", "large", "failure")
         shares = dict(
             zip(
-                ("videos", "legend", "chart", "time"),
-                page.browser.run(IN_VIEW, ["videos", "legend", "chart", "time"]),
+                ("videos", "chart", "time"),
+                page.browser.run(IN_VIEW, ["videos", "chart", "time"]),
                 strict=True,
             )
         )
-        assert [is_in_view for is_in_view, _ in shares.values()] == [True] * 4
+        assert [is_in_view for is_in_view, _ in shares.values()] == [True] * 3
         assert shares["chart"][1] >= 0.5
         assert (
             page.browser.run(
@@ -321,22 +338,82 @@ def test_the_threshold_is_dragged_in_the_chart(page: Page) -> None:
 
 
 def legend(page: Page) -> list[str]:
+    """Return the names of the questions."""
     return [str(name.get_attribute("textContent")) for name in page.browser.all("#legend .nameable button")]
+
+
+def captions(page: Page) -> list[str]:
+    """Return the names of the videos."""
+    return [str(name.get_attribute("textContent")) for name in page.browser.all("#videos .nameable button")]
+
+
+def lines(page: Page) -> set[tuple[str, str]]:
+    """Return the colour and the dash of each curve in the figure."""
+    page.browser["svg"].click()
+    svg = ElementTree.fromstring(page.browser.saved("curves.svg"))
+    return {(line.attrib["stroke"], line.attrib.get("stroke-dasharray", "")) for line in svg.iter(f"{SVG}polyline")}
+
+
+def test_twelve_videos_have_twelve_colours_and_whole_names(page: Page) -> None:
+    with page.browser.window(1440, 900):
+        for _ in range(4):
+            page.drop("success", "failure", "copy")
+        page.browser.until_text("status", "12 of 12 curves are done.")
+        assert captions(page)[:4] == ["success.mp4", "failure.mp4", "copy.mp4", "success.mp4 (2)"]
+        assert len({colour for colour, _ in lines(page)}) == 12
+        assert legend(page) == []
+        names = page.browser.run(
+            "return [...document.querySelectorAll('#videos .nameable button')].filter((each) => "
+            "each.scrollWidth <= each.clientWidth + 1).length"
+        )
+        assert names == 12
+
+
+def test_colours_tell_videos_apart_and_lines_tell_tasks_apart(page: Page) -> None:
+    page.browser.write("tasks", f"{TASK}\n{OTHER_TASK}")
+    page.drop("success")
+    page.browser.until_text("status", "2 of 2 curves are done.")
+    assert legend(page) == [TASK, OTHER_TASK]
+    assert len({colour for colour, _ in lines(page)}) == 2  # there is only one video
+    page.drop("failure")
+    page.browser.until_text("status", "4 of 4 curves are done.")
+    assert legend(page) == [TASK, OTHER_TASK]
+    found = lines(page)
+    assert len(found) == 4
+    assert [len({line[part] for line in found}) for part in (0, 1)] == [2, 2]
+    page.browser.all("#legend .remove")[1].click()
+    assert [row[1] for row in page.browser.cells("#curves tr")] == [TASK, TASK]
+    assert legend(page) == []
+
+
+def test_long_names_are_cut_between_words(page: Page) -> None:
+    script = """
+    const [text, most, done] = arguments;
+    import("/viewer/text.js").then(({ cut }) => done(cut(text, most)));
+    """
+    cases = {
+        ("a robot that does what it should do, first try", 30): "a robot that…do, first try",
+        ("rollout_seed_3_checkpoint_100k.mp4", 24): "rollout_seed…100k.mp4",
+        ("abcdefghijklmnopqrstuvwxyz", 4): "abcdef…vwxyz",
+        ("success.mp4", 4): "success.mp4",
+    }
+    for (text, most), expected in cases.items():
+        assert page.browser.driver.execute_async_script(script, text, most) == expected
 
 
 def test_videos_and_curves_are_renamed_coloured_and_removed(page: Page) -> None:
     page.score("success", "failure")
-    assert legend(page) == ["success.mp4", "failure.mp4"]
+    assert captions(page) == ["success.mp4", "failure.mp4"]
     page.browser.all("#videos .nameable button")[0].click()
     page.browser.all("#videos .nameable input")[0].send_keys(
         "a robot that does what it should do, first try", Keys.ENTER
     )
-    assert legend(page) == ["a robot that does wh…hould do, first try", "failure.mp4"]
-    page.browser.all("#legend .nameable button")[1].click()
-    page.browser.all("#legend .nameable input")[1].send_keys("dropped", Keys.ENTER)
-    assert legend(page)[1] == "dropped"
+    assert captions(page) == ["a robot that…do, first try", "failure.mp4"]
+    page.browser.all("#videos .nameable button")[1].click()
+    page.browser.all("#videos .nameable input")[1].send_keys("dropped", Keys.ENTER)
+    assert captions(page)[1] == "dropped"
     page.browser.run(
-        "const colour = document.querySelectorAll('#legend [type=color]')[1]; colour.value = '#ff00ff'; "
+        "const colour = document.querySelectorAll('#videos [type=color]')[1]; colour.value = '#ff00ff'; "
         "colour.dispatchEvent(new Event('input'))"
     )
     colours = page.browser.run(
@@ -345,12 +422,55 @@ def test_videos_and_curves_are_renamed_coloured_and_removed(page: Page) -> None:
     assert colours[1::2] == ["rgb(255, 0, 255)"] * 2
     assert [video["source"] for video in page.saved()["videos"]] == ["success.mp4", "failure.mp4"]  # the files' names
     page.browser.all("#videos .remove")[0].click()
-    assert legend(page) == ["dropped"]
-    assert len(page.browser.all("#videos video")) == 1
-    page.browser.all("#legend .remove")[0].click()
-    assert page.browser.cells("#curves tr") == []
-    page.browser.all("#question .first")[0].click()  # the video is still there
-    page.browser.until_text("status", "1 of 1 curves are done.")
+    assert captions(page) == ["dropped"]
+    assert [row[0] for row in page.browser.cells("#curves tr")] == ["dropped"]
+
+
+def test_what_was_cleared_comes_back(page: Page) -> None:
+    page.score("success", "failure")
+    page.compare()
+    before = page.saved()
+    page.browser["clear"].click()
+    page.browser.until_text("status", "Cleared 2 videos.")
+    assert page.browser.all("#videos video") == []
+    page.browser["undo"].click()
+    assert captions(page) == ["success.mp4", "failure.mp4"]
+    assert page.saved() == before
+    assert page.browser.all("#pairs p")[0].text.startswith("success.mp4 does the task better.")
+    assert not page.browser["undo"].is_displayed()
+
+
+def test_a_video_that_the_browser_cannot_show_tells_whether_it_was_scored(page: Page) -> None:
+    gif = page.videos / "clip.gif"
+    frames = [Image.fromarray(frame) for frame in make_clip("success", Task("red", "bowl"), 1).frames]
+    frames[0].save(gif, save_all=True, append_images=frames[1:])
+    page.browser.drop([gif])
+    told = "This browser cannot show this file, and it was not scored: see the numbers below."
+    page.browser.until(f"document.querySelector('#videos figure p').textContent === '{told}'")
+    assert page.browser.all("#videos figure p")[0].is_displayed()
+    assert "got another kind" in page.browser.cells("#curves tr")[0][-1]
+
+
+def test_the_space_bar_plays_unless_somebody_writes(page: Page) -> None:
+    page.score("success")
+    page.browser["tasks"].send_keys(" ")
+    assert page.browser["play"].text == "Play"
+    page.browser.run("document.activeElement.blur()")
+    ActionChains(page.browser.driver).send_keys(Keys.SPACE).perform()
+    page.browser.until_text("play", "Pause")
+
+
+def test_a_slow_upload_tells_how_far_it_is_and_then_the_curve_comes(page: Page) -> None:
+    link = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 20_000}  # bytes a second
+    page.browser.driver.execute_cdp_cmd("Network.enable", {})
+    page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link)
+    try:
+        page.drop("large")
+        page.browser.until("/ Uploading: [1-9]\\d? %\\.$/.test(document.getElementById('status').textContent)")
+        assert page.browser.cells("#curves tr")[0][-1].startswith("uploading, ")
+        page.browser.until_text("status", "1 of 1 curves are done.")
+    finally:
+        page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link | {"uploadThroughput": -1})
 
 
 def test_an_example_is_scored_with_a_click_and_its_command_line_runs(page: Page) -> None:

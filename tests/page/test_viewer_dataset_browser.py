@@ -305,13 +305,21 @@ def test_selected_episodes_are_taken_along(page: Page) -> None:
     others = [number for number in everything if number not in (2, 7)]
     for use, ending, away in (("delete", "cleaned", [2, 7]), ("keep", "kept", others)):
         Select(page.browser["use"]).select_by_value(use)
-        words = shlex.split(page.browser["use-words"].text)
-        options = dict(zip(words[1::2], words[2::2], strict=True))
-        assert words[0] == "lerobot-edit-dataset"
-        assert (options["--repo_id"], options["--root"]) == ("toy_v30_many", "toy_v30_many")
-        assert (options["--new_repo_id"], options["--new_root"]) == (f"toy_v30_many_{ending}",) * 2
-        assert options["--operation.type"] == "delete_episodes"
-        assert json.loads(options["--operation.episode_indices"]) == away
+        lines = page.browser["use-words"].text.splitlines()
+        assert [lines[0][:13], lines[2][:13]] == ["# LeRobot 0.5", "# LeRobot 0.4"]
+        home, *older = shlex.split(lines[3].removeprefix("# "))
+        assert home == "HF_LEROBOT_HOME=."
+        target = f"toy_v30_many_{ending}"
+        for words, roots in (
+            (shlex.split(lines[1]), {"--root": "toy_v30_many", "--new_root": target}),
+            (older, {}),
+        ):
+            assert words[0] == "lerobot-edit-dataset"
+            options = dict(zip(words[1::2], words[2::2], strict=True))
+            assert json.loads(options.pop("--operation.episode_indices")) == away
+            told = {"--repo_id": "toy_v30_many", "--new_repo_id": target, "--operation.type": "delete_episodes"}
+            assert options == {**told, **roots}
+        assert lines[4].endswith(f"label {target} again")
     page.browser["choose-none"].click()
     page.browser.write("task-part", "green")
     page.browser["choose-shown"].click()
@@ -426,6 +434,60 @@ def test_a_click_plays_the_episode_and_the_curve_follows(page: Page) -> None:
     last = [[columns[name][-1] for name in ("progress_sparse", "success")]]
     last += [[columns[f"{name}.{camera}"][-1] for name in ("progress", "success")] for camera in CAMERAS]
     np.testing.assert_allclose(page.numbers, last, rtol=0, atol=SHOWN)
+
+
+def test_keys_play_the_episode_step_to_the_next_and_close_it(page: Page) -> None:
+    first, second = page.episodes[:2]
+    page.at_rest(first)
+
+    def press(key: str) -> None:
+        ActionChains(page.browser.driver).send_keys(key).perform()
+
+    press(Keys.SPACE)
+    page.browser.until_text("episode-play", "Pause")
+    press("n")
+    page.browser.until_text("episode-title", f"Episode {second}")
+    press("p")
+    page.browser.until_text("episode-title", f"Episode {first}")
+    page.browser.write("task-part", "n")
+    assert page.browser["episode-title"].text == f"Episode {first}"
+    page.browser.run("document.activeElement.blur()")
+    press(Keys.ESCAPE)
+    assert not page.browser["episode"].is_displayed()
+
+
+def test_each_row_has_the_first_frame_and_the_curve(page: Page) -> None:
+    page.choose(BRIGHT)
+    pictures = "[...document.querySelectorAll('#episodes .thumb')]"
+    page.browser.until(f"{pictures}.length && {pictures}.every((each) => each.naturalWidth)")
+    points = page.browser.run(
+        "return [...document.querySelectorAll('#episodes tr')].map((row) => "
+        "[row.dataset.episode, row.querySelector('polyline').getAttribute('points')])"
+    )
+    for episode, text in points:
+        labels = columns_of(page.folders[BRIGHT], int(episode))["progress_sparse"]
+        heights = [float(point.split(",")[1]) for point in text.split()]
+        assert heights == pytest.approx([1 + (1 - value) * 18 for value in labels], abs=0.06)
+
+
+def test_a_number_below_the_threshold_is_seen_to_be_below(page: Page) -> None:
+    script = """
+    const done = arguments[0];
+    import("/viewer/text.js").then(({ shownBelow }) =>
+      done([[0.4996, 0.5], [0.49999, 0.5], [0.25, 0.5], [0.1, 0.1004]].map((pair) => shownBelow(...pair))));
+    """
+    assert page.browser.driver.execute_async_script(script) == ["0.4996", "0.49999", "0.250", "0.100"]
+
+
+def test_no_column_is_cut_beside_an_episode_and_other_labels(page: Page) -> None:
+    with page.browser.window(1440, 900):
+        Select(page.browser["others"]).select_by_index(1)
+        page.browser.until("document.querySelector('.episodes.beside')")
+        for is_watching in (False, True):
+            if is_watching:
+                page.watch(page.episodes[0])
+            beyond = "const list = document.getElementById('episode-list'); return list.scrollWidth - list.clientWidth"
+            assert page.browser.run(beyond) <= 0
 
 
 def test_dragging_in_the_chart_moves_the_videos_and_the_numbers(page: Page) -> None:
@@ -563,10 +625,10 @@ def test_the_key_opens_datasets_and_one_that_breaks_says_why(
     root = copied("toy_v21", tmp_path)
     with running(demo_server, tmp_path, "rfm", "--dataset", str(root), RFM_GATEWAY_API_KEY=KEY) as gateway:
         browser.driver.get(gateway.url)
-        browser.until("document.getElementById('errors').textContent")
+        browser.until("!document.getElementById('key-form').hidden")
         assert browser.all("#episodes tr") == []
-        for key in ("sesame", KEY):
-            browser.until("document.getElementById('errors').textContent.startsWith('key: expected it in X-API-Key')")
+        for key, told in (("sesame", ""), (KEY, "This is not the key. Type it again.")):
+            browser.until_text("key-wrong", told)
             browser.write("key", key)
             browser.all("#key-form button")[0].click()
         browser.until("document.getElementById('model').value")
@@ -575,7 +637,7 @@ def test_the_key_opens_datasets_and_one_that_breaks_says_why(
         page.at_rest(1)
         next(root.rglob("*front/episode_000002.mp4")).write_text("no video")
         browser.run("document.querySelector('#episodes tr[data-episode=\"2\"] button').click()")
-        told = browser.until("document.getElementById('errors').textContent")
+        told = browser.until("document.getElementById('episode-errors').textContent")
         assert "episode_000002.mp4: expected a whole video file, got Invalid data" in told
         assert str(tmp_path) not in told
 

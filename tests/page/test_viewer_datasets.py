@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import base64
 import errno
 import io
 import json
@@ -19,6 +20,7 @@ import av
 import numpy as np
 import pyarrow as pa
 import pytest
+from PIL import Image
 from pyarrow import parquet
 
 from gateway_requests import failure
@@ -84,6 +86,30 @@ def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: 
     file = root / "rfm_progress.parquet"
     assert told["provenance"] == json.loads(parquet.read_schema(file).metadata[b"rfm.provenance"])
     assert told["written_s"] == pytest.approx(file.stat().st_mtime)
+
+
+def test_a_preview_has_the_first_frame_as_for_the_labels_and_a_few_points(get: Get, folders: list[Path]) -> None:
+    preview = get(f"/{V21}/episodes/1/preview").json()
+    labels = columns_of(folders[V21], 1)["progress_sparse"]
+    assert len(labels) <= 32
+    assert preview["progress"] == pytest.approx(labels.tolist(), abs=1e-6)
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(preview["picture"]))))
+    dataset = LeRobotDataset(folders[V21])
+    frame = next(dataset.stored_frames(dataset.episode(1), CAMERAS[0]))
+    expected = Image.fromarray(frame)
+    expected.thumbnail((96, 72))
+    assert np.abs(picture.astype(int) - np.asarray(expected)).mean() < 5
+    plain = get("/2/episodes/1/preview").json()
+    assert plain["progress"] == []
+    assert plain["picture"]
+    assert "expected one from 0 to" in failure(get("/0/episodes/99/preview"), 404)
+
+
+def test_a_preview_of_a_broken_video_has_no_picture(tmp_path: Path) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    (root / VIDEO).write_bytes(b"no video")
+    with serving(root) as get:
+        assert get("/0/episodes/0/preview").json() == {"progress": [], "picture": None}
 
 
 @pytest.mark.parametrize("form", ["progress", "signals"])

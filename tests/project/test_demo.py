@@ -42,8 +42,11 @@ def example(name: str, *arguments: object) -> str:
 def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     with nothing_left_behind():
         shown = example("demo.py", "--output", tmp_path)
-    for text in ("put the red block in the bowl", "a success", "rewound", "P(first) = ", "similarity = ", "batches"):
+    for text in ("put the red block in the bowl", "a success", "rewound", "P(first) = ", "similarity = "):
         assert text in shown
+    assert "rfm serve model_repository --gateway-port 8100" in shown
+    assert f"rfm-client score {tmp_path}/success.mp4 --task 'put the red block in the bowl'" in shown
+    assert "http://localhost:8100/" in shown
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
     kept = load_trajectory(tmp_path / "success.mp4", task="put the red block in the bowl", fps=3).frames
     assert kept is not None
@@ -80,19 +83,20 @@ def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("COLUMNS", "160")
     clip.write(tmp_path / "clip.mp4")
     encoders = REPOSITORY / "rfm_encoder" / "1"
+    checkpoint = REPOSITORY / "rfm" / "1" / "checkpoint"
     options = {
-        "--video": tmp_path / "clip.mp4",
         "--task": clip.TASK,
         "--fps": 10,
         "--output": tmp_path,
-        "--checkpoint": REPOSITORY / "rfm" / "1" / "checkpoint",
+        "--checkpoint": checkpoint,
         "--image-encoder": encoders / "image_encoder",
         "--text-encoder": encoders / "text_encoder",
     }
     with nothing_left_behind():
-        result = rfm("demo", *(str(word) for pair in options.items() for word in pair))
+        result = rfm("try", tmp_path / "clip.mp4", *(word for pair in options.items() for word in pair))
     assert result.exit_code == 0, result.output
-    for shown in (clip.TASK, "clip.mp4", "32 frames", "batches"):
+    exported = f"rfm export --checkpoint {checkpoint} --image-encoder {encoders / 'image_encoder'}"
+    for shown in (clip.TASK, "clip.mp4", "32 frames", exported, "rfm serve my_models --gateway-port 8100"):
         assert shown in result.output
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
 
@@ -105,8 +109,7 @@ def test_a_repository_that_cannot_be_served_is_told(tmp_path: Path) -> None:
         (tmp_path / "none", "a folder of models"),
         (spaced, "a path without spaces, such as a link (ln -s)"),
     ):
-        options = {"--video": tmp_path / "clip.mp4", "--task": "x", "--repository": repository, "--output": tmp_path}
-        result = rfm("demo", *(str(word) for pair in options.items() for word in pair))
+        result = rfm("try", tmp_path / "clip.mp4", "--task", "x", "--repository", repository, "--output", tmp_path)
         assert result.exit_code == 1
         assert result.stderr.startswith(f"rfm: repository: expected {told}, got {repository}")
 

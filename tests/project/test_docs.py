@@ -330,6 +330,21 @@ def test_make_help_has_a_line_for_every_target() -> None:
     assert sorted(told) == sorted(names.replace("\\", "").split())
 
 
+@pytest.mark.parametrize("minor", [9, 13])
+def test_a_python_that_the_packages_do_not_take_is_told_before_anything_is_installed(
+    tmp_path: Path, minor: int
+) -> None:
+    stand_in, environment = tmp_path / "python", tmp_path / "venv"
+    pretend = f"import sys; sys.version_info = (3, {minor}, 0); exec(sys.argv[1])"
+    stand_in.write_text(f"#!/bin/sh\nexec {sys.executable} -c '{pretend}' \"$2\"\n")
+    stand_in.chmod(0o755)
+    words = ["make", f"VENV={environment}", f"PYTHON={stand_in}", "demo"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    expected = f"make: expected Python 3.10, 3.11 or 3.12, got 3.{minor}: make demo PYTHON=python3.12"
+    assert (done.returncode, done.stderr.splitlines()[0]) == (2, expected)
+    assert list(environment.iterdir()) == []
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
 def test_every_make_command_is_a_target(document: Path) -> None:
     if document.name == "CHANGELOG.md":

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -60,19 +61,42 @@ def test_a_command_of_the_other_program_is_told_with_that_program() -> None:
             assert f"No such command '{name}': that is `{other} {name}`" in done.stderr
 
 
+def test_a_renamed_command_is_told_with_the_new_name() -> None:
+    done = CliRunner().invoke(COMMANDS["rfm"], ["demo", "--video", "a.mp4"], env=COMMON, prog_name="rfm")
+    assert (done.exit_code, done.stderr.splitlines()[-1]) == (2, "Error: No such command 'demo': it is now `rfm try`")
+
+
 def test_the_help_of_each_program_names_the_other() -> None:
     for program, other in (("rfm", "rfm-client --help"), ("rfm-client", "rfm --help")):
         shown = CliRunner().invoke(COMMANDS[program], ["--help"], env=COMMON, prog_name=program).output
         assert other in " ".join(shown.split())
 
 
-def test_options_stand_in_groups_and_an_example_below() -> None:
+@pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if not hasattr(command, "commands")])
+def test_each_command_has_an_example_of_itself_before_the_options(name: str) -> None:
+    top = COMMANDS[name.split()[0]]
+    shown = CliRunner().invoke(top, [*name.split()[1:], "--help"], env=COMMON, prog_name=name.split()[0]).output
+    (example,) = re.findall(r"^  Example: (.*)$", shown, re.MULTILINE)
+    named = {name, name.replace("rfm ", "rfm-client ")}  # `rfm gateway` is the same command
+    assert any(example.startswith(f"{each} ") for each in named)
+    assert shown.index("Example:") < shown.index("  -h, --help")
+    context = COMMANDS[name].make_context(name, shlex.split(example)[len(name.split()) :])
+    assert all(context.params[each.name] is not None for each in COMMANDS[name].params if each.required and each.name)
+
+
+def test_options_stand_in_groups() -> None:
     shown = CliRunner().invoke(COMMANDS["rfm"], ["serve", "--help"], env=COMMON, prog_name="rfm").output
-    places = [
-        shown.index(f"\n{title}:\n") for title in ("Options", ServeConfig.TITLE, GatewayConfig.TITLE, "  Example")
-    ]
+    places = [shown.index(f"\n{title}:\n") for title in ("Options", ServeConfig.TITLE, GatewayConfig.TITLE)]
     assert places == sorted(places)
-    assert "\n    rfm serve my_models --gateway-port 8100 -- --log-verbose=1\n" in shown
+
+
+def test_what_is_needed_stands_first_and_certificates_last() -> None:
+    shown = CliRunner().invoke(COMMANDS["rfm-client"], ["gateway", "--help"], env=COMMON).output
+    options = re.findall(r"^  (--[\w-]+)", shown.partition("Gateway:")[2], re.MULTILINE)
+    assert options[0] == "--triton"
+    assert options[-5:] == ["--certificate", "--key", "--triton-ca-file", "--triton-certificate", "--triton-key"]
+    shown = CliRunner().invoke(COMMANDS["rfm-client"], ["--help"], env=COMMON).output
+    assert shown.index("\nCommands:") < shown.index("\nOptions:") < shown.index("\nCredentials:")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -90,7 +114,7 @@ DEFAULTS = {
     "rfm gateway": ["Port to listen on. [1 to 65535; default: 8000]", "default: --viewer"],
     "rfm serve": ["--gateway-viewer / --gateway-no-viewer", "default: --gateway-viewer", "default: 127.0.0.1"],
     "rfm export": ["[0 to 4096; default: 0]", "[at least 0; default: 256]"],
-    "rfm demo": ["[default: model_repository]", "[default: demo_output]"],
+    "rfm try": ["[default: model_repository]", "[default: demo_output]"],
 }
 
 
@@ -114,7 +138,7 @@ def test_what_chooses_frames_stands_in_one_group_of_score() -> None:
 def test_the_server_stands_last(name: str) -> None:
     shown = CliRunner().invoke(COMMANDS["rfm-client"], [*name.split()[1:], "--help"], env=COMMON).output
     titles = re.findall(r"^(\w[\w -]*):$", shown, re.MULTILINE)
-    assert titles[-2:] == ["Credentials", "Server"]
+    assert titles[-2:] == ["Server", "Credentials"]
 
 
 ALTERNATIVES = {

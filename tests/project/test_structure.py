@@ -32,6 +32,8 @@ FAMILIES = {
     "vlm": set(),
     "topreward": {"rfm.vlm"},
     "roboreward": {"rfm.vlm"},
+    "procvlm": {"rfm.vlm"},
+    "robodopamine": {"rfm.vlm"},
     "rynnvalue": {"rfm.vlm"},
 }  # and the families that each extends
 FOLDERS = {

@@ -53,6 +53,7 @@ def episodes_of(taker: Taker) -> list[dict[str, Any]]:
         for told in body["episodes"]:
             known = found.setdefault(told["id"], {**told, "ended": False, "steps": []})
             known["steps"] += told["steps"]
+            known |= {name: told[name] for name in ("reward", "total_reward") if name in told}
             known["ended"] |= told["ended"]
     return list(found.values())
 
@@ -262,15 +263,30 @@ def test_the_scores_that_add_returns_are_reported(served: Served, taker: Taker) 
 def test_a_gymnasium_environment_is_reported(served: Served, taker: Taker, blocking: bool) -> None:
     with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url, name="cart") as view:
         env = RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(live=view, blocking=blocking))
-        episodes = [play(env, seed)[1] for seed in range(2)]
+        episodes = [play(env, seed) for seed in range(2)]
         env.close()
     told = episodes_of(taker)
     assert [each["ended"] for each in told] == [True, True]
-    for each, infos in zip(told, episodes, strict=True):
+    for each, (rewards, infos) in zip(told, episodes, strict=True):
+        assert (each["reward"], each["total_reward"]) == (rewards[-1], pytest.approx(sum(rewards)))
         reported = {step["step"]: (step["progress"], step["success"]) for step in each["steps"]}
         for info in (info["reward_model"] for info in infos):
             assert reported[info["step"]] == (info["progress"], info["success"])
         assert max(reported) == len(infos) - 1
+
+
+def test_rewards_are_reported_after_the_end_too_and_only_numbers(taker: Taker) -> None:
+    with LiveView(taker.url) as view:
+        paid, unpaid = view.episode("go"), view.episode("go", 1)
+        for episode in (paid, unpaid):
+            episode.add(picture(), score(0))
+        paid.pay(0.5)
+        paid.end()
+        paid.pay(0.25)
+        unpaid.pay(float("nan"))
+    first, second = episodes_of(taker)
+    assert (first["reward"], first["total_reward"]) == (0.25, 0.75)
+    assert not {"reward", "total_reward"} & second.keys()
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))

@@ -31,8 +31,8 @@ from servers import wait_for
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--host", "0.0.0.0"), "rfm: host: expected a loopback address for Triton 2.51.0, which has known remote vul"),
-        (("--grpc-key", "key.pem"), "rfm: serve.grpc_key needs serve.grpc_certificate\n"),
+        (("--host", "0.0.0.0"), "rfm: --host: expected a loopback address for Triton 2.51.0, which has known remote vul"),
+        (("--grpc-key", "key.pem"), "rfm: --grpc-key needs --grpc-certificate\n"),
     ],
     ids=["open", "half a pair"],
 )  # fmt: skip

@@ -32,9 +32,10 @@ from rfm.launch.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.contract.descriptors import MOST
 from servers import children, model_processes, wait_for
+from terminals import Terminal
 
 VIDEO = ROOT / "tests/videos/jaco_play_pick_up_green_cup.mp4"
-DEMO = ["demo", f"--repository={REPOSITORY}", f"--video={VIDEO}", f"--task={clip.TASK}"]
+TRY = ["try", str(VIDEO), f"--repository={REPOSITORY}", f"--task={clip.TASK}"]
 
 
 def executable(file: Path, content: str) -> Path:
@@ -105,11 +106,37 @@ def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(
     assert not re.search(r"^I\d{4} ", log, re.MULTILINE)  # Triton's remarks
 
 
+@pytest.mark.triton
+@pytest.mark.slow
+def test_a_terminal_shows_one_screen_and_a_file_the_lines_of_triton(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    endpoints, gateway = Endpoints.free(), free_ports(1)[0]
+    words = [*command(REPOSITORY, endpoints), f"--gateway-port={gateway}"]
+    with nothing_left_behind(), Terminal(words) as terminal:
+        wait_for(lambda: "look at rewards in the browser" in terminal.shown)
+        terminal.process.send_signal(signal.SIGINT)
+        assert terminal.process.wait(EXIT_S) == 0
+    log = tmp_path / "rfm" / f"triton-{endpoints.http_port}.log"
+    shown = terminal.shown.splitlines()
+    assert shown[0] == f"rfm serve: loading rfm, rfm_encoder, rfm_frames from {REPOSITORY} ..."
+    for line in (
+        "  models   rfm 1, rfm_encoder 1, rfm_frames 1, on the CPU",
+        f"  gRPC     {endpoints.grpc_url}",
+        f"  page     http://127.0.0.1:{gateway}/",
+        f"  log      {log} (lines of Triton and the models)",
+    ):
+        assert line in shown
+    assert shown[-4].endswith(f"rfm-client score VIDEO --task TASK --url {endpoints.grpc_url}")
+    assert "successfully loaded 'rfm'" in log.read_text()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "number"),
-    [([], signal.SIGHUP), ([], signal.SIGKILL), (DEMO, signal.SIGTERM)],
-    ids=["hang up", "kill", "demo"],
+    [([], signal.SIGHUP), ([], signal.SIGKILL), (TRY, signal.SIGTERM)],
+    ids=["hang up", "kill", "try"],
 )
 def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], number: signal.Signals) -> None:
     """A stand-in never gets ready, so the moment of the signal is certain."""

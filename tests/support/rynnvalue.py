@@ -25,6 +25,8 @@ ISOLATED = "pred_slot_isolated_eager"
 SOURCES = {"usc_xarm_policy_ranking": ("an xArm single-arm robot", "the main right camera")}
 USUAL = ("a Franka single-arm robot", "the main right camera")
 
+OTHERS = ("a robot of another kind", "another camera")
+
 Meta = tuple[str | None, str | None]
 
 
@@ -67,17 +69,18 @@ class Case(Reference):
             steps = FRAME_STEPS if request["use_frame_steps"] else 0
             told = trajectory.get("metadata")
             meta = SOURCES[trajectory["data_source"]] if not told else _descriptions(told)
-            found.append(
-                Asked(
-                    ProgressSample(Trajectory(frames=frames, task=trajectory["task"]), steps),
-                    f"sample_{index}.",
-                    meta if self.summary["use_meta"] else (None, None),
-                )
+            meta = meta if self.summary["use_meta"] else (None, None)
+            robot, camera = (text or "" for text in meta)
+            described = Trajectory(
+                frames=frames, task=trajectory["task"], robot_description=robot, camera_description=camera
             )
+            found.append(Asked(ProgressSample(described, steps), f"sample_{index}.", meta))
         return found
 
-    def engine(self, meta: Meta) -> Engine:
-        return engine_of(self.checkpoint, meta)
+    @property
+    def engine(self) -> Engine:
+        """Of an export with descriptions that no case has."""
+        return engine_of(self.checkpoint, OTHERS if self.summary["use_meta"] else (None, None))
 
 
 def _descriptions(metadata: dict[str, Any]) -> Meta:

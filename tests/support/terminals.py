@@ -10,6 +10,9 @@ import re
 import struct
 import subprocess
 import termios
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
 
 from client_commands import RFM_CLIENT
 
@@ -18,24 +21,45 @@ _LINES = 50
 _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
+class Terminal:
+    """A command on a terminal, with standard error. ``shown`` grows while the command runs."""
+
+    def __init__(self, command: Sequence[str], width: int = WIDTH) -> None:
+        self._ours, its = pty.openpty()
+        fcntl.ioctl(its, termios.TIOCSWINSZ, struct.pack("HHHH", _LINES, width, 0, 0))
+        environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "TERMINAL_WIDTH")}
+        options = {"stdin": its, "stdout": its, "stderr": its, "env": {**environment, "TERM": "xterm"}}
+        self.process = subprocess.Popen(command, **options)
+        os.close(its)
+        self._shown: list[bytes] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def shown(self) -> str:
+        """What the terminal has shown. A progress bar overwrites the line from the start."""
+        lines = (
+            line.rpartition("\r\x1b[2K")[2] for line in b"".join(self._shown).decode(errors="replace").split("\r\n")
+        )
+        return "\n".join(_CONTROL.sub("", line).rstrip() for line in lines)
+
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+        self._reader.join()
+        os.close(self._ours)
+
+    def _read(self) -> None:
+        with suppress(OSError):  # it is closed
+            while part := os.read(self._ours, 4096):
+                self._shown.append(part)
+
+
 def on_terminal(*words: object, width: int = WIDTH) -> tuple[int, list[str]]:
     """Return the exit code of ``rfm-client`` and the lines on a terminal, with standard error."""
-    ours, its = pty.openpty()
-    fcntl.ioctl(its, termios.TIOCSWINSZ, struct.pack("HHHH", _LINES, width, 0, 0))
-    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "TERMINAL_WIDTH")}
-    command = [str(RFM_CLIENT), *map(str, words)]
-    with subprocess.Popen(command, stdin=its, stdout=its, stderr=its, env={**environment, "TERM": "xterm"}) as process:
-        os.close(its)
-        shown = b"".join(iter(lambda: _read(ours), b""))
-        code = process.wait(timeout=60)
-    os.close(ours)
-    # A progress bar overwrites the line from the start.
-    lines = (line.rpartition("\r\x1b[2K")[2].rstrip("\r") for line in shown.decode().split("\n"))
-    return code, [_CONTROL.sub("", line).rstrip() for line in lines]
-
-
-def _read(terminal: int) -> bytes:
-    try:
-        return os.read(terminal, 4096)
-    except OSError:  # it is closed
-        return b""
+    with Terminal([str(RFM_CLIENT), *map(str, words)], width) as terminal:
+        code = terminal.process.wait(timeout=60)
+    return code, terminal.shown.split("\n")

@@ -15,7 +15,7 @@ import requests
 
 from client_commands import invoke
 
-SCORE, COMPARE, SERVED = "viewer/score", "viewer/compare", "viewer/served"
+SCORE, COMPARE, SERVED, SERVER = "viewer/score", "viewer/compare", "viewer/served", "viewer/server"
 
 Json = dict[str, Any]
 

@@ -209,7 +209,7 @@ def test_what_an_execution_took_is_told(tmp_path: Path) -> None:
             execution.collate_s, execution.forward_s = 0.25, 0.5
             execution.add_tokens(6, 8)
             execution.num_encoded, execution.num_found, execution.cache_bytes = 3, 2, 1000
-            execution.out_of_memory_count, execution.num_unclear = 1, 2
+            execution.out_of_memory_count, execution.num_unclear, execution.num_unreadable = 1, 2, 3
             execution.on_forward()
             return super().answer(questions, execution)
 
@@ -220,7 +220,7 @@ def test_what_an_execution_took_is_told(tmp_path: Path) -> None:
     told = {metric.name: metric.value for metric in METRICS if metric.value and metric.name != "rfm_samples_total"}
     assert told == {
         "rfm_frames_total": 12, "rfm_out_of_memory_retries_total": 2, "rfm_frames_encoded_total": 6,
-        "rfm_unclear_answers_total": 2,
+        "rfm_unclear_answers_total": 2, "rfm_unreadable_answers_total": 3,
         "rfm_feature_cache_hits_total": 4, "rfm_feature_cache_misses_total": 6, "rfm_feature_cache_bytes": 1000,
         "rfm_forward_passes_total": 4, "rfm_batch_samples": 3, "rfm_batch_padding_ratio": 0.25,
         "rfm_collate_seconds": 0.25, "rfm_forward_seconds": 0.5,

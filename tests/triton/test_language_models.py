@@ -51,7 +51,7 @@ RYNN = ROOT / "rynnvalue" / "bro_symlog_bf16_tied" / "checkpoint"
 LEROBOT = ROOT / "lerobot_robometer" / "tok_disc10" / "checkpoint"
 DATASET = ROOT / "lerobot_rabc" / "home" / "golden" / "tiny_shared"
 NAMES = {"top": (TOP, "topreward"), "baseline": (TOP, "topreward-robometer"), "robo": (ROBO, "roboreward")}
-NAMES["rynn"] = RYNN, "rynnvalue,robot=a Franka single-arm robot,camera=the main right camera"
+NAMES["rynn"] = RYNN, rynnvalue.said(rynnvalue.OTHERS)  # each case has its own
 TASK = "put the red block in the bowl"
 
 
@@ -137,16 +137,37 @@ def test_steps_and_rewards_are_made_of_remaining_seconds(asked: Served) -> None:
         expected = r"progress: expected a score of each frame, got NaN: .*; score='remaining_s' takes what it predicts"
         with client.episode(TASK) as episode, pytest.raises(ValueError, match=expected):
             episode.add(frames[0])
+        described = Trajectory(frames=frames, task=TASK, robot_description="an arm", camera_description="a camera")
+        other = client.progress(described)
+        with client.episode(
+            TASK, score="remaining_s", robot_description="an arm", camera_description="a camera"
+        ) as episode:
+            others = [episode.add(frame) for frame in frames]
         options = RewardOptions(mode="shaping", gamma=1.0, score="remaining_s", max_frames=4)
         with RewardModelWrapper(cart_pole(max_episode_steps=3), client, TASK, options) as env:
             rewards, infos = play(env)
     np.testing.assert_allclose(
         [step.more_scores["remaining_s"] for step in steps], whole.remaining_s, rtol=1e-4, atol=1e-4
     )
+    np.testing.assert_allclose(
+        [step.more_scores["remaining_s"] for step in others], other.remaining_s, rtol=1e-4, atol=1e-4
+    )
+    assert np.abs(np.subtract(other.remaining_s, whole.remaining_s)).max() > 1e-2
     assert all(np.isnan(step.progress) and not step.succeeded for step in steps)
     seconds = [info["reward_model"]["remaining_s"] for info in infos]
     assert np.isfinite(seconds).all()
     np.testing.assert_allclose(rewards, -np.diff(seconds), rtol=0, atol=1e-4)
+
+
+def test_a_model_that_reads_no_descriptions_refuses_them(asked: Served, protocol: str) -> None:
+    frames = np.zeros((2, 48, 80, 3), np.uint8)
+    message = "descriptions: expected a model whose prompt names robot and camera.*; leave out robot_description"
+    with asked.client("top", protocol) as client, pytest.raises(InvalidSampleError, match=message):
+        client.progress(Trajectory(frames=frames, task=TASK, robot_description="an arm"))
+    with asked.client("robo", protocol) as client:
+        episode = client.episode(TASK, frames=2, camera_description="a camera")
+        with pytest.raises(InvalidSampleError, match=message):
+            episode.add(frames[0])
 
 
 def test_the_gateway_answers_as_rynnvalue_s_server(asked: Served, tmp_path: Path) -> None:
@@ -163,19 +184,19 @@ def test_the_gateway_answers_as_rynnvalue_s_server(asked: Served, tmp_path: Path
         for each in told.asked()
     ]
     other = json.loads(json.dumps(samples[:1]))
-    other[0]["trajectory"]["metadata"]["robot_description"] = "a robot of another kind"
+    other[0]["trajectory"]["metadata"]["robot_description"] = 7
     with running(asked.endpoints, tmp_path, "rynn") as gateway:
         url = f"{gateway.url}/evaluate_batch"
         answer = requests.post(url, json={"samples": samples, "use_frame_steps": True}, timeout=60).json()
         refused = requests.post(url, json={"samples": other}, timeout=60)
     for each, values in zip(told.asked(), answer["outputs_progress"]["progress_pred"], strict=True):
-        (expected,) = told.engine(each.meta).evaluate([each.sample])
+        (expected,) = told.engine.evaluate([each.sample])
         assert isinstance(expected, ProgressResult)
         assert expected.remaining_s is not None
         np.testing.assert_allclose(values, -expected.remaining_s, rtol=1e-4, atol=1e-4)
     assert "outputs_success" not in answer
     assert refused.status_code == 422
-    assert "expected 'a Franka single-arm robot', as the model was exported with" in refused.text
+    assert "expected a description, or null, got 7" in refused.text
 
 
 def test_lerobot_s_robometer_is_answered_as_by_lerobot(asked: Served, protocol: str) -> None:
@@ -446,6 +467,7 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
     assert "In s, in place of progress: seconds that remain until the task is done." in " ".join(done.output.split())
     with running(asked.endpoints, tmp_path, "rynn") as gateway:
         page.open(gateway.url)
+        page.run("document.getElementById('advanced').open = true")
         Select(page["rule"]).select_by_visible_text("rint_pad")
         for name, text in {"tasks": TASK, "fps": "0.5", "frames": "4"}.items():
             page.write(name, text)
@@ -468,10 +490,10 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
         with asked.client("rynn") as client, LiveView(gateway.url, name="run") as view:
             episode = client.episode(TASK, score="remaining_s", live=view)
             left_s = f"{episode.add(frame).more_scores['remaining_s']:.3f} s"
-        card = "[...document.querySelectorAll('#live-episodes dl div')].map((each) => each.textContent)"
+        card = "[...document.querySelectorAll('.live dl div')].map((each) => each.textContent)"
         page.until(f"{card}.includes('Remaining{left_s}')")
-        assert page.cells("#live-runs tr")[0][4] == f"{left_s} remaining"
-        assert f"final remaining {left_s}" in str(page["live-episodes"].get_attribute("innerHTML"))
+        poll(lambda: page.cells("#live-runs tr")[0][5] == f"{left_s} remaining")
+        assert f"final remaining {left_s}" in str(page["live-panel"].get_attribute("innerHTML"))
 
 
 def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``python -m rfm_gateway``: the gateway for installations without the ``rfm`` and ``rfm-client`` commands."""
+"""``python -m rfm_gateway``: the gateway as ``rfm serve`` runs it beside Triton."""
 
 from __future__ import annotations
 

@@ -56,14 +56,15 @@ _STATUS_OF = {  # HTTP status, by the client's error
 logger = logging.getLogger("rfm_gateway")
 
 
-def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
+def create_app(config: GatewayConfig, api_key: str | None = None, started_by: str = "rfm-client gateway") -> FastAPI:
     """Return the application.
 
     api_key: key that requests must show, except for health and documentation; None: no key
+    started_by: the command that a person repeats to start this gateway again
 
     Raises OSError for a missing folder, ValueError for a malformed URL or an unusable file.
     """
-    folder = None if config.allow_folder is None else config.allow_folder.resolve(strict=True)
+    folder = config.resolved_folder
     client, metrics = config.client(), GatewayMetrics()
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
     state = TritonState(client, config)
@@ -105,7 +106,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
     pages.add_docs(app)
     add_page = page_of(config)
     if add_page is not None:
-        add_page(PageHost(app, guards, config, limits, metrics))
+        add_page(PageHost(app, guards, config, limits, metrics, started_by))
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
     return app
 

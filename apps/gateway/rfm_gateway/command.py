@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import typer
 
@@ -38,6 +39,8 @@ def gateway(config: GatewayOptions) -> None:
 
     For a Triton that runs already. `rfm serve --gateway-port` starts Triton and gateway together, and restarts both.
     `rfm gateway` and `rfm-client gateway` are the same command; the second needs no PyTorch.
+
+    Example: rfm-client gateway --triton grpc://localhost:8001 --port 8100
     """
     try:
         import uvicorn
@@ -51,7 +54,7 @@ def gateway(config: GatewayOptions) -> None:
     address = config.address
     try:
         api_key, tls = config.api_key(os.environ), config.tls
-        app = create_app(config, api_key)
+        app = create_app(config, api_key, _started_by(sys.argv[0]))
         address.check_free("gateway", port_option="--port")
     except ConfigError:  # with_options names its option
         raise
@@ -71,6 +74,7 @@ def gateway(config: GatewayOptions) -> None:
         port=address.port,
         access_log=False,
         log_config=None,
+        log_level="warning",
         http=Connection,
         limit_concurrency=most_connections(raise_limit()),
         timeout_keep_alive=KEEP_ALIVE_S,
@@ -100,6 +104,12 @@ def gateway_command(config: GatewayConfig) -> list[str]:
         values = value if isinstance(value, tuple) else () if value is None else (value,)
         words += [word for value in values for word in (each.option, str(value))]
     return [sys.executable, "-m", "rfm_gateway", *words]
+
+
+def _started_by(program: str) -> str:
+    """Return the command that a person typed: this one, or ``rfm serve``, which runs ``python -m rfm_gateway``."""
+    name = Path(program).name
+    return f"{name} gateway" if name in ("rfm", "rfm-client") else "rfm serve"
 
 
 def page_link(config: GatewayConfig) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from rfm_client import AsyncRewardClient
-from rfm_client.options import ConfigError, Settings, setting
+from rfm_client.options import ConfigError, InvalidValueError, Settings, setting
 from rfm_client.serving import (
     DEFAULT_MODEL,
     Credentials,
@@ -45,12 +45,9 @@ class GatewayConfig(Settings):
     )
     metrics_url: str | None = setting(None, "URL of Triton's metrics. Default: those of the Triton beside it.")
     model: str | None = setting(None, "Model name in the repository. Default: rfm, or export.name.")
+    viewer: bool = setting(True, "Serve the page in the browser, at /.")
+    dataset: tuple[str, ...] = setting((), "LeRobot folder or HDF5 file to show on the page. Repeat for more.")
     api_key_file: Path | None = setting(None, f"File with the API key that requests need. Default: {KEY_VARIABLE}.")
-    certificate: Path | None = setting(None, "Serve HTTPS with this certificate (PEM).")
-    key: Path | None = setting(None, "The certificate's key (PEM).")
-    triton_ca_file: Path | None = setting(None, "Certificate authorities (PEM) for Triton. Default: the system's.")
-    triton_certificate: Path | None = setting(None, "Client certificate (PEM) for Triton.")
-    triton_key: Path | None = setting(None, "That certificate's key (PEM).")
     cors_origin: tuple[str, ...] = setting((), "Web origin that may send requests. Repeat for more.")
     allow_host: tuple[str, ...] = setting((), "Host name that callers without a key may use. Repeat for more.")
     allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
@@ -66,12 +63,17 @@ class GatewayConfig(Settings):
     max_waiting: int = setting(1024, "Most waiting evaluations; others get 503.", least=0)
     use_frame_steps: bool = setting(False, "Turn use_frame_steps on for requests without this field.")
     refuse_blank: bool = setting(False, "Refuse black and single-colour frames instead of warning.")
-    viewer: bool = setting(True, "Serve the page in the browser, at /.")
-    dataset: tuple[str, ...] = setting((), "LeRobot folder or HDF5 file to show on the page. Repeat for more.")
+    certificate: Path | None = setting(None, "Serve HTTPS with this certificate (PEM).")
+    key: Path | None = setting(None, "The certificate's key (PEM).")
+    triton_ca_file: Path | None = setting(None, "Certificate authorities (PEM) for Triton. Default: the system's.")
+    triton_certificate: Path | None = setting(None, "Client certificate (PEM) for Triton.")
+    triton_key: Path | None = setting(None, "That certificate's key (PEM).")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         ConfigError.require_both(self, "certificate", "key")
+        if self.metrics_url is not None and not self.metrics_url.startswith(("http://", "https://")):
+            raise ConfigError.at("metrics_url", "http://host:port/metrics", repr(self.metrics_url))
         for name in self.allow_host:
             if not _HOST_NAME.fullmatch(name):
                 raise ConfigError.at("allow_host", "a host name without scheme and port", repr(name))
@@ -86,6 +88,14 @@ class GatewayConfig(Settings):
         if self.triton is None:
             raise ConfigError.at("triton", "the URL of a Triton", "none")
         return self.triton
+
+    @property
+    def resolved_folder(self) -> Path | None:
+        """The allowed folder, with links resolved. Raises ConfigError if it is missing."""
+        try:
+            return None if self.allow_folder is None else self.allow_folder.resolve(strict=True)
+        except OSError as error:
+            raise ConfigError.at("allow_folder", "a folder", error) from None
 
     @property
     def credentials(self) -> Credentials:
@@ -110,14 +120,17 @@ class GatewayConfig(Settings):
 
         checkpoint: name of another export; None: the gateway's
         """
-        return AsyncRewardClient(
-            self.triton_url,
-            model=checkpoint or self.checkpoint,
-            timeout_s=self.timeout_s,
-            retry=False,  # the caller gets the error at once, and may retry
-            max_in_flight=self.max_in_flight,
-            **self.credentials.options,
-        )
+        try:
+            return AsyncRewardClient(
+                self.triton_url,
+                model=checkpoint or self.checkpoint,
+                timeout_s=self.timeout_s,
+                retry=False,  # the caller gets the error at once, and may retry
+                max_in_flight=self.max_in_flight,
+                **self.credentials.options,
+            )
+        except InvalidValueError as error:
+            raise ConfigError.like(error, where="triton") if error.where == "url" else error from None
 
     async def status(self, timeout_s: float) -> ServerStatus:
         """Read the state of Triton and of its devices. Raises ServerError."""

@@ -32,6 +32,7 @@ class PageHost:
     """The gateway that serves a page.
 
     guards: refuse requests without the gateway's key
+    started_by: the command that a person repeats to start the gateway again: ``rfm serve`` or one of its own
     """
 
     app: FastAPI
@@ -39,6 +40,7 @@ class PageHost:
     config: GatewayConfig
     limits: BodyLimits
     metrics: GatewayMetrics
+    started_by: str
 
     def add_endpoints(self, router: APIRouter) -> None:
         """Serve endpoints to callers with the gateway's key."""

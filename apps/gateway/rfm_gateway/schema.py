@@ -220,7 +220,9 @@ class PreferenceOutputs(BaseModel):
 class ProgressOutputs(BaseModel):
     """An entry for each progress sample, in order."""
 
-    progress_pred: list[list[float]] = Field(description="0..1, for each frame.")
+    progress_pred: list[list[float | None]] = Field(
+        description="0..1, for each frame; null: the model (Robo-Dopamine) did not compare the frame."
+    )
 
 
 class SuccessOutputs(BaseModel):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from traceback import clear_frames
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
@@ -44,7 +44,7 @@ from rfm_gateway.observe import within
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 FRAME_STEPS_OF_SECONDS = 8  # the same, for a model of remaining seconds
-_DESCRIPTIONS = {"robot_description": "robot", "camera_description": "camera"}  # settings, by keys of metadata
+_DESCRIPTIONS = ("robot_description", "camera_description")  # keys of metadata
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
 _BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the embedding of the task
@@ -243,27 +243,26 @@ class _Conversion:
         if self.frame_model is None:
             expected = "embeddings, since no model for raw frames is served"
             raise InvalidSampleError.at("frames", expected, "frames")
-        _check_descriptions(given, self.frame_model)
+        described = _descriptions(given) if self.frame_model.reads_descriptions else {}
         frames = self.files.frames(given.frames) if isinstance(given.frames, list) else given.uint8_frames
-        trajectory = Trajectory(frames=frames, task=given.task or "")
+        trajectory = Trajectory(frames=frames, task=given.task or "", **described)
         if self.refuse_blank:
             refuse_blank_frames(trajectory)
         return trajectory
 
 
 def _frame_steps(frames: ModelInfo | None) -> int:
-    is_of_seconds = frames is not None and "remaining_s" in frames.scores
-    return FRAME_STEPS_OF_SECONDS if is_of_seconds else FRAME_STEPS
+    return FRAME_STEPS if frames is None or frames.has_progress else FRAME_STEPS_OF_SECONDS
 
 
-def _check_descriptions(given: schema.TrajectoryInput, model: ModelInfo) -> None:
-    """Raise InvalidSampleError if metadata describes another robot or camera than the prompt of a model of seconds."""
+def _descriptions(given: schema.TrajectoryInput) -> dict[str, Any]:
+    """Return the descriptions of robot and camera in a trajectory's metadata. Raises InvalidSampleError."""
     told = given.metadata if isinstance(given.metadata, Mapping) else {}
-    named = model.network.get("config", {})
-    for key, setting in _DESCRIPTIONS.items() if "remaining_s" in model.scores else ():
-        if told.get(key) is not None and told[key] != named.get(setting):
-            expected = f"{named.get(setting)!r}, as the model was exported with (rfm export --as)"
-            raise InvalidSampleError.at(f"metadata.{key}", expected, repr(told[key]))
+    found = {key: told[key] for key in _DESCRIPTIONS if told.get(key) is not None}
+    for key, text in found.items():
+        if not isinstance(text, str) or not text.strip():
+            raise InvalidSampleError.at(f"metadata.{key}", "a description, or null", repr(text))
+    return found
 
 
 def _prefixes(sample: Sample) -> list[Sample]:

@@ -13,7 +13,7 @@ from rfm_client.frames import BlankFrames
 from rfm_labels.datasets.faults import listed
 
 Columns: TypeAlias = dict[str, Float32Array]
-PROGRESS, SUCCESS, REMAINING = "progress", "success", "remaining_s"
+PROGRESS, SUCCESS, REMAINING, HOP = "progress", "success", "remaining_s", "hop"
 SCORES = {name: score for name, score in FRAME_SCORES.items() if not score.is_per_bin}  # in the order of columns
 BlankCameras: TypeAlias = Mapping[str, Mapping[int, int]]  # highest value of the frames, by camera and episode
 BLANK_KEY = b"rfm.blank_cameras"

@@ -112,6 +112,10 @@ class LabelOptions(Settings):
         "How progress is made of remaining seconds, for a model without progress: "
         "remaining_over_first: 1 - the seconds / those of the episode's first frame.",
     )
+    robot_description: str = setting("", "Words for the robot in RynnValue's prompt. Default: those of the export.")
+    camera_description: str = setting(
+        "", "Words for the camera, with a single camera. If either is given, they replace both of the export."
+    )
     mode: Mode = setting("prefix", "prefix: frame t is scored on the frames up to t. whole: all frames together.")
     resize: bool = setting(False, "Downscale frames to the model's input size before sending.")
     episodes: Sequence[int] | None = setting(
@@ -179,8 +183,8 @@ def chosen_numbers(dataset: Dataset, options: LabelOptions) -> list[int]:
     known = set(dataset.numbers)
     wanted = sorted(known) if options.episodes is None else sorted(set(options.episodes))
     missing = [number for number in wanted if number not in known]
-    got = f"{', '.join(map(str, missing[:5])) or 'none'}; it has {listed(sorted(known))}"
-    require("episodes", bool(wanted) and not missing, f"some of the {len(known)} of the dataset", got)
+    got = f"{listed(missing) or 'none'}; it has {listed(sorted(known))}"
+    require("episodes", bool(wanted) and not missing, f"some of the dataset's {len(known)} episodes", got)
     if options.filter_key is not None:
         keys = ", ".join(dataset.filter_keys)
         is_known = options.filter_key in dataset.filter_keys

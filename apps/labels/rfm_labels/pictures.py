@@ -3,74 +3,133 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rfm_client import FrameScores
+from rfm_client.episodes import SuccessRule
+from rfm_client.plot import save
 from rfm_client.recording import Recording
 from rfm_labels.datasets.dataset import Dataset
 from rfm_labels.evaluation import LabelComparison
+from rfm_labels.label_files import read_provenance
 from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.plan import Item, Plan
 from rfm_labels.summary import Summary
 from rfm_labels.writing import Parts
 
-WIDTH_IN = 10.0
-HEIGHT_IN = 3.5
-DOTS_PER_IN = 150
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH_IN = 7.0  # of a page
+SUMMARY_IN, EVALUATION_IN = 1.9, 1.3  # heights of axes
+HEADLINE_IN = 0.5
 BINS = 20
+STYLE = ("default", "rfm_client.figure")  # the style file of all figures says what each colour means
+PROGRESS_COLOUR, SUCCESS_COLOUR, FAILURE_COLOUR = "C0", "C2", "C6"
+THRESHOLD = {"color": "#75808a", "linestyle": ":", "linewidth": 0.9, "zorder": 1}
 
 
-def draw_summary(file: Path, summary: Summary) -> None:
-    """Draw histograms of final progress and of steps backwards, and best success over final progress."""
+def draw_summary(file: Path, summary: Summary, labels: Path) -> None:
+    """Draw histograms of final progress and of steps backwards, and best success over final progress.
+
+    labels: the file of the labels, whose metadata give the title
+    """
     try:
+        import matplotlib.style
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError('pictures need matplotlib: pip install "./client[cli]", or use --no-picture') from error
-    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
-    final, by_success, backwards = figure.subplots(1, 3)
-    bins = np.linspace(0, 1, BINS + 1).tolist()
-    final.hist(summary.final_progress, bins=bins, color="tab:blue")
-    final.set(xlabel="final progress", ylabel="episodes", xlim=(0, 1))
-    if summary.best_success is None:
-        by_success.text(0.5, 0.5, "success is not predicted", ha="center")
-    else:
-        by_success.scatter(summary.final_progress, summary.best_success, s=12, color="tab:green")
-    by_success.set(
-        xlabel="final progress", ylabel="best success of the episode", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02)
-    )
-    backwards.hist(100 * summary.backwards, bins=BINS, color="tab:orange")
-    backwards.set(xlabel="steps on which progress falls (%)", ylabel="episodes")
-    figure.savefig(file, dpi=DOTS_PER_IN)
+    with matplotlib.style.context([*STYLE]):
+        figure = Figure(figsize=(WIDTH_IN, HEADLINE_IN + SUMMARY_IN), layout="constrained")
+        final, by_success, backwards = figure.subplots(1, 3)
+        succeeds = None
+        if summary.best_success is None:
+            by_success.text(0.5, 0.5, "success is not predicted", ha="center")
+        else:
+            succeeds = summary.best_success >= SuccessRule.threshold
+            colours = np.where(succeeds, SUCCESS_COLOUR, FAILURE_COLOUR)
+            by_success.scatter(
+                summary.final_progress, summary.best_success, s=10, c=colours, alpha=0.6, lw=0, clip_on=False
+            )
+            by_success.axhline(SuccessRule.threshold, **THRESHOLD)
+        names = {True: "succeed", False: "never succeed"}
+        _draw_ends(final, summary.final_progress, succeeds, names)
+        final.set_xlabel("final progress")
+        by_success.set(xlabel="final progress", ylabel="best success", xlim=(0, 1), ylim=(-0.03, 1.03))
+        by_success.set_yticks((0, 0.5, 1))
+        backwards.hist(100 * summary.backwards, bins=BINS, color=PROGRESS_COLOUR)
+        backwards.set(xlabel="steps on which progress falls (%)", ylabel="episodes")
+        for ax in (final, backwards):
+            ax.grid(visible=False, axis="x")
+            ax.yaxis.get_major_locator().set_params(integer=True)
+        dataset, checkpoint = _origin(labels)
+        _head(figure, f"{dataset}: {len(summary.episodes)} episodes", checkpoint)
+        if succeeds is not None:
+            figure.legend(*final.get_legend_handles_labels(), loc="outside lower left", ncols=2)
+        save(figure, file)
 
 
-def draw_evaluation(file: Path, comparison: LabelComparison) -> None:
-    """Draw a histogram of final progress for each label file, successes and failures apart."""
+def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Path]) -> None:
+    """Draw a histogram of final progress for each label file, successes and failures apart.
+
+    labels: the file of each evaluation, whose metadata give the titles
+    """
+    import matplotlib.style
     from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
 
-    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN * len(comparison.evaluations) * 0.75), layout="constrained")
-    axes = figure.subplots(len(comparison.evaluations), 1, sharex=True, sharey=True, squeeze=False)
-    for ax, each in zip(axes.flat, comparison.evaluations, strict=True):
-        parts = {"episodes": each.final_progress}
-        if comparison.is_success is not None:
-            parts = {
-                "successes": each.final_progress[comparison.is_success],
-                "failures": each.final_progress[~comparison.is_success],
+    count = len(comparison.evaluations)
+    with matplotlib.style.context([*STYLE]):
+        figure = Figure(figsize=(WIDTH_IN, HEADLINE_IN + EVALUATION_IN * count), layout="constrained")
+        axes = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+        origins = [_origin(each) for each in labels]
+        for ax, each, (_, checkpoint) in zip(axes, comparison.evaluations, origins, strict=True):
+            _draw_ends(ax, each.final_progress, comparison.is_success, {True: "successes", False: "failures"})
+            measures = {
+                "VOC": each.spearman,
+                "AUROC of progress": each.by_progress and each.by_progress.auroc,
+                "AUROC of success": each.by_success and each.by_success.auroc,
             }
-        colours = ["tab:green", "tab:red"] if len(parts) > 1 else ["tab:blue"]
+            told = [f"{name} {value:.2f}" for name, value in measures.items() if value is not None]
+            ax.set_title(f"{each.name}: {checkpoint}" if checkpoint else each.name)
+            ax.set_title("   ".join(told), loc="right")
+            ax.grid(visible=False, axis="x")
+            ax.yaxis.get_major_locator().set_params(integer=True)
+        axes[-1].set_xlabel("progress at the last frame")
+        datasets = ", ".join(dict.fromkeys(dataset for dataset, _ in origins))
+        _head(figure, f"{datasets}: {len(comparison.episodes)} episodes")
+        if comparison.is_success is not None:
+            figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=2)
+        save(figure, file)
+
+
+def _draw_ends(
+    ax: Axes, final: npt.NDArray[Any], is_success: npt.NDArray[np.bool_] | None, names: Mapping[bool, str]
+) -> None:
+    """Draw a histogram of final progress; with outcomes, successes stand on failures."""
+    if is_success is None:
+        ax.hist(final, bins=BINS, range=(0, 1), color=PROGRESS_COLOUR)
+    else:
+        parts = {names[outcome]: final[is_success == outcome] for outcome in (False, True)}
+        colours = [FAILURE_COLOUR, SUCCESS_COLOUR]
         ax.hist([*parts.values()], bins=BINS, range=(0, 1), color=colours, label=[*parts], stacked=True)
-        told = "" if each.spearman is None else f"   VOC {each.spearman:.2f}"
-        told += "" if each.by_progress is None else f"   AUROC of progress {each.by_progress.auroc:.2f}"
-        told += "" if each.by_success is None else f"   AUROC of success {each.by_success.auroc:.2f}"
-        ax.set(title=f"{each.name}{told}", ylabel="episodes")
-        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-        ax.legend(loc="upper left")
-    axes.flat[-1].set_xlabel("progress at the last frame")
-    figure.savefig(file, dpi=DOTS_PER_IN)
+    ax.set(ylabel="episodes", xlim=(0, 1))
+
+
+def _head(figure: Figure, *lines: str) -> None:
+    figure.suptitle("\n".join(filter(None, lines)), x=0.01, ha="left", fontsize=8)
+
+
+def _origin(labels: Path) -> tuple[str, str]:
+    """Return the sources of the dataset and of the checkpoint; of an unknown checkpoint an empty text."""
+    told = read_provenance(labels)
+    dataset, checkpoint = ((told.get(name) or {}).get("source") for name in ("dataset", "checkpoint"))
+    return dataset or labels.parent.name, checkpoint or ""
 
 
 def record_episodes(folder: Path, dataset: Dataset, plan: Plan, parts: Parts) -> Iterator[Path]:

@@ -21,6 +21,7 @@ from rfm_labels.options import QUIET, LabelOptions, Mode, ProgressRule, Watch, c
 from rfm_labels.scorer import CheckpointFacts, Scorer
 
 _RECIPE_FORMAT = 4  # increased when the same recipe gives other scores or other digests
+_OPTIONAL = ("progress_rule", "robot_description", "camera_description")  # labels made before have no such fields
 _OF_TRAINING = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
 _OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
 
@@ -33,6 +34,7 @@ class Recipe:
     corrections: of the cameras whose frames are turned, or stored as BGR
     verify: True: videos are identified by their content
     progress_rule: makes progress of remaining seconds; None: the checkpoint predicts progress
+    robot_description, camera_description: for the checkpoint's prompt, as in ``rfm_client.Trajectory``
     """
 
     checkpoint: CheckpointFacts
@@ -45,6 +47,8 @@ class Recipe:
     resize: bool
     verify: bool
     progress_rule: ProgressRule | None = None
+    robot_description: str = ""
+    camera_description: str = ""
 
     @classmethod
     def of(cls, options: LabelOptions, dataset: Dataset, checkpoint: CheckpointFacts) -> Recipe:
@@ -60,12 +64,14 @@ class Recipe:
             why = "of this model, whose scores are relative to the whole episode"
             raise InvalidSampleError.at("mode", f"whole {why}", f"{options.mode}; give --mode whole")
         _check_progress(options.progress_rule, checkpoint)
+        _check_descriptions(options, cameras, checkpoint)
         rule = "all" if options.mode == "whole" else options.sampling
         padding = checkpoint.trained_padding
         try:
             sampling = Sampling.of(rule, options.frames, checkpoint.max_frames, trained_padding=padding)
         except InvalidValueError as error:
-            told = f"{error.problem}: name them (--frames), or show all (--sampling all)"
+            remedy = "leave --frames out" if rule == "all" else "name them (--frames), or show all (--sampling all)"
+            told = f"{error.problem}: {remedy}"
             raise InvalidSampleError(told, error.where) from error
         return cls(
             checkpoint,
@@ -78,6 +84,8 @@ class Recipe:
             resize=options.resize,
             verify=options.verify,
             progress_rule=options.progress_rule,
+            robot_description=options.robot_description,
+            camera_description=options.camera_description,
         )
 
     @property
@@ -110,7 +118,7 @@ class Recipe:
             "fuse": self.fuse if len(self.cameras) > 1 else None,
             "resize": str(self.checkpoint.frame_size) if self.resize else None,
             "verify": self.verify,
-            **({"progress_rule": self.progress_rule} if self.progress_rule else {}),
+            **{name: value for name in _OPTIONAL if (value := getattr(self, name))},
         }
 
     def told(self, options: LabelOptions) -> list[str]:
@@ -214,6 +222,17 @@ def _check_progress(rule: ProgressRule | None, checkpoint: CheckpointFacts) -> N
         known = " or ".join(get_args(ProgressRule))
         expected = f"{known} with this model, which predicts remaining seconds and no progress"
         raise InvalidSampleError.at("progress_rule", expected, f"none; give --progress-rule {known}")
+
+
+def _check_descriptions(options: LabelOptions, cameras: Sequence[str], checkpoint: CheckpointFacts) -> None:
+    """Raise InvalidSampleError for descriptions that the prompt does not take, or a camera's for several cameras."""
+    given = [name for name in ("robot_description", "camera_description") if getattr(options, name)]
+    if given and not checkpoint.reads_descriptions:
+        expected = "none with this model, whose prompt names neither robot nor camera"
+        raise InvalidSampleError.at(given[0], expected, repr(getattr(options, given[0])))
+    if options.camera_description and len(cameras) > 1:
+        expected = "it with a single camera; choose one (--cameras)"
+        raise InvalidSampleError.at("camera_description", expected, f"it with {', '.join(cameras)}")
 
 
 @contextmanager

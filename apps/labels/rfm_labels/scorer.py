@@ -32,6 +32,7 @@ class CheckpointFacts:
     encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
     is_causal: True if no frame's score depends on later frames
     has_progress: False if it predicts remaining seconds in place of progress
+    reads_descriptions: True if its prompt names the robot and the camera
     """
 
     source: str | None
@@ -47,6 +48,7 @@ class CheckpointFacts:
     computation: str | None = None
     weights: str | None = None
     has_progress: bool = True
+    reads_descriptions: bool = False
 
     @classmethod
     def of(cls, described: object, **own: Any) -> CheckpointFacts:

@@ -17,6 +17,7 @@ from traceback import clear_frames
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rfm_client import (
     AccessDeniedError,
@@ -231,7 +232,7 @@ def episode_scores(
             else:
                 first = next(chunks)
                 with memory.holding(first[0].nbytes * count):
-                    result = _scores(_held(first, chunks, task, count), scorer, recipe, go_on)
+                    result = _scores(_held(first, chunks, task, count, recipe), scorer, recipe, go_on)
             by_camera.setdefault(camera, []).append(result)
     highest = {camera: frames.highest for camera, frames in shown.items()}
     blank = {camera: value for camera, value in highest.items() if value is not None}
@@ -240,13 +241,14 @@ def episode_scores(
 
 def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: DatasetEpisode, recipe: Recipe) -> Columns:
     columns: Columns = {}
-    cameras = [FrameScores.joined(results).arrays for results in by_camera.values()]
+    joined = [FrameScores.joined(results) for results in by_camera.values()]
+    cameras = [each.arrays for each in joined]
     for name, about in SCORES.items():
         scores = [np.asarray(of_camera.get(name, ()), np.float32) for of_camera in cameras]
         is_unknown = about.may_be_unknown and all(np.isnan(score).all() for score in scores)
         if is_unknown or not any(name in of_camera for of_camera in cameras):
             continue
-        _check_numbers(name, scores, episode)
+        _check_numbers(name, scores, [each.is_answered for each in joined], episode)
         fuse: Any = np.max if about.mark else getattr(np, recipe.fuse)  # mean, min or max
         sign = np.float32(1 if about.higher_is_better else -1)  # so that min is the worst camera
         columns[name] = sign * np.asarray(fuse(sign * np.stack(scores), axis=0), np.float32)
@@ -291,13 +293,14 @@ def _joined(parts: Sequence[Trajectory]) -> Trajectory:
     return Trajectory(video_embeddings=embeddings, text_embedding=parts[0].text_embedding)
 
 
-def _held(first: UInt8Array, others: Iterator[UInt8Array], task: str, count: int) -> Trajectory:
+def _held(first: UInt8Array, others: Iterator[UInt8Array], task: str, count: int, recipe: Recipe) -> Trajectory:
     frames = np.empty((count, *first.shape[1:]), np.uint8)
     start = 0
     for chunk in itertools.chain([first], others):
         frames[start : start + len(chunk)] = chunk
         start += len(chunk)
-    return Trajectory(frames=frames, task=task)
+    described = {name: getattr(recipe, name) for name in ("robot_description", "camera_description")}
+    return Trajectory(frames=frames, task=task, **described)
 
 
 def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:
@@ -329,8 +332,11 @@ def _checked(
     require(where, count == episode.num_frames, f"{episode.num_frames} frames", count)
 
 
-def _check_numbers(name: str, scores: list[Float32Array], episode: DatasetEpisode) -> None:
-    for score in scores:
-        if score.shape != (episode.num_frames,) or not np.isfinite(score).all():
+def _check_numbers(
+    name: str, scores: Sequence[Float32Array], answered: Sequence[npt.NDArray[np.bool_]], episode: DatasetEpisode
+) -> None:
+    """Raise InferenceFailedError unless each camera has numbers at the frames that the model answered about."""
+    for score, there in zip(scores, answered, strict=True):
+        if score.shape != (episode.num_frames,) or not np.isfinite(score[there]).all():
             got = "NaN: this checkpoint does not predict it" if np.isnan(score).any() else str(list(score.shape))
             raise InferenceFailedError(f"{name}: expected a score of each of {episode.num_frames} frames, got {got}")

@@ -78,7 +78,9 @@ def summary_of(labels: Any) -> Summary:
     for start, end in zip(starts, [*starts[1:], len(labels)], strict=True):
         table = labels.slice(start, end - start)
         progress = table[PROGRESS].to_numpy()
-        cameras = [table[name].to_numpy() for name in table.column_names if name.startswith(f"{PROGRESS}.")]
+        is_scored = np.isfinite(progress)  # NaN: the model did not answer about the frame
+        progress = progress[is_scored]
+        cameras = [table[name].to_numpy()[is_scored] for name in table.column_names if name.startswith(f"{PROGRESS}.")]
         numbers.append(episodes[start])
         final.append(progress[-1])
         backwards.append(np.mean(np.diff(progress) < -BACKWARDS_BY) if len(progress) > 1 else 0.0)

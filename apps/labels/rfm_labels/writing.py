@@ -29,6 +29,7 @@ import numpy as np
 
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.metadata import (
+    HOP,
     PROGRESS,
     REMAINING,
     SCORES,
@@ -49,9 +50,10 @@ SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run sees if its labels still hold
 COST_KEY = b"rfm.cost"  # apart from the provenance, which is equal for equal runs
 SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability", REMAINING: "remaining_time_s"}
-_OF_SECONDS = {  # further signals of remaining seconds, with their meaning
-    "potential": "Minus the remaining seconds",
-    "is_inference_frame": "1 where the model scored the frame itself",
+_POTENTIAL, _IS_SCORED = "potential", "is_inference_frame"
+_DERIVED = {  # further signals, with their meaning
+    _POTENTIAL: "Minus the remaining seconds",
+    _IS_SCORED: "1 where the model scored the frame itself",
 }
 
 _DIGEST_KEY = b"rfm.digest"
@@ -212,10 +214,14 @@ def with_totals(labels: Any, plan: Plan) -> Any:
     """
     import pyarrow as pa
 
+    derived = {}
     if REMAINING in labels.column_names:
         seconds = labels[REMAINING].to_numpy()
-        for name, values in zip(_OF_SECONDS, (-seconds, np.ones_like(seconds)), strict=True):
-            labels = labels.append_column(name, pa.array(values))
+        derived = {_POTENTIAL: -seconds, _IS_SCORED: np.ones_like(seconds)}
+    if HOP in labels.column_names:
+        derived[_IS_SCORED] = np.isfinite(labels[HOP].to_numpy()).astype(np.float32)
+    for name, values in derived.items():
+        labels = labels.append_column(name, pa.array(values))
     if not _has_several_tasks(plan):
         return labels
     progress = labels[PROGRESS].to_numpy()
@@ -224,7 +230,8 @@ def with_totals(labels: Any, plan: Plan) -> Any:
         end = begin + item.episode.num_frames
         for first, _ in item.episode.tasks[1:]:
             own = slice(begin + first, end)
-            total[own] = progress[own] - progress[own.start] + total[own.start - 1]
+            begun = np.nan_to_num(progress[own.start])  # of a model that compares frames: 0, before its first answer
+            total[own] = progress[own] - begun + total[own.start - 1]
         begin = end
     return labels.append_column(_TOTAL, pa.array(total))
 
@@ -240,12 +247,16 @@ def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost
         score, dot, camera = column.partition(".")
         signals[column] = f"reward.{name}.{SIGNAL_NAMES[score]}{dot}{camera}"
     if REMAINING in signals:
-        signals |= {column: f"reward.{name}.{column}" for column in _OF_SECONDS}
+        signals[_POTENTIAL] = f"reward.{name}.{_POTENTIAL}"
+    if REMAINING in signals or HOP in signals:
+        signals[_IS_SCORED] = f"reward.{name}.{_IS_SCORED}"
     metadata = {
         "format": b"lerobot.frame_signals",
         "schema_version": b"1",
         "provenance": canonical_json(plan.provenance()),
-        "descriptors": canonical_json({signal: _descriptor(column) for column, signal in signals.items()}),
+        "descriptors": canonical_json(
+            {signal: _descriptor(column, skips_frames=HOP in signals) for column, signal in signals.items()}
+        ),
         "episode_indices": canonical_json([item.episode.index for item in plan.items]),
     }
     ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
@@ -259,17 +270,19 @@ def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
     return digests if cost is None else {**digests, COST_KEY: cost.json()}
 
 
-def _descriptor(column: str) -> dict[str, Any]:
+def _descriptor(column: str, *, skips_frames: bool) -> dict[str, Any]:
+    """skips_frames: True if progress is NaN at frames that the model did not answer about"""
     name, _, camera = column.partition(".")
     score = SCORES.get(name)
-    meaning = _OF_SECONDS[name] if score is None else score.meaning
+    meaning = _DERIVED[name] if score is None else score.meaning
+    has_gaps = skips_frames and name in (PROGRESS, HOP)
     return {
         "description": meaning + (f", seen by {camera}" if camera else ""),
         "direction": "higher" if score is None or score.higher_is_better else "lower",
         "bounds": [None, None] if score is None else [*score.bounds],
         "unit": None,
-        "missing_values": "forbidden",
-        "allow_nan": False,  # the same in another revision of the proposal
+        "missing_values": "nan" if has_gaps else "forbidden",
+        "allow_nan": has_gaps,  # the same in another revision of the proposal
     }
 
 

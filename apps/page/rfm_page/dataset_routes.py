@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The page's endpoints for datasets: episodes, an episode's curves, and its video from each camera.
+"""The page's endpoints for datasets: episodes, an episode's preview and curves, and its video from each camera.
 
 A request names a dataset, an episode and a camera by number, and labels by a name from an earlier answer.
 """
@@ -55,6 +55,11 @@ def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIR
     @router.get("/viewer/datasets/{dataset}/episodes/{episode}")
     async def curves(request: Request, dataset: int, episode: int, labels: str | None = None) -> Response:
         return _json(await read(request, dataset, lambda shown: shown.curves(episode, labels)))
+
+    @router.get("/viewer/datasets/{dataset}/episodes/{episode}/preview")
+    async def preview(request: Request, dataset: int, episode: int, labels: str | None = None) -> Response:
+        with limits.decoding() as take:
+            return _json(await read(request, dataset, lambda shown: shown.preview(episode, labels, take)))
 
     @router.get("/viewer/datasets/{dataset}/episodes/{episode}/videos/{camera}")
     async def video(request: Request, dataset: int, episode: int, camera: int) -> Response:

@@ -40,6 +40,7 @@ from rfm_page.scores import ABOUT, INSTEAD
 
 MOST_BODY_BYTES = 4 * 2**20
 MOST_EPISODES = 128  # ended episodes are forgotten first, then the longest silent
+MOST_ENDED = 4096  # results of ended episodes; the newest are kept
 MOST_POINTS = 1000  # of a curve; the newest are kept
 FORGOTTEN_AFTER_S = 300.0  # of silence
 MOST_FRAME_BYTES = 128 * 2**10
@@ -100,12 +101,16 @@ class _Step(_Strict):
 
 
 class _ReportedEpisode(_Strict):
+    """An episode. reward, total_reward: the newest reward that was paid, and the sum so far; None: none was"""
+
     id: _Id
     name: _Text
     env: _Count
     task: _Text
     threshold: float | None
     ended: bool
+    reward: float | None = None
+    total_reward: float | None = None
     steps: Annotated[list[_Step], FailFast(), Field(max_length=_MOST_STEPS)]
 
 
@@ -137,6 +142,8 @@ class _KeptEpisode:
     heard_s: float = 0.0
     changed: int = 0
     has_ended: bool = False
+    reward: float | None = None
+    total_reward: float | None = None
     points: deque[tuple[int, dict[str, Any]]] = field(default_factory=lambda: deque(maxlen=MOST_POINTS))
     frame: bytes | None = None
     frame_changed: int = 0
@@ -150,6 +157,8 @@ class _KeptEpisode:
         return {
             **self.about,
             "has_ended": self.has_ended,
+            "reward": self.reward,
+            "total_reward": self.total_reward,
             "frame": self.frame_changed or None,
             "newest": newest,
             "steps": [point["step"] for point in new],
@@ -160,9 +169,26 @@ class _KeptEpisode:
             },
         }
 
+    def result(self, key: str, number: int) -> dict[str, Any]:
+        """Return how the episode ended. number: its number in its run, from 1"""
+        newest = self.points[-1][1] if self.points else None
+        instead = next(iter(newest["instead"].items()), None) if newest else None
+        leading, value = instead or ("progress", newest["progress"] if newest else None)
+        return {
+            "id": key,
+            "run": self.about["name"],
+            "number": number,
+            "total_reward": self.total_reward,
+            "leading": leading,
+            "value": value,
+            "success": newest["success"] if newest else None,
+            "succeeded": bool(newest and newest["succeeded"]),
+            "num_steps": newest["step"] + 1 if newest else 0,
+        }
+
 
 class LiveEpisodes:
-    """The newest episodes, each with its newest frame and points. For one thread.
+    """The newest episodes, each with its newest frame and points, and how episodes ended. For one thread.
 
     Each answer has a cursor. With it, the next answer has only changes.
 
@@ -172,6 +198,7 @@ class LiveEpisodes:
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
         self._episodes: dict[str, _KeptEpisode] = {}  # the longest silent first
+        self._ended: dict[str, tuple[int, dict[str, Any]]] = {}  # results with the number of their report, oldest first
         self._changed = 0
         self._life = secrets.token_hex(8)  # makes cursors of an earlier gateway invalid
 
@@ -185,10 +212,14 @@ class LiveEpisodes:
             episode = self._episodes.pop(told.id, None) or _KeptEpisode(about)
             episode.heard_s, episode.changed = self._clock_s(), self._changed
             episode.has_ended |= told.ended
+            if told.total_reward is not None:
+                episode.reward, episode.total_reward = told.reward, told.total_reward
             for step in told.steps:
                 if not episode.points or step.step > episode.points[-1][1]["step"]:  # a client may send a report twice
                     episode.points.append((self._changed, step.model_dump()))
             self._episodes[told.id] = episode
+            if episode.has_ended:
+                self._end(told.id, episode)
         for key, frame in report.frames.items():
             if key in self._episodes:
                 episode = self._episodes[key]
@@ -213,7 +244,19 @@ class LiveEpisodes:
                 {"id": key, "age_s": self._clock_s() - episode.heard_s, **episode.since(known)}
                 for key, episode in self._episodes.items()
             ],
+            "ended": [end for changed, end in self._ended.values() if changed > known],
         }
+
+    def _end(self, key: str, episode: _KeptEpisode) -> None:
+        """Keep how an episode ended. The last steps and rewards may come after the end."""
+        if key in self._ended:
+            number = self._ended[key][1]["number"]
+        else:
+            own = (end["number"] for _, end in reversed(self._ended.values()) if end["run"] == episode.about["name"])
+            number = next(own, 0) + 1
+        self._ended[key] = self._changed, episode.result(key, number)
+        if len(self._ended) > MOST_ENDED:
+            del self._ended[next(iter(self._ended))]
 
     def frame(self, key: str) -> bytes | None:
         """Return the newest frame of an episode as a JPEG file, or None."""

@@ -32,12 +32,14 @@ from rfm_client import (
     ProgressResult,
     ProgressSample,
     RewardError,
+    ServerError,
     Trajectory,
 )
 from rfm_client.frames import BlankFrames, ChannelOrder, Orientation, Rule, Sampling, resize_frames
 from rfm_client.serving import off_loop
 from rfm_gateway.mounting import GatewayConfig, PageHost, invalid, while_connected
 from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest
+from rfm_page.remedies import remedies
 from rfm_page.scores import ABOUT
 
 MOST_PREFIXES = 32  # in a request
@@ -64,13 +66,17 @@ def viewer_routes(host: PageHost) -> APIRouter:
     config, limits, metrics = host.config, host.limits, host.metrics
     router = APIRouter(include_in_schema=False)
 
+    @router.get("/viewer/server")
+    async def server() -> Response:
+        rules = [{"name": rule, "frames": _frames_of(rule)} for rule in get_args(Rule)]
+        about: dict[str, Any] = {"rules": rules, "orientations": get_args(Orientation)}
+        about |= {"channel_orders": get_args(ChannelOrder), "scores": ABOUT, "fps": DEFAULT_FPS}
+        return JSONResponse({**about, "url": config.triton_url, "remedies": remedies(config, host.started_by)})
+
     @router.get("/viewer/served")
     async def served() -> Response:
         models = [_told_of(name, info) for name, info in await _infos(config)]
-        rules = [{"name": rule, "frames": _frames_of(rule)} for rule in get_args(Rule)]
-        about = {"models": models, "model": config.checkpoint, "rules": rules}
-        about |= {"orientations": get_args(Orientation), "channel_orders": get_args(ChannelOrder)}
-        return JSONResponse({**about, "scores": ABOUT, "fps": DEFAULT_FPS, "url": config.triton_url})
+        return JSONResponse({"models": models, "model": config.checkpoint})
 
     @router.post("/viewer/score")
     async def score(request: Request) -> Response:
@@ -124,10 +130,10 @@ def viewer_routes(host: PageHost) -> APIRouter:
                     metrics.samples.labels("progress").inc(len(points["progress"]))
                     yield _event("scores", **points)
         except RewardError as error:
-            yield _event("failed", detail=str(error))
+            yield _event("failed", detail=str(error), is_servers=isinstance(error, ServerError))
         except Exception as error:
             logger.error("unexpected", exc_info=error)
-            yield _event("failed", detail="the gateway failed; its log has the reason")
+            yield _event("failed", detail="the gateway failed; its log has the reason", is_servers=False)
         else:
             yield _event("done", model_version=version, took_s=time.monotonic() - began_s)
 

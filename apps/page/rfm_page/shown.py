@@ -6,6 +6,8 @@ Needs pyarrow. T frames of an episode.
 
 from __future__ import annotations
 
+import base64
+import io
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -16,6 +18,7 @@ from typing import Any, ClassVar, TypeVar, get_args
 import numpy as np
 import numpy.typing as npt
 from fastapi import HTTPException
+from PIL import Image
 
 from rfm_client.episodes import SuccessRule
 from rfm_client.frames import ChannelOrder, Correction, Orientation
@@ -36,6 +39,8 @@ from rfm_labels import (
 Read = TypeVar("Read")
 
 _SUMMARIES_AT_A_TIME = 8  # summaries in memory
+_POINTS = 32  # of a preview's curve
+_PREVIEW_PX = (96, 72)  # width and height, at most
 
 
 @dataclass(frozen=True)
@@ -162,6 +167,38 @@ class ShownDataset(ABC):
         if not 0 <= camera < len(self.cameras):
             raise HTTPException(404, f"camera: expected one of {len(self.cameras)} with videos, got {camera}")
         return self.mp4(self._episode(number), self.cameras[camera], take)
+
+    def preview(self, number: int, labels: str | None, take: Callable[[int], object]) -> dict[str, Any]:
+        """Return an episode's progress at a few points, and its first frame as JPEG in base64; null: it cannot be read.
+
+        take: as of ``video``
+        """
+        episode, file = self._episode(number), self._labels(labels)
+        found = None if file is None else read_episode_labels(file, number)
+        progress = None if found is None else found.fused.progress
+        if progress is not None:
+            places = np.linspace(0, len(progress) - 1, min(_POINTS, len(progress))).round().astype(int)
+            progress = progress[places]
+        unused = self.dataset.unused_cameras(self.cameras)
+        camera = next((each for each in self.cameras if each not in unused), None)
+        try:
+            picture = None if camera is None else self._picture(episode, file, camera, take)
+        except DatasetError:  # the list of faults tells it
+            picture = None
+        return {"progress": [] if progress is None else progress.tolist(), "picture": picture}
+
+    def _picture(
+        self, episode: DatasetEpisode, file: Path | None, camera: str, take: Callable[[int], object]
+    ) -> str | None:
+        frame = next(self.dataset.stored_frames(episode, camera), None)
+        if frame is None:
+            return None
+        take(frame.nbytes)
+        image = Image.fromarray(self._correction(file, camera).applied(frame))
+        image.thumbnail(_PREVIEW_PX)
+        jpeg = io.BytesIO()
+        image.save(jpeg, "JPEG")
+        return base64.b64encode(jpeg.getvalue()).decode()
 
     def _without_folder(self, message: str) -> str:
         """Return a message without the folder's path, for users on other machines."""

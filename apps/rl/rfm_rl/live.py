@@ -51,7 +51,7 @@ LONGEST_PX = 256  # longer side of a reported frame
 JPEG_QUALITY = 85
 
 About: TypeAlias = Mapping[str, Any]  # identity of an episode
-Entry: TypeAlias = tuple[About, Mapping[str, Any] | None]  # its step; None: it has ended
+Entry: TypeAlias = tuple[About, Mapping[str, Any] | None]  # its step, or what was paid; None: it has ended
 
 logger = logging.getLogger(__name__)
 
@@ -63,6 +63,7 @@ class LiveEpisode:
         self._view = view  # keeps the view, and so the reporter, alive
         self._reporter, self._about = reporter, about
         self._has_ended = False
+        self._total_reward = 0.0
 
     def add(self, frame: UInt8Array, score: StepScore) -> None:
         """Queue a step for the reports, unless the episode has ended. Return at once, and raise nothing.
@@ -77,6 +78,16 @@ class LiveEpisode:
         if scores["progress"] is None and instead in score.more_scores:
             step["instead"] = {instead: score.more_scores[instead]}
         self._reporter.add(self._about, step, np.asarray(frame))
+
+    def pay(self, reward: float) -> None:
+        """Queue a reward that the policy got for the reports, also after the end. Return at once, and raise nothing.
+
+        The page adds up the rewards of an episode to its return. Episodes without a reward have none.
+        """
+        self._total_reward += reward
+        newest, total = _or_none(reward), _or_none(self._total_reward)
+        if newest is not None and total is not None:
+            self._reporter.pay(self._about, {"reward": newest, "total_reward": total})
 
     def end(self) -> None:
         """Queue the end of the episode for the reports. Return at once, and raise nothing."""
@@ -177,6 +188,14 @@ class Reporter:
             for kept, most in ((self._frames, MOST_FRAMES_KEPT), (self._running, MOST_RUNNING)):
                 if len(kept) > most:
                     del kept[next(iter(kept))]
+        self._has_more.set()
+
+    def pay(self, about: About, paid: Mapping[str, float]) -> None:
+        """Queue the newest reward of an episode, and the sum so far."""
+        if self._stopping.is_set() or self._was_forked():
+            return
+        with self._lock:
+            self._steps.append((about, paid))
         self._has_more.set()
 
     def end(self, about: About) -> None:
@@ -290,6 +309,8 @@ def report_body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
         told = episodes.setdefault(about["id"], {**about, "ended": False, "steps": []})
         if step is None:
             told["ended"] = True
+        elif "total_reward" in step:
+            told |= step
         else:
             told["steps"].append(step)
     pictures = {key: base64.b64encode(_jpeg(frame)).decode() for key, frame in frames.items()}

@@ -14,6 +14,7 @@ import numpy as np
 from rfm_client import InvalidSampleError, RewardClient, UInt8Array
 from rfm_client.episodes import Episode, EpisodeOptions, FrameOptions, StepScore, SuccessRule
 from rfm_client.options import InvalidValueError, checked_count, checked_finite, require
+from rfm_rl.live import LiveEpisode
 
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
@@ -153,6 +154,19 @@ class RewardOptions(FrameOptions):
         return {camera: found[camera] for camera in self.cameras}
 
 
+class PaidView:
+    """A view that reports one episode, and keeps it, so that it hears of the rewards, too."""
+
+    def __init__(self, view: Any) -> None:
+        self._view = view
+        self.reported: Any = None
+
+    def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> Any:
+        """Return a new episode of the view."""
+        self.reported = self._view.episode(task, env, threshold)
+        return self.reported
+
+
 class RewardedEpisode:
     """The rewards of one episode: its newest known score, and open requests.
 
@@ -162,10 +176,12 @@ class RewardedEpisode:
     total_reward: sum of its rewards until now
     """
 
-    def __init__(self, options: RewardOptions, episode: Episode, index: int | None) -> None:
+    def __init__(
+        self, options: RewardOptions, episode: Episode, index: int | None, view: PaidView | None = None
+    ) -> None:
         self.index = index
         self.steps = episode
-        self._options = options
+        self._options, self._view = options, view
         self.pending: list[Future[list[StepScore]]] = []
         self.known: StepScore | None = None
         self._paid_progress = np.nan
@@ -233,6 +249,9 @@ class RewardedEpisode:
             reward += options.success_bonus
         reward += env_reward if options.add_to_env_reward else 0.0
         self.total_reward += reward
+        reported = None if self._view is None else self._view.reported
+        if isinstance(reported, LiveEpisode):  # other views take steps only
+            reported.pay(reward)
         return reward
 
     def info(self) -> Info:
@@ -282,9 +301,10 @@ class Rewarder:
         frame: uint8 [H, W, 3]; with cameras, a dict of these
         index: number of its environment; None: the only environment
         """
-        episode = self._client.episode(task, env=index, **self._options.scoring)
+        view = None if self._options.live is None else PaidView(self._options.live)
+        episode = self._client.episode(task, env=index, **{**self._options.scoring, "live": view})
         episode.keep(frame)
-        return RewardedEpisode(self._options, episode, index)
+        return RewardedEpisode(self._options, episode, index, view)
 
     def score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
         """Collect known scores, and request those of newest frames that are due. Raises RewardError.

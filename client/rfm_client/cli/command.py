@@ -10,12 +10,14 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING
 from enum import IntEnum
-from typing import Annotated, Any, Generic, NoReturn, TypeVar, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Generic, NoReturn, TypeVar, get_args, get_origin
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import OptionInfo
 
+from rfm_client.cli.help_sections import argument_name, write_options
+from rfm_client.cli.messages import UsageError, in_plain_words, same_words, told
 from rfm_client.contract import errors
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of
 
@@ -79,6 +81,13 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
             command(**values)
         except ConfigError as error:
             raise _named(error, {each.name: each.option for some in options.values() for each in some}) from None
+        except errors.LocatedError as error:  # of what an option names: a server, a dataset
+            place, _, name = error.where.rpartition(": ")
+            typed = {each.name: each.option for some in options.values() for each in some if _key(each) in context.obj}
+            typed |= {option.strip("-").replace("-", "_"): option for option in typed.values()}
+            if name not in typed or name == "frames":  # those of a sample
+                raise
+            raise error.like(error, where=": ".join(filter(None, [place, typed[name]]))) from None
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -105,29 +114,23 @@ class Command(TyperCommand):
         try:
             return super().parse_args(ctx, completed)
         except typer.BadParameter as error:
-            error.message = error.message.removeprefix("Value error, ")  # by pydantic, with which typer validates
+            error.message = in_plain_words(error)
+            raise
+        except UsageError as error:
+            if unknown := getattr(error, "option_name", ""):
+                same = same_words(unknown, [option for each in self.params for option in each.opts])
+                vars(error)["possibilities"] = same or vars(error)["possibilities"]
             raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the words of the usage line: an argument's name, in brackets if it may be left out."""
         arguments = [each for each in self.get_params(ctx) if each.param_type_name == "argument"]
-        names = [_argument(each) if each.required else f"[{_argument(each)}]" for each in arguments]
+        names = [argument_name(each) if each.required else f"[{argument_name(each)}]" for each in arguments]
         return [*([self.options_metavar] if self.options_metavar else []), *names]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write sections for the arguments, the command's own options, and each group of settings."""
-        sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx)
-            if record is not None:
-                is_argument = parameter.param_type_name == "argument"
-                record = (_argument(parameter), record[1]) if is_argument else record
-                title = "Arguments" if is_argument else getattr(parameter, "rich_help_panel", None) or "Options"
-                sections.setdefault(title, []).append(record)
-        for title, records in sections.items():
-            if records:
-                with formatter.section(title):
-                    formatter.write_dl(records)
+        write_options(self, ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command, and report an error, each of its lines with the name of the program."""
@@ -141,22 +144,47 @@ class Command(TyperCommand):
             code, lines = ExitCode.FAILED, [missing_package(error)]
         except (errors.LocatedError, errors.RewardError, OSError) as error:
             code = exit_code(error) if self.has_codes else ExitCode.FAILED
-            lines = str(error).split("\n")
+            lines = told(error).split("\n")
         for line in lines:
             report(line, self.program)
         raise typer.Exit(code)
 
 
-class Commands(TyperGroup):
+class CommandGroup(TyperGroup):
+    """Commands, which stand before the options in the help."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the words before the command. An error about an option of a command says where that stands."""
+        try:
+            return super().parse_args(ctx, args)
+        except UsageError as error:
+            option = vars(error).get("option_name", "")
+            owners = [name for name, each in self.commands.items() if any(option in one.opts for one in each.params)]
+            if owners:
+                vars(error)["message"] += (
+                    f": it stands after the command, as in {ctx.command_path} {owners[0]} {option}"
+                )
+            raise
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands, then the options."""
+        self.format_commands(ctx, formatter)
+        write_options(self, ctx, formatter)
+
+
+class Commands(CommandGroup):
     """The commands of ``rfm-client``. Names the right program for a command of the other one."""
 
     other_program = "rfm"
-    others: Collection[str] = ("export", "serve", "demo", "models")
+    others: Collection[str] = ("export", "serve", "try", "models")
+    renamed: ClassVar[Mapping[str, str]] = {}  # commands of earlier versions, with the names of today
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command. Raises an error of usage that names the other program, where that has it."""
+        """Find the command. Raises an error of usage with the right name, or the program that has the command."""
         if args[0] in self.others and self.get_command(ctx, args[0]) is None:
             ctx.fail(f"No such command '{args[0]}': that is `{self.other_program} {args[0]}`")
+        if args[0] in self.renamed:
+            ctx.fail(f"No such command '{args[0]}': it is now `{ctx.info_name} {self.renamed[args[0]]}`")
         return super().resolve_command(ctx, args)
 
 
@@ -276,10 +304,6 @@ def _set_placeholder(hint: Any) -> None:
     for mark in get_args(hint)[1:]:
         if isinstance(mark, OptionInfo) and mark.metavar is None:
             mark.metavar = placeholder_of(get_args(hint)[0])
-
-
-def _argument(parameter: Any) -> str:
-    return str(parameter.metavar or parameter.name.upper())
 
 
 def _shown(default: Any) -> str:

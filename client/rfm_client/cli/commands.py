@@ -26,6 +26,8 @@ from rfm_client.cli.command import (
     usage_errors,
     with_options,
 )
+from rfm_client.cli.help_sections import MOST_COLUMNS
+from rfm_client.cli.next_steps import steps_with_server
 from rfm_client.cli.options import (
     CredentialFiles,
     JsonOutput,
@@ -36,14 +38,16 @@ from rfm_client.cli.options import (
     StatusOptions,
     VideoOptions,
     WaitOptions,
+    check_folder,
 )
 from rfm_client.cli.show import StreamedTable, in_place_of_progress, print_tables, scores_table, status_tables
 from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames, write_perf_analyzer_input
 from rfm_client.contract.addresses import split_url
-from rfm_client.contract.errors import RewardError
+from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.settings import ConfigError
+from rfm_client.contract.triton import FEWER_FRAMES
 from rfm_client.plot import save
 
 MIN_COMPARED = 2
@@ -56,7 +60,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MOST_COLUMNS},
 )
 
 _APPLICATIONS = {"evaluate": "labels", "gateway": "gateway", "label": "labels"}  # the packages of commands
@@ -91,7 +95,10 @@ def score(
     output: OutputOptions,
     server: ServerOptions,
 ) -> None:
-    """Score each frame of one or more videos: progress and success. A failed video does not stop the others."""
+    """Score each frame of one or more videos: progress and success. A failed video does not stop the others.
+
+    Example: rfm-client score video.mp4 --task "put the block in the bowl"
+    """
     output.begin(videos)
     if prefix.sampling is not None and video.max_frames is not None:
         raise ConfigError.of_two("sampling", "conflicts with", "max_frames")
@@ -122,7 +129,8 @@ def score(
     if output.strips is not None and scored:
         from rfm_client.cli.pictures import plot
 
-        plot(output.strips, [outcome.panel for outcome in scored])
+        title = scoring.heading(video.task, [outcome.checkpoint for outcome in scored])
+        plot(output.strips, [outcome.panel for outcome in scored], title)
     raise typer.Exit(scoring.exit_code_of_outcomes(outcomes))
 
 
@@ -138,12 +146,15 @@ def compare(
 
     Every two videos are compared in both orders. The rank follows the mean probability of winning against the others.
     A video has no rank ("?") if the orders disagree about one of its pairs. The table also shows progress at the end.
+
+    Example: rfm-client compare a.mp4 b.mp4 --task "put the block in the bowl"
     """
     if len(videos) < MIN_COMPARED:
         raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
     output.begin(videos)
     with server.connected() as client:
         comparison = comparing.compare(client, videos, video)
+        checkpoint = scoring.checkpoint_of(client, comparison.sources[0].trajectory)
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
         _report_blank(source.name, source.blank)
@@ -153,7 +164,7 @@ def compare(
     if output.plot is not None:
         from rfm_client.cli.pictures import plot
 
-        plot(output.plot, comparison.panels(), title=f'"{video.task}"' if video.task else None)
+        plot(output.plot, comparison.panels(), scoring.heading(video.task, [checkpoint]))
 
 
 @app.command(cls=Command, epilog=EXIT_CODES)
@@ -165,12 +176,19 @@ def status(
         str | None, typer.Option(help="URL of the server's metrics. Default: /metrics on port 8002 of the same host.")
     ] = None,
 ) -> None:
-    """Show the server's models, requests, batches, GPUs and memory."""
+    """Show the server's models, requests, batches, GPUs and memory.
+
+    Triton counts since the model was loaded, warm-up included; a model counts callers' samples since Triton started.
+    Failed requests got an error. Refused samples cannot be scored, and the caller has to mend them. queue ms is the
+    mean wait of a request for its turn.
+
+    Example: rfm-client status --url grpc://gpu-box:8001
+    """
     from rfm_client.transport.status import ServerStatus
 
     if metrics_url is not None and len(server.urls) > 1:
         raise typer.BadParameter("--metrics-url needs a single --url")
-    output.make_folders()
+    output.check_folders()
     with usage_errors("--url"):
         statuses = [
             ServerStatus.read(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=server.credentials)
@@ -178,16 +196,26 @@ def status(
         ]
     if output.prints_tables:
         print_tables(*(table for status in statuses for table in status_tables(status)))
+        if ready := next((status for status in statuses if status.ready), None):
+            typer.echo(steps_with_server(ready.url, ready.checkpoints))
     output.write_json(documents.status_document(statuses))
 
 
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def wait(server: WaitOptions) -> None:
-    """Wait until a server has the model ready, or --timeout passes."""
+    """Wait until a server has the model ready, or --timeout passes.
+
+    Example: rfm-client wait --timeout 600
+    """
     started_s = time.monotonic()
-    with server.client() as client:
-        client.wait_ready(server.timeout_s)
+    try:
+        with server.client() as client:
+            client.wait_ready(server.timeout_s)
+    except DeadlineExceededError:
+        where, remedy = ", ".join(server.urls), "rfm-client status shows what it does; rfm serve starts one"
+        expected = f"{where}: expected {server.model} to be ready within {server.timeout_s:g} s, got no such answer"
+        raise DeadlineExceededError(f"{expected}: {remedy}") from None
     typer.echo(f"ready after {time.monotonic() - started_s:.1f} s")
 
 
@@ -198,15 +226,19 @@ def sample(
     output: JsonOutput,
     server: ServerOptions,
 ) -> None:
-    """Score synthetic samples, to check that the server answers. Their scores mean nothing."""
-    output.make_folders()
+    """Score synthetic samples, to check that the server answers. Their scores mean nothing.
+
+    Example: rfm-client sample --num-samples 8
+    """
+    output.check_folders()
     with server.connected() as client:
         samples = synthetic.samples(client)
         outcomes = client.evaluate(samples, return_errors=True)
     failures = [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
     for index, outcome in enumerate(outcomes):
         if isinstance(outcome, RewardError):
-            report(f"samples[{index}]: {outcome}")
+            remedy = f"; {FEWER_FRAMES}"  # for videos; here --num-frames decides
+            report(f"samples[{index}]: {str(outcome).replace(remedy, '')}")
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if output.prints_tables and rows:
         of = "frames" if are_frames(samples) else "embeddings"
@@ -225,8 +257,11 @@ def bench_input(
     """Write synthetic samples as input of Triton's perf_analyzer.
 
     It prints a perf_analyzer command that sends them.
+
+    Example: rfm-client bench-input --output samples.json
     """
-    output.parent.mkdir(parents=True, exist_ok=True)
+    with usage_errors("--output"):
+        check_folder("output", output.parent)
     with server.connected() as client:
         samples = synthetic.samples(client)
     write_perf_analyzer_input(output, samples)

@@ -13,20 +13,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import PurePath
 from statistics import fmean
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.scoring import Source, fitted_to
-from rfm_client.cli.show import at_end, number, table
+from rfm_client.cli.show import FittingTable, at_end, number, table
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
 from rfm_client.contract.results import FrameScores, PreferenceResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Trajectory
 from rfm_client.frames.fit_to_checkpoint import with_frame_indices
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 LEGEND = (
     "no answer: the orders disagree, or both are exactly 0.5. "
@@ -81,7 +78,7 @@ class Comparison:
             return None
         return sorted(self._numbers, key=lambda index: cast(int, self.ranks[index]))
 
-    def tables(self) -> list[Table | str]:
+    def tables(self) -> list[FittingTable | str]:
         """Return a table of sources, the best first, a table of pairs, and without a ranking a legend."""
         columns = ("video", "rank", "P(wins)", "its final progress", "its final success", "frames")
         pairs = ("first", "second", "P(first wins)", "asked second first", "mean", "orders")

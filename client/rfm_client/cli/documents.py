@@ -140,5 +140,8 @@ def _error(error: Exception, message: str) -> dict[str, Any]:
 
 
 def _or_null(scores: npt.NDArray[Any]) -> list[Any] | None:
-    """The marks, or the numbers as float64 of the same value; None if the checkpoint does not predict them."""
-    return None if np.isnan(scores).all() else scores.tolist()
+    """The marks, or the numbers as float64 of the same value; None in place of NaN, or of all if all are NaN."""
+    missing = np.isnan(scores)
+    if missing.all():
+        return None
+    return [None if is_missing else score for score, is_missing in zip(scores.tolist(), missing, strict=True)]

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -32,6 +34,14 @@ FRAMES = "Frames"  # heading of all options that decide which frames are scored,
 MAX_PICTURED = MAX_CURVES  # videos; a larger picture is unreadable, and soon cannot be drawn
 _PICTURES = (".png", ".pdf", ".svg")
 _ENDINGS = {"json": (".json",), "plot": _PICTURES, "strips": _PICTURES, "rrd": (".rrd",)}
+
+
+def check_folder(name: str, folder: Path) -> None:
+    """Raise ConfigError about the setting ``name`` if no file can be made in the folder."""
+    if not folder.is_dir():
+        raise ConfigError.at(name, f"a folder at {folder}", f"none: mkdir -p {shlex.quote(str(folder))}")
+    if not os.access(folder, os.W_OK):
+        raise ConfigError.at(name, f"a folder at {folder} that you can write to", "no permission")
 
 
 def timeout_setting(default_s: float, help: str = "Time limit of a request, in seconds.") -> Any:
@@ -143,7 +153,7 @@ class VideoFiles(Settings):
 
     TITLE: ClassVar[str] = "Videos"
 
-    task: str = setting("", "The task, as a sentence.")
+    task: str = setting("", "The task, as a sentence. Required, except for embeddings with a task.")
     resize: bool = setting(False, "Downscale frames to the model's input size before sending.")
     orient: Orientation = setting("none", "Turn frames upright first (see docs/guides/label_a_dataset.md).")
     channels: ChannelOrder = setting("rgb", "Channel order in the file; bgr swaps red and blue.")
@@ -243,13 +253,10 @@ class JsonOutput(Settings):
         """The folders of the files, by option."""
         return {name: Path(value).parent for name, value in self._files.items()}
 
-    def make_folders(self) -> None:
-        """Make the files' folders where they are missing. Raises ConfigError if that fails."""
+    def check_folders(self) -> None:
+        """Raise ConfigError, before the first request, for a file in a folder that is missing or closed."""
         for name, folder in self._folders.items():
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ConfigError.at(name, f"a folder at {folder}", error.strerror) from None
+            check_folder(name, folder)
 
     def write_json(self, document: Mapping[str, Any]) -> None:
         """Write the document to the file or standard output, if --json is given."""
@@ -271,11 +278,11 @@ class PlotOutput(JsonOutput):
     )
 
     def begin(self, videos: Sequence[str]) -> None:
-        """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
+        """Raise ConfigError for a missing folder, and for more videos than the files take."""
         for name in self._files:
             if _ENDINGS[name] == _PICTURES and len(videos) > MAX_PICTURED:
                 raise ConfigError.at(name, f"at most {MAX_PICTURED} videos", len(videos))
-        self.make_folders()
+        self.check_folders()
 
 
 @dataclass(frozen=True)
@@ -306,14 +313,16 @@ class OutputOptions(PlotOutput):
     def _folders(self) -> dict[str, Path]:
         folders = super()._folders
         if self.npy is not None:
-            folders["npy"] = self.npy.parent if self.npy.suffix == ".npy" and not self.npy.is_dir() else self.npy
+            folders["npy"] = self.npy if self.npy.is_dir() else self.npy.parent
         return folders
 
     def begin(self, videos: Sequence[str]) -> None:
-        """Make the files' folders. Raises ConfigError, before that, for more videos than the files take."""
+        """Raise ConfigError for a missing folder, and for more videos than the files take. Make the folder of --npy."""
         if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
             raise ConfigError.at("npy", f"a folder for {len(videos)} videos", self.npy)
         super().begin(videos)
+        if self.npy is not None and self.npy.suffix != ".npy":
+            self.npy.mkdir(exist_ok=True)
 
     def array_files(self, stems: Sequence[str]) -> list[Path]:
         """Return the .npy file of each video; empty without --npy."""

@@ -3,27 +3,37 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.results import FRAME_SCORES, FrameScores
+from rfm_client.contract.results import FRAME_SCORES, SUCCESS_THRESHOLD, FrameScores
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.plot import save
+from rfm_client.plot import BOUNDS, COLOURS, FAINT, GRID, STYLE, THRESHOLD, save
 
 if TYPE_CHECKING:
-    from matplotlib.figure import SubFigure
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-STRIP_FRAMES = 8
-WIDTH_IN = 10.0
-COLUMN_WIDTH_IN = 7.0  # of panels side by side
-PANEL_HEIGHT_IN = 4.0
+MOST_FRAMES, FEWEST_FRAMES = 8, 5  # of a strip
+EVEN_ENOUGH = 1.3  # largest gap between frames of a strip, as a multiple of the smallest
+WIDTH_IN = 7.0  # of a page
+COLUMN_WIDTH_IN = 4.8  # of panels side by side
 
-_LOOKS = (("tab:blue", "-", "o"), ("tab:green", "--", "s"))  # of progress, or what replaces it, and of success
+# inches within a panel
+_LEFT, _RIGHT = 0.5, 0.1
+_SECOND_AXIS = 0.35  # more at the right, for success beside a score in a unit
+_TITLE, _STRIP_GAP, _BELOW = 0.22, 0.06, 0.5
+_CURVES = 1.3
+_HIGHEST_FRAME = 1.2
+_FRAME_GAP = 0.04
+_HEADLINE = 0.17  # a line of the figure's title
+_LETTER = 0.08
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +53,11 @@ class Panel:
     strip: UInt8Array | None
     strip_positions: npt.NDArray[np.float64]
 
+    @property
+    def has_second_axis(self) -> bool:
+        """True if success has an axis of its own, since the other score has a unit."""
+        return bool(FRAME_SCORES[self.scores.leading].unit) and not np.isnan(self.scores.success).all()
+
     @classmethod
     def of(
         cls,
@@ -58,65 +73,155 @@ class Panel:
         """
         scored = scores.scored_frames
         positions = scored.astype(np.float64) if times_s is None else times_s[scored]
-        shown = np.unique(np.linspace(0, len(scored) - 1, STRIP_FRAMES).round().astype(int))
+        shown = _evenly(positions)
         strip = None if frames is None else frames[scored[shown]]
         return cls(title, scores, positions, "frame" if times_s is None else "s", strip, positions[shown])
 
 
-def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, columns: int = 1) -> None:
-    """Draw a picture, in the format of the file's suffix: for each panel a film strip, below it the scores.
+def _evenly(positions: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
+    """Return the indices of frames for a strip: as many as lie at even distances, the first and the last included."""
+    best, least = np.arange(len(positions)), np.inf
+    for count in range(MOST_FRAMES, FEWEST_FRAMES - 1, -1):
+        targets = np.linspace(positions[0], positions[-1], count)
+        shown = np.unique(np.abs(positions - targets[:, None]).argmin(axis=1))
+        gaps = np.diff(positions[shown])
+        ratio = gaps.max() / gaps.min() if len(gaps) else 1.0
+        if ratio < least:
+            best, least = shown, ratio
+        if ratio <= EVEN_ENOUGH:
+            break
+    return best
 
+
+def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, columns: int = 1) -> None:
+    """Draw a picture, in the format of the file's suffix: for each panel the scores, above them frames at their times.
+
+    title: the first line is bold
     columns: panels side by side
     """
     try:
-        import matplotlib
+        import matplotlib.style
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError('plots need matplotlib: pip install "./client[cli]"') from error
 
     rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
-    heights_in = [PANEL_HEIGHT_IN * (1 if any(panel.strip is not None for panel in row) else 0.7) for row in rows]
-    with matplotlib.rc_context({"text.parse_math": False}):
-        figure = Figure(
-            figsize=(WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN * columns, sum(heights_in)), layout="constrained"
-        )
-        if title is not None:
-            figure.suptitle(title)
-        parts = figure.subfigures(len(rows), columns, squeeze=False, height_ratios=heights_in)
-        for part, panel in zip(parts.flat, panels):  # noqa: B905 - the last row may have room left
-            _draw(part, panel)
+    width_in = WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN
+    layouts = [[_Layout.of(panel, width_in) for panel in row] for row in rows]
+    heights_in = [max(layout.height_in for layout in row) for row in layouts]
+    told = [] if title is None else _wrapped(title, width_in * columns - _LEFT)
+    top_in = 0.1 + (_HEADLINE * len(told) + 0.04 if told else 0)
+    with matplotlib.style.context([*STYLE]):
+        figure = Figure(figsize=(width_in * columns, top_in + sum(heights_in)))
+        for number, (line, is_first) in enumerate(told):
+            look: dict[str, Any] = {"weight": "bold"} if is_first else {"color": FAINT}
+            y = 1 - (0.1 + _HEADLINE * number) / figure.get_figheight()
+            figure.text(_LEFT / figure.get_figwidth(), y, line, va="top", **look)
+        for row, own, height_in in zip(rows, layouts, heights_in, strict=True):
+            for column, (panel, layout) in enumerate(zip(row, own, strict=True)):
+                _draw(_Page(figure, width_in * column + _LEFT, top_in), panel, layout, height_in)
+            top_in += height_in
         save(figure, file)
 
 
-def _draw(part: SubFigure, panel: Panel) -> None:
-    columns = len(panel.strip_positions)
-    if panel.strip is None:
-        axes = part.add_subplot()
-    else:
-        grid = part.add_gridspec(2, columns, height_ratios=[1, 2])
-        for column, (frame, position) in enumerate(zip(panel.strip, panel.strip_positions, strict=True)):
-            picture = part.add_subplot(grid[0, column])
-            picture.imshow(frame)
+def _wrapped(title: str, width_in: float) -> list[tuple[str, bool]]:
+    """Return the lines of a title that fit the width, and True for those of its first line."""
+    most = int(width_in / _LETTER)
+    return [(part, not number) for number, line in enumerate(title.splitlines()) for part in textwrap.wrap(line, most)]
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Inches of a panel. limits: of the time axis, so that no frame is cut off"""
+
+    width_in: float
+    strip_in: float
+    frame_in: float
+    limits: tuple[float, float]
+
+    @property
+    def height_in(self) -> float:
+        return _TITLE + self.strip_in + (_STRIP_GAP if self.strip_in else 0) + _CURVES + _BELOW
+
+    @classmethod
+    def of(cls, panel: Panel, panel_in: float) -> _Layout:
+        """Return the layout with the widest frames that do not overlap at their times."""
+        width_in = panel_in - _LEFT - _RIGHT - (_SECOND_AXIS if panel.has_second_axis else 0)
+        first, last = panel.positions[[0, -1]].tolist()
+        if panel.strip is None:
+            margin = 0.02 * (last - first) or 0.5
+            return cls(width_in, 0, 0, (first - margin, last + margin))
+        height_px, width_px = panel.strip.shape[1:3]
+        most_in = _HIGHEST_FRAME * width_px / height_px
+        if first == last:
+            frame_in = min(most_in, width_in)
+            return cls(width_in, frame_in * height_px / width_px, frame_in, (first - 0.5, last + 0.5))
+        nearest = np.diff(panel.strip_positions).min()
+        frame_in = min(most_in, width_in * nearest / (last - first + nearest))
+        margin = (last - first) * frame_in / (width_in - frame_in) / 2
+        return cls(width_in, frame_in * height_px / width_px, frame_in, (first - margin, last + margin))
+
+
+@dataclass(frozen=True)
+class _Page:
+    """A figure measured in inches from a point near the top left corner."""
+
+    figure: Figure
+    left_in: float
+    top_in: float
+
+    def axes(self, left_in: float, top_in: float, width_in: float, height_in: float) -> Axes:
+        """Add axes that begin this far right of the point and below it."""
+        width, height = self.figure.get_size_inches()
+        bottom = 1 - (self.top_in + top_in + height_in) / height
+        return self.figure.add_axes(((self.left_in + left_in) / width, bottom, width_in / width, height_in / height))
+
+
+def _draw(page: _Page, panel: Panel, layout: _Layout, height_in: float) -> None:
+    begin, end = layout.limits
+    below_in = height_in - _CURVES - _BELOW  # panels of a row share the height of their curves
+    axes = page.axes(0, below_in, layout.width_in, _CURVES)
+    axes.set_xlim(layout.limits)
+    axes.set_xlabel("time (s)" if panel.unit == "s" else "frame", loc="left")
+    if len(panel.positions) == 1:
+        axes.set_xticks(panel.positions)
+    top_in = below_in
+    if panel.strip is not None:
+        top_in -= layout.strip_in + _STRIP_GAP
+        for frame, position in zip(panel.strip, panel.strip_positions, strict=True):
+            middle_in = (position - begin) / (end - begin) * layout.width_in
+            width_in = layout.frame_in - _FRAME_GAP
+            picture = page.axes(middle_in - width_in / 2, top_in, width_in, layout.strip_in)
+            picture.imshow(frame, aspect="auto")
             picture.set_axis_off()
-            picture.set_title(f"{position:.1f} s" if panel.unit == "s" else f"{position:.0f}", fontsize=8)
-        axes = part.add_subplot(grid[1, :])
+            axes.axvline(position, **GRID)
+        axes.grid(visible=False, axis="x")
+    _draw_curves(axes, panel)
+    words = page.axes(0, top_in - _TITLE, layout.width_in, _TITLE)
+    words.set_axis_off()
+    words.text(0, 0.65, panel.title, va="center")
+
+
+def _draw_curves(axes: Axes, panel: Panel) -> None:
     leading = FRAME_SCORES[panel.scores.leading]
-    of_shares = axes.twinx() if leading.unit and not np.isnan(panel.scores.success).all() else axes
+    of_shares = axes.twinx() if panel.has_second_axis else axes
     handles = []
-    for (colour, line, marker), name in zip(_LOOKS, (panel.scores.leading, "success"), strict=True):
+    for name in (panel.scores.leading, "success"):
         scores, own = panel.scores.arrays[name], of_shares if name == "success" else axes
         if np.isnan(scores).all():
-            handles += own.plot([], [], color=colour, label=f"{name}: not predicted")
+            handles += own.plot([], [], color=COLOURS[name], label=f"{name}: not predicted")
         else:
-            label = FRAME_SCORES[name].title(name)
-            handles += own.plot(
-                panel.positions, scores, color=colour, linestyle=line, marker=marker, markersize=4, label=label
-            )
-    axes.set(xlabel="time (s)" if panel.unit == "s" else "frame")
+            label, known = FRAME_SCORES[name].title(name), ~np.isnan(scores)
+            positions = np.asarray(panel.positions)[known]
+            handles += own.plot(positions, scores[known], color=COLOURS[name], marker="o", label=label, clip_on=False)
+            if name == "success":
+                label = f"threshold {SUCCESS_THRESHOLD}"
+                handles.append(own.axhline(SUCCESS_THRESHOLD, **THRESHOLD, label=label))
     if leading.unit:
-        axes.set(ylabel=leading.title(panel.scores.leading))
-    if of_shares is not axes or not leading.unit:
-        of_shares.set(ylabel="score", ylim=(-0.02, 1.02))
-    axes.grid(alpha=0.3)
-    axes.legend(handles=handles, loc="upper left", fontsize=8)
-    part.suptitle(panel.title, fontsize=10)
+        axes.set_ylabel(leading.title(panel.scores.leading))
+        axes.set_ylim(bottom=min(0.0, float(np.nanmin(panel.scores.arrays[panel.scores.leading]))))
+    if panel.has_second_axis or not leading.unit:
+        of_shares.set(ylim=BOUNDS, yticks=(0, 0.5, 1), ylabel="success" if panel.has_second_axis else "")
+        of_shares.grid(visible=not panel.has_second_axis, axis="y")
+    below = -(_BELOW - 0.14) / _CURVES
+    axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, below), ncols=3, borderaxespad=0, borderpad=0)

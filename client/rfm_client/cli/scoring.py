@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client score``: read trajectories from files, score them, show each result as soon as it arrives."""
+"""``rfm-client score``: read trajectories from files, score them, show the results in the order of the files."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import itertools
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package
+from rfm_client.cli.messages import told
 from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.show import at_end, number
@@ -96,12 +97,14 @@ class Source:
 class Scored:
     """A source's scores.
 
+    checkpoint: as in ``checkpoint_of``
     num_frames: frames that were read
     times_s: float64 [T], times of the T scored frames; None: unknown
     blank: as in ``Source``
     """
 
     name: str
+    checkpoint: str
     result: ProgressResult
     num_frames: int
     times_s: Times | None
@@ -148,19 +151,17 @@ class SourceScorer:
     _gone: RewardError | None = None
 
     def score_all(self, names: Sequence[str], tell: Tell) -> list[Outcome]:
-        """Return the outcomes of all sources, in order. ``tell`` takes each outcome as it arrives."""
+        """Return the outcomes of all sources, in order. ``tell`` takes each when all before it have arrived."""
         with ThreadPoolExecutor(WORKERS) as pool, _progress_bar(len(names)) as advance:
             try:
-                numbers: dict[Future[Outcome], int] = {
-                    pool.submit(self.outcome, number, name): number for number, name in enumerate(names)
-                }
-                for future in as_completed(numbers):
-                    tell(numbers[future], future.result())
+                futures = [pool.submit(self.outcome, number, name) for number, name in enumerate(names)]
+                for number, future in enumerate(futures):
+                    tell(number, future.result())
                     advance()
             except BaseException:  # an interrupt, or a full disk: no other source shall begin
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
-        return [future.result() for future in numbers]
+        return [future.result() for future in futures]
 
     def outcome(self, number: int, name: str) -> Outcome:
         """Return the scores of a source, or the reason of its failure."""
@@ -172,20 +173,22 @@ class SourceScorer:
             if self._gone is not None:
                 return Failed(name, self._gone, NOT_ASKED, is_server_gone=True)
             result = _evaluate(self.client, ProgressSample(source.trajectory), self.video, self.prefix)
+            checkpoint = checkpoint_of(self.client, source.trajectory)
         except ImportError as error:
             return Failed(name, error, missing_package(error))
         except (RewardError, OSError) as error:
             if isinstance(error, InvalidSampleError) and error.source == name:  # which the report names
                 error.source = ""
-            return Failed(name, error, str(error), is_server_gone=self._is_server_gone(error))
+            return Failed(name, error, told(error), is_server_gone=self._is_server_gone(error))
         if self.record is not None:
             self.record(number, source, result)
         return Scored(
             name=name,
+            checkpoint=checkpoint,
             result=result,
             num_frames=source.trajectory.num_frames,
             times_s=source.times_of(result),
-            panel=source.panel(f'{PurePath(name).name}: "{self.video.task}"', result),
+            panel=source.panel(PurePath(name).name, result),
             took_s=time.monotonic() - started_s,
             blank=source.blank,
         )
@@ -263,6 +266,17 @@ def _evaluate(
     return cast(ProgressResult, with_frame_indices(told, fit.frame_indices))
 
 
+def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:
+    """Return the source of the checkpoint that scores the trajectory, else the model's name."""
+    info = client.model_info(frames=trajectory.frames is not None)
+    return info.source or info.name
+
+
+def heading(task: str, checkpoints: Iterable[str]) -> str:
+    """Return the title of a figure: the task, and below it the checkpoints."""
+    return "\n".join([*[f'"{task}"'] * (not is_blank(task)), ", ".join(dict.fromkeys(checkpoints))])
+
+
 def figure(scored: Sequence[Scored], task: str) -> Figure:
     """Return one figure with the curves of these sources. Raises ImportError without matplotlib."""
     files = [PurePath(each.name).name for each in scored]
@@ -270,7 +284,7 @@ def figure(scored: Sequence[Scored], task: str) -> Figure:
     return plot_scores(
         [each.result for each in scored],
         files if is_unique else [each.name for each in scored],
-        title=f'"{task}"' if task else None,
+        title=heading(task, [each.checkpoint for each in scored]),
         times_s=[each.times_s for each in scored],
     )
 

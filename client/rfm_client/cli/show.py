@@ -18,26 +18,19 @@ from rfm_client.contract.results import (
     Result,
     trajectory_scores,
 )
-from rfm_client.transport.status import DEVICE_METRICS, Device, ServerStatus
+from rfm_client.transport.status import Device, ServerStatus
 
 if TYPE_CHECKING:
-    from rich.console import Console, ConsoleOptions, RenderResult
+    from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
     from rich.measure import Measurement
     from rich.table import Table
 
 FILE_WIDTH = 200
 SHORT_CELL = 16  # characters; a column without longer cells does not wrap
 SHORTEST_NAME = 12
+UNLIMITED = 10_000  # columns
 CUT = "..."  # for the left-out part of a name
 GAP = "  "  # between columns of a ``StreamedTable``
-
-STATUS_LEGEND = (
-    "since load: since the model was loaded, warm-up included, as Triton's statistics count; since start: since Triton "
-    "was started, as the model's metrics count, which go on where a model is loaded again. requests: answered with "
-    "scores; failed: answered with an error; refused: samples that cannot be scored, the caller's fault. batches: "
-    "since start of callers' samples, since load of all; queue ms: until a request's turn, on average in Triton since "
-    "load and in the model since start. The server's log has the reason of each failure."
-)
 
 _GIB = 2**30
 
@@ -88,12 +81,42 @@ class ShortName:
         yield Text(shortened(self.text, options.max_width), no_wrap=True, overflow="ellipsis")
 
 
-def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> Table:
+@dataclass(frozen=True)
+class FittingTable:
+    """A table whose headers stand on one line where they fit.
+
+    wide, narrow: the table with each header on one line, and with headers as narrow as their columns
+    """
+
+    wide: Table
+    narrow: Table
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the wide table if it fits, else the narrow one."""
+        from rich.measure import Measurement
+
+        width = Measurement.get(console, options.update(max_width=UNLIMITED), self.wide).maximum
+        yield self.wide if width <= options.max_width else self.narrow
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> FittingTable:
     """Return a table of plain texts: square brackets are no markup.
 
     names: number of first columns with names and paths, which are shortened to fit; of the other columns, only those
         with long cells wrap
     """
+    widest = [max((len(row[index]) for row in rows), default=0) for index in range(len(columns))]
+    are_short = [index >= names and width <= SHORT_CELL for index, width in enumerate(widest)]
+    folded = [
+        textwrap.fill(column, max(width, *map(len, column.split()))) if is_short and column else column
+        for column, width, is_short in zip(columns, widest, are_short, strict=True)
+    ]
+    return FittingTable(*(_table(title, headers, rows, names, are_short) for headers in (columns, folded)))
+
+
+def _table(
+    title: str, headers: Sequence[str], rows: Sequence[Sequence[str]], names: int, are_short: Sequence[bool]
+) -> Table:
     from rich import box
     from rich.table import Table
     from rich.text import Text
@@ -101,10 +124,7 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
     shown = Table(
         box=box.SIMPLE_HEAD, collapse_padding=True, title=Text(title) if title else None, title_justify="left"
     )
-    for index, column in enumerate(columns):
-        widest = max((len(row[index]) for row in rows), default=0)
-        is_short = index >= names and widest <= SHORT_CELL
-        header = textwrap.fill(column, max(widest, *map(len, column.split()))) if is_short and column else column
+    for header, is_short in zip(headers, are_short, strict=True):
         shown.add_column(Text(header), overflow="fold", no_wrap=is_short)
     for row in rows:
         shown.add_row(*map(ShortName, row[:names]), *map(Text, row[names:]))
@@ -158,7 +178,7 @@ class StreamedTable:
             print(f"\n{GAP}{text}", flush=True)
 
 
-def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
+def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> FittingTable:
     """Return a table with a row for each trajectory: its sample's answer, and the scores of its last frame."""
     shown = []
     for name, result in rows:
@@ -175,8 +195,8 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
     return table(title, ("sample", "answer", "progress at the end", "success at the end"), shown)
 
 
-def status_tables(status: ServerStatus) -> list[Table | str]:
-    """Return tables of models, of their batches, and of the machine if its metrics describe it, with a legend."""
+def status_tables(status: ServerStatus) -> list[RenderableType]:
+    """Return tables of models, of their batches, and of the machine if its metrics describe it."""
     version = f" {status.version}" if status.version else ""
     title = f"{status.url}: Triton{version}, {'ready' if status.ready else 'not ready'}"
     requests = ("model", "v", "state", "requests since load", "failed since load", "refused since start", "pending now")
@@ -188,16 +208,15 @@ def status_tables(status: ServerStatus) -> list[Table | str]:
         times = number(model.compute_ms_per_batch, 2), number(model.queue_ms_per_request, 2)
         each, since = number(model.samples_per_batch, 1), "start" if model.batches and model.batches.count else "load"
         batched.append((model.name, model.version, str(model.batch_count), each, *times, since))
-    shown: list[Table | str] = [
+    shown: list[RenderableType] = [
         table(title, requests, counted),
         *(f"{model.name} {model.version}: {model.reason}" for model in status.models if model.reason),
         table("", batches, batched),
-        STATUS_LEGEND,
         *filter(None, [status.metrics_error]),
     ]
     if status.devices:
         columns = ("device", "utilization", "memory used", "memory")
-        shown += ["", table(f"machine, from {DEVICE_METRICS}", columns, [_device_row(each) for each in status.devices])]
+        shown += [table("machine", columns, [_device_row(each) for each in status.devices])]
     return shown
 
 

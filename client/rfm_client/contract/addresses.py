@@ -17,6 +17,12 @@ _URL = re.compile(
     r"((?P<scheme>grpcs?|https?)://|dns:///)(?P<address>(\[[\da-fA-F:.]+(%\w+)?\]|[^][:/@\s]+):(?P<port>\d{1,5}))/?"
 )
 _PORTS = {"grpc": 8001, "http": 8000}
+_OPENSSL_REASONS = {
+    "NO_CERTIFICATE_OR_CRL_FOUND": "a file without certificate",
+    "KEY_VALUES_MISMATCH": "the key of another certificate",
+    "BAD_DECRYPT": "an encrypted key",
+    "BAD_PASSWORD_READ": "an encrypted key",
+}
 
 
 def split_url(url: str) -> tuple[str, str]:
@@ -77,4 +83,7 @@ def load_certificate(context: ssl.SSLContext, certificate: str | Path, key: str 
 
 
 def _reason(error: OSError) -> str:
-    return getattr(error, "reason", None) or error.strerror or "no PEM file"
+    """What is wrong with a PEM file, in place of OpenSSL's words."""
+    if not isinstance(error, ssl.SSLError):
+        return error.strerror or str(error)
+    return _OPENSSL_REASONS.get(error.reason or "", "a file in another format")

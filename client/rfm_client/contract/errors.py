@@ -40,6 +40,8 @@ class LocatedError(Exception):
     @classmethod
     def at(cls, where: object, expected: str, got: object, remedy: str = "") -> Self:
         """Return the error of a value that is not as expected."""
+        if isinstance(got, OSError) and got.strerror:
+            got = f"{got.filename}: {got.strerror}" if got.filename else got.strerror
         error = cls(f"expected {expected}, got {got}{'; ' if remedy else ''}{remedy}", where)
         error.expected, error.got, error.remedy = expected, str(got), remedy
         return error

@@ -43,6 +43,9 @@ def write_log(process: str, environment: Mapping[str, str]) -> None:
     level = environment.get(LEVEL_VARIABLE, "INFO").upper()
     if level not in _LEVELS:
         raise ConfigError.at(LEVEL_VARIABLE, f"one of {', '.join(_LEVELS)}", f"{level!r:.100}")
+    root = logging.getLogger()
+    for each in [each for each in root.handlers if type(each) is logging.StreamHandler]:
+        root.removeHandler(each)  # for the short lines of a command, which becomes a server here
     handler = _StandardError()
     handler.setFormatter(LogLines(process))
     logging.basicConfig(handlers=[handler], level=logging.INFO)

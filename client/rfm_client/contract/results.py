@@ -48,6 +48,7 @@ class Score:
     bounds: smallest and largest value; None: no bound
     unit: of the values, such as ``s``; empty: none
     higher_is_better: False: lower values are better
+    skips_frames: its models answer about some frames only: this score and progress are NaN at the others
     is_newer: exports of its family exist that lack it, so a served model may gain it
     """
 
@@ -60,6 +61,7 @@ class Score:
     bounds: tuple[float | None, float | None] = (0.0, 1.0)
     unit: str = ""
     higher_is_better: bool = True
+    skips_frames: bool = False
     is_newer: bool = False
 
     def short(self, name: str) -> str:
@@ -80,7 +82,8 @@ class Score:
 class FrameScores:
     """Scores of each frame of one trajectory. Everything else that knows a score derives it from its ``Score``.
 
-    progress: float32 [T], share of the task done, 0..1; NaN throughout: the checkpoint does not predict it
+    progress: float32 [T], share of the task done, 0..1; NaN throughout: the checkpoint does not predict it; NaN where
+        ``is_answered`` is False. Robo-Dopamine's is not clipped and may leave 0..1
     success: float32 [T], probability that the task is done; NaN throughout: the checkpoint does not predict it
     progress_logits: float32 [T, K], raw scores of the progress bins, on request, from discrete checkpoints only
     log_prob: float32 [T], logarithm of TOPReward's probability that the frames so far complete the task, on request
@@ -90,6 +93,7 @@ class FrameScores:
     relative_s: float32 [T], RynnValue's seconds from the frame before to each frame, negative where the task went
         backwards; 0 at the first frame
     entropy: float32 [T], entropy in nats of the probabilities behind ``remaining_s``; larger: less sure
+    hop: float32 [T], change of progress at each frame that Robo-Dopamine compared with another; NaN: not compared
     frame_indices: int64 [T], indices of the scored frames in the trajectory; None: all frames
     """
 
@@ -139,12 +143,27 @@ class FrameScores:
             higher_is_better=False,
         ),
     ] = None
+    hop: Annotated[
+        Float32Array | None,
+        Score(
+            "Change of progress at each frame that the model compared with another",
+            asked="if given",
+            bounds=(None, None),
+            skips_frames=True,
+        ),
+    ] = None
     frame_indices: npt.NDArray[np.int64] | None = None
 
     @property
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """The scores that are there, by name."""
         return {name: scores for name in FRAME_SCORES if (scores := getattr(self, name)) is not None}
+
+    @property
+    def is_answered(self) -> npt.NDArray[np.bool_]:
+        """bool [T], True at the frames that the model answered about; progress is NaN at the others."""
+        skipping = [scores for name, scores in self.arrays.items() if FRAME_SCORES[name].skips_frames]
+        return ~np.isnan(skipping[0]) if skipping else np.ones(len(self.progress), bool)
 
     @property
     def leading(self) -> str:
@@ -179,13 +198,13 @@ class FrameScores:
     @property
     def last_progress(self) -> float:
         """Progress at the last frame. Raises ValueError if the checkpoint does not predict it."""
-        return float(_known("progress", self.progress)[-1])
+        return float(_known("progress", self.progress[-1:])[-1])
 
     @property
     def progress_deltas(self) -> Float32Array:
         """float32 [T], change of progress since the previous scored frame; 0 for the first.
 
-        Raises ValueError if the checkpoint does not predict progress.
+        Raises ValueError if the checkpoint does not predict progress at each frame.
         """
         progress = _known("progress", self.progress)
         return np.diff(progress, prepend=progress[:1])
@@ -318,6 +337,7 @@ def _preferred(preference: float) -> Literal["first", "second"] | None:
 
 
 def _known(name: str, scores: Float32Array) -> Float32Array:
-    is_known = not np.isnan(scores).any()
-    require(name, is_known, "a score of each frame", "NaN: this checkpoint does not predict it")
+    missing = np.isnan(scores)
+    why = "this checkpoint does not predict it" if missing.all() else "the model answered about the others only (hop)"
+    require(name, not missing.any(), "a score of each frame", f"NaN: {why}")
     return scores

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,9 @@ UInt8Array: TypeAlias = npt.NDArray[np.uint8]
 NamedFrame: TypeAlias = tuple[bytes, npt.NDArray[Any]]  # a frame's digest, and what a server has of the frame
 
 MIN_FRAME_STEPS = 2  # a prefix sampled to a single frame is no trajectory
+MOST_VIEWS = 2  # besides the frames
 MAX_FRAME_STEPS = 4096  # more frames than any checkpoint takes
+DESCRIPTION_FIELDS = ("robot_description", "camera_description")
 _PLAIN_NUMBERS = ("I", "F")  # Pillow's modes of depth pictures, which no conversion makes a colour picture
 
 
@@ -35,6 +37,11 @@ class Trajectory:
     video_embeddings: float32 [T, D], in place of ``frames``
     text_embedding: float32 [Dt], embedding of the task, for ``video_embeddings``
     task: a sentence, for ``frames``
+    robot_description, camera_description: for ``frames``, the words for the robot and the camera in RynnValue's prompt;
+        if either is given, they replace both of the export; empty: none
+    views: with ``frames``, those of further cameras at the same times, uint8 [T, H, W, 3] each; Robo-Dopamine reads
+        those of the left and the right wrist, in this order
+    goal: with ``frames``, a picture of the task done, uint8 [H, W, 3], RGB; Robo-Dopamine reads it
     named: in place of ``frames``, on a server: the digest of each frame with its pixels, uint8 [H, W, 3], or with its
         embedding, float32 [D], which the encoders kept
 
@@ -45,6 +52,10 @@ class Trajectory:
     video_embeddings: Float32Array | None = None
     text_embedding: Float32Array | None = None
     task: str = ""
+    robot_description: str = ""
+    camera_description: str = ""
+    views: tuple[UInt8Array, ...] = ()
+    goal: UInt8Array | None = None
     named: tuple[NamedFrame, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -53,10 +64,17 @@ class Trajectory:
             got = "both" if given else "neither"
             raise InvalidSampleError.at("trajectory", "either frames or video_embeddings", got)
         check_task(self.task)
+        for name in DESCRIPTION_FIELDS:
+            check_text(name, getattr(self, name))
+        if self.video_embeddings is not None and any(self.descriptions):
+            expected = "none with video_embeddings"
+            raise InvalidSampleError.at(" or ".join(DESCRIPTION_FIELDS), expected, str(self.descriptions))
         if self.frames is not None and self.text_embedding is not None:
             raise InvalidSampleError.at("text_embedding", "None with frames, which go with task", "an embedding")
         if self.frames is not None:
             object.__setattr__(self, "frames", _checked_frames(self.frames))
+        if self.has_views:
+            self._check_views()
         if self.video_embeddings is not None:
             embeddings = _checked_floats("video_embeddings", self.video_embeddings, ("T", "D"))
             object.__setattr__(self, "video_embeddings", embeddings)
@@ -68,8 +86,15 @@ class Trajectory:
         """The trajectory with shapes in place of values."""
         arrays = {"frames": self.frames, "video_embeddings": self.video_embeddings, "text": self.text_embedding}
         shapes = [f"{name}={array.dtype} {list(array.shape)}" for name, array in arrays.items() if array is not None]
+        shapes += [f"view={array.dtype} {list(array.shape)}" for array in self.views]
+        shapes += [] if self.goal is None else [f"goal={self.goal.dtype} {list(self.goal.shape)}"]
         shapes += [] if self.named is None else [f"named={self.num_frames} frames"]
         return f"Trajectory({', '.join([*shapes, f'task={self.task!r}'])})"
+
+    @property
+    def has_views(self) -> bool:
+        """True if there are views or a goal, which only some models read."""
+        return bool(self.views) or self.goal is not None
 
     @property
     def positions(self) -> npt.NDArray[Any]:
@@ -79,9 +104,31 @@ class Trajectory:
         return array
 
     @property
+    def descriptions(self) -> tuple[str, str]:
+        """The descriptions of robot and camera."""
+        return self.robot_description, self.camera_description
+
+    @property
     def num_frames(self) -> int:
         """T, the number of frames."""
         return len(self.positions if self.named is None else self.named)
+
+    def _check_views(self) -> None:
+        """Check views and goal. Raises InvalidSampleError."""
+        if self.frames is None and self.named is None:
+            raise InvalidSampleError.at("views", "none without frames", "views or a goal of embeddings")
+        require("views", len(self.views) <= MOST_VIEWS, f"at most {MOST_VIEWS}", len(self.views), InvalidSampleError)
+        views = []
+        for index, view in enumerate(self.views):
+            try:
+                views.append(_checked_frames(view))
+            except InvalidSampleError as error:
+                raise error.inside(f"views[{index}]") from None
+            expected, got = f"{self.num_frames} frames, as frames", len(views[-1])
+            require(f"views[{index}]", got == self.num_frames, expected, got, InvalidSampleError)
+        object.__setattr__(self, "views", tuple(views))
+        if self.goal is not None:
+            object.__setattr__(self, "goal", _checked_goal(self.goal))
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,10 +215,15 @@ def check_frame_steps(steps: Any) -> None:
 
 def check_task(task: Any) -> None:
     """Raise InvalidSampleError unless ``task`` is text that UTF-8 can encode."""
-    if not isinstance(task, str):
-        raise InvalidSampleError.at("task", "str", type(task).__name__)
-    if any(0xD800 <= ord(character) <= 0xDFFF for character in task):
-        raise InvalidSampleError.at("task", "text that UTF-8 can encode", "a lone surrogate")
+    check_text("task", task)
+
+
+def check_text(where: str, text: Any) -> None:
+    """Raise InvalidSampleError unless ``text`` is text that UTF-8 can encode."""
+    if not isinstance(text, str):
+        raise InvalidSampleError.at(where, "str", type(text).__name__)
+    if any(0xD800 <= ord(character) <= 0xDFFF for character in text):
+        raise InvalidSampleError.at(where, "text that UTF-8 can encode", "a lone surrogate")
 
 
 def stackable(trajectories: Sequence[Trajectory]) -> list[list[Trajectory]]:
@@ -243,6 +295,16 @@ def _checked_frames(frames: Any) -> UInt8Array:
     return array
 
 
+def _checked_goal(goal: Any) -> UInt8Array:
+    try:
+        frames: UInt8Array = _checked_frames(as_array(goal)[np.newaxis])
+    except InvalidSampleError:
+        array = as_array(goal)
+        got = f"{array.dtype} {list(array.shape)}"
+        raise InvalidSampleError.at("goal", "a picture, uint8 [H, W, 3]", got) from None
+    return cast(UInt8Array, frames[0])
+
+
 def _checked_floats(where: str, values: Any, axes: tuple[str, ...]) -> Float32Array:
     expected = f"float32 [{', '.join(axes)}]"
     try:
@@ -275,6 +337,8 @@ def _check_text(trajectory: Trajectory, where: str) -> None:
 
 def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
     """Check that both are of one kind. Embeddings need one width; frames may differ in size."""
+    if first.has_views or (isinstance(second, Trajectory) and second.has_views):
+        raise InvalidSampleError.at(where, "trajectories without views and goal, which only progress has", "them")
     if not isinstance(second, Trajectory):
         raise InvalidSampleError.at(where, "Trajectory", type(second).__name__)
     if (first.frames is None) != (second.frames is None):

@@ -7,6 +7,7 @@ real Triton say each of its phrases.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Collection
 from typing import Any, TypeAlias, TypeVar
@@ -14,7 +15,7 @@ from urllib.parse import urljoin
 
 from rfm_client.contract import errors
 from rfm_client.contract.names import frames_name
-from rfm_client.contract.wire import NUM_FRAMES, SECOND_FRAMES
+from rfm_client.contract.wire import DESCRIPTIONS, GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 
@@ -47,18 +48,32 @@ RESTRICTED = "is restricted, expecting header"  # the API needs a key
 _NO_CONNECTION = re.compile(  # gRPC's own words: nothing was sent
     "failed to connect|connections to all backends failing|errors resolving|resolution failed"
 )
+_REASON = re.compile(r"(?:: |\[)((?:Connection|Domain name|Name|No route|Network)[\w ]+)\]?$")  # of a libc or gRPC
 _PROXY_ALONE = "http2 header with status: 502"  # a proxy answered: the server behind it did not
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or a proxy's
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
 _WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not make
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
 )
-_NO_SECOND_FRAMES = re.compile(rf"expected \d+ inputs but got .*'{SECOND_FRAMES}'|unexpected .*input '{SECOND_FRAMES}'")
+_NO_INPUT = re.compile(
+    r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*input )"
+    rf"'(?P<name>{'|'.join((SECOND_FRAMES, DESCRIPTIONS, *VIEWS, GOAL))})'"
+)
+_OF_VIEWS = ("a model that reads views and a goal, such as Robo-Dopamine", "leave out views and goal")
+# What a model without an optional input is sent it for, and the remedy.
+_WITHOUT = {
+    SECOND_FRAMES: ("a model that takes pairs of two frame sizes", "export it again, or resize a trajectory"),
+    DESCRIPTIONS: (
+        "a model whose prompt names robot and camera, such as RynnValue",
+        "leave out robot_description and camera_description, or export a RynnValue again",
+    ),
+    **dict.fromkeys((*VIEWS, GOAL), _OF_VIEWS),
+}
 _NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
 _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as ``LocatedError`` writes them
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
 
-_FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
+FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
 _START = "start the server there (rfm serve), or give the URL of one that runs"
 _NO_PROXY = "unset that variable, or add the server's host to no_proxy"
 _NAME = "give the checkpoint's name with model (--model)"
@@ -81,7 +96,7 @@ def invalid_sample(text: str) -> errors.InvalidSampleError:
         return errors.InvalidSampleError(text)
     where, expected, got = fields.groups()
     has_too_many = where.endswith(NUM_FRAMES) and expected.startswith("at most ")
-    return errors.InvalidSampleError.at(where, expected, got, _FEWER_FRAMES if has_too_many else "")
+    return errors.InvalidSampleError.at(where, expected, got, FEWER_FRAMES if has_too_many else "")
 
 
 def error_from(
@@ -110,7 +125,8 @@ def error_from(
             case "ClientResponseError":
                 return errors.InferenceFailedError(f"{url}: no answer of an HTTP server: {type(raised).__name__}")
             case "ClientConnectorError" | "OSError" | "EOFError" | "HTTPException":
-                return unreachable(url, str(raised) or type(raised).__name__)
+                number = getattr(raised, "errno", None) or 0
+                return unreachable(url, os.strerror(number) if number > 0 else str(raised) or type(raised).__name__)
             case "ClientError":  # aiohttp's, after the request was sent
                 lost = unreachable(url, str(raised) or type(raised).__name__)
                 lost.may_have_ended_server = True
@@ -135,10 +151,11 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
     shape = _WRONG_SHAPE.search(text)
     if shape is not None:
         return errors.InvalidSampleError.at(shape["name"], f"[{shape['expected']}]", f"[{shape['got']}]")
-    if _NO_SECOND_FRAMES.search(text):
-        expected = "a model that takes pairs of two frame sizes"
-        got, remedy = "one that was exported before there was this input", "export it again, or resize a trajectory"
-        return errors.InvalidSampleError.at(SECOND_FRAMES, expected, got, remedy)
+    without = _NO_INPUT.search(text)
+    if without is not None:
+        expected, remedy = _WITHOUT[without["name"]]
+        got = "another, or one that was exported before there was this input"
+        return errors.InvalidSampleError.at(without["name"], expected, got, remedy)
     if PROCESS_ENDED in text and "Stub process" in text:
         return errors.ProcessEndedError(text)
     if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: a retry may succeed
@@ -180,6 +197,8 @@ def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
 
 def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.ServerUnavailableError:
     """Return the error of a failed connection to the server, or to its proxy."""
+    told = _REASON.search(reason)
+    reason = told[1] if told else reason
     if proxy is None:
         return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", _START)
     fault = f"{url}: no connection through {proxy}: {reason}"

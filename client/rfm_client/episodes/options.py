@@ -129,6 +129,8 @@ class StepKeywords(TypedDict, total=False):
     resize: bool
     success: SuccessRule
     live: StepView | None
+    robot_description: str
+    camera_description: str | Mapping[str, str]
     timeout_s: float | None
     score: StepValue
 
@@ -146,6 +148,9 @@ class FrameOptions:
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
     live: view to which each step is reported, with the first camera's frame; it delays no step
+    robot_description: the words for the robot in RynnValue's prompt; empty: those of the export
+    camera_description: the words for the camera: one text for all cameras, or a dict by camera. If either is given,
+        they replace both of the export
     score: the score that each step must have, ``progress`` or ``remaining_s``; a step of a checkpoint that does not
         predict it raises ValueError
     """
@@ -157,6 +162,8 @@ class FrameOptions:
     channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
     resize: bool = False
     live: StepView | None = None
+    robot_description: str = ""
+    camera_description: str | Mapping[str, str] = ""
     score: StepValue = "progress"
 
     def __post_init__(self) -> None:
@@ -170,10 +177,25 @@ class FrameOptions:
         require("fuse", self.fuse in FUSES, f"one of {', '.join(FUSES)}", repr(self.fuse))
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one for all frames, as cameras names none"
-        for name, given in (("orient", self.orient), ("channels", self.channels)):
+        by_camera = {name: getattr(self, name) for name in ("orient", "channels", "camera_description")}
+        for name, given in by_camera.items():
             unknown = [] if isinstance(given, str) else [repr(each) for each in given if each not in cameras]
             require(name, not unknown, expected, ", ".join(unknown))
         self.corrections  # noqa: B018  raises ValueError for an unknown value
+        for name, text in (("robot_description", self.robot_description), *self._of_cameras):
+            require(name, isinstance(text, str), "text", type(text).__name__)
+
+    @property
+    def descriptions(self) -> list[tuple[str, str]]:
+        """Descriptions of the robot and of each camera, in the order of the cameras."""
+        return [(self.robot_description, text) for _, text in self._of_cameras]
+
+    @property
+    def _of_cameras(self) -> list[tuple[str, str]]:
+        """The name of the option, and each camera's description."""
+        given = self.camera_description
+        texts = [given if isinstance(given, str) else given.get(camera, "") for camera in self.cameras or ("",)]
+        return [("camera_description", text) for text in texts]
 
     @property
     def corrections(self) -> list[Correction]:

@@ -49,11 +49,13 @@ class Window:
     """Frames of one size with their task, to be scored for progress. Raises InvalidSampleError for an invalid task.
 
     episode: identifies the episode of the frames; all windows of an episode go to one server
+    descriptions: of robot and camera, as in Trajectory
     """
 
     frames: tuple[Frame, ...]
     task: str
     episode: object
+    descriptions: tuple[str, str] = ("", "")
 
     def __post_init__(self) -> None:
         check_task(self.task)
@@ -68,7 +70,11 @@ class Window:
     @property
     def sample(self) -> ProgressSample:
         """The window as a sample, with all pixels. Raises InvalidSampleError."""
-        return ProgressSample(Trajectory(frames=np.stack([frame.pixels for frame in self.frames]), task=self.task))
+        robot, camera = self.descriptions
+        frames = np.stack([frame.pixels for frame in self.frames])
+        return ProgressSample(
+            Trajectory(frames=frames, task=self.task, robot_description=robot, camera_description=camera)
+        )
 
     @property
     def digests(self) -> list[bytes]:
@@ -156,7 +162,8 @@ class Steps:
         try:
             require("frame", step >= 0, "one to score", "none yet", InvalidSampleError)
             shown = [self._frames[index] for index in prefix.indices]
-            return prefix, [Window(of_camera, self.task, self) for of_camera in zip(*shown, strict=True)]
+            of_cameras = zip(zip(*shown, strict=True), self.options.descriptions, strict=True)
+            return prefix, [Window(frames, self.task, self, described) for frames, described in of_cameras]
         except InvalidSampleError as error:
             raise self._located(error) from None
 

@@ -38,9 +38,10 @@ def snapshot(sample: Sample) -> Sample:
     """Return the sample with copies of its arrays, so that the caller may change the originals before it is sent."""
 
     def copied(trajectory: Trajectory) -> Trajectory:
-        names = ("frames", "video_embeddings", "text_embedding")
+        names = ("frames", "video_embeddings", "text_embedding", "goal")
         arrays = {name: getattr(trajectory, name) for name in names}
-        return replace(trajectory, **{name: array.copy() for name, array in arrays.items() if array is not None})
+        copies = {name: array.copy() for name, array in arrays.items() if array is not None}
+        return replace(trajectory, **copies, views=tuple(view.copy() for view in trajectory.views))
 
     return with_trajectories(sample, [copied(t) for t in sample.trajectories]) if isinstance(sample, Sample) else sample
 

@@ -139,8 +139,11 @@ def _arrays(file: Path) -> Mapping[str, npt.NDArray[Any]]:
             if isinstance(loaded, np.ndarray):
                 return {"video_embeddings" if loaded.ndim == 2 else "frames": loaded}
             return {key: loaded[key] for key in loaded.files}
+    except FileNotFoundError as error:
+        raise InvalidSampleError.at("file", "a file of arrays", f"no file of this name ({file})") from error
     except (OSError, EOFError, BadZipFile, zlib.error, *_BROKEN_NPY) as error:
-        raise InvalidSampleError.at("file", "arrays of numbers and text, none pickled", f"{error} ({file})") from error
+        told = "a file of another kind" if str(error).startswith("Cannot load file containing pickled") else error
+        raise InvalidSampleError.at("file", "arrays of numbers and text, none pickled", f"{told} ({file})") from error
 
 
 def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:

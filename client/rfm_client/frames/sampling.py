@@ -143,7 +143,8 @@ def thinned(num_frames: int, limit: int | None) -> FrameIndices | None:
 def taken(trajectory: Trajectory, indices: FrameIndices) -> Trajectory:
     """Return the trajectory with the frames or embeddings at ``indices``, int64 [N], and its task."""
     if trajectory.frames is not None:
-        return replace(trajectory, frames=trajectory.frames[indices])
+        views = tuple(view[indices] for view in trajectory.views)
+        return replace(trajectory, frames=trajectory.frames[indices], views=views)
     assert trajectory.video_embeddings is not None  # a Trajectory has frames or embeddings
     return replace(trajectory, video_embeddings=trajectory.video_embeddings[indices])
 

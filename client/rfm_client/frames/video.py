@@ -143,10 +143,19 @@ def _errors_of(source: str | Path) -> Iterator[None]:
     except InvalidSampleError as error:
         raise InvalidSampleError.like(error, source=str(source)) from error
     except (import_av().FFmpegError, OSError) as error:
-        told = InvalidSampleError.at("video", _EXPECTED, error.strerror or error)
+        told = InvalidSampleError.at("video", _EXPECTED, _read_instead(error))
         if isinstance(error, FileNotFoundError):
             told = InvalidSampleError.at("video", "a video file", "no file of this name")
         raise InvalidSampleError.like(told, source=str(source)) from error
+
+
+def _read_instead(error: Exception) -> object:
+    """What was there in place of a video, without the words of FFmpeg and urllib."""
+    if isinstance(error, import_av().InvalidDataError):
+        return "a file of another kind, or a damaged one"
+    reason = getattr(error, "reason", None)  # of a URL
+    fault = reason if isinstance(reason, OSError) else error
+    return getattr(fault, "strerror", None) or fault
 
 
 def _check_numbers(fps: float | None, start_s: float | None, end_s: float | None, timeout_s: float) -> None:
@@ -205,7 +214,7 @@ def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
     except (OSError, HTTPException, ValueError) as error:
         if isinstance(error, HTTPError):
             error.close()  # an HTTPError holds the connection
-        raise FrameFileError.of(_EXPECTED, str(error)) from error
+        raise FrameFileError.of(_EXPECTED, _read_instead(error)) from error
 
 
 def _within(packets: Packets, start_s: float | None, end_s: float | None) -> tuple[int, int]:

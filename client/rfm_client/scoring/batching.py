@@ -23,7 +23,10 @@ def groups(samples: Mapping[int, Sample], model: str) -> Iterator[tuple[str, lis
     def key(index: int) -> tuple[str, list[tuple[int, ...]], tuple[int, ...]]:
         trajectories = samples[index].trajectories
         shapes = [together[0].positions.shape[1:] for together in stackable(trajectories)]
-        text = trajectories[0].text_embedding
+        first = trajectories[0]
+        shapes += [(number, *view.shape[1:]) for number, view in enumerate(first.views)]
+        shapes += [] if first.goal is None else [first.goal.shape]
+        text = first.text_embedding
         return model_of(samples[index], model), shapes, () if text is None else text.shape
 
     by_length = sorted(samples, key=lambda index: (key(index), num_positions(samples[index])))
@@ -46,7 +49,7 @@ def parts(samples: Mapping[int, Sample], group: Sequence[int], max_batch_size: i
 
 
 def padded_bytes(samples: Sequence[Sample]) -> int:
-    """Return the bytes of one request's frame positions, padding included. The samples fit the same arrays."""
+    """Return the bytes of one request's frames, or embeddings, padding included. The samples fit the same arrays."""
     longest: list[int] = [max(sizes) for sizes in zip(*map(array_bytes, samples), strict=True)]
     return len(samples) * sum(longest)
 
@@ -57,7 +60,9 @@ def num_positions(sample: Sample) -> int:
 
 
 def array_bytes(sample: Sample) -> list[int]:
-    """Return the bytes of the sample's frame positions in each array of the request."""
+    """Return the bytes of the sample's frames, or embeddings, in each array of the request."""
+    first = sample.trajectories[0]
     if len(sample.trajectories) == 1:
-        return [sample.trajectories[0].positions.nbytes]
+        goal = () if first.goal is None else (first.goal,)
+        return [array.nbytes for array in (first.positions, *first.views, *goal)]
     return [sum(t.positions.nbytes for t in together) for together in stackable(sample.trajectories)]

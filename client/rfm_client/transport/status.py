@@ -28,7 +28,6 @@ from rfm_client.transport.ports import OF_A_PORT, wrong_port
 
 METRICS_PORT = 8002
 METRICS_OPTION = "--metrics-url"
-DEVICE_METRICS = "nv_cpu_utilization, nv_gpu_utilization, nv_*_memory_*_bytes"
 _PROCESSOR = "CPU"
 _FRAMES = frames_name("")  # end of the names of models for raw frames
 PENDING_METRIC = "nv_inference_pending_request_count"

@@ -54,10 +54,14 @@ def evaluate(
     """Compare reward models by their labels of one dataset.
 
     With outcomes, successes and failures are told apart. Labels are those of `rfm-client label --name NAME`.
+
+    Example: rfm-client evaluate my_dataset --outcome outcomes.csv
     """
     from rfm_labels import DatasetError, evaluate_labels, find_label_files, read_outcomes
 
-    output.make_folders()
+    output.check_folders()
+    if not dataset.exists():
+        raise DatasetError.at(dataset, "a labelled dataset", "no file or folder of this name")
     files = labels or find_label_files(dataset)
     if not files:
         expected = "label files, NAME_progress.parquet or in HDF5 (rfm-client label), or --labels"
@@ -70,7 +74,7 @@ def evaluate(
     if output.plot is not None:
         from rfm_labels.pictures import draw_evaluation
 
-        draw_evaluation(output.plot, comparison)
+        draw_evaluation(output.plot, comparison, files)
 
 
 def _print_tables(comparison: LabelComparison) -> None:

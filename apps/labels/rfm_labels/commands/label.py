@@ -17,7 +17,7 @@ import typer
 from rfm_client import RewardError
 from rfm_client.command_line import ExitCode, ServerOptions, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
-from rfm_client.options import Settings, setting
+from rfm_client.options import ConfigError, Settings, setting
 from rfm_labels.commands.progress_bar import ProgressBar, Say
 from rfm_labels.datasets.cameras import parsed_by_camera
 from rfm_labels.datasets.dataset import Dataset, SeveralTasks
@@ -90,6 +90,8 @@ class EpisodeTexts(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.override_task and not self.task:
+            raise ConfigError.of_two("override_task", "needs", "task")
         for option in _OF_CAMERAS:
             parsed_by_camera(option, getattr(self, option))
 
@@ -133,6 +135,8 @@ def label(
     The label files have the forms that training code reads, such as LeRobot's.
 
     Run the same command again to label the missing episodes.
+
+    Example: rfm-client label my_dataset --url grpc://gpu-box:8001
     """
 
     @contextmanager
@@ -313,7 +317,7 @@ class LabelCommand:
             source = Path(self.source)
             of_file = f"{dataset_stem(source)}." if source.suffix.lower() in SUFFIXES else ""
             picture = (self.labels.output or beside) / f"{of_file}{self.labels.name}_summary.png"
-            draw_summary(picture, summary)
+            draw_summary(picture, summary, file)
             typer.echo(f"{picture}")
 
     def _dataset(self) -> Dataset:

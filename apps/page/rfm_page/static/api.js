@@ -1,8 +1,18 @@
 // SPDX-License-Identifier: MIT
 // Asks the gateway. Every error is an Error whose message reads `where: expected X, got Y`.
 
+import { send } from "./upload.js";
+
 /** An answer that wants the gateway's key. */
 export class KeyWanted extends Error {}
+
+/** No answer: the gateway is away. */
+export class GatewayAway extends Error {}
+
+/** The gateway answers, but cannot do it now: Triton is not ready, too slow, or refuses the gateway. */
+export class ServerError extends Error {}
+
+const OF_SERVER = [502, 503, 504];
 
 let key = "";
 
@@ -16,6 +26,11 @@ export function hasKey() {
   return key !== "";
 }
 
+/** What the gateway tells without Triton: the names of scores, and the command lines that mend faults. */
+export async function aboutServer() {
+  return (await answer("viewer/server")).json();
+}
+
 /** Which models are served, and what may be asked of them. */
 export async function served() {
   return (await answer("viewer/served")).json();
@@ -26,12 +41,12 @@ export async function compare(form, signal) {
   return (await answer("viewer/compare", { method: "POST", body: form, signal })).json();
 }
 
-/** Scores a video, and calls `onEvent(name, document)` with each event as it comes. */
-export async function score(form, signal, onEvent) {
-  const response = await answer("viewer/score", { method: "POST", body: form, signal });
+/** Scores a video, and calls `onEvent(name, document)` with each event as it comes, and before `onSent(share)` while the video leaves. */
+export async function score(form, signal, onEvent, onSent) {
+  const response = await answer("viewer/score", { body: form, signal }, (path, options) => send(path, options, onSent));
   let isOver = false;
   for await (const [name, document] of events(response.body)) {
-    if (name === "failed") throw new Error(document.detail);
+    if (name === "failed") throw new (document.is_servers ? ServerError : Error)(document.detail);
     isOver ||= name === "done";
     onEvent(name, document);
   }
@@ -58,6 +73,11 @@ export async function curvesOf(number, episode, labels, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}${chosen(labels)}`, { signal })).json();
 }
 
+/** A few points of an episode's curve, and a small picture. */
+export async function previewOf(number, episode, labels, signal) {
+  return (await answer(`viewer/datasets/${number}/episodes/${episode}/preview${chosen(labels)}`, { signal })).json();
+}
+
 /** The video of an episode by one camera, as a Blob: an address of its own could not show the key. */
 export async function videoOf(number, episode, camera, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}/videos/${camera}`, { signal })).blob();
@@ -82,18 +102,19 @@ function chosen(labels) {
   return labels === null ? "" : `?labels=${encodeURIComponent(labels)}`;
 }
 
-async function answer(path, options = {}) {
+async function answer(path, options = {}, ask = fetch) {
   const headers = key ? { "X-API-Key": key } : {};
   let response;
   try {
-    response = await fetch(path, { ...options, headers });
+    response = await ask(path, { ...options, headers });
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new Error(`gateway: expected an answer, got none (${error.message})`);
+    throw new GatewayAway(`gateway: expected an answer, got none (${error.message})`);
   }
   if (response.ok) return response;
   const reason = await reasonOf(response);
-  throw response.status === 401 ? new KeyWanted(reason) : new Error(reason);
+  if (response.status === 401) throw new KeyWanted(reason);
+  throw new (OF_SERVER.includes(response.status) ? ServerError : Error)(reason);
 }
 
 async function reasonOf(response) {

@@ -6,11 +6,12 @@ import { leadingOf, marksOf, scaleOf, titleOf } from "./signals.js";
 import { shown } from "./text.js";
 import uPlot from "./uplot/uPlot.esm.js";
 
-const NUM_COLOURS = 8;
+const NUM_COLOURS = 12;
 const VALUE_PX = 16; // height of a number beside a line
 const VALUE_WIDTH_PX = 48;
 const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
 export const MARK_PX = 72; // at least between the marks of the axis below
+const FAINT = "50"; // opacity, in hexadecimal
 const POINT_PX = 20; // nearer to each other, points are not drawn as dots
 const LARGE_PX = 400; // a chart so high and so wide has larger letters
 const LOW_PX = 240; // a chart so low has fewer marks
@@ -103,7 +104,7 @@ export class Chart {
   /**
    * Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`; one with a `leading`
    * has the array of this name in place of progress.
-   * Some have a `begin`, a `colour`, a `successIndex` of another colour for success, or are `isDashed`.
+   * Some have a `begin`, a `colour`, a `successIndex` of another colour for success, or a `dash`: lengths of strokes and gaps. One that `isFaint` has no numbers beside it.
    */
   show(curves) {
     this.#curves = curves.filter(({ times }) => times.length);
@@ -117,7 +118,7 @@ export class Chart {
       curve.times, ...signals.map((signal) => curve.times.map((_, index) => heightOf(this.#panes, signal, curve[signal]?.[index]))),
     ]);
     const data = tables.length ? uPlot.join(tables) : [[], []];
-    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${this.#curves.map(({ isDashed }) => (isDashed ? "-" : "_")).join("")}`;
+    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${JSON.stringify(this.#curves.map(({ dash, isFaint }) => [dash, isFaint]))}`;
     if (shape !== this.#shape || !this.#plot) {
       this.#plot?.destroy();
       this.#plot = this.#curves.length ? this.#newPlot(signals, data) : null;
@@ -163,7 +164,7 @@ export class Chart {
   #showValues(seconds) {
     const dots = [];
     const labels = Object.keys(this.#panes).flatMap((signal) => {
-      const here = this.#curves.map((curve) => {
+      const here = this.#curves.filter(({ isFaint }) => !isFaint).map((curve) => {
         const index = pointAt(curve.times, seconds);
         return { curve, signal, time: curve.times[index], value: index === null ? null : curve[signal]?.[index] };
       });
@@ -236,9 +237,9 @@ export class Chart {
       values: (_, splits) => splits.map((height) => `${number.get(height)}`),
     };
     const series = this.#drawn.flatMap((curve, place) => signals.map((signal) => {
-      const stroke = () => colourOf(this.#drawn[place] ?? curve, signal);
+      const stroke = () => `${colourOf(this.#drawn[place] ?? curve, signal)}${curve.isFaint ? FAINT : ""}`;
       const points = { show: isRoomy, size: 5, fill: stroke };
-      return { stroke, width: 2, dash: curve.isDashed ? [6, 4] : undefined, points };
+      return { stroke, width: 2, dash: curve.dash ?? undefined, points };
     }));
     const options = {
       ...this.#size(),

@@ -4,7 +4,15 @@
 import { cut } from "./text.js";
 
 const SEPARATOR = ", ";
-const TOLD_APART_BY = ["name", "task", "model", "sampling", "fps"];
+
+/** What a question can differ in, as a name tells it. */
+const ASKED = {
+  task: ({ task }) => task,
+  model: ({ model }) => model,
+  rule: ({ rule, frames }) => (frames ? `${rule}, ${frames} frames` : rule),
+  fps: ({ fps }) => `${fps} fps`,
+  resize: ({ resize }) => (resize ? "downscaled" : "full size"),
+};
 
 /** One question about one video, and its points. */
 export class Curve {
@@ -15,16 +23,20 @@ export class Curve {
   state = "waiting";
   error = null;
   version = null;
+  sentPercent = null;
   numFrames = null;
   sampledFrames = null;
   blank = null; // what the frames show, if nothing
-  title = null; // that somebody gave it
-  colour = null; // that somebody gave it
+  index = 0; // of its colour
+  colour = null; // that somebody gave its video, or its question
+  dash = null; // lengths of strokes and gaps; null: a solid line
+  title = null; // that somebody gave its question
+  questionColour = null; // that somebody gave its question
   leaving = new AbortController(); // aborted as soon as the curve is removed
 
   /** settings: task, model, rule, frames, fps, orient, channels, resize, as in the form */
-  constructor(index, video, settings) {
-    Object.assign(this, { index, video, ...settings, frames: settings.frames || null });
+  constructor(video, settings) {
+    Object.assign(this, { video, ...settings, frames: settings.frames || null });
     this.allTimes = null;
   }
 
@@ -44,7 +56,21 @@ export class Curve {
   }
 
   get label() {
-    return this.title ?? `${this.name}: ${this.task} (${this.model}, ${this.sampling})`;
+    return `${this.name}: ${this.title ?? `${this.task} (${this.model}, ${this.sampling})`}`;
+  }
+
+  /** Takes the share of the video that has been sent. Says whether that is news. */
+  takeSent(share) {
+    const percent = Math.floor(100 * share);
+    if (percent === this.sentPercent) return false;
+    this.sentPercent = percent;
+    this.state = percent < 100 ? `uploading, ${percent} %` : "sent";
+    return true;
+  }
+
+  /** Whether the video is on the way. */
+  get isUploading() {
+    return this.state.startsWith("uploading");
   }
 
   /** Takes an event of the gateway. */
@@ -90,14 +116,37 @@ export function pointAt(times, seconds) {
   return low ? low - 1 : null;
 }
 
-/** A short name of each curve: what tells it from the others, in at most `most` letters. */
+/**
+ * The questions that curves answer, in the order in which they were first asked: each with a `key`, its `curves`, a
+ * `name` that tells it from the others, and the `title` and `colour` that somebody gave it.
+ */
+export function questionsOf(curves) {
+  const isCorrected = new Map(); // a question differs in corrections only if one video was asked about with several
+  for (const curve of curves) isCorrected.set(curve.video, (isCorrected.get(curve.video) ?? new Set()).add(`${corrections(curve)}`));
+  const fields = { ...ASKED };
+  if ([...isCorrected.values()].some(({ size }) => size > 1)) fields.corrected = (curve) => corrections(curve).join(", ") || "as stored";
+  const alike = new Map();
+  for (const curve of curves) {
+    const key = JSON.stringify(Object.values(fields).map((told) => told(curve)));
+    alike.set(key, [...(alike.get(key) ?? []), curve]);
+  }
+  const firsts = [...alike.values()].map(([first]) => first);
+  const differing = Object.values(fields).filter((told) => new Set(firsts.map(told)).size > 1);
+  return [...alike].map(([key, own]) => {
+    const title = own.find((curve) => curve.title)?.title ?? null;
+    const colour = own.find((curve) => curve.questionColour)?.questionColour ?? null;
+    return { key, curves: own, title, colour, name: title ?? (differing.map((told) => told(own[0])).join(SEPARATOR) || own[0].task) };
+  });
+}
+
+/** A short name of each curve: its video, its question, or both, in at most `most` letters. */
 export function shortNames(curves, most) {
-  const drawn = curves.filter(({ times }) => times.length); // of the others the sampling is not known
-  const told = TOLD_APART_BY.filter((field) => new Set(drawn.map((curve) => curve[field])).size > 1);
-  const fields = told.length ? told : ["name"];
+  const questions = questionsOf(curves);
+  const hasVideos = new Set(curves.map(({ video }) => video)).size > 1 || questions.length < 2;
   return curves.map((curve) => {
-    const parts = fields.map((field) => (field === "fps" ? `${curve.fps} fps` : curve[field]));
+    const question = questions.find((each) => each.curves.includes(curve));
+    const parts = [...(hasVideos ? [curve.name] : []), ...(questions.length > 1 ? [question.name] : [])];
     const each = Math.floor((most + SEPARATOR.length) / parts.length) - SEPARATOR.length;
-    return cut(curve.title ?? parts.map((part) => cut(part, each)).join(SEPARATOR), most);
+    return parts.map((part) => cut(part, each)).join(SEPARATOR);
   });
 }

@@ -1,11 +1,17 @@
 // SPDX-License-Identifier: MIT
 // The tab of datasets: how their episodes end, which one wants to see first, one that is watched, some that are taken along.
 
-import { curvesOf, datasets, episodesOf, faultsOf, videoOf } from "./api.js";
+import { curvesOf, datasets, episodesOf, faultsOf, previewOf, videoOf } from "./api.js";
+import { Asking } from "./asking.js";
 import { colourName } from "./chart.js";
 import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, WORST_FIRST } from "./episodes.js";
+import { deadLink, failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
+import { onKeys } from "./keys.js";
+import { DASHES } from "./looks.js";
+import { Previews } from "./previews.js";
+import { Place } from "./states.js";
 import { save } from "./takeaway.js";
 import { cut, shown } from "./text.js";
 import { Timeline } from "./timeline.js";
@@ -21,8 +27,12 @@ const NOTHING = {
 export class DatasetTab {
   #page;
   #onScore;
-  #onError;
+  #onShown;
+  #failedAnywhere;
+  #places;
   #histogram;
+  #previews = new Previews(({ episode }) => previewOf(this.#number, episode, this.#labels, this.#loading.signal));
+  #loading = new AbortController();
   #table;
   #timeline;
   #datasets = [];
@@ -36,23 +46,37 @@ export class DatasetTab {
   #watched = null;
   #stopping = new AbortController();
   #checking = new AbortController();
+  #asking = new Asking((isCurrent) => this.#ask(isCurrent));
+  #wanted = new URLSearchParams(); // what an address says, until the datasets are there
+  #numShown = 0; // of addresses
+  #isShowing = false; // what an address says
   #faults = {}; // by dataset: one look at all videos for each load of the page
 
-  /** onScore({ files, task, fps, corrections, origins }): somebody wants an episode scored; onError(error): something went wrong */
-  constructor(page, { onScore, onError }) {
+  /**
+   * onScore({ files, task, fps, corrections, origins }): somebody wants an episode scored
+   * onShown(isStep): something else is shown; isStep: Back should lead to what was shown before
+   * failedAnywhere(error): shows an error that is one on every tab, and says whether it is
+   */
+  constructor(page, { onScore, onShown, failedAnywhere }) {
     this.#page = page;
+    this.#onShown = onShown;
     this.#onScore = onScore;
-    this.#onError = onError;
+    this.#failedAnywhere = failedAnywhere;
+    const places = { none: "no-datasets", errors: "dataset-errors", hits: "no-hits", episode: "episode-errors" };
+    this.#places = Object.fromEntries(Object.entries(places).map(([name, id]) => [name, new Place(page[id])]));
     this.#histogram = new Histogram(page.histogram);
     const rows = { scroller: page["episode-list"], body: page.episodes, above: page["episodes-above"], below: page["episodes-below"] };
     this.#table = new EpisodeTable(rows, {
-      onWatch: (episode) => this.#watch(episode), chosen: this.#chosen, onChoose: () => this.#showChosen(),
+      previews: this.#previews,
+      onWatch: (episode) => { this.#watch(episode); this.#onShown(true); },
+      chosen: this.#chosen,
+      onChoose: () => this.#showChosen(),
     });
     const elements = {
       videos: page["episode-videos"], chart: page["episode-chart"], slider: page["episode-time"], button: page["episode-play"],
       told: page["episode-time-told"],
     };
-    this.#timeline = new Timeline(elements, { onThreshold: (value) => this.#cutAt(value) });
+    this.#timeline = new Timeline(elements, { onThreshold: (value) => { this.#cutAt(value); this.#onShown(false); } });
     this.#listen();
   }
 
@@ -60,10 +84,12 @@ export class DatasetTab {
     const page = this.#page;
     const on = (name, event, action) => page[name].addEventListener(event, action);
     on("shelf", "submit", (event) => event.preventDefault());
-    on("shelf", "change", () => page.errors.replaceChildren());
-    on("dataset", "change", () => this.#choose());
-    on("labels", "change", () => this.#load());
-    on("others", "change", () => this.#load());
+    on("shelf", "change", () => this.#places.errors.clear());
+    on("shelf", "input", () => this.#onShown(false));
+    on("order", "change", () => this.#onShown(false));
+    on("dataset", "change", () => this.#choose().then(() => this.#onShown(true)));
+    on("labels", "change", () => this.#load().then(() => this.#onShown(true)));
+    on("others", "change", () => this.#load().then(() => this.#onShown(true)));
     on("cutoff", "input", () => this.#cutAt(Number(page.cutoff.value)));
     on("order", "change", () => this.#orderBy(page.order.value, false));
     on("task-part", "input", () => this.#showTable());
@@ -75,6 +101,7 @@ export class DatasetTab {
       head.querySelector("button").addEventListener("click", () => {
         const { order } = head.dataset;
         this.#orderBy(order, page.order.value === order && !this.#isTurned);
+        this.#onShown(false);
       });
     }
     on("choose-shown", "click", () => this.#select(this.#shown.map(({ episode }) => episode)));
@@ -86,21 +113,37 @@ export class DatasetTab {
     on("episode-close", "click", () => this.#close());
     on("episode-before", "click", () => this.#step(-1));
     on("episode-after", "click", () => this.#step(1));
+    const keys = { " ": () => page["episode-play"].click(), n: () => this.#step(1), p: () => this.#step(-1), Escape: () => this.#close() };
+    onKeys(keys, () => this.#watched && !page["dataset-panel"].hidden);
   }
 
-  /** Asks which datasets there are, and shows the first. */
-  async begin() {
+  /** Asks which datasets there are until there is one, and shows the first. */
+  begin() {
+    this.#asking.begin();
+  }
+
+  async #ask(isCurrent) {
+    let there;
     try {
-      this.#datasets = await datasets();
+      there = await datasets();
     } catch (error) {
-      this.#onError(error);
-      return;
+      if (!isCurrent() || this.#failedAnywhere(error)) return true; // the page begins again
+      this.#places.none.show(failure("The datasets cannot be listed", error, () => this.begin()));
+      return false;
     }
+    if (!isCurrent()) return true;
+    if (there.length) this.#places.none.clear();
+    else this.#places.none.show(noDataset(() => this.begin()));
+    if (there.length && JSON.stringify(there) === JSON.stringify(this.#datasets)) return true; // they are shown
+    this.#wanted = new URLSearchParams(this.params);
+    this.#datasets = there;
     const { dataset } = this.#page;
     dataset.replaceChildren(...this.#datasets.map(({ name, kind }, index) => new Option(`${name} (${kind.replace("LeRobot ", "")})`, index)));
     this.#page.datasets.hidden = this.#page["dataset-side"].hidden = !this.#datasets.length;
-    this.#page["no-datasets"].hidden = this.#datasets.length > 0;
-    if (this.#datasets.length) await this.#choose();
+    this.#page.fold.disabled = !this.#page["dataset-panel"].hidden && !this.#datasets.length;
+    if (this.#datasets.length) await this.show(this.#wanted);
+    this.#onShown(false);
+    return this.#datasets.length > 0;
   }
 
   get #number() {
@@ -126,11 +169,84 @@ export class DatasetTab {
     return taken.sort((one, other) => one.episode - other.episode);
   }
 
-  async #choose() {
+  /** What an address says of the dataset, the episode and the settings. */
+  get params() {
+    const page = this.#page;
+    if (!this.#datasets.length || this.#isShowing) return [...this.#wanted].filter(([name]) => name !== "tab");
+    const { labels } = this.#datasets[this.#number];
+    const settings = [
+      ["dataset", this.#name(this.#number), ""],
+      ["labels", this.#labels ?? "", labels[0] ?? ""],
+      ["beside", page.others.value, ""],
+      ["cutoff", page.cutoff.value, `${this.#told.threshold}`],
+      ["order", page.order.value, this.#usualOrder],
+      ["turned", this.#isTurned ? "1" : "", ""],
+      ...FILTER_NAMES.map((name) => [name, page[`only-${name}`].checked ? (page[`number-${name}`]?.value ?? "1") : "", ""]),
+      ["contains", page["task-part"].value, ""],
+      ["episode", this.#watched ? `${this.#watched.episode}` : "", ""],
+    ];
+    return settings.filter(([, value, usual]) => value !== usual).map(([name, value]) => [name, value]);
+  }
+
+  /** Shows what an address says; as soon as the datasets are there. */
+  async show(params) {
+    this.#wanted = params;
+    if (!this.#datasets.length) return;
+    this.#isShowing = true;
+    this.#places.errors.clear();
+    const number = (this.#numShown += 1);
+    const page = this.#page;
+    const wanted = params.get("dataset");
+    const index = wanted === null ? 0 : this.#datasets.findIndex((_, each) => this.#name(each) === wanted);
+    const of = [Math.max(index, 0), params.get("labels"), params.get("beside")];
+    if (this.#told === NOTHING || of[0] !== this.#number || (of[1] ?? page.labels.options[0].value) !== page.labels.value
+      || (of[2] ?? "") !== page.others.value) await this.#choose(...of);
+    if (number !== this.#numShown) return; // another address is shown
+    this.#isShowing = false;
+    if (this.#told === NOTHING) return;
+    this.#showSettings(params);
+    if (index < 0) this.#places.errors.show(deadLink(`The dataset ${wanted}`));
+    const episode = index < 0 ? null : params.get("episode");
+    if (episode === `${this.#watched?.episode ?? ""}`) return;
+    const row = this.#episodes.find((each) => `${each.episode}` === episode);
+    if (row) this.#watch(row);
+    else if (this.#watched) this.#leave();
+    if (episode !== null && !row) this.#places.errors.show(deadLink(`Episode ${episode}`));
+  }
+
+  #showSettings(params) {
+    const page = this.#page;
+    for (const name of FILTER_NAMES) {
+      page[`only-${name}`].checked = params.has(name) && !(name === "differ" && !page.others.value);
+      if (params.has(name) && page[`number-${name}`]) page[`number-${name}`].value = params.get(name);
+    }
+    page["task-part"].value = params.get("contains") ?? "";
+    page.order.value = params.get("order") ?? this.#usualOrder;
+    if (!page.order.value) page.order.value = this.#usualOrder; // no such order
+    this.#isTurned = params.has("turned");
+    this.#cutAt(Number(params.get("cutoff") ?? this.#told.threshold));
+  }
+
+  /** The name of a dataset; of the second one of a name with ~2. */
+  #name(number) {
+    const { name } = this.#datasets[number];
+    const before = this.#datasets.slice(0, number).filter((each) => each.name === name).length;
+    return before ? `${name}~${before + 1}` : name;
+  }
+
+  get #usualOrder() {
+    return this.#told.episodes.some(({ final_progress: final }) => final !== undefined) ? WORST_FIRST : PLAIN_ORDER;
+  }
+
+  /** Shows a dataset. chosen, beside: the labels; null: the first, none */
+  async #choose(number = this.#number, chosen = null, beside = null) {
+    this.#page.dataset.value = number;
     const { labels } = this.#datasets[this.#number];
     const options = (none) => [...(none ? [new Option("none", "")] : []), ...labels.map((name) => new Option(name))];
     this.#page.labels.replaceChildren(...options(!labels.length));
     this.#page.others.replaceChildren(...options(true));
+    if (labels.includes(chosen)) this.#page.labels.value = chosen;
+    if (labels.includes(beside)) this.#page.others.value = beside;
     await this.#load();
   }
 
@@ -138,6 +254,10 @@ export class DatasetTab {
   async #load() {
     this.#leave();
     this.#checking.abort();
+    this.#loading.abort();
+    this.#loading = new AbortController();
+    this.#previews.clear();
+    this.#places.errors.clear();
     this.#chosen.clear();
     const { signal } = this.#stopping;
     const page = this.#page;
@@ -150,11 +270,11 @@ export class DatasetTab {
     } catch (error) {
       if (signal.aborted) return;
       [this.#told, this.#others] = [NOTHING, null];
-      this.#onError(error);
+      this.#failed("errors", "The dataset cannot be shown", error, () => this.#load());
     }
     const isLabelled = this.#told.episodes.some(({ final_progress: final }) => final !== undefined);
     page.cutoff.value = this.#told.threshold;
-    page.order.value = isLabelled ? WORST_FIRST : PLAIN_ORDER;
+    page.order.value = this.#usualOrder;
     this.#isTurned = false;
     page["filter-differ"].hidden = !other;
     if (!other) page["only-differ"].checked = false;
@@ -162,7 +282,7 @@ export class DatasetTab {
     page.ends.hidden = !isLabelled;
     this.#showMade();
     this.#cutAt(this.#told.threshold);
-    await this.#check();
+    this.#check();
   }
 
   /** Asks which episodes cannot be labelled now, while the others are shown. */
@@ -175,8 +295,12 @@ export class DatasetTab {
       for (const row of told.episodes) row.fault = faults[row.episode] ?? null;
       this.#judge();
     } catch (error) {
-      if (!signal.aborted) this.#onError(error);
+      if (!signal.aborted) this.#failed("errors", "The videos of the episodes could not be checked", error, () => this.#check());
     }
+  }
+
+  #failed(place, title, error, retry) {
+    if (!this.#failedAnywhere(error)) this.#places[place].show(failure(title, error, retry));
   }
 
   /** Judges all episodes by another threshold. */
@@ -208,6 +332,7 @@ export class DatasetTab {
     const page = this.#page;
     const filters = FILTER_NAMES.filter((name) => page[`only-${name}`].checked).map((name) => this.#filter(name));
     this.#shown = sorted(kept(this.#episodes, filters, page["task-part"].value), page.order.value, this.#isTurned);
+    this.#showNoHits();
     this.#table.show(this.#shown, this.#threshold);
     page["shown-told"].textContent = `${this.#shown.length} of ${this.#episodes.length}`;
     for (const head of page["episode-list"].querySelectorAll("th[data-order]")) {
@@ -217,6 +342,21 @@ export class DatasetTab {
     }
     if (this.#watched) this.#table.mark(this.#watched.episode, this.#shown);
     this.#showChosen();
+  }
+
+  /** Says why no episode is listed. */
+  #showNoHits() {
+    const { hits, errors } = this.#places;
+    if (this.#shown.length || !errors.isEmpty) hits.clear();
+    else hits.show(this.#episodes.length ? noHit(this.#episodes.length, () => this.#clearFilters()) : noEpisode());
+    this.#page["episode-list"].hidden = !this.#shown.length;
+  }
+
+  #clearFilters() {
+    for (const name of FILTER_NAMES) this.#page[`only-${name}`].checked = false;
+    this.#page["task-part"].value = "";
+    this.#showTable();
+    this.#onShown(false);
   }
 
   #select(numbers) {
@@ -237,7 +377,7 @@ export class DatasetTab {
     const dataset = this.#datasets[this.#number];
     const all = this.#episodes.map(({ episode }) => episode);
     this.#words = dataset ? lerobotWords(page.use.value, dataset, numbers, all) : "";
-    page["use-words"].textContent = cut(this.#words, MOST_LETTERS);
+    page["use-words"].textContent = this.#words.split("\n").map((line) => cut(line, MOST_LETTERS)).join("\n");
   }
 
   #json() {
@@ -295,6 +435,7 @@ export class DatasetTab {
   #close() {
     const { episode } = this.#watched;
     this.#leave();
+    this.#onShown(true);
     this.#page.episodes.querySelector(`tr[data-episode="${episode}"] button`)?.focus();
   }
 
@@ -302,7 +443,9 @@ export class DatasetTab {
   #step(direction) {
     const place = this.#shown.findIndex(({ episode }) => episode === this.#watched.episode);
     const next = this.#shown[place + direction];
-    if (next) this.#watch(next);
+    if (!next) return;
+    this.#watch(next);
+    this.#onShown(false);
   }
 
   async #watch(episode) {
@@ -310,7 +453,8 @@ export class DatasetTab {
     this.#watched = { ...episode, files: [] };
     const page = this.#page;
     const { signal } = this.#stopping;
-    page.errors.replaceChildren();
+    this.#places.episode.clear();
+    this.#places.errors.clear();
     page.episode.hidden = false;
     page.datasets.classList.add("watching");
     this.#table.mark(episode.episode, this.#shown);
@@ -324,7 +468,7 @@ export class DatasetTab {
     try {
       await this.#fetch(episode, signal);
     } catch (error) {
-      if (!signal.aborted) this.#onError(error);
+      if (!signal.aborted) this.#failed("episode", `Episode ${episode.episode} cannot be shown`, error, () => this.#watch(episode));
     }
   }
 
@@ -340,13 +484,14 @@ export class DatasetTab {
     this.#page["episode-legend"].replaceChildren(...curves.map(legendItem));
     const blobs = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
+    if (!cameras.length) this.#places.episode.show(noVideo());
     const { name } = this.#datasets[this.#number];
     cameras.forEach((camera, index) => {
       const file = `${name}_episode_${`${episode}`.padStart(6, "0")}.${short(camera)}.mp4`;
       this.#watched.files.push(new File([blobs[index]], file, { type: blobs[index].type }));
       const title = unused[index] ? `${short(camera)} (${unused[index]}: not scored)` : short(camera);
       const video = this.#timeline.videos.add(this.#watched.files.at(-1), title, corrections[index]);
-      this.#timeline.videos.mark(video, curves.filter(({ label }) => label === short(camera)));
+      this.#timeline.videos.mark(video, curves.find(({ label }) => label === short(camera)));
     });
     this.#page["score-episode"].disabled = unused.every(Boolean) || !this.#told.has_stored_pixels; // of no camera, too
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
@@ -368,7 +513,7 @@ function curvesIn({ times_s: times, curves }, file) {
   return curves.map(({ camera, progress, success }, index) => {
     const name = camera ? short(camera) : curves.length > 1 ? "all cameras" : "labels";
     const label = file === null ? name : `${name} (${reward(file)})`;
-    return { index, label, progress, success: success ?? none, times, allTimes: times, isDashed: file !== null };
+    return { index, label, progress, success: success ?? none, times, allTimes: times, dash: file === null ? null : DASHES[1] };
   });
 }
 
@@ -383,10 +528,10 @@ function describe(curves) {
   return told.length ? told.join("; ") : "This episode has no labels.";
 }
 
-function legendItem({ index, label, isDashed }) {
+function legendItem({ index, label, dash }) {
   const item = document.createElement("li");
   const swatch = document.createElement("span");
-  swatch.className = `swatch ${colourName(index)}${isDashed ? " dashed" : ""}`;
+  swatch.className = `swatch ${colourName(index)}${dash ? " dashed" : ""}`;
   item.append(swatch, label);
   return item;
 }

@@ -2,7 +2,8 @@
 // The episodes of a dataset: which ones somebody wants to see, in which order, and a table of them.
 
 import { cell, label } from "./table.js";
-import { shown } from "./text.js";
+import { blank } from "./previews.js";
+import { shown, shownBelow } from "./text.js";
 import { VirtualRows } from "./virtual.js";
 
 export const WORST_FIRST = "worst first";
@@ -22,6 +23,7 @@ const ORDERS = {
   difference: [["difference", true]],
 };
 
+const PROGRESS = 4; // its column
 const NAMES = ["", "", "Task", "Frames", "Progress", "Best", "End", "Back", "Cameras", "Differ"]; // of columns, on a telephone
 
 /** What a filter keeps, by name; the second argument is the number beside it */
@@ -73,19 +75,21 @@ export function sorted(episodes, order, isTurned) {
 
 /**
  * A table of episodes. elements: as `VirtualRows` takes them
- * onWatch(episode): somebody wants to watch one; chosen: the numbers of those that are selected; onChoose(): they are others
+ * previews: fill the pictures and curves; onWatch(episode): somebody wants to watch one; chosen: the numbers of those that are selected; onChoose(): they are others
  */
 export class EpisodeTable {
   #body;
   #rows;
   #onWatch;
+  #previews;
   #chosen;
   #onChoose;
   #watched = null;
   #threshold = 0.5;
 
-  constructor(elements, { onWatch, chosen, onChoose }) {
+  constructor(elements, { previews, onWatch, chosen, onChoose }) {
     this.#body = elements.body;
+    this.#previews = previews;
     this.#onWatch = onWatch;
     this.#chosen = chosen;
     this.#onChoose = onChoose;
@@ -143,8 +147,12 @@ export class EpisodeTable {
     const scores = [episode.final_progress, episode.best_success, episode.last_success];
     scores.forEach((value, place) => {
       const isBelow = place > 0 && value !== undefined && value !== null && value < this.#threshold;
-      row.append(cell(shown(value), isBelow ? "number below" : "number"));
+      row.append(isBelow ? cell(shownBelow(value, this.#threshold), "number below") : cell(shown(value), "number"));
     });
+    const { picture, curve } = blank();
+    header.prepend(picture);
+    row.cells[PROGRESS].prepend(curve);
+    this.#previews.fill(episode, row, picture, curve);
     row.append(cell(percent(episode.backwards), "number"), cell(shown(episode.disagreement), "number"));
     row.append(cell(`${shown(episode.difference)}${episode.verdict_differs ? " ≠" : ""}`, "number difference"));
     row.addEventListener("click", () => this.#onWatch(episode));

@@ -63,14 +63,14 @@ export function svgFigure(template, curves, { title, threshold, label = "seconds
       for (const points of runs(curve, signal)) {
         const path = points.map(([time, value]) => `${x(time).toFixed(2)},${y(signal, value).toFixed(2)}`).join(" ");
         const look = { fill: "none", stroke: colourOf(curve, signal, template), "stroke-width": 1.1, "stroke-linejoin": "round" };
-        add("polyline", { points: path, ...look, ...(curve.isDashed ? { "stroke-dasharray": "4 2" } : {}) });
+        add("polyline", { points: path, ...look, ...dashOf(curve) });
       }
     }
   }
   shortNames(drawn, LETTERS).forEach((name, place) => {
     const at = bottom + 2 * LINE + 8 + place * (LINE + 2);
     const stroke = colourOf(drawn[place], leadingOf(drawn[place]), template);
-    add("line", { x1: LEFT, x2: LEFT + 14, y1: at - 2.5, y2: at - 2.5, stroke, "stroke-width": 1.5 });
+    add("line", { x1: LEFT, x2: LEFT + 14, y1: at - 2.5, y2: at - 2.5, stroke, "stroke-width": 1.1, ...dashOf(drawn[place]) });
     add("text", { x: LEFT + 18, y: at, fill: ink }, name);
   });
   return new XMLSerializer().serializeToString(svg);
@@ -90,6 +90,11 @@ export async function pngFigure(svg) {
   } finally {
     URL.revokeObjectURL(image.src);
   }
+}
+
+/** The line of a curve: half as large as on the page. */
+function dashOf({ dash }) {
+  return dash ? { "stroke-dasharray": dash.map((length) => length / 2).join(" ") } : {};
 }
 
 /** The points of a signal, as [time, value], in pieces without a gap. */

@@ -1,11 +1,12 @@
 // SPDX-License-Identifier: MIT
-// One line that names the curves: the colour and the name of each can be changed, and each can be removed.
+// The legend of the questions: the captions of the videos name the colours, and this names the lines.
 
 import { colourOf } from "./chart.js";
-import { shortNames } from "./curves.js";
+import { questionsOf } from "./curves.js";
+import { byQuestion, sampleOf } from "./looks.js";
 import { nameable, remover } from "./nameable.js";
 
-const NAME_LETTERS = 40;
+const NAME_LETTERS = 48;
 
 export class Legend {
   #host;
@@ -13,47 +14,55 @@ export class Legend {
   #onRemove;
   #items = new Map();
 
-  /** onChange(): a colour or a name is another; onRemove(curve): somebody wants a curve away */
+  /** onChange(): a colour or a name is another; onRemove(curves): somebody wants these curves away */
   constructor(host, { onChange, onRemove }) {
     this.#host = host;
     this.#onChange = onChange;
     this.#onRemove = onRemove;
   }
 
-  /** Names these curves. */
+  /** Names the questions that these curves answer. One question alone needs no name. */
   show(curves) {
-    for (const [curve, { element }] of this.#items) {
-      if (curves.includes(curve)) continue;
+    const all = questionsOf(curves);
+    const questions = all.length > 1 ? all : [];
+    const isByQuestion = byQuestion(curves, all);
+    for (const [key, { element }] of this.#items) {
+      if (questions.some((question) => question.key === key)) continue;
       element.remove();
-      this.#items.delete(curve);
+      this.#items.delete(key);
     }
-    const names = shortNames(curves, NAME_LETTERS);
-    curves.forEach((curve, place) => {
-      if (!this.#items.has(curve)) this.#items.set(curve, this.#newItem(curve));
-      const { element, colour, name, away } = this.#items.get(curve);
+    questions.forEach((question, place) => {
+      if (!this.#items.has(question.key)) this.#items.set(question.key, this.#newItem());
+      const item = this.#items.get(question.key);
+      const { element, colour, line, name, away } = item;
+      const [first] = question.curves;
+      item.curves = question.curves;
       if (this.#host.children[place] !== element) this.#host.insertBefore(element, this.#host.children[place] ?? null);
-      colour.value = colourOf(curve);
-      colour.setAttribute("aria-label", `Colour of ${names[place]}`);
-      name.show(names[place], curve.label);
-      away.setAttribute("aria-label", `Remove ${names[place]}`);
+      colour.hidden = !isByQuestion;
+      colour.value = colourOf(first);
+      colour.setAttribute("aria-label", `Colour of ${question.name}`);
+      line.style.color = isByQuestion ? colourOf(first) : "";
+      line.replaceChildren(sampleOf(first.dash));
+      name.show(question.name, `${first.task} (${first.model}, ${first.sampling})`, NAME_LETTERS);
+      away.setAttribute("aria-label", `Remove the curves of ${question.name}`);
     });
-    this.#host.hidden = !curves.length;
+    this.#host.hidden = !questions.length;
   }
 
-  #newItem(curve) {
-    const [element, colour] = [document.createElement("li"), document.createElement("input")];
+  #newItem() {
+    const [element, colour, line] = ["li", "input", "span"].map((tag) => document.createElement(tag));
+    const item = { element, colour, line, curves: [] };
     colour.type = "color";
     colour.className = "swatch";
-    colour.addEventListener("input", () => {
-      curve.colour = colour.value;
-      this.#onChange();
-    });
-    const name = nameable((text) => {
-      curve.title = text || null;
-      this.#onChange();
-    });
-    const away = remover(() => this.#onRemove(curve));
-    element.append(colour, name.element, away);
-    return { element, colour, name, away };
+    colour.addEventListener("input", () => this.#changeAll(item, { questionColour: colour.value }));
+    item.name = nameable((text) => this.#changeAll(item, { title: text || null }));
+    item.away = remover(() => this.#onRemove(item.curves));
+    element.append(colour, line, item.name.element, item.away);
+    return item;
+  }
+
+  #changeAll({ curves }, change) {
+    for (const curve of curves) Object.assign(curve, change);
+    this.#onChange();
   }
 }

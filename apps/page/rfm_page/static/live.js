@@ -2,29 +2,37 @@
 // The tab of running episodes: each with its newest frame, its curve and its numbers, as clients report them.
 
 import { hasKey, KeyWanted, liveNews } from "./api.js";
-import { LiveCard } from "./livecard.js";
+import { colourName } from "./chart.js";
+import { failure } from "./faults.js";
+import { History, mean } from "./history.js";
+import { LiveCard, titleOfRun } from "./livecard.js";
 import { cellOf, learn } from "./signals.js";
-import { cell, label } from "./table.js";
+import { Place } from "./states.js";
+import { cell, label, named } from "./table.js";
 import { NONE, shown } from "./text.js";
 
 const ASK_EVERY_MS = 500;
 const ASK_AGAIN_AFTER_MS = 5000;
-const ENDED_AT_A_TIME = 12;
+const ENDED_AT_A_TIME = 24;
 
 export class LiveTab {
   #page;
-  #onError;
+  #failedAnywhere;
+  #errors;
   #cards = new Map();
+  #history;
+  #runs = []; // their places are those of their colours
   #cursor = "";
   #timer = null;
-  #isAway = false;
   #asking = 0; // number of the loop that asks
   #mostEnded = ENDED_AT_A_TIME;
 
-  /** onError(error): something went wrong */
-  constructor(page, { onError }) {
+  /** failedAnywhere(error): shows an error that is one on every tab, and says whether it is */
+  constructor(page, { failedAnywhere }) {
     this.#page = page;
-    this.#onError = onError;
+    this.#failedAnywhere = failedAnywhere;
+    this.#errors = new Place(page["live-errors"]);
+    this.#history = new History(page["live-history"]);
     page["live-more"].addEventListener("click", () => {
       this.#mostEnded += ENDED_AT_A_TIME;
       this.#show();
@@ -53,22 +61,21 @@ export class LiveTab {
         const news = await liveNews(this.#cursor);
         if (asking !== this.#asking) return;
         this.#take(news);
-        if (this.#isAway) this.#page.errors.replaceChildren();
-        this.#isAway = false;
+        this.#errors.clear();
       }
     } catch (error) {
       if (asking !== this.#asking) return;
-      this.#isAway = true;
-      this.#onError(error);
+      if (!this.#failedAnywhere(error)) this.#errors.show(failure("The running episodes cannot be shown", error));
       if (error instanceof KeyWanted) return; // it begins again with a key
       after = ASK_AGAIN_AFTER_MS;
     }
     this.#timer = setTimeout(() => this.#ask(asking), after);
   }
 
-  #take({ cursor, is_whole: isWhole, most_points: mostPoints, scores, episodes }) {
+  #take({ cursor, is_whole: isWhole, most_points: mostPoints, scores, episodes, ended }) {
     learn(scores);
     this.#cursor = cursor;
+    this.#history.take(ended, isWhole);
     const there = new Set(episodes.map(({ id }) => id));
     for (const id of [...this.#cards.keys()].filter((each) => isWhole || !there.has(each))) this.#remove(id);
     episodes.forEach((news, rank) => { // first the one that has been silent for longest
@@ -90,13 +97,11 @@ export class LiveTab {
     const ended = cards.filter(({ hasEnded }) => hasEnded).sort((one, other) => other.rank - one.rank);
     running.sort((one, other) => one.title.localeCompare(other.title, "en", { numeric: true }));
     const visible = [...running, ...ended.slice(0, this.#mostEnded)];
-    const { children } = this.#page["live-episodes"];
-    const elements = visible.map(({ element }) => element);
-    if (elements.length !== children.length || elements.some((each, index) => each !== children[index])) {
-      this.#page["live-episodes"].replaceChildren(...elements);
-    }
-    for (const card of visible) card.show();
     const page = this.#page;
+    place(page["live-episodes"], running);
+    place(page["live-ended"], visible.slice(running.length));
+    for (const card of visible) card.show();
+    page["live-ended-title"].hidden = !ended.length;
     const numHidden = cards.length - visible.length;
     page["no-live"].hidden = cards.length > 0;
     page["live-summary"].hidden = !cards.length;
@@ -104,41 +109,49 @@ export class LiveTab {
     page["live-more"].textContent = `Show more of ${numHidden} ended episodes`;
     const told = `Running: ${running.length}. Ended: ${ended.length}.`;
     if (page["live-told"].textContent !== told) page["live-told"].textContent = told;
-    this.#showRuns(cards, ended);
+    this.#showRuns(cards);
   }
 
-  /** Shows the means of each run. ended: the newest first */
-  #showRuns(cards, ended) {
-    const last = Math.max(Math.floor(Number(this.#page["live-last"].value)) || 1, 1);
-    const head = this.#page["live-runs"].closest("table").querySelectorAll("thead th");
+  /** Shows the means of each run over the last episodes that ended. */
+  #showRuns(cards) {
+    const page = this.#page;
+    const last = Math.max(Math.floor(Number(page["live-last"].value)) || 1, 1);
+    const head = page["live-runs"].closest("table").querySelectorAll("thead th");
     const names = [...head].map(({ textContent }) => textContent);
-    const rows = [...new Set(cards.map(({ run }) => run))].sort().map((run) => {
-      const all = ended.filter((card) => card.run === run);
-      const own = all.slice(0, last);
+    const runs = [...new Set([...this.#runs, ...this.#history.runs, ...cards.map(({ run }) => run)])];
+    this.#runs = runs;
+    this.#history.show(last, runs.map((run) => [run, titleOfRun(run)]));
+    for (const card of cards) card.mark(colourName(runs.indexOf(card.run)));
+    page["live-running-title"].hidden = !cards.some(({ hasEnded }) => !hasEnded);
+    const rows = runs.map((run, index) => {
+      const all = this.#history.of(run);
+      const own = all.slice(-last);
       const numRunning = cards.filter((card) => card.run === run && !card.hasEnded).length;
       const rate = own.length ? `${(100 * mean(own.map(({ succeeded }) => Number(succeeded)))).toFixed(0)} %` : NONE;
-      const newest = own[0] ?? cards.find((card) => card.run === run);
-      const alike = own.filter(({ leading }) => leading === newest.leading); // seconds and shares have no mean
+      const leading = own.at(-1)?.leading ?? cards.find((card) => card.run === run)?.leading ?? "progress";
+      const alike = own.filter((end) => end.leading === leading); // seconds and shares have no mean
       const means = [
-        cellOf(newest.leading, mean(alike.map(({ lastLeading }) => lastLeading))),
-        shown(mean(own.map(({ lastSuccess }) => lastSuccess))),
+        shown(mean(own.map(({ total_reward: paid }) => paid))),
+        cellOf(leading, mean(alike.map(({ value }) => value))),
+        shown(mean(own.map(({ success }) => success))),
       ];
-      const steps = mean(own.map(({ numSteps }) => numSteps));
-      const texts = [numRunning, all.length, rate, ...means, steps === null ? NONE : steps.toFixed(1)];
+      const steps = mean(own.map(({ num_steps: count }) => count));
+      const texts = [numRunning, all.at(-1)?.number ?? 0, rate, ...means, steps === null ? NONE : steps.toFixed(1)];
       const row = document.createElement("tr");
-      const header = document.createElement("th");
-      header.scope = "row";
-      header.textContent = run;
-      row.append(header, ...texts.map((text) => cell(text, "number")));
+      row.append(named({ index }, titleOfRun(run)), ...texts.map((text) => cell(text, "number")));
       return label(row, names);
     });
+    const isPaid = this.#history.runs.some((run) => this.#history.of(run).at(-1).total_reward !== null);
+    head[0].closest("table").classList.toggle("unpaid", !isPaid);
     const text = (each) => each.map(({ textContent }) => textContent).join("\n");
-    if (text(rows) !== text([...this.#page["live-runs"].rows])) this.#page["live-runs"].replaceChildren(...rows);
+    if (text(rows) !== text([...page["live-runs"].rows])) page["live-runs"].replaceChildren(...rows);
   }
 }
 
-/** The mean of the numbers that are there; null: none is. */
-function mean(values) {
-  const there = values.filter((value) => value !== null && value !== undefined);
-  return there.length ? there.reduce((sum, value) => sum + value, 0) / there.length : null;
+/** Puts the elements of cards into a host, in their order. */
+function place(host, cards) {
+  const elements = cards.map(({ element }) => element);
+  const { children } = host;
+  if (elements.length === children.length && elements.every((each, index) => each === children[index])) return;
+  host.replaceChildren(...elements);
 }

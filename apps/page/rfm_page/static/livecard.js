@@ -6,13 +6,19 @@ import { Chart } from "./chart.js";
 import { leadingOf, shortOf, measured, toldAt } from "./signals.js";
 import { shown } from "./text.js";
 
-const NUMBERS = ["Step", "Progress", "Success", "Lag", "Last step"];
+const NUMBERS = ["Step", "Progress", "Success", "Reward", "Return", "Lag", "Last step"];
+const IF_PAID = ["Reward", "Return"]; // only where rewards are reported
+
+/** The name of a run on the page. */
+export function titleOfRun(run) {
+  return run || "Episode";
+}
 
 export class LiveCard {
   #id;
   #mostPoints;
   #about = {};
-  #curve = { index: 0, successIndex: 1, times: [], progress: [], success: [] };
+  #curve = { index: 0, successIndex: 2, times: [], progress: [], success: [] };
   #newest = null;
   #heardMs = 0;
   #frame = null;
@@ -22,6 +28,7 @@ export class LiveCard {
   #rank = 0;
   #image = document.createElement("img");
   #heading = document.createElement("h2");
+  #opener = document.createElement("button");
   #state = document.createElement("p");
   #task = document.createElement("p");
   #chartHost = document.createElement("div");
@@ -48,6 +55,8 @@ export class LiveCard {
     const head = document.createElement("div");
     head.className = "head";
     head.append(this.#heading, this.#state);
+    this.#opener.type = "button";
+    this.#opener.addEventListener("click", () => this.#open(!this.element.classList.contains("open")));
     this.element.append(head, this.#task, this.#image, this.#chartHost, list);
     this.#chart = new Chart(this.#chartHost, (step) => this.#chart.moveTo(step), { label: null, isOfSteps: true });
     this.#chart.moveTo(NaN); // there is no step to mark
@@ -56,11 +65,7 @@ export class LiveCard {
 
   /** The name of its run. */
   get run() {
-    return this.#about.name || "Episode";
-  }
-
-  get succeeded() {
-    return this.#newest?.succeeded ?? false;
+    return this.#about.name;
   }
 
   /** The name of the score that tells how far the task is. */
@@ -72,16 +77,8 @@ export class LiveCard {
     return this.#curve[this.leading].at(-1) ?? null;
   }
 
-  get lastSuccess() {
-    return this.#newest?.success ?? null;
-  }
-
-  get numSteps() {
-    return this.#newest === null ? null : this.#newest.step + 1;
-  }
-
   get title() {
-    return `${this.run}, environment ${this.#about.env}`;
+    return `${titleOfRun(this.run)}, environment ${this.#about.env}`;
   }
 
   get hasEnded() {
@@ -91,6 +88,11 @@ export class LiveCard {
   /** Its place among all episodes: the higher, the later it was heard of. */
   get rank() {
     return this.#rank;
+  }
+
+  /** Shows the colour of its run. */
+  mark(colour) {
+    this.element.style.setProperty("--run", `var(--${colour})`);
   }
 
   /** Takes over what is new, and its rank. */
@@ -103,7 +105,7 @@ export class LiveCard {
     const [leading = "progress"] = Object.keys(instead);
     const news = { times: steps, progress, success, ...instead };
     const joined = Object.entries(news).map(([name, values]) => [name, most([...(old[name] ?? []), ...values])]);
-    this.#curve = { index: 0, successIndex: 1, leading, ...Object.fromEntries(joined) };
+    this.#curve = { index: 0, successIndex: 2, leading, ...Object.fromEntries(joined) };
     this.#about = about;
     this.#newest = newest;
     this.#frame = frame;
@@ -127,21 +129,45 @@ export class LiveCard {
   }
 
   #showNews() {
-    const { task, has_ended: hasEnded, threshold } = this.#about;
+    const { task, has_ended: hasEnded, reward, total_reward: total } = this.#about;
     const { step, success, succeeded, ms } = this.#newest ?? {};
-    this.#heading.textContent = this.title;
+    if (hasEnded) {
+      this.#opener.textContent = this.title;
+      if (!this.#opener.isConnected) this.#heading.replaceChildren(this.#opener);
+    } else this.#heading.textContent = this.title;
     this.#state.textContent = `${hasEnded ? "ended" : "running"}${succeeded ? ", succeeded" : hasEnded ? ", no success" : ""}`;
-    this.#state.className = `state ${succeeded ? "good" : hasEnded ? "bad" : ""}`;
+    this.#state.className = `state ${succeeded ? "good" : ""}`;
     this.#task.textContent = task;
     this.element.classList.toggle("ended", hasEnded);
+    this.element.classList.toggle("succeeded", Boolean(succeeded));
     this.#image.alt = `Newest frame of ${this.title}: ${task}`;
-    const texts = { Step: `${step ?? "-"}`, Progress: measured(this.leading, this.lastLeading), Success: shown(success), Lag: ms === undefined ? "-" : `${ms.toFixed(0)} ms` };
+    const texts = { Step: `${step ?? "-"}`, Progress: measured(this.leading, this.lastLeading), Success: shown(success), Reward: shown(reward), Return: shown(total), Lag: ms === undefined ? "-" : `${ms.toFixed(0)} ms` };
     for (const [name, text] of Object.entries(texts)) this.#numbers.get(name).textContent = text;
+    for (const name of IF_PAID) this.#numbers.get(name).parentElement.hidden = total === null;
     const { times } = this.#curve;
     this.#numbers.get("Progress").previousSibling.textContent = capitalised(shortOf(this.leading));
-    this.#chart.setThreshold(threshold);
-    this.#chart.show([{ ...this.#curve, label: this.title, begin: times[0], allTimes: times }]);
+    this.#opener.setAttribute("aria-expanded", this.element.classList.contains("open"));
+    if (!this.#isSmall) this.#draw();
     this.#chartHost.setAttribute("aria-label", `${times.length} steps: final ${toldAt(this.#curve, -1)}, final success ${shown(success)}`);
+  }
+
+  /** Whether it is a small picture in the strip of ended episodes. */
+  get #isSmall() {
+    return this.hasEnded && !this.element.classList.contains("open");
+  }
+
+  /** Draws the curve. */
+  #draw() {
+    const { times } = this.#curve;
+    this.#chart.setThreshold(this.#about.threshold);
+    this.#chart.show([{ ...this.#curve, label: this.title, begin: times[0], allTimes: times }]);
+  }
+
+  /** Shows an ended episode whole, or as a small picture. */
+  #open(isOpen) {
+    this.element.classList.toggle("open", isOpen);
+    this.#opener.setAttribute("aria-expanded", isOpen);
+    if (isOpen) this.#draw();
   }
 
   /** Fetches the newest frame if somebody can see it. */

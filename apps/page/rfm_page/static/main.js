@@ -1,77 +1,143 @@
 // SPDX-License-Identifier: MIT
 // The page: what its controls do.
 
-import { compare, KeyWanted, score, served, useKey } from "./api.js";
+import { aboutServer, compare, GatewayAway, hasKey, KeyWanted, score, served, ServerError, useKey } from "./api.js";
+import { Address } from "./address.js";
+import { Asking } from "./asking.js";
 import { Curve } from "./curves.js";
 import { DatasetTab } from "./dataset.js";
 import { exampleFiles } from "./examples.js";
+import { failure, noModel, otherModel, serverAway, tritonAway, useRemedies } from "./faults.js";
 import { pngFigure, svgFigure } from "./figure.js";
+import { onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
 import { LiveTab } from "./live.js";
+import { byQuestion, giveLooks } from "./looks.js";
 import { Queue } from "./queue.js";
+import { Settings } from "./settings.js";
 import { Sidebar } from "./sidebar.js";
+import { copied, Place } from "./states.js";
 import { showTable } from "./table.js";
 import { Tabs } from "./tabs.js";
 import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
 import { learn, toldAt } from "./signals.js";
-import { addVerdict } from "./verdicts.js";
+import { addVerdict, areOneFile, sentenceOf } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
+const TASK_WANTED = "What is the robot to do? Type it, then press Score.";
 
 const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((element) => [element.id, element]));
 const queue = new Queue(CURVES_AT_A_TIME);
 const timeline = new Timeline(
   { videos: page.videos, chart: page.chart, slider: page.time, button: page.play, told: page["time-told"] },
-  { changing: { onName: update, onRemove: removeVideo }, onThreshold: dragThreshold },
+  { changing: { onName: showNames, onColour: changed, onRemove: removeVideo }, onThreshold: dragThreshold },
 );
-const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurve });
+const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurves });
 const sidebar = new Sidebar(page.fold);
 const { videos, chart } = timeline;
-const tabs = new Tabs(["score", "dataset", "live"].map((name) => [page[`${name}-tab`], page[`${name}-panel`]]), shownTab);
-const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, onError: failed });
-const liveTab = new LiveTab(page, { onError: failed });
+const TABS = ["score", "dataset", "live"];
+const tabs = new Tabs(TABS.map((name) => [page[`${name}-tab`], page[`${name}-panel`]]), shownTab);
+const places = { away: new Place(page.away), errors: new Place(page.errors), served: new Place(page["served-state"]) };
+const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, onShown: told, failedAnywhere });
+const liveTab = new LiveTab(page, { failedAnywhere });
+const choices = new Settings(page, chooseRule);
+const address = new Address(go);
+let shownIndex = 0; // of the tab
 let curves = [];
 let verdicts = [];
-let gateway = { models: [], rules: [], url: "" };
+const gateway = { models: [], rules: [], url: "" };
 let stopping = new AbortController();
-let numCurves = 0;
 
-async function begin() {
-  page.errors.replaceChildren();
+const askingServer = new Asking(askServer);
+const askingModels = new Asking(askServed);
+
+/** Asks what is there; again until the server answers, and then until there is something to show. */
+function begin() {
+  askingServer.begin();
+}
+
+/** Begins the tabs as soon as the server answers. Says whether it does, or a key is wanted first. */
+async function askServer(isCurrent) {
+  let about;
+  try {
+    about = await aboutServer();
+  } catch (error) {
+    if (isCurrent()) showAnywhere(error);
+    return isCurrent() && error instanceof KeyWanted; // the page begins again with a key
+  }
+  learn(about.scores); // before a tab draws a curve
+  if (!isCurrent()) return true;
+  if (!gateway.rules.length) offer(about);
+  useRemedies(about.remedies);
+  places.away.clear();
+  page["key-form"].hidden = true;
   datasetTab.begin();
   liveTab.begin();
-  try {
-    gateway = await served();
-  } catch (error) {
-    page.status.textContent = "";
-    failed(error);
-    return;
-  }
-  learn(gateway.scores);
-  page["key-form"].hidden = true;
-  page.model.replaceChildren(...gateway.models.map(({ name }) => new Option(name)));
+  if (!gateway.models.length) askingModels.begin();
+  return true;
+}
+
+/** Offers the choices of this server. */
+function offer(about) {
+  Object.assign(gateway, about);
   page.rule.replaceChildren(...gateway.rules.map(({ name }) => new Option(name)));
   page.orient.replaceChildren(...gateway.orientations.map((name) => new Option(name === "none" ? "as stored" : name, name)));
   page.channels.replaceChildren(...gateway.channel_orders.map((name) => new Option(name.toUpperCase(), name)));
   videos.correct(correction());
   page.fps.value = gateway.fps;
-  if (gateway.models.some(({ name }) => name === gateway.model)) page.model.value = gateway.model;
-  chooseRule();
-  page.examples.hidden = !gateway.models.length;
-  const none = "model: expected one that scores frames of videos, got none";
-  page.status.textContent = gateway.models.length ? "" : none;
 }
 
-/** Shows an error, and the form for the key if that is what is wrong. */
-function failed(error) {
+/** Asks which models are served, and offers them. Says whether there is one. */
+async function askServed(isCurrent) {
+  let answer;
+  try {
+    answer = await served();
+  } catch (error) {
+    if (!isCurrent()) return true;
+    page.status.textContent = "";
+    if (failedAnywhere(error)) return true; // the page begins again
+    places.served.show(tritonAway(error, () => askingModels.begin()));
+    return false;
+  }
+  if (!isCurrent()) return true;
+  Object.assign(gateway, answer);
+  page.model.replaceChildren(...gateway.models.map(({ name }) => new Option(name)));
+  if (gateway.models.some(({ name }) => name === gateway.model)) page.model.value = gateway.model;
+  chooseRule();
+  if (gateway.models.length) warnOfModel(choices.begin());
+  page.examples.hidden = !gateway.models.length;
+  page.status.textContent = "";
+  if (gateway.models.length) places.served.clear();
+  else places.served.show(noModel(() => askingModels.begin()));
+  return gateway.models.length > 0;
+}
+
+/** Shows on every tab that a key is wanted, or that the server is away. Says whether one of them is so. */
+function showAnywhere(error) {
   if (error instanceof KeyWanted) {
+    page["key-wrong"].textContent = hasKey() ? "This is not the key. Type it again." : "";
     page["key-form"].hidden = false;
     page.key.focus();
-  }
-  const line = document.createElement("p");
-  line.textContent = error.message;
-  page.errors.replaceChildren(line);
+    page.key.select();
+    page.status.textContent = "";
+    places.away.clear();
+  } else if (error instanceof GatewayAway) {
+    places.away.show(serverAway(error, begin));
+    places.served.clear();
+  } else return false;
+  return true;
+}
+
+/** Shows what is wrong on every tab, and begins again when the server is back. Says whether something of that kind is wrong. */
+function failedAnywhere(error) {
+  if (error instanceof GatewayAway) askingServer.begin();
+  return showAnywhere(error);
+}
+
+/** Shows on the tab of videos what went wrong. */
+function failed(error, title = "That did not work", retry = null) {
+  if (!failedAnywhere(error)) places.errors.show(failure(title, error, retry));
 }
 
 /** Chooses the rule of the model's training. */
@@ -88,6 +154,39 @@ function showLimits() {
   page.frames.disabled = !isOpen;
   if (!isOpen) page.frames.value = "";
   page.frames.placeholder = isOpen ? `${model?.max_frames ?? ""} as trained`.trim() : `${rule?.frames ?? "all"}`;
+}
+
+/** Says that a link names a model that is not served. wanted: its name; null: all is well */
+function warnOfModel(wanted) {
+  if (wanted !== null) places.errors.show(otherModel(wanted, page.model.value));
+  videos.correct(correction());
+  showThreshold();
+}
+
+/** What the address of the page is now. */
+function shownParams() {
+  const last = page["live-last"];
+  const ofLive = () => (last.value === last.defaultValue ? [] : [["last", last.value]]);
+  const ofTab = [() => choices.params, () => datasetTab.params, ofLive][shownIndex]();
+  return [...(shownIndex ? [["tab", TABS[shownIndex]]] : []), ...ofTab];
+}
+
+/** Writes into the address what is shown now. isStep: Back leads to what was shown before */
+function told(isStep = false) {
+  if (isStep) address.step(shownParams());
+  else address.correct(shownParams);
+}
+
+/** Shows what an address says. */
+function go(params) {
+  shownIndex = Math.max(TABS.indexOf(params.get("tab")), 0); // so that the tab is no new step
+  tabs.select(shownIndex);
+  if (shownIndex === 0) warnOfModel(choices.show(params));
+  if (shownIndex === 1) datasetTab.show(params);
+  if (shownIndex === 2) {
+    page["live-last"].value = params.get("last") ?? page["live-last"].defaultValue;
+    page["live-last"].dispatchEvent(new Event("input"));
+  }
 }
 
 function settings() {
@@ -118,6 +217,7 @@ function addFiles(files, about = []) {
     videos.add(file, file.name, corrected, { origin });
   });
   page.files.value = "";
+  page.undo.hidden = true;
   update();
   if (!videos.all.length || !page.model.value) return;
   if (tasks().length) scoreAll();
@@ -127,7 +227,7 @@ function addFiles(files, about = []) {
 /** Asks for the task of videos that are there without one. */
 function askForTask() {
   sidebar.open();
-  page["task-wanted"].textContent = "What is the robot to do? Type it, then press Score.";
+  page["task-wanted"].textContent = TASK_WANTED;
   page.tasks.focus();
 }
 
@@ -146,32 +246,26 @@ async function scoreExamples(names) {
     const { files, origins, task } = await exampleFiles(names);
     page.tasks.value = task;
     addFiles(files, origins.map((origin) => ({ origin })));
+    places.errors.clear();
   } catch (error) {
-    failed(error);
+    failed(error, "The example could not be loaded", () => scoreExamples(names));
   }
 }
 
 /** Asks about each video and task that was not yet asked about with these settings. */
 function scoreAll() {
-  page.errors.replaceChildren();
-  const missing = [
-    [!videos.all.length, "video: expected a file, got none: drop one"],
-    [!tasks().length, "task: expected a sentence, got none"],
-    [!page.model.value, "model: expected one that is served, got none"],
-  ].find(([isMissing]) => isMissing);
-  if (missing) {
-    failed(new Error(missing[1]));
-    return;
-  }
-  page["task-wanted"].textContent = "";
+  places.errors.clear();
+  page["files-wanted"].textContent = videos.all.length ? "" : "Choose a video, or drop one on the page.";
+  page["task-wanted"].textContent = tasks().length ? "" : TASK_WANTED;
+  if (!page.model.value) askingModels.begin(); // the page says why there is none
+  if (!videos.all.length || !tasks().length || !page.model.value) return;
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
-      const curve = new Curve(numCurves, video, { task, ...settings(), orient: video.orient, channels: video.channels });
+      const curve = new Curve(video, { task, ...settings(), orient: video.orient, channels: video.channels });
       if (known.has(curve.identity)) continue;
       curves = curves.filter(({ identity }) => identity !== curve.identity); // one that failed is asked again
       curves.push(curve);
-      numCurves += 1;
       queue.add(() => ask(curve, AbortSignal.any([stopping.signal, curve.leaving.signal])));
     }
   }
@@ -186,11 +280,11 @@ async function ask(curve, signal) {
     await score(form(fields, { video: video.file }), signal, (name, document) => {
       curve.take(name, document);
       update();
-    });
+    }, (share) => curve.takeSent(share) && update());
   } catch (error) {
     curve.state = "failed";
     curve.error = signal.aborted ? "stopped" : error.message;
-    if (!signal.aborted) failed(error instanceof KeyWanted ? error : new Error(`${video.name}: ${error.message}`));
+    if (!signal.aborted) failed(error, `${video.name} could not be scored`, error instanceof ServerError ? scoreAll : null);
   }
   setTimeout(update); // when the queue knows, too
 }
@@ -199,25 +293,34 @@ async function comparePair() {
   const [first, second] = videos.all;
   const { model, fps, resize } = settings();
   const { orient, channels } = first;
-  page.errors.replaceChildren();
+  const before = verdicts.length;
+  places.errors.clear();
   page.compare.disabled = true;
   try {
     if (!tasks().length) throw new Error("task: expected a sentence, got none");
     for (const name of ["orient", "channels"]) {
       if (second[name] !== first[name]) throw new Error(`${name}: expected the same of both videos, got ${first[name]} and ${second[name]}`);
     }
-    for (const task of tasks()) {
+    const isOneFile = await areOneFile(first.file, second.file);
+    if (isOneFile) tell({ videos: [first, second], answer: null });
+    for (const task of isOneFile ? [] : tasks()) {
       const data = form({ task, model, fps, orient, channels, resize }, { first: first.file, second: second.file });
       const answer = await compare(data, stopping.signal);
-      const verdict = { videos: [first, second], task, model, fps, orient, channels, resize, answer };
-      verdicts.push(verdict);
-      addVerdict(page.pairs, verdict);
-      update();
+      tell({ videos: [first, second], task, model, fps, orient, channels, resize, answer });
     }
   } catch (error) {
-    if (!stopping.signal.aborted) failed(error);
+    if (!stopping.signal.aborted) failed(error, "The videos could not be compared", comparePair);
   }
   update();
+  if (verdicts.length > before) page.status.textContent = verdicts.slice(before).map(sentenceOf).join(" ");
+}
+
+/** Shows a verdict, and scrolls to it. */
+function tell(verdict) {
+  verdicts.push(verdict);
+  const box = addVerdict(page.pairs, verdict);
+  update();
+  box.scrollIntoView({ block: "nearest" });
 }
 
 function stop() {
@@ -235,26 +338,64 @@ function clear() {
   videos.clear();
   curves = [];
   verdicts = [];
-  numCurves = 0;
   page.pairs.replaceChildren();
-  page.errors.replaceChildren();
-  page["task-wanted"].textContent = "";
+  places.errors.clear();
+  page["files-wanted"].textContent = page["task-wanted"].textContent = "";
   page.status.textContent = "";
   timeline.moveTo(0);
   update();
+}
+
+/** Clears the tab, and offers to take that back. */
+function clearForNow() {
+  stop();
+  const gone = { entries: videos.all, curves, verdicts };
+  const text = page.tasks.value;
+  clear();
+  page.status.textContent = `Cleared ${gone.entries.length} ${gone.entries.length === 1 ? "video" : "videos"}.`;
+  page.undo.hidden = false;
+  page.undo.onclick = () => {
+    page.tasks.value ||= text;
+    restore(gone);
+  };
+  page.undo.focus();
+}
+
+/** Brings back what was cleared, beside what has come since. */
+function restore({ entries, curves: old, verdicts: oldVerdicts }) {
+  const again = new Map(entries.map((entry) => {
+    const { file, name, title, colour, origin, orient, channels } = entry;
+    return [entry, videos.add(file, name, { orient, channels }, { origin, title, colour })];
+  }));
+  for (const curve of old) curve.video = again.get(curve.video);
+  for (const verdict of oldVerdicts) verdict.videos = verdict.videos.map((video) => again.get(video));
+  curves.push(...old);
+  verdicts.push(...oldVerdicts);
+  page.undo.hidden = true;
+  showNames();
 }
 
 function removeVideo(video) {
   videos.remove(video);
   for (const curve of curves.filter((each) => each.video === video)) forget(curve);
   verdicts = verdicts.filter((verdict) => !verdict.videos.includes(video));
+  showNames();
+}
+
+/** Shows everything under the names and colours of now. */
+function showNames() {
   page.pairs.replaceChildren();
   for (const verdict of verdicts) addVerdict(page.pairs, verdict);
   update();
 }
 
-function removeCurve(curve) {
-  forget(curve);
+/** The verdicts that the model gave: those on one file twice have no answer. */
+function answered() {
+  return verdicts.filter(({ answer }) => answer);
+}
+
+function removeCurves(gone) {
+  for (const curve of gone) forget(curve);
   update();
 }
 
@@ -262,11 +403,12 @@ function removeCurve(curve) {
 function forget(curve) {
   curve.leaving.abort();
   curves = curves.filter((each) => each !== curve);
+  if (!curves.some(({ error }) => error)) places.errors.clear();
 }
 
 /** Shows a curve in another colour or under another name. */
 function changed() {
-  update();
+  showNames();
   chart.redraw();
 }
 
@@ -293,54 +435,73 @@ function figure() {
 function update() {
   const scored = curves.filter(({ times }) => times.length);
   page.empty.hidden = videos.all.length > 0;
+  page["served-state"].classList.toggle("whole", !videos.all.length);
+  if (videos.all.length) page["files-wanted"].textContent = "";
   page.clear.hidden = !videos.all.length;
   page.stage.hidden = !videos.all.length;
   page.numbers.hidden = !curves.length;
+  giveLooks(curves);
   timeline.show(curves);
   legend.show(curves);
-  for (const video of videos.all) videos.mark(video, curves.filter((curve) => curve.video === video));
+  const isByQuestion = byQuestion(curves);
+  for (const video of videos.all) {
+    const own = curves.filter((curve) => curve.video === video);
+    videos.mark(video, isByQuestion ? null : own[0]);
+    videos.tell(video, own.map(({ state }) => state));
+  }
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle;
   page.compare.disabled = videos.all.length !== 2 || !page.model.value;
-  page.take.hidden = !scored.length && !verdicts.length;
+  page.take.hidden = !scored.length && !answered().length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
-  page.command.textContent = commands(gateway.url, scored, verdicts);
+  page.command.textContent = commands(gateway.url, scored, answered());
+  told();
   const done = curves.filter(({ state }) => state === "done").length;
-  if (curves.length) page.status.textContent = `${done} of ${curves.length} curves are done.`;
+  if (curves.length && !page["score-panel"].hidden) page.status.textContent = `${done} of ${curves.length} curves are done.${uploading()}`;
   page.chart.setAttribute("aria-label", scored.length
     ? scored.map((curve) => `${curve.label}: final ${toldAt(curve, -1)}`).join("; ")
     : "No curves yet.");
 }
 
+/** How much of the videos that are on the way has been sent, in words. */
+function uploading() {
+  const percents = curves.filter(({ isUploading }) => isUploading).map(({ sentPercent }) => sentPercent);
+  return percents.length ? ` Uploading: ${Math.floor(percents.reduce((sum, each) => sum + each) / percents.length)} %.` : "";
+}
+
 /** The settings belong to the tabs that have some, and what is said of curves to the first. */
 function shownTab(index) {
-  page.fold.disabled = index === 2;
+  page.fold.disabled = index === 2 || (index === 1 && page["dataset-side"].hidden);
   page.status.textContent = "";
+  const isStep = index !== shownIndex;
+  shownIndex = index;
+  if (isStep) told(true);
   if (index === 0) update();
 }
 
-async function copy(text, name) {
-  try {
-    await navigator.clipboard.writeText(text);
-    page.status.textContent = `The ${name} copied.`;
-  } catch { // there is none where the page comes over plain HTTP from another machine
-    failed(new Error("clipboard: expected leave to write to it, got none: mark the text and copy it"));
-  }
+async function copy(text, name, element) {
+  const isCopied = await copied(text, element);
+  page.status.textContent = isCopied ? `The ${name} copied.` : "The browser lets no page copy here: press Ctrl+C.";
 }
 
 function listen(element, events) {
   for (const [name, action] of Object.entries(events)) element.addEventListener(name, action);
 }
 
-listen(page.question, { submit: (event) => { event.preventDefault(); scoreAll(); } });
+listen(page.question, {
+  submit: (event) => { event.preventDefault(); scoreAll(); },
+  input: () => told(),
+  change: () => told(),
+});
+listen(page["live-last"], { input: () => told() });
 listen(page["key-form"], { submit: (event) => { event.preventDefault(); useKey(page.key.value.trim()); begin(); } });
 listen(page.files, { change: () => addFiles(page.files.files) });
 listen(page.model, { change: chooseRule });
 listen(page.rule, { change: showLimits });
 for (const select of [page.orient, page.channels]) listen(select, { change: () => videos.correct(correction()) });
 listen(page.stop, { click: stop });
-listen(page.clear, { click: clear });
+listen(page.clear, { click: clearForNow });
 listen(page.compare, { click: comparePair });
 listen(page.threshold, { input: showThreshold });
 listen(page.tasks, { keydown: (event) => { if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) scoreAll(); } });
@@ -349,12 +510,12 @@ listen(page.examples, { click: ({ target }) => {
   if (button) scoreExamples(button.dataset.example.split(" "));
 } });
 listen(page.csv, { click: () => save("curves.csv", csv(curves), "text/csv") });
-listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, verdicts), "application/json") });
+listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, answered()), "application/json") });
 listen(page.png, { click: async () => save("curves.png", await pngFigure(figure())) });
 listen(page.svg, { click: () => save("curves.svg", figure(), "image/svg+xml") });
-listen(page.copy, { click: () => copy(page.command.textContent, "command line is") });
-listen(page["use-copy"], { click: () => copy(datasetTab.words, "words are") });
-listen(page["live-copy"], { click: () => copy(page["live-code"].textContent, "lines are") });
+listen(page.copy, { click: () => copy(page.command.textContent, "command line is", page.command) });
+listen(page["use-copy"], { click: () => copy(datasetTab.words, "words are", page["use-words"]) });
+listen(page["live-copy"], { click: () => copy(page["live-code"].textContent, "lines are", page["live-code"]) });
 listen(document, {
   dragover: (event) => { event.preventDefault(); page.dropping.hidden = false; },
   dragleave: (event) => { if (!event.relatedTarget) page.dropping.hidden = true; },
@@ -367,5 +528,7 @@ listen(document, {
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", update);
 
+onKeys({ " ": () => page.play.click() }, () => !page["score-panel"].hidden && !page.play.disabled);
 showThreshold();
+go(address.params);
 begin();

@@ -1,17 +1,18 @@
 // SPDX-License-Identifier: MIT
 // Small parts of the page: a name that a click lets one change, a button that removes.
 
-const END_LETTERS = 7; // of a name, which are always to be seen, since names differ at their ends
+import { cut, writeName } from "./text.js";
+
+const NAME_LETTERS = 30;
 
 /**
- * A name that is a button; a click makes it a field. Where it does not fit, its middle is left out.
+ * A name that is a button; a click makes it a field. Of a long one the middle is left out.
  * onName(text): somebody gave another name; empty: none
  */
 export function nameable(onName) {
   const element = document.createElement("span");
   const button = document.createElement("button");
   const field = document.createElement("input");
-  const [begun, ended] = ["span", "span"].map((tag) => button.appendChild(document.createElement(tag)));
   let whole = "";
   element.className = "nameable";
   button.type = "button";
@@ -37,12 +38,11 @@ export function nameable(onName) {
     button.focus();
   });
   element.append(button, field);
-  /** text: the name; about: what the name stands for */
-  const show = (text, about = text) => {
+  /** text: the name; about: what the name stands for; most: letters */
+  const show = (text, about = text, most = NAME_LETTERS) => {
     whole = text;
     button.setAttribute("aria-label", text);
-    begun.textContent = text.slice(0, -END_LETTERS);
-    ended.textContent = text.slice(-END_LETTERS);
+    writeName(button, cut(text, most));
     button.title = about === text ? `${text}: click to rename` : `${text}: ${about}; click to rename`;
   };
   return { element, show };

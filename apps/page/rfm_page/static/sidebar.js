@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: MIT
 // The settings beside what is shown: a button folds them away, and the browser remembers that.
 
+import { remember, remembered } from "./remembered.js";
+
 const KEY = "rfm.settings";
 const CLOSED = "closed";
 const WIDE = "(min-width: 720px)"; // elsewhere the settings would hide what is shown, so they begin folded away
@@ -10,7 +12,7 @@ export class Sidebar {
 
   constructor(button) {
     this.#button = button;
-    const told = localStorage.getItem(KEY);
+    const told = remembered(KEY);
     this.#show(told === null ? matchMedia(WIDE).matches : told !== CLOSED);
     button.addEventListener("click", () => this.#set(!this.#isOpen));
   }
@@ -25,7 +27,7 @@ export class Sidebar {
   }
 
   #set(isOpen) {
-    localStorage.setItem(KEY, isOpen ? "open" : CLOSED);
+    remember(KEY, isOpen ? "open" : CLOSED);
     this.#show(isOpen);
   }
 

@@ -8,9 +8,39 @@ export function shown(value) {
   return value === null || value === undefined ? NONE : value.toFixed(3);
 }
 
-/** A text of at most `most` letters; of a longer one the middle is left out, since names differ at their ends. */
+const MOST_DIGITS = 8;
+
+/** A number below a threshold, with as many digits as show that it is below. */
+export function shownBelow(value, threshold) {
+  let digits = 3;
+  while (digits < MOST_DIGITS && Number(value.toFixed(digits)) >= threshold) digits += 1;
+  return value.toFixed(digits);
+}
+
+const FEWEST_LETTERS = 12; // fewer tell nothing
+const BETWEEN_WORDS = /[\s_\-.,:;/]/;
+
+/** A text of at most `most` letters, and 12 at least: of a longer one the middle is left out, between words if it can be, since names differ at their ends. */
 export function cut(text, most) {
-  if (text.length <= most) return text;
-  const begin = Math.ceil((most - 1) / 2);
-  return `${text.slice(0, begin)}…${text.slice(text.length - (most - 1 - begin))}`;
+  const room = Math.max(most, FEWEST_LETTERS) - 1;
+  if (text.length <= room + 1) return text;
+  const [begin, end] = [text.slice(0, Math.ceil(room / 2)), text.slice(-Math.floor(room / 2))];
+  const isWhole = [BETWEEN_WORDS.test(text[begin.length]), BETWEEN_WORDS.test(text[text.length - end.length - 1])];
+  return `${isWhole[0] ? begin : wholeWords(begin)}…${isWhole[1] ? end : reversed(wholeWords(reversed(end)))}`;
+}
+
+/** The text up to the last word that may be cut, unless little would be left. */
+function wholeWords(text) {
+  const place = [...text].findLastIndex((letter) => BETWEEN_WORDS.test(letter));
+  return place >= FEWEST_LETTERS / 2 ? text.slice(0, place) : text;
+}
+
+function reversed(text) {
+  return [...text].reverse().join("");
+}
+
+/** Writes a name into an element, which breaks lines between the words of the name. */
+export function writeName(element, name) {
+  const pieces = name.split(/(?<=[_\-/])/);
+  element.replaceChildren(...pieces.flatMap((piece, place) => (place ? [document.createElement("wbr"), piece] : [piece])));
 }

@@ -1,16 +1,24 @@
 // SPDX-License-Identifier: MIT
 // The videos of the page, which move together: one time for all of them.
 
-import { colourName } from "./chart.js";
+import { colourName, colourOf } from "./chart.js";
 import { nameable, remover } from "./nameable.js";
 
 const AS_STORED = { orient: "none", channels: "rgb" };
+const MOST_IN_A_ROW = 6; // of more the videos are small, so that all names are to be seen
+const LONG_LETTERS = 14; // a longer name may need two lines
+const UNSHOWN = { // by the state of its curve
+  waiting: "This browser cannot show this file.",
+  done: "This browser cannot show this file. It was scored all the same.",
+  failed: "This browser cannot show this file, and it was not scored: see the numbers below.",
+};
 const NEAR_S = 0.05; // a video that is so near to a time shows it
 const INSIDE_S = 0.001; // behind the begin of a frame, so that rounding does not show the one before
 
 /**
  * Videos in `host`. `onTime(seconds, video)` is called as long as one plays. The page has the controls.
- * Where videos can be changed: onName(): one has another title; onRemove(video): somebody wants one away
+ * Where videos can be changed: onName(): one has another title; onColour(): one has another colour;
+ * onRemove(video): somebody wants one away
  */
 export class Videos {
   #host;
@@ -36,23 +44,45 @@ export class Videos {
   /** Shows a file under a name as the model sees it, and gives what is known of it. more: what else is known */
   add(file, name = file.name, correction = AS_STORED, more = {}) {
     const [figure, player, caption, trouble] = ["figure", "video", "figcaption", "p"].map((tag) => document.createElement(tag));
-    const entry = { id: (this.#numAdded += 1), file, name, title: name, figure, player, wanted: null, ...more };
-    entry.swatch = document.createElement("span");
+    const entry = { id: (this.#numAdded += 1), file, name, title: this.#freeTitle(name), place: this.#freePlace(), colour: null };
+    Object.assign(entry, { figure, player, trouble, wanted: null, ...more });
     Object.assign(player, { src: URL.createObjectURL(file), muted: true, playsInline: true, preload: "auto" });
-    player.setAttribute("aria-label", `Video ${name}`);
+    player.setAttribute("aria-label", `Video ${entry.title}`);
     show(entry, correction);
-    trouble.textContent = "This browser cannot show it; its curve counts all the same.";
+    trouble.textContent = UNSHOWN.waiting;
     trouble.hidden = true;
     player.addEventListener("error", () => { trouble.hidden = false; });
-    entry.swatch.className = "swatch";
-    entry.swatch.hidden = true;
+    entry.swatch = document.createElement(this.#changing ? "input" : "span");
+    Object.assign(entry.swatch, { className: "swatch", hidden: true });
     caption.append(entry.swatch, ...(this.#changing ? this.#controls(entry) : [name]));
     player.addEventListener("play", () => this.#follow(entry));
     player.addEventListener("seeked", () => this.#arrived(entry));
     figure.append(caption, player, trouble);
     this.#host.append(figure);
     this.#entries.push(entry);
+    this.#fit();
     return entry;
+  }
+
+  /** The name, with a number if another video has it. */
+  #freeTitle(name) {
+    const taken = new Set(this.#entries.map(({ title }) => title));
+    let number = 1;
+    while (taken.has(number === 1 ? name : `${name} (${number})`)) number += 1;
+    return number === 1 ? name : `${name} (${number})`;
+  }
+
+  /** The first place of a colour that no video has. */
+  #freePlace() {
+    const taken = new Set(this.#entries.map(({ place }) => place));
+    let place = 0;
+    while (taken.has(place)) place += 1;
+    return place;
+  }
+
+  #fit() {
+    this.#host.classList.toggle("many", this.#entries.length > MOST_IN_A_ROW);
+    this.#host.classList.toggle("tall", this.#entries.some(({ title }) => title.length > LONG_LETTERS));
   }
 
   /** Shows all videos as their frames become upright RGB before they are scored. */
@@ -60,11 +90,18 @@ export class Videos {
     for (const entry of this.#entries) show(entry, correction);
   }
 
-  /** Shows the colour of a video's curve, where it has one alone. */
-  mark(entry, curves) {
-    entry.swatch.hidden = curves.length !== 1;
-    const [{ colour, index } = {}] = curves;
-    entry.swatch.style.background = colour ?? `var(--${colourName(index)})`;
+  /** Shows the colour of a video's curves; null: they have several. */
+  mark(entry, curve) {
+    entry.swatch.hidden = !curve;
+    if (!curve) return;
+    if (this.#changing) entry.swatch.value = colourOf(curve);
+    else entry.swatch.style.background = `var(--${colourName(curve.index)})`;
+  }
+
+  /** Says of a video that this browser cannot show whether it was scored. states: of its curves */
+  tell(entry, states) {
+    const state = ["done", "failed"].find((each) => states.includes(each)) ?? "waiting";
+    entry.trouble.textContent = UNSHOWN[state];
   }
 
   /** Moves all videos to a time, but for `but`. */
@@ -89,6 +126,7 @@ export class Videos {
     URL.revokeObjectURL(entry.player.src);
     entry.figure.remove();
     this.#entries = this.#entries.filter((each) => each !== entry);
+    this.#fit();
   }
 
   /** Removes all videos. */
@@ -97,19 +135,30 @@ export class Videos {
     for (const { player } of this.#entries) URL.revokeObjectURL(player.src);
     this.#entries = [];
     this.#host.replaceChildren();
+    this.#fit();
   }
 
-  /** What changes the title of a video, and what removes it. */
+  /** What changes the colour and the title of a video, and what removes it. */
   #controls(entry) {
     const title = nameable((text) => {
       entry.title = text || entry.name;
-      title.show(entry.title, entry.name);
-      away.setAttribute("aria-label", `Remove ${entry.title}`);
+      write();
+      this.#fit();
       this.#changing.onName();
     });
     const away = remover(() => this.#changing.onRemove(entry));
-    title.show(entry.title);
-    away.setAttribute("aria-label", `Remove ${entry.title}`);
+    const { swatch } = entry;
+    swatch.type = "color";
+    swatch.addEventListener("input", () => {
+      entry.colour = swatch.value;
+      this.#changing.onColour();
+    });
+    const write = () => {
+      title.show(entry.title, entry.name);
+      away.setAttribute("aria-label", `Remove ${entry.title}`);
+      swatch.setAttribute("aria-label", `Colour of ${entry.title}`);
+    };
+    write();
     return [title.element, away];
   }
 

@@ -54,6 +54,7 @@ def decode_results(
 
     Raises InferenceFailedError if the answer lacks a score: a missing reward is not 0 or NaN. Only a score that a
     checkpoint need not predict (success, and progress where remaining seconds are there) may be NaN, at all frames.
+    Progress and ``hop`` may be NaN at the same frames, which the model did not answer about.
     """
     return [_decode_result(tensors, row, sample, model_version) for row, sample in enumerate(samples)]
 
@@ -100,8 +101,16 @@ def _timing(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> BatchTiming | 
 
 
 def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: slice) -> FrameScores:
+    skipping = next((name for name, score in FRAME_SCORES.items() if score.skips_frames and name in tensors), None)
     given: dict[str, Any] = {
-        name: _present(tensors, name, row, positions, may_lack=score.may_be_unknown or score.replaced_by in tensors)
+        name: _present(
+            tensors,
+            name,
+            row,
+            positions,
+            may_lack=score.may_be_unknown or score.replaced_by in tensors,
+            answered_as=skipping if name in ("progress", skipping) else None,
+        )
         for name, score in FRAME_SCORES.items()
         if name in tensors or score.asked == "always"
     }
@@ -109,17 +118,27 @@ def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions
 
 
 def _present(
-    tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, positions: slice, *, may_lack: bool = False
+    tensors: Mapping[str, npt.NDArray[Any]],
+    name: str,
+    row: int,
+    positions: slice,
+    *,
+    may_lack: bool = False,
+    answered_as: str | None = None,
 ) -> Float32Array:
     """One row's scores at some positions. Raises InferenceFailedError unless all are present and finite.
 
     may_lack: True: all may be NaN, if the checkpoint does not predict them
+    answered_as: the score that is NaN at the same frames, which the model does not answer about; the last frame always
+        has an answer
     """
     scores, count = tensors[name], positions.stop - positions.start
     if scores.ndim < 2 or row >= len(scores):
         raise InferenceFailedError(f"{name}: expected scores of sample {row}, got an array {list(scores.shape)}")
     part: Float32Array = scores[row, positions]
-    is_good = np.isfinite(part).all() or (may_lack and np.isnan(part).all())
+    is_good = bool(np.isfinite(part).all()) or (may_lack and bool(np.isnan(part).all()))
+    if answered_as is not None and len(part) == count and np.isfinite(part[-1]):
+        is_good = np.array_equal(np.isfinite(part), ~np.isnan(tensors[answered_as][row, positions]))
     if len(part) != count or not is_good:
         raise InferenceFailedError(f"{name}: expected {count} finite scores, got {part.tolist()}")
     return part

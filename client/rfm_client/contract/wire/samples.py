@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -22,10 +23,12 @@ from rfm_client.contract.samples import (
     stackable,
 )
 from rfm_client.contract.wire.specs import (
+    DESCRIPTIONS,
     DIGEST_BYTES,
     FRAME_DIGESTS,
     FRAME_STEPS,
     FRAMES,
+    GOAL,
     NUM_FRAMES,
     SAMPLE_TYPE,
     SECOND_FRAMES,
@@ -33,6 +36,7 @@ from rfm_client.contract.wire.specs import (
     TEXT_EMBEDDING,
     UNKNOWN_FRAMES,
     VIDEO_EMBEDDINGS,
+    VIEWS,
     SampleType,
     Tensors,
     encoder_inputs,
@@ -53,7 +57,10 @@ _SAMPLE_TYPES = {
 
 
 def encode_samples(samples: Sequence[Sample]) -> Tensors:
-    """Return one request. Apart from time, all first trajectories need one shape, and all second trajectories, too."""
+    """Return one request. Apart from time, all first trajectories need one shape, and all second trajectories, too.
+
+    All samples need the same views and goal, of the same shapes, or none.
+    """
     tensors: Tensors = {
         SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
         NUM_FRAMES: np.array([_lengths(sample) for sample in samples], np.int32),
@@ -64,8 +71,13 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
     arrays = zip(*(stackable(sample.trajectories) for sample in samples), strict=True)
     for name, rows in zip((FRAMES, SECOND_FRAMES) if has_frames else (VIDEO_EMBEDDINGS,), arrays, strict=False):
         tensors[name] = pad_stack([[trajectory.positions for trajectory in row] for row in rows])
+    views = zip(*(text.views for text in texts), strict=True)
+    tensors |= {name: pad_stack([[view] for view in rows]) for name, rows in zip(VIEWS, views, strict=False)}
+    if texts[0].goal is not None:
+        tensors[GOAL] = np.stack([text.goal for text in texts if text.goal is not None])
     if has_frames:
         tensors[TASK] = np.array([[text.task.encode()] for text in texts], np.object_)
+        tensors |= _descriptions([text.descriptions for text in texts])
     else:
         embeddings = [text.text_embedding for text in texts if text.text_embedding is not None]
         tensors[TEXT_EMBEDDING] = embeddings[0][np.newaxis] if len(embeddings) == 1 else np.stack(embeddings)
@@ -105,11 +117,17 @@ def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | No
     return _decode_rows(tensors, kept, _decode_encoder_sample)
 
 
-def encode_refs(videos: Sequence[Sequence[bytes]], tasks: Sequence[str], sent: Sequence[UInt8Array]) -> Tensors:
+def encode_refs(
+    videos: Sequence[Sequence[bytes]],
+    tasks: Sequence[str],
+    sent: Sequence[UInt8Array],
+    descriptions: Sequence[tuple[str, str]] = (),
+) -> Tensors:
     """Return one request for the progress of videos whose frames are named by their digests.
 
     videos, tasks: the digests of the frames of each video, and its task
     sent: frames that the model may lack, uint8 [H, W, 3] of one size; empty: it has all frames
+    descriptions: of robot and camera, for each video; empty: those of the export
     """
     count = len(videos)
     num_rows = -(-len(sent) // count)
@@ -125,6 +143,7 @@ def encode_refs(videos: Sequence[Sequence[bytes]], tasks: Sequence[str], sent: S
         FRAMES: frames,
         FRAME_DIGESTS: pad_stack(digests),
         TASK: np.array([[task.encode()] for task in tasks], np.object_),
+        **_descriptions(descriptions),
     }
 
 
@@ -137,6 +156,13 @@ def encode_trajectories(encoded: Sequence[EncoderSample], num_positions: int, ou
         TEXT_EMBEDDING: np.stack([text for text in texts if text is not None]),
     }
     return {name: embeddings[name] for name in outputs}
+
+
+def _descriptions(descriptions: Sequence[tuple[str, str]]) -> Tensors:
+    """Return the optional tensor of the descriptions, unless all are empty."""
+    if not any(map(any, descriptions)):
+        return {}
+    return {DESCRIPTIONS: np.array([[text.encode() for text in each] for each in descriptions], np.object_)}
 
 
 def _lengths(sample: Sample) -> tuple[int, int]:
@@ -178,7 +204,13 @@ def _decode_sample(row: Row, known: Known) -> Sample:
         if lengths[0] < 1 or lengths[1] != 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
         positions, _ = _positions(row, lengths)
-        return ProgressSample(_trajectory(row, positions, known), frame_steps)
+        views = tuple(_unpadded(row, name, lengths[0]) for name in VIEWS if name in row)
+        trajectory = _trajectory(row, positions, known)
+        if views or GOAL in row:
+            trajectory = replace(trajectory, views=views, goal=row.get(GOAL))
+        return ProgressSample(trajectory, frame_steps)
+    if given := [name for name in (*VIEWS, GOAL) if name in row]:
+        raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {given[0]}", SampleType(sample_type).name.lower())
     if FRAME_DIGESTS in row:
         raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {FRAME_DIGESTS}", SampleType(sample_type).name.lower())
     if min(lengths) < 1:
@@ -197,10 +229,12 @@ def _decode_encoder_sample(row: Row, known: Known) -> EncoderSample:
 
 
 def _trajectory(row: Row, positions: npt.NDArray[Any], known: Known) -> Trajectory:
-    if FRAME_DIGESTS in row:
-        return Trajectory(named=_named([bytes(digest) for digest in positions], known), task=_task(row))
     if FRAMES in row:
-        return Trajectory(frames=positions, task=_task(row))
+        shown: dict[str, Any] = {"frames": positions}
+        if FRAME_DIGESTS in row:
+            shown = {"named": _named([bytes(digest) for digest in positions], known)}
+        robot, camera = (_text(row, DESCRIPTIONS, place) for place in (0, 1)) if DESCRIPTIONS in row else ("", "")
+        return Trajectory(**shown, task=_text(row, TASK), robot_description=robot, camera_description=camera)
     return Trajectory(video_embeddings=positions, text_embedding=row[TEXT_EMBEDDING])
 
 
@@ -237,9 +271,9 @@ def _unpadded(row: Row, name: str, total: int) -> npt.NDArray[Any]:
     return positions[:total]
 
 
-def _task(row: Row) -> str:
-    raw = row[TASK][0]
+def _text(row: Row, name: str, place: int = 0) -> str:
+    raw = row[name][place]
     try:
         return raw.decode() if isinstance(raw, bytes) else str(raw)
     except UnicodeDecodeError:
-        raise InvalidSampleError.at(TASK, "UTF-8 text", "other bytes") from None
+        raise InvalidSampleError.at(name, "UTF-8 text", "other bytes") from None

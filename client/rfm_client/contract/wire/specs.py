@@ -25,8 +25,11 @@ VIDEO_EMBEDDINGS = "video_embeddings"
 TEXT_EMBEDDING = "text_embedding"
 FRAMES = "frames"
 SECOND_FRAMES = "second_frames"
+LEFT_FRAMES, RIGHT_FRAMES, GOAL = "left_frames", "right_frames", "goal"
+VIEWS = (LEFT_FRAMES, RIGHT_FRAMES)
 FRAME_DIGESTS = "frame_digests"
 TASK = "task"
+DESCRIPTIONS = "descriptions"
 
 PROGRESS = "progress"
 SUCCESS = "success"
@@ -74,7 +77,12 @@ _FRAMES_SPECS = (
     TensorSpec(SECOND_FRAMES, "UINT8", (VARIABLE, VARIABLE, VARIABLE, 3), ragged=True, optional=True),
     TensorSpec(TASK, "BYTES", (1,)),
 )
+_VIEWS_SPECS = (
+    *(TensorSpec(view, "UINT8", (VARIABLE, VARIABLE, VARIABLE, 3), ragged=True, optional=True) for view in VIEWS),
+    TensorSpec(GOAL, "UINT8", (VARIABLE, VARIABLE, 3), ragged=True, optional=True),
+)
 _DIGESTS_SPEC = TensorSpec(FRAME_DIGESTS, "UINT8", (VARIABLE, DIGEST_BYTES), ragged=True, optional=True)
+_DESCRIPTIONS_SPEC = TensorSpec(DESCRIPTIONS, "BYTES", (2,), optional=True)
 
 
 def frame_digest(frame: UInt8Array) -> bytes:
@@ -90,9 +98,17 @@ def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
     return (*_QUESTION_SPECS, video, TensorSpec(TEXT_EMBEDDING, "FP32", (text_dim,)))
 
 
-def frame_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
-    """Return the inputs of a model that scores raw frames; ``by_digest``: with the digests of frames."""
-    return (*_QUESTION_SPECS, *_FRAMES_SPECS, *([_DIGESTS_SPEC] if by_digest else []))
+def frame_inputs(
+    *, by_digest: bool = False, described: bool = False, with_views: bool = False
+) -> tuple[TensorSpec, ...]:
+    """Return the inputs of a model that scores raw frames.
+
+    by_digest: with the digests of frames
+    described: with descriptions of robot and camera
+    with_views: with the frames of further cameras, and a goal
+    """
+    more = (*_VIEWS_SPECS * with_views, *[_DESCRIPTIONS_SPEC] * described, *[_DIGESTS_SPEC] * by_digest)
+    return (*_QUESTION_SPECS, *_FRAMES_SPECS, *more)
 
 
 def encoder_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:

@@ -1,0 +1,91 @@
+// SPDX-License-Identifier: MIT
+// What the page says of each fault and of each thing that is missing, with the command that mends it.
+
+import { ServerError } from "./api.js";
+
+const BY_ITSELF = "This page asks again by itself.";
+let remedies = {}; // command lines of this server, by what is missing
+
+/** From now on, states name the command lines of this server. */
+export function useRemedies(told) {
+  remedies = told;
+}
+
+/** The server that brought the page is away. */
+export function serverAway(error, retry) {
+  return {
+    title: "The server does not answer",
+    text: "It has stopped, or the network is down. If it does not come back, start it again with your options, for example:",
+    command: remedies.start,
+    details: error.message,
+    buttons: [["Try again", retry]],
+    note: BY_ITSELF,
+  };
+}
+
+/** Triton is away behind the server. */
+export function tritonAway(error, retry) {
+  const text = remedies.starts_triton
+    ? "It starts, or starts again, by itself. If that takes longer than a minute, ask how it is:"
+    : "The server reaches no Triton. Start one where the server looks for it, for example:";
+  return {
+    title: "Triton is not ready",
+    text,
+    command: remedies.triton,
+    details: error.message,
+    buttons: [["Try again", retry]],
+    note: BY_ITSELF,
+  };
+}
+
+export function noModel(retry) {
+  return {
+    kind: "empty",
+    title: "No model is served",
+    text: "Triton runs, but has no model that scores videos. Export a checkpoint into its repository:",
+    command: remedies.model,
+    buttons: [["Look again", retry]],
+    note: BY_ITSELF,
+  };
+}
+
+export function noDataset(retry) {
+  return {
+    kind: "empty",
+    title: "No dataset yet",
+    text: "Start the server again with a LeRobot folder or an HDF5 file, and look through its episodes here:",
+    command: remedies.dataset,
+    buttons: [["Look again", retry]],
+    note: BY_ITSELF,
+  };
+}
+
+export function noEpisode() {
+  return { kind: "empty", title: "No episodes", text: "This dataset is empty." };
+}
+
+export function noHit(numEpisodes, clear) {
+  const text = numEpisodes === 1 ? "The filters hide the only episode." : `The filters hide all ${numEpisodes} episodes.`;
+  return { kind: "empty", title: "No episode matches", text, buttons: [["Clear the filters", clear]] };
+}
+
+export function noVideo() {
+  return { kind: "empty", title: "No videos", text: "This episode has no camera; its curves are below." };
+}
+
+/** A link names a model that is not served. */
+export function otherModel(wanted, chosen) {
+  return { title: `The model ${wanted} is not served here`, text: `The link names it. The model ${chosen} is chosen instead.` };
+}
+
+/** A link names what the server does not show. what: the dataset or episode, as the subject of a sentence */
+export function deadLink(what) {
+  return { title: `${what} is not shown here`, text: "The link leads to another server, or to a dataset that has changed." };
+}
+
+/** Something failed. title: what, as a sentence without a full stop */
+export function failure(title, error, retry = null) {
+  const buttons = retry ? [["Try again", retry]] : [];
+  if (error instanceof ServerError) return { title, text: "The server could not answer.", details: error.message, buttons };
+  return { title, text: error.message, buttons };
+}

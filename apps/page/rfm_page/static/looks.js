@@ -1,0 +1,35 @@
+// SPDX-License-Identifier: MIT
+// What curves look like: a colour for each video, and a line for each question, so that no two look alike.
+
+import { questionsOf } from "./curves.js";
+import { svgElement } from "./svg.js";
+
+const SAMPLE_PX = 32; // length of the line in a legend
+
+/** Lines: lengths of strokes and gaps; the first one is solid. */
+export const DASHES = [null, [8, 4], [2, 3], [12, 3, 2, 3], [5, 2], [16, 4]];
+
+/** Gives each curve a colour, a line, and the title of its question. Where there is only one video, the colour is the question's. */
+export function giveLooks(curves) {
+  const questions = questionsOf(curves);
+  const isByQuestion = byQuestion(curves, questions);
+  questions.forEach(({ curves: alike, title, colour }, place) => {
+    for (const curve of alike) {
+      const look = isByQuestion ? { index: place, colour } : { index: curve.video.place, colour: curve.video.colour };
+      Object.assign(curve, { ...look, title, questionColour: colour, dash: DASHES[place % DASHES.length] });
+    }
+  });
+}
+
+/** Whether colours tell questions apart, since there is only one video. */
+export function byQuestion(curves, questions = questionsOf(curves)) {
+  return questions.length > 1 && new Set(curves.map(({ video }) => video)).size === 1;
+}
+
+/** A piece of a line as a picture, in the colour of the text around it. */
+export function sampleOf(dash) {
+  const svg = svgElement("svg", { class: "sample", width: SAMPLE_PX, height: 4, "aria-hidden": "true" });
+  const look = { stroke: "currentColor", "stroke-width": 2, "stroke-dasharray": (dash ?? []).join(" ") };
+  svg.append(svgElement("line", { x2: SAMPLE_PX, y1: 2, y2: 2, ...look }));
+  return svg;
+}

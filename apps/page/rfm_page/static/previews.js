@@ -1,0 +1,77 @@
+// SPDX-License-Identifier: MIT
+// What each row of a table shows of its episode: the first frame, and the curve of progress.
+
+import { svgElement } from "./svg.js";
+
+const AT_A_TIME = 2;
+const REST_MS = 120; // rows that are scrolled past are not asked about
+const MOST_KNOWN = 2000;
+const [WIDTH, HEIGHT] = [64, 20];
+
+export class Previews {
+  #ask;
+  #known = new Map(); // by number of the episode
+  #waiting = [];
+  #numAsked = 0;
+  #timer = null;
+
+  /** ask(episode): a promise of `progress` and `picture` in base64, which fails if the table is another meanwhile */
+  constructor(ask) {
+    this.#ask = ask;
+  }
+
+  /** Forgets everything: the episodes are others. */
+  clear() {
+    this.#known = new Map();
+    this.#waiting = [];
+  }
+
+  /** Fills a picture and a curve as soon as somebody can see their row. */
+  fill(episode, row, picture, curve) {
+    const preview = this.#known.get(episode.episode);
+    if (preview) {
+      draw(preview, picture, curve);
+      return;
+    }
+    this.#waiting.push({ episode, row, picture, curve });
+    clearTimeout(this.#timer);
+    this.#timer = setTimeout(() => this.#next(), REST_MS);
+  }
+
+  #next() {
+    this.#waiting = this.#waiting.filter(({ row }) => row.isConnected);
+    while (this.#numAsked < AT_A_TIME && this.#waiting.length) this.#fetch(this.#waiting.shift());
+  }
+
+  async #fetch({ episode, picture, curve }) {
+    this.#numAsked += 1;
+    const known = this.#known;
+    try {
+      const preview = await this.#ask(episode);
+      known.set(episode.episode, preview);
+      if (known.size > MOST_KNOWN) known.delete(known.keys().next().value);
+      draw(preview, picture, curve);
+    } catch { // the row stays without; whatever is wrong is told where somebody asks for more
+    } finally {
+      this.#numAsked -= 1;
+      this.#next();
+    }
+  }
+}
+
+function draw({ picture: jpeg, progress }, picture, curve) {
+  if (jpeg) picture.src = `data:image/jpeg;base64,${jpeg}`;
+  const there = progress.map((value, index) => [index, value]).filter(([, value]) => value !== null);
+  const x = (index) => 1 + (index / Math.max(progress.length - 1, 1)) * (WIDTH - 2);
+  const y = (value) => 1 + (1 - Math.min(Math.max(value, 0), 1)) * (HEIGHT - 2);
+  curve.firstChild.setAttribute("points", there.map(([index, value]) => `${x(index).toFixed(1)},${y(value).toFixed(1)}`).join(" "));
+}
+
+/** An empty picture and an empty curve. */
+export function blank() {
+  const picture = document.createElement("img");
+  Object.assign(picture, { alt: "", className: "thumb" });
+  const curve = svgElement("svg", { class: "spark", width: WIDTH, height: HEIGHT, "aria-hidden": "true" });
+  curve.append(svgElement("polyline", {}));
+  return { picture, curve };
+}

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: MIT
+"""Messages in the words of the command line: no text of libraries, no arguments of Python functions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import typer
+
+from rfm_client.contract.triton import FEWER_FRAMES
+
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # click's, or that of typer's own copy of click
+_EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number", "float_parsing": "a number"}
+
+
+def told(error: Exception) -> str:
+    """Return the message for a command's user, who knows options and no arguments of Python functions."""
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error).replace(FEWER_FRAMES, "leave --no-subsample out, or score prefixes (--frame-steps, --sampling)")
+
+
+def in_plain_words(error: typer.BadParameter) -> str:
+    """Return the message of an invalid value without the words of pydantic, with which typer validates."""
+    details: list[Any] = getattr(error.__cause__, "errors", list)()
+    expected = _EXPECTED.get(details[0]["type"]) if details else None
+    if expected is None:
+        return error.message.removeprefix("Value error, ")
+    return f"expected {expected}, got {details[0]['input']!r}"
+
+
+def same_words(option: str, options: Sequence[str]) -> list[str]:
+    """Return the options with the words of this one in another order."""
+    words = sorted(option.strip("-").split("-"))
+    return [each for each in options if sorted(each.strip("-").split("-")) == words]

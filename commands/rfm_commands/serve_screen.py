@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: MIT
+"""What ``rfm serve`` shows in a terminal: where it listens, what it serves, what to try next. Triton logs to a file.
+
+Without a terminal, as under systemd or in a container, all lines go to standard error.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import IO
+
+from google.protobuf.text_format import ParseError
+
+from rfm.launch.endpoints import Endpoints
+from rfm.launch.repository_folder import models_in
+from rfm_client.cli.next_steps import PAGE_PORT, PAGE_URL, command, next_steps, score_step
+from rfm_client.contract.listening import from_here
+from rfm_client.contract.names import frames_name
+from rfm_commands.rollout import names_of
+from rfm_export.publish import read_config
+from rfm_gateway import GatewayConfig
+
+LOG_FOLDER = Path(".local", "state", "rfm")  # in the home folder, as the XDG base directory specification has it
+
+
+def log_file(named: Path | None, http_port: int, environment: Mapping[str, str]) -> Path | None:
+    """Return the file for Triton's lines; None: standard error, which is no terminal.
+
+    named: the user's choice; None: no choice
+    """
+    if named is not None or not sys.stderr.isatty():
+        return named
+    folder = environment.get("XDG_STATE_HOME")
+    return (Path(folder, "rfm") if folder else Path.home() / LOG_FOLDER) / f"triton-{http_port}.log"
+
+
+@contextmanager
+def opened(log: Path | None) -> Iterator[IO[bytes] | None]:
+    """Context manager with the file, to append to. Raises OSError."""
+    if log is None:
+        yield None
+        return
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab") as file:
+        yield file
+
+
+@dataclass
+class ServeScreen:
+    """The screen of one server.
+
+    gateway: the gateway beside it; None: no gateway
+    log: file with Triton's lines
+    """
+
+    repository: Path
+    endpoints: Endpoints
+    gateway: GatewayConfig | None
+    log: Path
+    _began_s: float = field(default_factory=time.monotonic)
+
+    def show_start(self) -> None:
+        """Say what is loading; nothing if there is no model, which the server reports."""
+        if models := models_in(self.repository):
+            self._show(f"loading {', '.join(models)} from {self.repository} ...")
+
+    def show_ready(self) -> None:
+        """Show the addresses, models and device, and what to try next."""
+        rows = {
+            "models": f"{self._models()}, on {self._devices()}",
+            "gRPC": self.endpoints.grpc_url,
+            "HTTP": self.endpoints.http_url,
+            "metrics": self.endpoints.metrics_url,
+            **self._gateway_row(),
+            "log": f"{self.log} (lines of Triton and the models)",
+        }
+        lines = [f"  {name:9}{value}" for name, value in rows.items()]
+        seconds = time.monotonic() - self._began_s
+        self._show(f"ready after {seconds:.0f} s; Ctrl-C stops it", "", *lines, "", next_steps(*self._steps()), "")
+
+    def _show(self, *lines: str) -> None:
+        print("\n".join(["rfm serve: " + lines[0], *lines[1:]]), file=sys.stderr, flush=True)
+
+    def _models(self) -> str:
+        """Each model with the versions that its file names."""
+        shown = []
+        for model in models_in(self.repository):
+            try:
+                versions = read_config(self.repository, model).version_policy.specific.versions
+            except (OSError, ParseError):  # another program's; Triton has read it
+                versions = []
+            shown.append(" ".join([model, *map(str, versions)]))
+        return ", ".join(shown)
+
+    def _devices(self) -> str:
+        """The GPUs of all models, or the CPU."""
+        gpus: set[int] = set()
+        for model in models_in(self.repository):
+            try:
+                gpus.update(gpu for group in read_config(self.repository, model).instance_group for gpu in group.gpus)
+            except (OSError, ParseError):
+                continue
+        return f"GPU {', '.join(map(str, sorted(gpus)))}" if gpus else "the CPU"
+
+    def _gateway_row(self) -> dict[str, str]:
+        if self.gateway is None:
+            return {}
+        url = self.gateway.address.url("http" if self.gateway.certificate is None else "https")
+        has_page = self.gateway.viewer and find_spec("rfm_page") is not None
+        return {"page" if has_page else "gateway": f"{url}/"}
+
+    def _steps(self) -> list[tuple[str, str]]:
+        here = replace(self.endpoints, host=from_here(self.endpoints.host))
+        models = models_in(self.repository)
+        purpose, score = score_step(
+            here.grpc_url, [name for name in names_of(self.repository) if frames_name(name) in models]
+        )
+        steps = [(f"in another terminal, {purpose}", score)]
+        if self.gateway is None:
+            again = command("rfm", "serve", self.repository, "--gateway-port", PAGE_PORT)
+            steps.append((f"or serve it with the page at {PAGE_URL}", again))
+        return steps

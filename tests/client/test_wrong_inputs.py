@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: MIT
+"""What ``rfm`` and ``rfm-client`` answer to wrong inputs: the whole message, as a user reads it."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from in_process import rfm, rfm_client
+from labelling import LEROBOT
+from paths import ROOT
+from servers import Endpoints
+
+NOBODY = "grpc://localhost:1"  # where no server listens
+STARTED = "start the server there (rfm serve), or give the URL of one that runs"
+URL = "expected grpc://host:port or http://host:port, or grpcs:// or https://, got"
+DATASET = (
+    "expected a LeRobot dataset (meta/info.json), an RLDS dataset (features.json), an HDF5 file (.hdf5, .h5), a folder "
+    "of videos, of folders of pictures or of .npy and .npz files with tasks.csv or tasks.json, or a Hub id "
+    "org/name[@revision], got"
+)
+PAIR = "expected a certificate and its key (PEM, unencrypted) at"
+SHOWN = "expected the folder of a LeRobot dataset (meta/info.json), or an HDF5 file, got"
+SOURCE = "checkpoint: expected a folder that exists or a Hugging Face id org/name[/subfolder][@tag], got"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A working folder with the files that the commands name."""
+    folder = tmp_path_factory.mktemp("wrong")
+    (folder / "empty").mkdir()
+    (folder / "repository").symlink_to(ROOT / "model_repository")
+    shutil.copytree(LEROBOT / "toy_v21", folder / "dataset")
+    for name in ("file.txt", "broken.mp4", "broken.npz", "key.pem"):
+        (folder / name).write_text("some words")
+    (folder / "mistake.yaml").write_text("serve: {\n")
+    (folder / "unknown.yaml").write_text("gateway: {prt: 8100}\n")
+    np.save(folder / "grey.npy", np.zeros((4, 32, 32), np.uint8))
+    np.save(folder / "clip.npy", np.random.default_rng(0).integers(0, 256, (4, 32, 32, 3), np.uint8))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("HF_HUB_OFFLINE", "1")
+        yield folder
+
+
+# Usage errors; the message follows "Error: ".
+USAGE = {
+    "rfm-client score": "Missing argument 'VIDEO...'.",
+    "rfm-client score a.mp4 --tsk x": "No such option: --tsk (Possible options: --fps, --task)",
+    "rfm-client score a.mp4 --steps-frame 8": "No such option: --steps-frame (Possible options: --frame-steps)",
+    "rfm-client score a.mp4 --fps zero": "Invalid value for '--fps': expected a number, got 'zero'",
+    "rfm-client score a.mp4 --fps 0": "Invalid value for '--fps': expected at least 0.001, got 0.0",
+    "rfm-client score a.mp4 --fps nan": "Invalid value for '--fps': expected a finite number, got nan",
+    "rfm-client score a.mp4 --max-frames 1.5": "Invalid value for '--max-frames': expected a whole number, got '1.5'",
+    "rfm-client score a.mp4 --channels grb": "Invalid value for '--channels': 'grb' is not one of 'rgb', 'bgr'.",
+    "rfm-client score a.mp4 --frames 8": "Invalid value: --frames needs --sampling",
+    "rfm-client score a.mp4 --frame-steps 8 --sampling all": "Invalid value: --sampling conflicts with --frame-steps",
+    "rfm-client score a.mp4 --frame-steps 1": ("Invalid value for '--frame-steps': expected 0 or at least 2, got 1"),
+    "rfm-client score a.mp4 --plot a.jpg": (
+        "Invalid value for '--plot': expected a file that ends in .png, .pdf, .svg, got a.jpg"
+    ),
+    "rfm-client score a.mp4 --plot nowhere/a.png": (
+        "Invalid value for '--plot': expected a folder at nowhere, got none: mkdir -p nowhere"
+    ),
+    "rfm-client score a.mp4 --npy a.txt": "Invalid value for '--npy': expected a .npy file or a folder, got a.txt",
+    "rfm-client score a.mp4 --url localhost:8001": f"Invalid value for '--url': {URL} 'localhost:8001'",
+    "rfm-client score a.mp4 --url grpc://localhost:99999": f"Invalid value for '--url': {URL} 'grpc://localhost:99999'",
+    "rfm-client score a.mp4 --ca-file nope.pem": (
+        "Invalid value for '--ca-file': expected certificates (PEM) at nope.pem, got No such file or directory"
+    ),
+    "rfm-client score a.mp4 --ca-file key.pem": (
+        "Invalid value for '--ca-file': expected certificates (PEM) at key.pem, got a file without certificate"
+    ),
+    "rfm-client score a.mp4 --client-certificate key.pem": ("Invalid value: --client-certificate needs --client-key"),
+    "rfm-client score a.mp4 --client-certificate key.pem --client-key key.pem": (
+        f"Invalid value for '--client-certificate': {PAIR} key.pem and key.pem, got a file in another format"
+    ),
+    "rfm-client score a.mp4 --api-key-file nope.txt": (
+        "Invalid value for '--api-key-file': expected a text file, got nope.txt: No such file or directory"
+    ),
+    "rfm-client compare a.mp4": "Invalid value for VIDEO: expected at least 2 videos, got 1",
+    "rfm-client sample --num-frames 8-4": (
+        "Invalid value for '--num-frames': expected a length (8), several (4,8,16) or a range (4-16), got '8-4'"
+    ),
+    "rfm-client bench-input --output nowhere/a.json": (
+        "Invalid value for '--output': expected a folder at nowhere, got none: mkdir -p nowhere"
+    ),
+    "rfm-client --task x score a.mp4": (
+        "No such option: --task: it stands after the command, as in rfm-client score --task"
+    ),
+    "rfm-client stauts": "No such command 'stauts'. Did you mean 'status'?",
+    "rfm-client serve my_models": "No such command 'serve': that is `rfm serve`",
+    "rfm-client gateway": "Missing option '--triton'.",
+    "rfm-client gateway --triton localhost": f"Invalid value for '--triton': {URL} 'localhost'",
+    f"rfm-client gateway --triton {NOBODY} --metrics-url nope": (
+        "Invalid value for '--metrics-url': expected http://host:port/metrics, got 'nope'"
+    ),
+    f"rfm-client gateway --triton {NOBODY} --allow-folder nope": (
+        "Invalid value for '--allow-folder': expected a folder, got nope: No such file or directory"
+    ),
+    f"rfm-client gateway --triton {NOBODY} --dataset file.txt": f"Invalid value for '--dataset': {SHOWN} file.txt",
+    "rfm-client label": "Missing argument 'DATASET'.",
+    "rfm-client label dataset --episodes 5:2": (
+        "Invalid value for '--episodes': expected numbers and ranges such as 0:100,205, got '5:2'"
+    ),
+    "rfm-client label dataset --format csv": (
+        "Invalid value for '--format': expected one of progress, signals, hdf5, got 'csv'"
+    ),
+    "rfm-client label dataset --shard 3": "Invalid value for '--shard': expected i/n, for example 0/8, got '3'",
+    "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
+    "rfm-client label dataset --name a/b": (
+        "Invalid value for '--name': expected 1 to 64 letters, digits, _ or -, got 'a/b'"
+    ),
+    "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
+    "rfm demo": "No such command 'demo': it is now `rfm try`",
+    "rfm try": "Missing argument 'VIDEO'.",
+    "rfm try a.mp4": "Missing option '--task'.",
+    "rfm serve": "Invalid value: give FOLDER or --repository",
+    "rfm serve repository other": ("Invalid value: expected one FOLDER, and after it -- --OPTION=VALUE, got other"),
+    "rfm serve repository --port-http 8000": "No such option: --port-http (Possible options: --http-port)",
+    "rfm serve repository --http-port abc": "Invalid value for '--http-port': expected a whole number, got 'abc'",
+    "rfm serve repository --gateway-dataset nope": (
+        "Invalid value: --gateway-dataset needs --gateway-port, which starts the gateway"
+    ),
+    "rfm export nope": "Missing option '--repository'.",
+    "rfm models rollout rfm two --repository repository": (
+        "Invalid value for 'VERSION': expected a whole number, got 'two'"
+    ),
+}
+
+# Other errors, each with the exit code; the message follows the name of the program.
+FAILURES = {
+    f"rfm-client status --url {NOBODY}": (3, f"{NOBODY}: no connection: Connection refused: {STARTED}"),
+    "rfm-client status --url http://localhost:1": (
+        *(3, f"http://localhost:1: no connection: Connection refused: {STARTED}"),
+    ),
+    f"rfm-client wait --timeout 0.1 --url {NOBODY}": (
+        *(4, f"{NOBODY}: expected rfm to be ready within 0.1 s, got no such answer: "),
+        "rfm-client status shows what it does; rfm serve starts one",
+    ),
+    "rfm-client evaluate nope": (1, "nope: expected a labelled dataset, got no file or folder of this name"),
+    "rfm-client evaluate dataset": (
+        1,
+        "dataset: expected label files, NAME_progress.parquet or in HDF5 (rfm-client label), or --labels, got none",
+    ),
+    "rfm-client label nope": (1, f"nope: {DATASET} none"),
+    "rfm-client label file.txt": (1, f"file.txt: {DATASET} another file"),
+    "rfm-client label dataset --orient top=rotate180": (
+        1,
+        "--orient: expected one of the cameras observation.images.front, observation.images.wrist, got 'top'",
+    ),
+    "rfm serve nope": (
+        *(1, "repository: expected a folder of models, got nope, which is not there: "),
+        "rfm export --checkpoint CHECKPOINT --repository nope writes one",
+    ),
+    "rfm serve repository --http-port 0": (1, "--http-port: expected at least 1, got 0"),
+    "rfm serve repository --host here": (
+        1,
+        "--host: expected an IP address without a port, such as 127.0.0.1, ::1, 0.0.0.0 or ::, got 'here'",
+    ),
+    "rfm serve repository --grpc-key key.pem": (1, "--grpc-key needs --grpc-certificate"),
+    "rfm serve repository --grpc-certificate key.pem --grpc-key key.pem": (
+        1,
+        f"--grpc-certificate: {PAIR} key.pem and key.pem, got a file in another format",
+    ),
+    "rfm serve repository --gateway-port 28100 --gateway-dataset nope": (1, f"--gateway-dataset: {SHOWN} nope"),
+    "rfm serve repository --config nope.yaml": (
+        1,
+        "nope.yaml: expected a YAML file, got nope.yaml: No such file or directory",
+    ),
+    "rfm serve repository --config mistake.yaml": (
+        *(1, "mistake.yaml: expected a YAML file, got a mistake in line 2 "),
+        "(expected the node content, but found '<stream end>')",
+    ),
+    "rfm export nope --repository out": (1, f"{SOURCE} 'nope'"),
+    "rfm export file.txt --repository out": (1, f"{SOURCE} the file file.txt"),
+    "rfm export empty --repository out --name 'a b'": (1, "--name: expected letters, digits, _ and -, got 'a b'"),
+    "rfm try nope.mp4 --task x": (1, "video: expected a video file, got no file of this name (nope.mp4)"),
+    f"rfm models list --url {NOBODY}": (1, f"{NOBODY}: no connection: Connection refused: {STARTED}"),
+}
+
+# With a server of the demo's checkpoint. A video's name stands before its message.
+AT_SERVER = {
+    "score nope.mp4 --task x": (1, "nope.mp4: video: expected a video file, got no file of this name"),
+    "score file.txt --task x": (
+        1,
+        "file.txt: video: expected a file with a video stream, got a file of another kind, or a damaged one",
+    ),
+    "score broken.npz --task x": (
+        1,
+        "broken.npz: file: expected arrays of numbers and text, none pickled, got a file of another kind (broken.npz)",
+    ),
+    "score grey.npy --task x": (
+        *(1, "grey.npy: frames: expected uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W], got uint8 [4, 32, 32] "),
+        "(grey.npy)",
+    ),
+    "score http://localhost:1/a.mp4 --task x": (
+        1,
+        "http://localhost:1/a.mp4: video: expected a file with a video stream, got Connection refused",
+    ),
+    "score clip.npy": (1, 'clip.npy: task: expected a sentence with frames, got none: add --task "SENTENCE"'),
+    "compare clip.npy nope.npy --task x": (1, "file: expected a file of arrays, got no file of this name (nope.npy)"),
+    "label dataset --episodes 100:200": (
+        1,
+        "--episodes: expected some of the dataset's 8 episodes, got 100:200; it has 0:8",
+    ),
+    "label dataset --cameras top": (
+        1,
+        "--cameras: expected some of observation.images.front, observation.images.wrist, got 'top'",
+    ),
+    "label dataset --format hdf5": (
+        1,
+        "--format: expected progress or signals for a dataset that is no HDF5 file, got hdf5",
+    ),
+    "label dataset --mode whole --frames 4": (1, "frames: expected none with the rule all, got 4: leave --frames out"),
+}
+
+
+def answer(command: str) -> tuple[int, str]:
+    """Return the exit code and the last line of standard error."""
+    program, *words = shlex.split(command)
+    done = (rfm if program == "rfm" else rfm_client)(*words)
+    return done.exit_code, done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(("command", "message"), USAGE.items(), ids=USAGE)
+def test_wrong_usage_is_told_in_the_words_of_the_command_line(command: str, message: str) -> None:
+    assert answer(command) == (2, f"Error: {message}")
+
+
+@pytest.mark.parametrize(("command", "told"), FAILURES.items(), ids=FAILURES)
+def test_what_cannot_be_done_is_told_with_what_was_found(command: str, told: tuple[int | str, ...]) -> None:
+    code, *message = told
+    program = command.split()[0]
+    assert answer(command) == (code, f"{program}: {''.join(map(str, message))}")
+
+
+@pytest.mark.triton
+@pytest.mark.parametrize(("words", "told"), AT_SERVER.items(), ids=AT_SERVER)
+def test_inputs_that_a_server_would_score_are_told(
+    demo_server: Endpoints, words: str, told: tuple[int | str, ...]
+) -> None:
+    code, *message = told
+    expected = f"rfm-client: {''.join(map(str, message))}"
+    assert answer(f"rfm-client {words} --url {demo_server.grpc_url}") == (code, expected)
+
+
+def test_there_are_enough_of_them() -> None:
+    messages = [*USAGE.values(), *("".join(map(str, told)) for told in (*FAILURES.values(), *AT_SERVER.values()))]
+    assert len(messages) >= 60
+    for words in (r"\[Errno", "pydantic", "Input should be", "Value error", r"_ssl\.c", "StatusCode", "last error"):
+        assert not re.search(words, " ".join(messages))

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""The page in Chromium where something is missing or has failed: what it says, and how it goes on by itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from browsers import Browser
+from gateways import free_port, running
+from labelling import BrightnessScorer
+from rfm_labels import LabelOptions, label, open_dataset
+from servers import Endpoints
+from shown_datasets import copied
+
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
+NOWHERE = Endpoints(http_port=1, grpc_port=1, metrics_port=1)
+BLOCKED = """
+Object.defineProperty(window, "localStorage", { get() { throw new DOMException("denied", "SecurityError"); } });
+"""  # what Chromium does with cookies blocked
+THEMES = ("light", "dark")
+
+
+def wait_for_state(browser: Browser, place: str) -> str:
+    """Return the text of a state once it is shown."""
+    return str(browser.until(f"document.querySelector('#{place} .state')?.innerText.replace(/\\n+/g, '\\n')"))
+
+
+def without_violations(browser: Browser) -> None:
+    for theme in THEMES:
+        with browser.theme(theme):
+            assert browser.violations() == []
+
+
+def test_the_page_works_where_the_browser_blocks_cookies(
+    demo_server: Endpoints, quiet_browser: Browser, tmp_path: Path
+) -> None:
+    blocking = quiet_browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": BLOCKED})
+    try:
+        with running(demo_server, tmp_path) as gateway:
+            quiet_browser.open(gateway.url)
+            quiet_browser["fold"].click()
+            assert not quiet_browser["question"].is_displayed()
+            quiet_browser.all("#examples [data-example=success]")[0].click()
+            quiet_browser.until_text("status", "1 of 1 curves are done.")
+    finally:
+        quiet_browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", blocking)
+
+
+def test_a_page_opened_before_triton_goes_on_when_triton_is_there(
+    demo_server: Endpoints, browser: Browser, tmp_path: Path
+) -> None:
+    port = free_port()
+    with running(NOWHERE, tmp_path, port=port) as gateway:
+        browser.driver.get(gateway.url)
+        told = wait_for_state(browser, "served-state")
+        assert told.startswith("Triton is not ready\nIt starts, or starts again, by itself.")
+        assert "rfm-client status --url grpc://127.0.0.1:1\nCopy" in told
+        assert "Connection refused" not in told  # it stands behind Details
+        browser.all("#served-state summary")[0].click()
+        assert "Connection refused" in browser["served-state"].text
+        assert browser["rule"].get_attribute("value")  # what needs no Triton can be chosen
+        without_violations(browser)
+        browser.run("window.isFirst = true")
+
+        browser["live-tab"].click()  # which asks for news, and finds that the server is away
+    assert wait_for_state(browser, "away").startswith("The server does not answer")
+    assert "connection refused" not in browser["away"].text.lower()
+    without_violations(browser)
+    with running(demo_server, tmp_path, port=port):
+        browser["score-tab"].click()
+        browser.until("document.getElementById('model').value")
+        browser.until("!document.querySelector('#away .state, #served-state .state')")
+    assert browser.run("return window.isFirst")  # without a reload
+
+
+def test_a_dataset_added_by_a_restart_is_shown_without_a_reload(browser: Browser, tmp_path: Path) -> None:
+    root, port = copied("toy_v21", tmp_path), free_port()
+    label(open_dataset(root), BrightnessScorer(), LabelOptions())
+    with running(NOWHERE, tmp_path, port=port) as gateway:
+        browser.driver.get(gateway.url)
+        browser["dataset-tab"].click()
+        told = wait_for_state(browser, "no-datasets")
+        assert told.startswith("No dataset yet")
+        assert f"rfm serve my_models --gateway-port {port} --gateway-dataset my_dataset" in told
+        middle = browser.run(
+            "const box = document.querySelector('#no-datasets .state').getBoundingClientRect(); "
+            "return (box.left + box.right) / 2 / innerWidth"
+        )
+        assert middle == pytest.approx(0.5, abs=0.02)  # not in the column of the settings
+        without_violations(browser)
+    with running(NOWHERE, tmp_path, "rfm", "--dataset", str(root), port=port):
+        browser.until("document.querySelectorAll('#episodes tr').length === 8")
+        assert not browser.all("#no-datasets .state")
+        browser.write("task-part", "no task has this")
+        assert wait_for_state(browser, "no-hits").startswith("No episode matches\nThe filters hide all 8 episodes.")
+        without_violations(browser)
+        browser.all("#no-hits button")[0].click()
+        browser.until("document.querySelectorAll('#episodes tr').length === 8")
+        assert browser["task-part"].get_attribute("value") == ""
+        labels = (root / "rfm_progress.parquet").read_bytes()
+        (root / "rfm_progress.parquet").write_text("no labels")
+        browser.run("document.getElementById('labels').dispatchEvent(new Event('change'))")
+        assert wait_for_state(browser, "dataset-errors").startswith("The dataset cannot be shown")
+        assert not browser.all("#no-hits .state")
+        without_violations(browser)
+        (root / "rfm_progress.parquet").write_bytes(labels)
+        browser.all("#dataset-errors .actions button")[0].click()
+        browser.until("document.querySelectorAll('#episodes tr').length === 8")
+        assert not browser.all("#dataset-errors .state")
+
+
+def test_a_wrong_key_is_told_from_none(browser: Browser, tmp_path: Path) -> None:
+    with running(NOWHERE, tmp_path, RFM_GATEWAY_API_KEY="open sesame") as gateway:
+        browser.driver.get(gateway.url)
+        browser.until("!document.getElementById('key-form').hidden")
+        assert browser["key-wrong"].text == ""
+        assert not browser["question"].is_displayed()
+        without_violations(browser)
+        browser.write("key", "sesame")
+        browser.all("#key-form button")[0].click()
+        browser.until_text("key-wrong", "This is not the key. Type it again.")
+        browser.write("key", "open sesame")
+        browser.all("#key-form button")[0].click()
+        browser.until("document.getElementById('key-form').hidden")
+        assert browser["question"].is_displayed()
+
+
+@pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
+def test_no_state_is_wider_than_the_window(browser: Browser, tmp_path: Path, size: tuple[int, int]) -> None:
+    with browser.window(*size), running(NOWHERE, tmp_path) as gateway:
+        browser.driver.get(gateway.url)
+        for tab, place in (("score", "served-state"), ("dataset", "no-datasets")):
+            browser[f"{tab}-tab"].click()
+            wait_for_state(browser, place)
+            browser.draw()
+            assert browser.run("return document.documentElement.scrollWidth - innerWidth") <= 0
