@@ -7,7 +7,7 @@ TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
 .PHONY: help demo test test-all nightly test-newest check parity differences bench bench-full gpu gpu-packages perf chaos soak format model_repository \
-  clean ops-check ops-tools audit lock mutate docs prose internal-imports pictures version
+  clean ops-check ops-tools audit lock mutate docs reference prose internal-imports pictures version
 
 # What can be made: this list.
 help:
@@ -157,6 +157,10 @@ docs: | $(VENV)
 	$(VENV)/docs/bin/pip install --quiet --disable-pip-version-check "mkdocs-material>=9.8,<10" \
 	  "mkdocstrings[python]>=1,<2" ruff
 	NO_MKDOCS_2_WARNING=1 $(VENV)/docs/bin/mkdocs build --strict --quiet
+
+# Write the tables of docs/reference that come from the code.
+reference: $(INSTALLED)
+	$(BIN)/python tools/reference.py
 
 # Count the words that make docstrings, comments and documents hard to read. It fails nothing.
 prose:

@@ -33,6 +33,7 @@ class BackboneConfig:
     """The configuration of a backbone, and the dtype of its parameters and heads.
 
     backbone: transformers' configuration (config.json)
+    dtype: number type of the network on a GPU
     video_prompt: form of a Qwen3-VL's prompt with a video (``rfm.vlm.video_prompt``)
     weights: form of rounded layers (``rfm.vlm.rounded``); None: not rounded
     """
@@ -65,11 +66,11 @@ class VlmConfig(BackboneConfig):
     multi_image: each frame is an image; else a trajectory is a video
     per_frame_progress_token: the state of an image is that of a progress token behind it
     frame_pooling: pools an image's tokens to its state, without progress tokens; boundary: takes the last token
-    pooling_temperature: of attention pooling
+    pooling_temperature: temperature of attention pooling
     average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
     progress_in_preference: prompts for preference also ask for progress
-    size_px: height and width to which every frame is resized first; None: resizing starts from each frame's size
-    trained_frames: as in ``rfm_client.contract.description.Description``
+    size_px: for videos: height and width to which every frame is resized first; null: each frame keeps its own
+    trained_frames: most frames of a trajectory in training, by default also of clients; None: unknown
     """
 
     multi_image: bool

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """config.yaml of a vision-language training run: the settings that weights do not hold.
 
-docs/reference/checkpoints.md lists every setting and its default.
+``make reference`` writes SETTINGS and the defaults into docs/reference/checkpoints.md.
 """
 
 from __future__ import annotations

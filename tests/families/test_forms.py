@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The forms of checkpoints in docs/reference/checkpoints.md: files as PEFT writes them, and a test for each row."""
+"""The forms in which checkpoints are saved: files as PEFT writes them, and a test for each form."""
 
 from __future__ import annotations
 

@@ -31,8 +31,6 @@ from labelling import LEROBOT
 from paths import ROOT
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.contract import FRAME_SCORES, wire
-from rfm_client.contract.settings import Setting
-from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
 from servers import Endpoints
 
@@ -41,7 +39,6 @@ pytestmark = pytest.mark.triton
 DOCS = ROOT / "docs"
 CLIENT_GUIDE = DOCS / "guides" / "use_the_client.md"
 CONTRACT = DOCS / "reference" / "contract.md"
-CONFIGURATION = DOCS / "reference" / "configuration.md"
 ARCHITECTURE = DOCS / "explanation" / "architecture.md"
 GUIDES = sorted([*DOCS.glob("guides/*.md"), *DOCS.glob("tutorials/*.md")])
 RUN = (ROOT / "README.md", ROOT / "client" / "README.md", *GUIDES)  # whose examples and client commands are run
@@ -239,14 +236,10 @@ def parse(command: Command, arguments: Sequence[str], parent: Context | None = N
         parse(subcommands[arguments[end - 1]], arguments[end:], context)
 
 
-def test_every_command_and_option_is_documented() -> None:
-    configuration = CONFIGURATION.read_text()
+def test_every_command_and_option_has_a_help_text() -> None:
     for name, command in get_command(rfm_app).commands.items():  # type: ignore[attr-defined]
         assert command.help, name
-        assert f"`rfm {name}`" in configuration
-        for parameter in options(command):
-            for option in (*parameter.opts, *parameter.secondary_opts):
-                assert f"`{option.replace('--gateway-', '--')}`" in configuration or f"`{option}`" in configuration
+        assert list(options(command)), name
 
 
 def options(command: Command) -> Iterator[Parameter]:
@@ -300,30 +293,10 @@ def test_the_answer_to_the_curl_of_the_contract_is_strict_json(demo_server: Endp
     assert {output["name"]: output["shape"] for output in answer["outputs"]} == {"progress": [1, 2], "success": [1, 2]}
 
 
-ROW = re.compile(r"^\| `(\w+)` \| (`(--[\w-]+)`[^|]*)?\| .*\(([^()]*)\) \|$", re.MULTILINE)
-
-
-@pytest.mark.parametrize("section", SECTIONS)
-def test_every_key_is_documented_under_its_lifetime_with_its_option_and_default(section: str) -> None:
-    heading = {"export": "At export", "serve": "At serve", "gateway": "In the gateway"}[section]
-    (text,) = re.findall(rf"^## {heading}\n(.*?)^## ", CONFIGURATION.read_text(), re.MULTILINE | re.DOTALL)
-    assert text.startswith(f"\nKeys of the section `{section}`")
-    documented = [(key, option, default) for key, _, option, default in ROW.findall(text)]
-    assert documented == [
-        (key, each.option if each.has_option else "", shown(each)) for key, each in SECTIONS[section].settings().items()
-    ]
-
-
-def shown(setting: Setting) -> str:
-    """A default as the document spells it."""
-    value = setting.default
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "null" if value is None else "none" if value == () else f"{value:g}" if type(value) is float else str(value)
-
-
-def test_every_key_of_the_fastapi_server_is_documented() -> None:
-    assert dict(re.findall(r"^\| `(\w+)` \| `([\w.]+)` \|$", CONFIGURATION.read_text(), re.MULTILINE)) == FASTAPI_KEYS
+def test_the_tables_of_the_reference_are_those_of_the_code() -> None:
+    command = [sys.executable, ROOT / "tools" / "reference.py", "--check"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
