@@ -95,7 +95,8 @@ def _check_network(folder: Path, names: Iterable[str], model_type: str | None) -
     stated = content.get("model_type")
     found = next((kind for name in names for kind, own in _NETWORKS.items() if own.search(name)), None)
     is_first = stated is None and found == next(iter(_NETWORKS))  # the first ReWiND checkpoints state nothing
-    if found is None or "type" in content or is_first or stated in (found, model_type):  # ``type``: of LeRobot
+    is_expected = stated is not None and stated in (found, model_type)
+    if found is None or "type" in content or is_first or is_expected:  # ``type``: of LeRobot
         return
     got = "none" if stated is None else shown(stated)
     expected = f"{found}, by the names of the weights"

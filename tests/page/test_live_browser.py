@@ -302,7 +302,7 @@ def test_progress_and_success_have_one_colour_each_and_numbers_at_the_pointer(pa
         )
         colours = {
             page.browser.run(f"return getComputedStyle(document.documentElement).getPropertyValue('--curve-{n}')")
-            for n in (0, 1)
+            for n in (0, 2)
         }
         assert [text for text, _ in shown] == ["0.500", "0.250"]
         assert {hex_of(colour) for _, colour in shown} == colours

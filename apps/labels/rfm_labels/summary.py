@@ -79,10 +79,10 @@ def summary_of(labels: Any) -> Summary:
         table = labels.slice(start, end - start)
         progress = table[PROGRESS].to_numpy()
         is_scored = np.isfinite(progress)  # NaN: the model did not answer about the frame
+        final.append(progress[-1])
         progress = progress[is_scored]
         cameras = [table[name].to_numpy()[is_scored] for name in table.column_names if name.startswith(f"{PROGRESS}.")]
         numbers.append(episodes[start])
-        final.append(progress[-1])
         backwards.append(np.mean(np.diff(progress) < -BACKWARDS_BY) if len(progress) > 1 else 0.0)
         if SUCCESS in table.column_names:
             success = table[SUCCESS].to_numpy()

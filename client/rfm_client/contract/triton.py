@@ -59,12 +59,18 @@ _NO_INPUT = re.compile(
     r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*input )"
     rf"'(?P<name>{'|'.join((SECOND_FRAMES, DESCRIPTIONS, *VIEWS, GOAL))})'"
 )
-_OF_VIEWS = ("a model that reads views and a goal, such as Robo-Dopamine", "leave out views and goal")
-# What a model without an optional input is sent it for, and the remedy.
+_OF_VIEWS = (
+    "a model that reads views and a goal, such as Robo-Dopamine",
+    "one that reads the frames of one camera",
+    "leave out views and goal",
+)
+_OLD = "one that was exported before there was this input"
+# By optional input: a model that has it, one that has not, and the remedy.
 _WITHOUT = {
-    SECOND_FRAMES: ("a model that takes pairs of two frame sizes", "export it again, or resize a trajectory"),
+    SECOND_FRAMES: ("a model that takes pairs of two frame sizes", _OLD, "export it again, or resize a trajectory"),
     DESCRIPTIONS: (
         "a model whose prompt names robot and camera, such as RynnValue",
+        f"another, or {_OLD}",
         "leave out robot_description and camera_description, or export a RynnValue again",
     ),
     **dict.fromkeys((*VIEWS, GOAL), _OF_VIEWS),
@@ -153,8 +159,7 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
         return errors.InvalidSampleError.at(shape["name"], f"[{shape['expected']}]", f"[{shape['got']}]")
     without = _NO_INPUT.search(text)
     if without is not None:
-        expected, remedy = _WITHOUT[without["name"]]
-        got = "another, or one that was exported before there was this input"
+        expected, got, remedy = _WITHOUT[without["name"]]
         return errors.InvalidSampleError.at(without["name"], expected, got, remedy)
     if PROCESS_ENDED in text and "Stub process" in text:
         return errors.ProcessEndedError(text)
