@@ -265,7 +265,7 @@ WRONG_USES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_user_s_file_type_checks_against_the_installed_wheel(tmp_path: Path) -> None:
     copied, wheels, environment, user_file = (
         tmp_path / name for name in ("client", "wheels", "environment", "user.py")
