@@ -33,7 +33,7 @@ from rfm_client.contract import (
     Sample,
     SimilarityResult,
 )
-from rfm_client.contract.samples import DESCRIPTION_FIELDS, EncoderSample, with_trajectories
+from rfm_client.contract.samples import EncoderSample, with_trajectories
 
 Outcome: TypeAlias = Result | RewardError
 
@@ -180,7 +180,7 @@ class Engine:
             if any(sample.trajectories[0].descriptions) and not self.predictor.reads_descriptions:
                 expected = "none, as the prompt of this checkpoint names neither robot nor camera"
                 got = str(sample.trajectories[0].descriptions)
-                raise InvalidSampleError.at(" or ".join(DESCRIPTION_FIELDS), expected, got)
+                raise InvalidSampleError.at(" or ".join(sample.trajectories[0].DESCRIPTION_FIELDS), expected, got)
             rows = self.predictor.rows(embedded_sample)
         except RewardError as error:
             return Prepared(sample, error)

@@ -25,7 +25,6 @@ from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees
 from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import ProgressSample, Sample
-from rfm_client.contract.samples import DESCRIPTION_FIELDS
 
 VALUE_TOKEN, RELATIVE_TOKEN = "<value>", "<relative_value>"
 IMAGE = VISION_START + IMAGE_PAD + VISION_END
@@ -100,7 +99,7 @@ class RynnCollator(VlmCollator):
         assert isinstance(sample, ProgressSample)  # by check_type
         (trajectory,) = sample.trajectories
         self._check_task(trajectory.task)
-        for name, text in zip(DESCRIPTION_FIELDS, trajectory.descriptions, strict=True):
+        for name, text in zip(trajectory.DESCRIPTION_FIELDS, trajectory.descriptions, strict=True):
             self._check_special_tokens(name, text)
         video = video_of(trajectory, sample.frame_steps)
         conversation = self.conversation(video, trajectory.task, trajectory.descriptions)

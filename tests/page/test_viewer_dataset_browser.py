@@ -390,7 +390,8 @@ def test_ten_thousand_episodes_are_a_few_rows_of_the_document(
         assert numbers[-1] == NUM_LARGE - 1
         page.browser["choose-shown"].click()
         assert page.browser["chosen-told"].text == f"{NUM_LARGE} episodes selected"
-        assert 390 < len(page.browser["use-words"].text) <= 400  # cut between numbers
+        shown_words = page.browser["use-words"].text
+        assert 390 < len(shown_words) <= 400
         for name in ("clipboard-read", "clipboard-write"):
             granted = {"origin": page.url, "permission": {"name": name}, "setting": "granted"}
             page.browser.driver.execute_cdp_cmd("Browser.setPermission", granted)
@@ -398,6 +399,8 @@ def test_ten_thousand_episodes_are_a_few_rows_of_the_document(
         page.browser.until_text("status", "The words are copied.")
         copied_words = page.browser.driver.execute_async_script("navigator.clipboard.readText().then(arguments[0])")
         assert copied_words == f'--dataset.episodes="{list(range(NUM_LARGE))}"'
+        begin, end = shown_words.split("…")
+        assert copied_words.startswith(f"{begin},") and copied_words.endswith(f" {end.lstrip()}")  # no number is cut
         page.browser.all(f"#episodes tr[data-episode='{NUM_LARGE - 1}'] button")[0].click()
         page.browser.until_text("episode-title", f"Episode {NUM_LARGE - 1}")
         page.browser["episode-before"].click()

@@ -44,7 +44,6 @@ from rfm_gateway.observe import within
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 FRAME_STEPS_OF_SECONDS = 8  # the same, for a model of remaining seconds
-_DESCRIPTIONS = ("robot_description", "camera_description")  # keys of metadata
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
 _BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the embedding of the task
@@ -258,7 +257,7 @@ def _frame_steps(frames: ModelInfo | None) -> int:
 def _descriptions(given: schema.TrajectoryInput) -> dict[str, Any]:
     """Return the descriptions of robot and camera in a trajectory's metadata. Raises InvalidSampleError."""
     told = given.metadata if isinstance(given.metadata, Mapping) else {}
-    found = {key: told[key] for key in _DESCRIPTIONS if told.get(key) is not None}
+    found = {key: told[key] for key in Trajectory.DESCRIPTION_FIELDS if told.get(key) is not None}
     for key, text in found.items():
         if not isinstance(text, str) or not text.strip():
             raise InvalidSampleError.at(f"metadata.{key}", "a description, or null", repr(text))

@@ -21,7 +21,7 @@ from rfm_labels.datasets.hdf5 import Hdf5Dataset
 from rfm_labels.hdf5_labels import Hdf5Labels, check_room, hdf5_labels
 from rfm_labels.hdf5_tables import own_file
 from rfm_labels.label_files import LabelFile, parquet_labels
-from rfm_labels.metadata import HOP, SCORES, Cost, blank_from_metadata, blank_lines
+from rfm_labels.metadata import SCORES, Cost, blank_from_metadata, blank_lines, skipping_in
 from rfm_labels.options import DEFAULTS, QUIET, Format, LabelOptions, Watch
 from rfm_labels.plan import Item, Plan, all_faults, plan_labels
 from rfm_labels.scorer import Scorer
@@ -150,7 +150,8 @@ def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
         gone = [item for item in missing if file.digests.get(item.episode.index) == item.digest]
         for item, columns in file.read(gone) if gone else ():
             scores = {name: columns[name] for name in order if name in columns}
-            answered = np.isfinite(scores[HOP]) if HOP in scores else np.ones(item.episode.num_frames, bool)
+            skipping = skipping_in(scores)
+            answered = slice(None) if skipping is None else np.isfinite(scores[skipping])
             of_all = [
                 len(each) == item.episode.num_frames and np.isfinite(each[answered]).all() for each in scores.values()
             ]

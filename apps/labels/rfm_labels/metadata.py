@@ -13,7 +13,7 @@ from rfm_client.frames import BlankFrames
 from rfm_labels.datasets.faults import listed
 
 Columns: TypeAlias = dict[str, Float32Array]
-PROGRESS, SUCCESS, REMAINING, HOP = "progress", "success", "remaining_s", "hop"
+PROGRESS, SUCCESS, REMAINING = "progress", "success", "remaining_s"
 SCORES = {name: score for name, score in FRAME_SCORES.items() if not score.is_per_bin}  # in the order of columns
 BlankCameras: TypeAlias = Mapping[str, Mapping[int, int]]  # highest value of the frames, by camera and episode
 BLANK_KEY = b"rfm.blank_cameras"
@@ -52,6 +52,11 @@ class Cost:
     def frames_per_s(self) -> float:
         """Frames of the dataset that were labelled in a second."""
         return self.frames / self.seconds
+
+
+def skipping_in(names: Iterable[str]) -> str | None:
+    """Return the score that is NaN, as progress is, at frames without an answer; None: every frame has an answer."""
+    return next((name for name in names if name in SCORES and SCORES[name].skips_frames), None)
 
 
 def blank_by_camera(of_episodes: Iterable[tuple[int, Mapping[str, int]]]) -> BlankCameras:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
-from rfm_client import InvalidSampleError, RewardError
+from rfm_client import InvalidSampleError, RewardError, Trajectory
 from rfm_client.frames import ChannelOrder, Correction, Fuse, Orientation, Sampling
 from rfm_client.options import InvalidValueError, first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
@@ -21,7 +21,7 @@ from rfm_labels.options import QUIET, LabelOptions, Mode, ProgressRule, Watch, c
 from rfm_labels.scorer import CheckpointFacts, Scorer
 
 _RECIPE_FORMAT = 4  # increased when the same recipe gives other scores or other digests
-_OPTIONAL = ("progress_rule", "robot_description", "camera_description")  # labels made before have no such fields
+_OPTIONAL = ("progress_rule", *Trajectory.DESCRIPTION_FIELDS)  # labels made before have no such fields
 _OF_TRAINING = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
 _OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
 
@@ -226,13 +226,13 @@ def _check_progress(rule: ProgressRule | None, checkpoint: CheckpointFacts) -> N
 
 def _check_descriptions(options: LabelOptions, cameras: Sequence[str], checkpoint: CheckpointFacts) -> None:
     """Raise InvalidSampleError for descriptions that the prompt does not take, or a camera's for several cameras."""
-    given = [name for name in ("robot_description", "camera_description") if getattr(options, name)]
+    given = [name for name in Trajectory.DESCRIPTION_FIELDS if getattr(options, name)]
     if given and not checkpoint.reads_descriptions:
         expected = "none with this model, whose prompt names neither robot nor camera"
         raise InvalidSampleError.at(given[0], expected, repr(getattr(options, given[0])))
     if options.camera_description and len(cameras) > 1:
-        expected = "it with a single camera; choose one (--cameras)"
-        raise InvalidSampleError.at("camera_description", expected, f"it with {', '.join(cameras)}")
+        expected, remedy = "a single camera, which it describes", "choose one (--cameras)"
+        raise InvalidSampleError.at("camera_description", expected, ", ".join(cameras), remedy)
 
 
 @contextmanager

@@ -299,7 +299,7 @@ def _held(first: UInt8Array, others: Iterator[UInt8Array], task: str, count: int
     for chunk in itertools.chain([first], others):
         frames[start : start + len(chunk)] = chunk
         start += len(chunk)
-    described = {name: getattr(recipe, name) for name in ("robot_description", "camera_description")}
+    described = {name: getattr(recipe, name) for name in Trajectory.DESCRIPTION_FIELDS}
     return Trajectory(frames=frames, task=task, **described)
 
 

@@ -29,7 +29,6 @@ import numpy as np
 
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.metadata import (
-    HOP,
     PROGRESS,
     REMAINING,
     SCORES,
@@ -40,6 +39,7 @@ from rfm_labels.metadata import (
     blank_from_metadata,
     blank_to_metadata,
     canonical_json,
+    skipping_in,
 )
 from rfm_labels.plan import Item, Plan
 
@@ -218,8 +218,9 @@ def with_totals(labels: Any, plan: Plan) -> Any:
     if REMAINING in labels.column_names:
         seconds = labels[REMAINING].to_numpy()
         derived = {_POTENTIAL: -seconds, _IS_SCORED: np.ones_like(seconds)}
-    if HOP in labels.column_names:
-        derived[_IS_SCORED] = np.isfinite(labels[HOP].to_numpy()).astype(np.float32)
+    skipping = skipping_in(labels.column_names)
+    if skipping is not None:
+        derived[_IS_SCORED] = np.isfinite(labels[skipping].to_numpy()).astype(np.float32)
     for name, values in derived.items():
         labels = labels.append_column(name, pa.array(values))
     if not _has_several_tasks(plan):
@@ -248,15 +249,14 @@ def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost
         signals[column] = f"reward.{name}.{SIGNAL_NAMES[score]}{dot}{camera}"
     if REMAINING in signals:
         signals[_POTENTIAL] = f"reward.{name}.{_POTENTIAL}"
-    if REMAINING in signals or HOP in signals:
+    skipping = skipping_in(signals)
+    if REMAINING in signals or skipping is not None:
         signals[_IS_SCORED] = f"reward.{name}.{_IS_SCORED}"
     metadata = {
         "format": b"lerobot.frame_signals",
         "schema_version": b"1",
         "provenance": canonical_json(plan.provenance()),
-        "descriptors": canonical_json(
-            {signal: _descriptor(column, skips_frames=HOP in signals) for column, signal in signals.items()}
-        ),
+        "descriptors": canonical_json({signal: _descriptor(column, skipping) for column, signal in signals.items()}),
         "episode_indices": canonical_json([item.episode.index for item in plan.items]),
     }
     ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
@@ -270,12 +270,12 @@ def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
     return digests if cost is None else {**digests, COST_KEY: cost.json()}
 
 
-def _descriptor(column: str, *, skips_frames: bool) -> dict[str, Any]:
-    """skips_frames: True if progress is NaN at frames that the model did not answer about"""
+def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
+    """skipping: as ``skipping_in`` returns it"""
     name, _, camera = column.partition(".")
     score = SCORES.get(name)
     meaning = _DERIVED[name] if score is None else score.meaning
-    has_gaps = skips_frames and name in (PROGRESS, HOP)
+    has_gaps = skipping is not None and name in (PROGRESS, skipping)
     return {
         "description": meaning + (f", seen by {camera}" if camera else ""),
         "direction": "higher" if score is None or score.higher_is_better else "lower",

@@ -27,6 +27,7 @@ from rfm_client.cli.command import (
     with_options,
 )
 from rfm_client.cli.help_sections import MOST_COLUMNS
+from rfm_client.cli.messages import with_remedy
 from rfm_client.cli.next_steps import steps_with_server
 from rfm_client.cli.options import (
     CredentialFiles,
@@ -47,7 +48,6 @@ from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.settings import ConfigError
-from rfm_client.contract.triton import FEWER_FRAMES
 from rfm_client.plot import save
 
 MIN_COMPARED = 2
@@ -239,8 +239,7 @@ def sample(
     failures = [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
     for index, outcome in enumerate(outcomes):
         if isinstance(outcome, RewardError):
-            remedy = f"; {FEWER_FRAMES}"  # for videos; here --num-frames decides
-            report(f"samples[{index}]: {str(outcome).replace(remedy, '')}")
+            report(f"samples[{index}]: {with_remedy(outcome, '')}")  # that of videos is none: --num-frames decides
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if output.prints_tables and rows:
         of = "frames" if are_frames(samples) else "embeddings"

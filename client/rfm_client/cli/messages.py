@@ -8,6 +8,7 @@ from typing import Any
 
 import typer
 
+from rfm_client.contract.errors import LocatedError
 from rfm_client.contract.triton import FEWER_FRAMES
 
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # click's, or that of typer's own copy of click
@@ -18,7 +19,14 @@ def told(error: Exception) -> str:
     """Return the message for a command's user, who knows options and no arguments of Python functions."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    return str(error).replace(FEWER_FRAMES, "leave --no-subsample out, or score prefixes (--frame-steps, --sampling)")
+    return str(with_remedy(error, "leave --no-subsample out, or score prefixes (--frame-steps, --sampling)"))
+
+
+def with_remedy(error: Exception, remedy: str) -> Exception:
+    """Return an error of too many frames with this remedy, or none if it is empty; return others as they are."""
+    if isinstance(error, LocatedError) and error.remedy == FEWER_FRAMES:
+        return type(error).at(error.where, error.expected, error.got, remedy)
+    return error
 
 
 def in_plain_words(error: typer.BadParameter) -> str:

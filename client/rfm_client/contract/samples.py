@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, TypeAlias, cast
+from typing import Any, ClassVar, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,6 @@ NamedFrame: TypeAlias = tuple[bytes, npt.NDArray[Any]]  # a frame's digest, and 
 MIN_FRAME_STEPS = 2  # a prefix sampled to a single frame is no trajectory
 MOST_VIEWS = 2  # besides the frames
 MAX_FRAME_STEPS = 4096  # more frames than any checkpoint takes
-DESCRIPTION_FIELDS = ("robot_description", "camera_description")
 _PLAIN_NUMBERS = ("I", "F")  # Pillow's modes of depth pictures, which no conversion makes a colour picture
 
 
@@ -45,8 +44,12 @@ class Trajectory:
     named: in place of ``frames``, on a server: the digest of each frame with its pixels, uint8 [H, W, 3], or with its
         embedding, float32 [D], which the encoders kept
 
+    DESCRIPTION_FIELDS: the names of the descriptions
+
     Raises InvalidSampleError.
     """
+
+    DESCRIPTION_FIELDS: ClassVar[tuple[str, str]] = ("robot_description", "camera_description")
 
     frames: UInt8Array | None = None
     video_embeddings: Float32Array | None = None
@@ -64,11 +67,11 @@ class Trajectory:
             got = "both" if given else "neither"
             raise InvalidSampleError.at("trajectory", "either frames or video_embeddings", got)
         check_task(self.task)
-        for name in DESCRIPTION_FIELDS:
+        for name in self.DESCRIPTION_FIELDS:
             check_text(name, getattr(self, name))
         if self.video_embeddings is not None and any(self.descriptions):
             expected = "none with video_embeddings"
-            raise InvalidSampleError.at(" or ".join(DESCRIPTION_FIELDS), expected, str(self.descriptions))
+            raise InvalidSampleError.at(" or ".join(self.DESCRIPTION_FIELDS), expected, str(self.descriptions))
         if self.frames is not None and self.text_embedding is not None:
             raise InvalidSampleError.at("text_embedding", "None with frames, which go with task", "an embedding")
         if self.frames is not None:
