@@ -399,8 +399,9 @@ def test_ten_thousand_episodes_are_a_few_rows_of_the_document(
         page.browser.until_text("status", "The words are copied.")
         copied_words = page.browser.driver.execute_async_script("navigator.clipboard.readText().then(arguments[0])")
         assert copied_words == f'--dataset.episodes="{list(range(NUM_LARGE))}"'
-        begin, end = shown_words.split("…")
-        assert copied_words.startswith(f"{begin},") and copied_words.endswith(f" {end.lstrip()}")  # no number is cut
+        begin, end = (part.strip(", ") for part in shown_words.split("…"))
+        assert copied_words.startswith(f"{begin}, ")  # no number is cut
+        assert copied_words.endswith(f", {end}")
         page.browser.all(f"#episodes tr[data-episode='{NUM_LARGE - 1}'] button")[0].click()
         page.browser.until_text("episode-title", f"Episode {NUM_LARGE - 1}")
         page.browser["episode-before"].click()
