@@ -14,7 +14,7 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.results import SUCCESS_THRESHOLD
-from rfm_client.contract.samples import Float32Array, UInt8Array
+from rfm_client.contract.samples import Float32Array, Trajectory, UInt8Array
 from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.sampling import Rule, Sampling
@@ -182,20 +182,16 @@ class FrameOptions:
             unknown = [] if isinstance(given, str) else [repr(each) for each in given if each not in cameras]
             require(name, not unknown, expected, ", ".join(unknown))
         self.corrections  # noqa: B018  raises ValueError for an unknown value
-        for name, text in (("robot_description", self.robot_description), *self._of_cameras):
-            require(name, isinstance(text, str), "text", type(text).__name__)
+        for descriptions in self.descriptions:
+            for name, text in zip(Trajectory.DESCRIPTION_FIELDS, descriptions, strict=True):
+                require(name, isinstance(text, str), "text", type(text).__name__)
 
     @property
     def descriptions(self) -> list[tuple[str, str]]:
         """Descriptions of the robot and of each camera, in the order of the cameras."""
-        return [(self.robot_description, text) for _, text in self._of_cameras]
-
-    @property
-    def _of_cameras(self) -> list[tuple[str, str]]:
-        """The name of the option, and each camera's description."""
-        given = self.camera_description
-        texts = [given if isinstance(given, str) else given.get(camera, "") for camera in self.cameras or ("",)]
-        return [("camera_description", text) for text in texts]
+        given, cameras = self.camera_description, self.cameras or ("",)
+        of_cameras = [given.get(camera, "") if isinstance(given, Mapping) else given for camera in cameras]
+        return [(self.robot_description, text) for text in of_cameras]
 
     @property
     def corrections(self) -> list[Correction]:
