@@ -45,6 +45,7 @@ def test_the_page_works_where_the_browser_blocks_cookies(
             assert not quiet_browser["question"].is_displayed()
             quiet_browser.all("#examples [data-example=success]")[0].click()
             quiet_browser.until_text("status", "1 of 1 curves are done.")
+            quiet_browser.driver.get("about:blank")  # before the gateway ends
     finally:
         quiet_browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", blocking)
 
