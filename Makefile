@@ -92,7 +92,7 @@ gpu-packages: $(INSTALLED)
 	rm -rf build/gpu build/gpu.tar.xz
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-compile --target build/gpu/site \
 	  --python-version 3.12 --implementation cp --only-binary :all: $(addprefix --platform ,$(PLATFORMS)) \
-	  --constraint constraints.txt nvidia-pytriton numpy tritonclient python-rapidjson
+	  --constraint constraints.txt nvidia-pytriton numpy tritonclient python-rapidjson gymnasium farama-notifications
 	cd build/gpu/site && find . -type d -name tests -prune -exec rm -r {} + && rm -r bin pytriton/tritonserver/caches \
 	  nvidia_pytriton.libs/libpython3* $$(find pytriton/tritonserver/python_backend_stubs -mindepth 1 -type d ! -name 3.12)
 	$(if $(BEFORE),mkdir build/gpu/before && git archive $(BEFORE) rfm client/rfm_client export/rfm_export commands | \

@@ -31,7 +31,7 @@ import report
 import torch
 from contestants import DEMO, DEMO_ENCODERS, Contestant, serving
 from load import Load
-from random_checkpoints import BASE_MODEL, QWEN, ROBOMETER
+from random_checkpoints import AS_RYNNVALUE, BASE_MODEL, QWEN, ROBOMETER, RYNNVALUE
 from real_size import FRAMES, FULL, SMALLEST, Scale, described
 from report import Row
 
@@ -42,6 +42,9 @@ LIMIT_S = 510  # the rest of nine minutes is for servers that end
 TESTS_S = 150
 SOURCES = ("", "client", "apps/gateway", "apps/labels", "export", "commands")  # folders of a checkout with packages
 NOW, BEFORE = "now", "before"  # names of runs
+# Packages that may be there, compiled for a newer numpy than that of Triton's Python backend. transformers uses them
+# where they exist, and nothing here needs them.
+HIDDEN = ("scipy", "sklearn", "pandas")
 KEY = ("what", "way", "graphs", "frames", "size", "callers", "repeated")
 FIGURES = ("samples_per_s", "failed", "p50_ms", "p99_ms", "tokens", "peak_gib")
 
@@ -73,7 +76,8 @@ class Run:
             venv.create(place, symlinks=True)
             (packages,) = place.glob("lib/python3*/site-packages")
             folders = [*(str(self.checkout / source) for source in SOURCES), *filter(os.path.isdir, sys.path[1:])]
-            (packages / "benchmark.pth").write_text("\n".join(folders) + "\n")
+            hide = f"import sys; sys.modules.update(dict.fromkeys({HIDDEN}))"
+            (packages / "benchmark.pth").write_text("\n".join([hide, *folders]) + "\n")
         return str(place / "bin" / "python3")
 
     @property
@@ -93,9 +97,12 @@ def tests(run: Run) -> Iterator[Row]:
     """Run the tests that need a GPU; with --tiny only collect them."""
     folder = report.ROOT / "tests"
     files = sorted(str(file) for file in folder.rglob("test_*.py") if "@pytest.mark.gpu" in file.read_text())
-    words = [sys.executable, "-m", "pytest", "-m", "gpu", "-n", "0", "-W", "default", *files]
+    words = [run.python, "-m", "pytest", "-m", "gpu", "-n", "0", "-W", "default", *files]
     words += ["--collect-only"] if run.scale.device == "cpu" else []
-    done = subprocess.run(words, cwd=report.ROOT, capture_output=True, text=True, timeout=TESTS_S, check=False)
+    alone = {**os.environ, "PYTHONPATH": ""}
+    done = subprocess.run(
+        words, cwd=report.ROOT, env=alone, capture_output=True, text=True, timeout=TESTS_S, check=False
+    )
     print(done.stdout[-6000:], done.stderr[-2000:], flush=True)
     yield {"what": "pytest -m gpu", "result": done.stdout.strip().splitlines()[-1], "status": done.returncode}
     if done.returncode:
@@ -104,7 +111,7 @@ def tests(run: Run) -> Iterator[Row]:
 
 def engine(run: Run) -> Iterator[Row]:
     """Measure the bare engine in a separate process."""
-    for kind in (ROBOMETER, QWEN):
+    for kind in (ROBOMETER, QWEN, RYNNVALUE):
         run.checkpoint(kind)
     words = [run.python, str(Path(__file__).with_name("real_size.py")), str(run.folder)]
     words += ["--tiny"] if run.scale is SMALLEST else []
@@ -155,6 +162,13 @@ def roboreward(run: Run) -> Iterator[Row]:
     yield from served(run, "roboreward", run.checkpoint(QWEN), {"reward_model": "roboreward"}, asked)
 
 
+def rynnvalue(run: Run) -> Iterator[Row]:
+    """Serve RynnValue, where the checkout has it."""
+    if (run.checkout / "rfm" / "rynnvalue").exists():
+        asked = [(n, FRAMES, run.scale.small_px, False) for n in run.scale.callers]
+        yield from served(run, "rynnvalue", run.checkpoint(RYNNVALUE), {"reward_model": AS_RYNNVALUE}, asked)
+
+
 def served(
     run: Run,
     what: str,
@@ -192,7 +206,7 @@ def _grpc_of(run: Run, checkpoint: Path, place: Path, settings: Mapping[str, Any
 
 
 PARTS: dict[str, Callable[[Run], Iterator[Row]]] = {
-    part.__name__: part for part in (tests, engine, robometer, graphs, encoders, topreward, roboreward)
+    part.__name__: part for part in (tests, engine, robometer, graphs, encoders, topreward, roboreward, rynnvalue)
 }
 
 
@@ -366,6 +380,7 @@ def main() -> None:
     parser.add_argument("--limit-s", type=int, default=LIMIT_S, help=f"stop after these seconds (default: {LIMIT_S})")
     parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
     arguments = parser.parse_args()
+    sys.modules.update(dict.fromkeys(HIDDEN))  # type: ignore[arg-type]  # None: an import says that there is none
     scale, checkout = SMALLEST if arguments.tiny else FULL, arguments.checkout
     if scale.device == "cuda" and not torch.cuda.is_available():
         parser.error(f"expected a GPU, got none by PyTorch {torch.__version__}; --tiny runs on the CPU")

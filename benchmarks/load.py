@@ -198,7 +198,8 @@ async def connected(way: str, url: str) -> AsyncIterator[Ask]:
 
 def _score(result: Result) -> float:
     if isinstance(result, ProgressResult):
-        return result.last_progress
+        seconds = getattr(result, "remaining_s", None)  # of RynnValue; older commits lack it
+        return result.last_progress if seconds is None else float(seconds[-1])
     return result.preference if isinstance(result, PreferenceResult) else result.similarity
 
 

@@ -19,10 +19,12 @@ from typing import Any
 import torch
 
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
-ROBOMETER, QWEN = "robometer", "qwen"  # kinds of a checkpoint
+ROBOMETER, QWEN, RYNNVALUE = "robometer", "qwen", "rynnvalue"  # kinds of a checkpoint
+AS_RYNNVALUE = "rynnvalue,robot=a Franka single-arm robot,camera=the main right camera"
 SOURCES = {  # small checkpoints with all other files
     ROBOMETER: GOLDEN / "vlm" / "q3_tok_disc10_bf16" / "checkpoint",
     QWEN: GOLDEN / "reward_models" / "roboreward" / "rr_tied_bf16" / "checkpoint",
+    RYNNVALUE: GOLDEN / "reward_models" / "rynnvalue" / "bro_symlog_bf16_tied" / "checkpoint",
 }
 BASE_MODEL = GOLDEN / "vlm" / "bases" / "q3"  # Robometer's tokenizer
 PREFIX, EMBEDDING, HEAD = "model.", "model.language_model.embed_tokens.weight", "lm_head.weight"
@@ -35,11 +37,16 @@ SCORE_HEADS = {"progress": 10, "success": 1, "preference": 1}  # outputs
 
 @dataclass(frozen=True)
 class Size:
-    """Settings that replace those of the small checkpoints. vocabulary: of the ordinary Qwen3-VL; 0: the small one"""
+    """Settings that replace those of the small checkpoints.
+
+    vocabulary: of the ordinary Qwen3-VL; 0: the small one
+    published_heads: True: RynnValue's heads and bins have the published size
+    """
 
     text: Mapping[str, Any] = field(default_factory=dict)
     vision: Mapping[str, Any] = field(default_factory=dict)
     vocabulary: int = 0
+    published_heads: bool = False
 
 
 TINY = Size(
@@ -57,6 +64,7 @@ QWEN3_VL_4B = Size(
         "out_hidden_size": 2560, "deepstack_visual_indexes": [5, 11, 17], "num_position_embeddings": 2304,
     },
     151_936,
+    published_heads=True,
 )  # fmt: skip
 
 
@@ -75,6 +83,10 @@ def write(folder: Path, kind: str, size: Size, device: str = "cpu") -> Path:
     if kind == QWEN:
         config["text_config"]["vocab_size"] = size.vocabulary or config["text_config"]["vocab_size"]
         config["text_config"]["tie_word_embeddings"] = config["tie_word_embeddings"] = False
+    if kind == RYNNVALUE and size.published_heads:
+        from rfm.rynnvalue.settings import PUBLISHED  # older commits lack it
+
+        config |= {name: value for name, value in PUBLISHED.items() if name.endswith("_config")}
     (of_kind / "config.json").write_text(json.dumps(config, indent=2))
     generator = torch.Generator(device).manual_seed(0)
     shapes = _backbone_shapes(config)
@@ -85,7 +97,10 @@ def write(folder: Path, kind: str, size: Size, device: str = "cpu") -> Path:
         del common
     os.link(shared, of_kind / SHARDS[0])
     own = {EMBEDDING: _random(EMBEDDING, shapes[EMBEDDING], generator)}
-    own |= _score_heads(shapes[EMBEDDING][1]) if kind == ROBOMETER else _answering_head(of_kind, own)
+    if kind == RYNNVALUE:
+        own |= _value_heads(config)
+    else:
+        own |= _score_heads(shapes[EMBEDDING][1]) if kind == ROBOMETER else _answering_head(of_kind, own)
     save_file(own, of_kind / SHARDS[1], metadata={"format": "pt"})
     places = dict.fromkeys(shapes, SHARDS[0]) | dict.fromkeys(own, SHARDS[1])
     index = {"metadata": {}, "weight_map": places}
@@ -97,7 +112,8 @@ def _backbone_shapes(config: Mapping[str, Any]) -> dict[str, Sequence[int]]:
     from transformers import Qwen3VLConfig, Qwen3VLModel
 
     with torch.device("meta"):
-        network = Qwen3VLModel._from_config(Qwen3VLConfig(**config))
+        told = {name: value for name, value in config.items() if name != "attn_implementation"}  # RynnValue's own
+        network = Qwen3VLModel._from_config(Qwen3VLConfig(**told))
     return {PREFIX + name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
 
 
@@ -121,6 +137,22 @@ def _score_heads(width: int) -> dict[str, torch.Tensor]:
             made[f"{name}.weight"] = torch.randn(shape) / math.sqrt(shape[1])
             made[f"{name}.bias"] = torch.zeros(shape[0])
     return {name: tensor.bfloat16() for name, tensor in made.items()}
+
+
+def _value_heads(config: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    from rfm.rynnvalue.network import HeadConfig, ValueHead
+
+    made: dict[str, torch.Tensor] = {}
+    names = {"value": [f"value_heads.{number}" for number in range(config["num_value_heads"])]}
+    names["relative_value"] = ["relative_value_head"]
+    for kind, heads in names.items():
+        told, bins = config[f"{kind}_head_config"], config[f"{kind}_tokenizer_config"]
+        settings = HeadConfig(told["head_type"], told["hidden_dims"], told["depth"], told["activation"])
+        num_inputs = config[f"{kind}_token_repeat"] * config["text_config"]["hidden_size"]
+        for name in heads:
+            head = ValueHead(settings, num_inputs, bins["bins"])
+            made |= {f"{name}.{key}": tensor.bfloat16() for key, tensor in head.state_dict().items()}
+    return made
 
 
 def _answering_head(folder: Path, own: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

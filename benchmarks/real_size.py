@@ -15,12 +15,13 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
 from load import Calls, Load, Measured, samples
-from random_checkpoints import BASE_MODEL, QWEN, QWEN3_VL_4B, ROBOMETER, TINY, Size
+from random_checkpoints import AS_RYNNVALUE, BASE_MODEL, QWEN, QWEN3_VL_4B, ROBOMETER, RYNNVALUE, TINY, Size
 
 from rfm import families
 from rfm.engine import Engine
@@ -89,12 +90,14 @@ def measured(engine: Engine, scale: Scale, count: int, frames: int, px: tuple[in
 def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
     """Measure all networks in turn. Graphs are measured where the engine knows them."""
     small, usual, (one, some, many) = scale.small_px, scale.usual_px, scale.callers
-    plans: Sequence[tuple[str, str, Sequence[tuple[int, int, tuple[int, int]]]]] = (
+    plans: list[tuple[str, str, Sequence[tuple[int, int, tuple[int, int]]]]] = [
         ("Robometer", ROBOMETER, [(n, FRAMES, px) for px in (small, usual) for n in (one, some, many)]),
         ("topreward", QWEN, [(one, scale.many_frames // 4, small), (one, scale.many_frames, small)]),
         ("roboreward", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
         ("roboreward-expected", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
-    )
+    ]
+    if find_spec("rfm.rynnvalue"):
+        plans += [(AS_RYNNVALUE, RYNNVALUE, [(n, FRAMES, small) for n in (one, some, many)])]
     knows_graphs = "cuda_graphs" in inspect.signature(Engine.of).parameters
     for what, kind, sizes in plans:
         for graphs in (False, True) if knows_graphs and kind == ROBOMETER else (False,):
@@ -103,7 +106,12 @@ def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
             checkpoint = families.load(folder / kind, **sources)
             engine = Engine.of(checkpoint, device=scale.device, max_sample_tokens=MAX_TOKENS, **options)
             for size in sizes[:2] if graphs else sizes:
-                yield {"what": what, "way": "engine", "graphs": graphs, **measured(engine, scale, *size)}
+                yield {
+                    "what": what.partition(",")[0],
+                    "way": "engine",
+                    "graphs": graphs,
+                    **measured(engine, scale, *size),
+                }
             del engine
             if scale.device != "cpu":
                 torch.cuda.empty_cache()

@@ -242,3 +242,16 @@ def test_the_work_grows_with_the_number_of_questions() -> None:
     checkpoint = families.load(CHECKPOINT, reward_model="robodopamine,mode=mean")
     short, long = (checkpoint.flop(ProgressSample(Trajectory(frames=FRONT[[0] * count], task="t"))) for count in (2, 3))
     assert 1.9 < long / short < 2.1  # twice as many questions
+
+
+@pytest.mark.gpu
+def test_a_gpu_writes_the_original_s_answers() -> None:
+    cases = [each for each in READABLE if each.config == CHECKPOINT.parent]
+    for case in cases:
+        loaded = families.load(CHECKPOINT, reward_model=case.said)
+        on_cpu, on_gpu = (Engine.of(loaded, device=each, dtype=torch.float32) for each in ("cpu", "cuda"))
+        (expected,), (result,) = (each.evaluate([case.sample]) for each in (on_cpu, on_gpu))
+        assert isinstance(expected, ProgressResult)
+        assert isinstance(result, ProgressResult)
+        np.testing.assert_array_equal(result.progress, expected.progress)
+    assert cases

@@ -347,3 +347,15 @@ def test_explain_states_attention_bins_and_sources() -> None:
     }  # fmt: skip
     assert told["use_meta"].value is False
     assert told["rows_of_the_embedding"].value == 667
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", [ISOLATED_CONFIG, CAUSAL_CONFIG])
+def test_a_gpu_gives_the_cpu_s_seconds(name: str) -> None:
+    samples = [progress(noise(n, h, w, n)) for n, h, w in ((1, 24, 40), (5, 48, 80), (3, 33, 120))]
+    samples += [progress(noise(9, seed=9), frame_steps=4)]
+    loaded = families.load(FOLDER / name / "checkpoint", reward_model=said(USUAL))
+    on_cpu, on_gpu = (Engine.of(loaded, device=device, dtype=torch.float32) for device in ("cpu", "cuda"))
+    for expected, result in zip(scored(on_cpu, *samples), scored(on_gpu, *samples), strict=True):
+        check_seconds(result.remaining_s, expected.remaining_s)
+        check_seconds(result.relative_s, expected.relative_s)
