@@ -22,6 +22,7 @@ from typing import Any
 import torch
 from load import Calls, Load, Measured, samples
 from random_checkpoints import AS_RYNNVALUE, BASE_MODEL, QWEN, QWEN3_VL_4B, ROBOMETER, RYNNVALUE, TINY, Size
+from torch.profiler import ProfilerActivity, profile
 
 from rfm import families
 from rfm.engine import Engine
@@ -30,6 +31,7 @@ FRAMES = 8
 WARM_UP_CALLS = 3  # a CUDA graph is captured at the third
 LEAST_ROUNDS = 3
 MAX_TOKENS = 10**6
+SHOWN_KERNELS = 12
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,23 @@ def measured(engine: Engine, scale: Scale, count: int, frames: int, px: tuple[in
     told = Measured.of([Calls(latencies_s, 0, sum(latencies_s))], count)
     row = described(px, frames, count, tokens=engine.prepare(sample(0)).num_tokens)
     figures = {"samples_per_s": told.samples_per_s, "failed": 0, "p50_ms": told.p50_ms, "p99_ms": told.p99_ms}
-    return {**row, **figures, "peak_gib": torch.cuda.max_memory_allocated() / 2**30 if on_gpu else None}
+    if on_gpu:
+        figures |= {"peak_gib": torch.cuda.max_memory_allocated() / 2**30, "device_ms": device_ms(engine, batch)}
+    return {**row, **figures}
+
+
+def device_ms(engine: Engine, batch: Sequence[Any]) -> float:
+    """Return the milliseconds in which kernels of a batch run: far fewer than its latency means that the host is slow.
+
+    Prints the kernels that take most time to standard error.
+    """
+    with profile(activities=[ProfilerActivity.CUDA]) as told:
+        engine.evaluate(batch)
+        torch.cuda.synchronize()
+    kernels = sorted(told.key_averages(), key=lambda each: each.self_device_time_total, reverse=True)
+    for each in kernels[:SHOWN_KERNELS]:
+        print(f"{each.self_device_time_total / 1e3:9.3f} ms {each.count:5} {each.key[:100]}", file=sys.stderr)
+    return float(sum(each.self_device_time_total for each in kernels) / 1e3)
 
 
 def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
