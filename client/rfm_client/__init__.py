@@ -13,6 +13,7 @@ from rfm_client.client import RewardClient
 from rfm_client.contract import (
     FRAME_SCORES,
     AccessDeniedError,
+    Analysis,
     ClientClosedError,
     DeadlineExceededError,
     FrameScores,
@@ -42,6 +43,7 @@ from rfm_client.frames.inputs import as_trajectory, load_trajectory
 __all__ = [
     "FRAME_SCORES",
     "AccessDeniedError",
+    "Analysis",
     "AsyncRewardClient",
     "ClientClosedError",
     "DeadlineExceededError",

@@ -15,7 +15,7 @@ from urllib.parse import urljoin
 
 from rfm_client.contract import errors
 from rfm_client.contract.names import frames_name
-from rfm_client.contract.wire import DESCRIPTIONS, GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS
+from rfm_client.contract.wire import DESCRIPTIONS, GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS, WRITE_ANALYSIS
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 
@@ -57,7 +57,7 @@ _WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not m
 )
 _NO_INPUT = re.compile(
     r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*input )"
-    rf"'(?P<name>{'|'.join((SECOND_FRAMES, DESCRIPTIONS, *VIEWS, GOAL))})'"
+    rf"'(?P<name>{'|'.join((SECOND_FRAMES, DESCRIPTIONS, WRITE_ANALYSIS, *VIEWS, GOAL))})'"
 )
 _OF_VIEWS = (
     "a model that reads views and a goal, such as Robo-Dopamine",
@@ -72,6 +72,11 @@ _WITHOUT = {
         "a model whose prompt names robot and camera, such as RynnValue",
         f"another, or {_OLD}",
         "leave out robot_description and camera_description, or export a RynnValue again",
+    ),
+    WRITE_ANALYSIS: (
+        "a model that writes analyses, such as RynnValue",
+        f"another, or {_OLD}",
+        "leave out analysis (--analysis), or export a RynnValue again",
     ),
     **dict.fromkeys((*VIEWS, GOAL), _OF_VIEWS),
 }
