@@ -27,15 +27,17 @@ class RynnBatch(VlmBatch):
 
     values, relatives: int64 [G] and [Q], index of the first token of each group among all tokens of the batch: the
         B * L of the conversations, then those of the packs
-    ends: int64 [A], index of the last token of each conversation that is analysed
+    last_tokens: int64 [A], index of the last token of each conversation that is analysed
     """
 
     values: Tensor = field(kw_only=True)
     relatives: Tensor = field(kw_only=True)
-    ends: Tensor = field(kw_only=True)
+    last_tokens: Tensor = field(kw_only=True)
 
     @classmethod
-    def of(cls, batch: VlmBatch, rows: Sequence[RynnRow], relative_token: int, relative_copies: int) -> RynnBatch:
+    def of(
+        cls, batch: VlmBatch, conversations: Sequence[RynnRow], relative_token: int, relative_copies: int
+    ) -> RynnBatch:
         """Return the batch whose spans hold, for each frame, its relative values (if any) and its values (if any)."""
         packs = [each.input_ids.flatten() for each in batch.packs]
         ids = torch.cat([batch.inputs["input_ids"].flatten(), *packs]).numpy()
@@ -47,9 +49,10 @@ class RynnBatch(VlmBatch):
         behind = firsts + has_relative * relative_copies
         found = behind[behind < ends], firsts[has_relative]
         values, relatives = (torch.from_numpy(np.ascontiguousarray(each)) for each in found)
-        ends = [index * length + row.num_tokens - 1 for index, row in enumerate(rows) if row.is_analysed]
-        return cls(**vars(batch), values=values, relatives=relatives, ends=torch.tensor(ends, dtype=torch.int64))
+        last = [index * length + row.num_tokens - 1 for index, row in enumerate(conversations) if row.is_analysed]
+        last_tokens = torch.tensor(last, dtype=torch.int64)
+        return cls(**vars(batch), values=values, relatives=relatives, last_tokens=last_tokens)
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> RynnBatch:
-        own = {name: change(getattr(self, name)) for name in ("values", "relatives", "ends")}
+        own = {name: change(getattr(self, name)) for name in ("values", "relatives", "last_tokens")}
         return RynnBatch(**{**vars(super()._changed(change)), **own})

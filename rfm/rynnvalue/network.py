@@ -213,7 +213,7 @@ class RynnNetwork(nn.Module):
         values = _of_groups(states, batch.values, self.config.value_copies)
         relatives = _of_groups(states, batch.relatives, self.config.relative_copies)
         logits = torch.stack([head(values) for head in self.value_heads])
-        next_tokens = None if key_values is None else self.lm_head(states[batch.ends])
+        next_tokens = None if key_values is None else self.lm_head(states[batch.last_tokens])
         return RynnOutput(logits, self.relative_value_head(relatives), next_tokens, made)
 
 

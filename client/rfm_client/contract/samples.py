@@ -140,8 +140,8 @@ class ProgressSample:
 
     frame_steps: 0 scores the trajectory as a whole. N >= 2 is dense mode: frame t is scored on its prefix 0..t alone,
         sampled to N frames, as an RL loop sees it at that step
-    analysis: True: the model also writes an ``Analysis`` of the whole trajectory, at the cost of a pass for each of up to
-        128 tokens. Only RynnValue does, and not in dense mode
+    analysis: True: the model also writes an ``Analysis`` of the whole trajectory, which costs a pass for each of its
+        tokens, up to 128. Only RynnValue does, and not in dense mode
     """
 
     trajectory: Trajectory
