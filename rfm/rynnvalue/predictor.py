@@ -51,19 +51,20 @@ class RynnPredictor(TextPredictor):
         counts = np.array([self.collator.num_groups(row) for row in rows])
         of_values, of_relatives = np.cumsum(counts, axis=0)[:-1].T
         parts = np.split(remaining_s, of_values), np.split(entropies, of_values), np.split(relative_s, of_relatives)
-        scores: list[RowScores | RewardError] = [
+        scores = [
             RowScores([_scores(*part)], is_of_prefixes=row.picked is not None)
             for row, *part in zip(rows, *parts, strict=True)
         ]
         if key_values is None:
-            return scores
+            return list(scores)
         analysed = [index for index, row in enumerate(rows) if row.is_analysed]
         key_values.keep(analysed)
         answers = self.written([rows[index] for index in analysed], output.next_tokens[:, None], key_values, execution)
+        found: dict[int, RowScores | RewardError] = dict(enumerate(scores))
         for index, answer in zip(analysed, answers, strict=True):
             analysis = Analysis(self.text(answer))
-            scores[index] = replace(scores[index], analysis=analysis) if answer.is_finite else not_finite()
-        return scores
+            found[index] = replace(scores[index], analysis=analysis) if answer.is_finite else not_finite()
+        return [*found.values()]
 
     def _read(self, output: RynnOutput) -> tuple[Float32Array, Float32Array, Float32Array, bool]:
         """Return remaining seconds, entropies, relative seconds, and True if the pass's features are finite.

@@ -62,14 +62,14 @@ def tree_hidden_states(
     inputs: dict[str, Tensor],
     packs: Sequence[Packs],
     features: Tensor,
-    kept: KeyValues | None = None,
+    key_values_of_trunks: KeyValues | None = None,
 ) -> Tensor:
     """Return the hidden states behind the final norm, of the trunks and then of each call, [1, all tokens, D].
 
     language, inputs, features: as in ``rfm.vlm.qwen.last_hidden_state``, of the trunks
-    kept: receives the keys and values of the trunks; None: they are not needed
+    key_values_of_trunks: receives the keys and values of the trunks; None: they are not needed
     """
-    key_values = TrunkKeyValues(kept)
+    key_values = TrunkKeyValues(key_values_of_trunks)
     options = _cached(language, key_values)  # type: ignore[arg-type]  # transformers asks for ``update`` alone
     trunks, *calls = (_Part(language, each, features) for each in (inputs, *(each.inputs for each in packs)))
     # The mask of a single call is kept; those of several are made anew for each layer, so that memory holds one.
