@@ -184,8 +184,9 @@ def test_analyses_have_the_tokens_of_the_original_code(case: Case, monkeypatch: 
         assert isinstance(result, ProgressResult), result
         check_seconds(result.remaining_s, case.expected(asked.prefix, "value.pred_value"))
         told = case.generated(asked.prefix)
-        if told["margin"] < (1 if case.summary["dtype"] == "bfloat16" else 2 * LOGIT_TOLERANCE):
-            continue  # another kernel may write another token
+        least = 1 if case.summary["dtype"] == "bfloat16" else 2 * LOGIT_TOLERANCE
+        if told is None or told["margin"] < least:
+            continue  # not stored, or another kernel may write another token
         ended = [*predictor.collator.config.stops] * told["stopped_at_eos"]
         assert [*written[-1], *ended] == told["new_ids"]
         assert result.analysis == Analysis(told["text"])

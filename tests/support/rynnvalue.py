@@ -58,10 +58,11 @@ class Case(Reference):
         array = self.arrays[f"{prefix}{rounded}{self.attention}.{name}"]
         return array.mean(0) if name.startswith("value") else array.reshape(-1)
 
-    def generated(self, prefix: str) -> dict[str, Any]:
-        """The original's analysis of a sample."""
+    def generated(self, prefix: str) -> dict[str, Any] | None:
+        """The original's analysis of a sample; None: it is not stored."""
         sample = self.content["samples"][int(prefix.removeprefix("sample_").removesuffix("."))]
-        return dict(sample["generation"][self.attention])
+        found: dict[str, Any] | None = sample["generation"].get(self.attention)
+        return found
 
     def asked(self) -> list[Asked]:
         inputs = self.file.parent / self.content["inputs"]
