@@ -15,7 +15,7 @@ from urllib.parse import urljoin
 
 from rfm_client.contract import errors
 from rfm_client.contract.names import frames_name
-from rfm_client.contract.wire import DESCRIPTIONS, GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS
+from rfm_client.contract.wire import ANALYSIS, DESCRIPTIONS, GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 
