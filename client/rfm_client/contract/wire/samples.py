@@ -204,6 +204,8 @@ def _decode_sample(row: Row, known: Known) -> Sample:
     if sample_type not in list(SampleType):
         types = ", ".join(f"{t.value} ({t.name.lower()})" for t in SampleType)
         raise InvalidSampleError.at(SAMPLE_TYPE, f"one of {types}", str(sample_type))
+    if analysis > (sample_type == SampleType.PROGRESS):
+        raise InvalidSampleError.at(WRITE_ANALYSIS, "0, or 1 with a sample of type progress", str(analysis))
     if sample_type == SampleType.PROGRESS:
         if lengths[0] < 1 or lengths[1] != 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
@@ -212,8 +214,6 @@ def _decode_sample(row: Row, known: Known) -> Sample:
         trajectory = _trajectory(row, positions, known)
         if views or GOAL in row:
             trajectory = replace(trajectory, views=views, goal=row.get(GOAL))
-        if analysis not in (0, 1):
-            raise InvalidSampleError.at(WRITE_ANALYSIS, "0 or 1", str(analysis))
         return ProgressSample(trajectory, frame_steps, bool(analysis))
     if given := [name for name in (*VIEWS, GOAL) if name in row]:
         raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {given[0]}", SampleType(sample_type).name.lower())
@@ -223,8 +223,6 @@ def _decode_sample(row: Row, known: Known) -> Sample:
         raise InvalidSampleError.at(NUM_FRAMES, "at least one frame of each of the two trajectories", str(lengths))
     if frame_steps != 0:
         raise InvalidSampleError.at(FRAME_STEPS, "0 unless the sample is of type progress", str(frame_steps))
-    if analysis != 0:
-        raise InvalidSampleError.at(WRITE_ANALYSIS, "0 unless the sample is of type progress", str(analysis))
     first, second = (_trajectory(row, array, known) for array in _positions(row, lengths))
     return (PreferenceSample if sample_type == SampleType.PREFERENCE else SimilaritySample)(first, second)
 
