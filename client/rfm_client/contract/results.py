@@ -23,6 +23,7 @@ SUCCESS_THRESHOLD = 0.5
 PAIR_SCORES = ("preference", "similarity")  # of two trajectories
 EVEN = 0.5  # preference for neither trajectory
 ProgressRule: TypeAlias = Literal["remaining_over_first"]
+_DESCRIPTION = re.compile(r"-\s*Video Description:[^\S\n]*(\S.*)", re.IGNORECASE)  # on one line
 
 
 @dataclass(frozen=True)
@@ -278,9 +279,6 @@ class Analysis:
     def _said(self, name: str) -> bool | None:
         found = re.search(rf"-\s*{name}:\s*(Yes|No)(?![\w/])", self.text, re.IGNORECASE)
         return found[1].lower() == "yes" if found else None
-
-
-_DESCRIPTION = re.compile(r"-\s*Video Description:[^\S\n]*(\S.*)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -95,7 +95,7 @@ def _decode_result(
     num_first, *num_second = (trajectory.num_frames for trajectory in sample.trajectories)
     if isinstance(sample, ProgressSample):
         result = decode_progress(tensors, row, num_first, model_version)
-        return replace(result, analysis=_analysis(tensors[ANALYSIS], row)) if sample.analysis else result
+        return replace(result, analysis=_analysis(tensors, row)) if sample.analysis else result
     first = _scores_between(tensors, row, slice(0, num_first))
     second = _scores_between(tensors, row, slice(num_first, num_first + sum(num_second)))
     of_request: dict[str, Any] = {"timing": _timing(tensors, row), "model_version": model_version}
@@ -106,11 +106,13 @@ def _decode_result(
     return SimilarityResult(similarity=similarity, reference=first, other=second, **of_request)
 
 
-def _analysis(written: npt.NDArray[Any], row: int) -> Analysis:
+def _analysis(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Analysis:
     try:
-        return Analysis(written[row][0].decode())
-    except (AttributeError, IndexError, UnicodeDecodeError):
-        raise InferenceFailedError(f"{ANALYSIS}: expected a text of UTF-8 for sample {row}, got another") from None
+        return Analysis(tensors[ANALYSIS][row][0].decode())
+    except (AttributeError, LookupError, UnicodeDecodeError):
+        raise InferenceFailedError(
+            f"{ANALYSIS}: expected UTF-8 text for sample {row}, got something else or nothing"
+        ) from None
 
 
 def _timing(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> BatchTiming | None:
