@@ -13,7 +13,6 @@ from rfm_client.client import RewardClient
 from rfm_client.contract import (
     FRAME_SCORES,
     AccessDeniedError,
-    Analysis,
     ClientClosedError,
     DeadlineExceededError,
     FrameScores,
@@ -43,7 +42,6 @@ from rfm_client.frames.inputs import as_trajectory, load_trajectory
 __all__ = [
     "FRAME_SCORES",
     "AccessDeniedError",
-    "Analysis",
     "AsyncRewardClient",
     "ClientClosedError",
     "DeadlineExceededError",

@@ -140,7 +140,9 @@ class RynnCollator(VlmCollator):
         ids = np.concatenate([*parts, behind]).astype(np.int64)
         return Conversation(ids, self._position_ids(ids, (video,)), groups)
 
-    def collate(self, rows: Sequence[RynnRow], length: int | None = None) -> RynnBatch:  # type: ignore[override]
+    def collate(  # type: ignore[override]  # rows of its own
+        self, rows: Sequence[RynnRow], length: int | None = None
+    ) -> RynnBatch:
         """Return the batch of conversations. length: as in ``VlmCollator.collate``"""
         relative = self.config.relative_token, self.config.relative_copies
         return RynnBatch.of(super().collate(rows, length), rows, *relative)

@@ -21,7 +21,6 @@ from rfm.engine import Engine, Execution
 from rfm.families import CheckpointError
 from rfm.rynnvalue.network import Bins, RynnConfig, entropy
 from rfm_client import (
-    Analysis,
     InvalidSampleError,
     PreferenceSample,
     ProgressResult,
@@ -29,6 +28,7 @@ from rfm_client import (
     Trajectory,
     UInt8Array,
 )
+from rfm_client.contract import Analysis
 from rynnvalue import (
     CASES,
     FOLDER,
