@@ -27,7 +27,14 @@ if TYPE_CHECKING:
 
 NETWORK = "network"  # key in Checkpoint.parts: the weights of the network that scores
 # Fields of networks' configurations that are newer than some exports, with the value of those exports.
-_USUAL = {"has_preference": True, "has_success": True, "video_prompt": "bare", "strict_answers": False, "weights": None}
+_USUAL = {
+    "has_preference": True,
+    "has_success": True,
+    "video_prompt": "bare",
+    "strict_answers": False,
+    "weights": None,
+    "stops": (),
+}
 # Options, with the checkpoints that support them.
 _FOLLOWED_BY = {
     "video_prompt": "a checkpoint that shows videos to a Qwen3-VL",

@@ -19,18 +19,19 @@ from rfm.engine.pixels import Normalisation
 from rfm.family import Options
 from rfm.rynnvalue.network import Bins, HeadConfig, RynnConfig, RynnNetwork
 from rfm.rynnvalue.predictor import RynnPredictor
-from rfm.rynnvalue.prompts import RELATIVE_TOKEN, VALUE_TOKEN, RynnCollator
+from rfm.rynnvalue.prompts import END_OF_TURN, RELATIVE_TOKEN, VALUE_TOKEN, RynnCollator
 from rfm.rynnvalue.settings import PUBLISHED, Settings
 from rfm.vlm.backbone import QWEN_NAMES, UNUSED, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
 from rfm.vlm.images import BoundedImages
-from rfm.vlm.language import EMBEDDING, REWARD_MODEL, LanguageCheckpoint, processor_name
-from rfm.vlm.language_folder import dtype_of, reward_model_of
+from rfm.vlm.language import EMBEDDING, HEAD, REWARD_MODEL, LanguageCheckpoint, processor_name
+from rfm.vlm.language_folder import dtype_of, reward_model_of, tie
 from rfm.vlm.network import build_backbone
 from rfm.vlm.preprocessor import pixel_limits
 from rfm.vlm.processor import PROCESSOR_FOLDER, read_processor
 from rfm.vlm.qwen_checkpoint import SETTINGS, QwenCheckpoint
 from rfm.vlm.rounding import FLAG, decision, read_published, read_unrounded_config, round_layers
+from rfm.vlm.written import GENERATION_CONFIG, stops_of
 from rfm_client.contract.description import Description
 
 NAME = "rynnvalue"  # of ``--as``
@@ -65,6 +66,7 @@ class RynnCheckpoint(LanguageCheckpoint):
             more_scores=("remaining_s", "relative_s", "entropy"),
             asks_in_words=True,
             reads_descriptions=self.config.use_meta,
+            writes_analyses=bool(self.config.stops),
             keeps_features=True,
             uses_graphs=self.config.attention == "causal",  # else the groups need a mask
             is_large=True,
@@ -100,12 +102,12 @@ class RynnCheckpoint(LanguageCheckpoint):
         return RynnPredictor(network, self.collator, device, cache)
 
     def loaded(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the weights: no language head is tied to the embedding."""
-        return {**weights}
+        """Return the weights, with the embedding as the language head if the network has one that is tied to it."""
+        return super().loaded(weights) if self.config.stops else {**weights}
 
     def build(self, dtype: torch.dtype | None = None) -> Any:
         """Return the network with these weights, as ``QwenCheckpoint.build``. Raises CheckpointError."""
-        return QwenCheckpoint.build(self, dtype)
+        return super().build(dtype) if self.config.stops else QwenCheckpoint.build(self, dtype)
 
 
 def reads(folder: Path) -> bool:
@@ -133,12 +135,17 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnC
     told = {name: value for name, value in content.items() if name not in PUBLISHED and "value_token_id" not in name}
     backbone = backbone_config({**told, "model_type": QWEN3}, file)
     tensors, _ = read_published(folder, read_unrounded_config(backbone, file), MODEL_TYPE)
-    weights = {name: each for name, each in renamed(tensors, QWEN_NAMES).items() if not UNUSED.fullmatch(name)}
+    named = renamed(tensors, QWEN_NAMES)
+    weights = {name: each for name, each in named.items() if name == HEAD or not UNUSED.fullmatch(name)}
+    tie(weights, backbone, file)
     rows = _rows(backbone, weights, file)
     processor = options.base_model or folder
     tokenizer, preprocessor = read_processor(processor)
     fields["value_token"] = read.token("value_token_id", VALUE_TOKEN, tokenizer)
     fields["relative_token"] = read.token("relative_value_token_id", RELATIVE_TOKEN, tokenizer)
+    if is_there(folder / GENERATION_CONFIG):
+        stops_of(folder)  # raises for settings that change an analysis; the original ends at END_OF_TURN alone
+    fields["stops"] = (tokenizer.convert_tokens_to_ids(END_OF_TURN),)
     meta = _meta(options, use_meta=fields["use_meta"])
     base = Decision("base_model", source_name(processor), "--base-model" if options.base_model else "the checkpoint")
     dtype = dtype_of(backbone, file)
@@ -150,7 +157,8 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnC
         **{**fields, **limits, **{each.name: each.value for each in meta}},
     )
     size = [Decision(name, value, f"{processor_name(processor)}: size") for name, value in limits.items()]
-    decisions = (Decision("backbone", QWEN3, NETWORK_CONFIG), base, dtype, rows, *read.decisions, *meta, *size)
+    stops = Decision("stops", fields["stops"], f"{END_OF_TURN}, as in the original")
+    decisions = (Decision("backbone", QWEN3, NETWORK_CONFIG), base, dtype, rows, *read.decisions, stops, *meta, *size)
     return _rounded(RynnCheckpoint(config, weights, processor, decisions, tuple(read.unexpected)), options)
 
 
@@ -161,6 +169,7 @@ def _exported(folder: Path, content: dict[str, Any], options: Options) -> RynnCh
     for name, made in parts.items():
         told = {key: tuple(each) if isinstance(each, list) else each for key, each in saved[name].items()}
         saved[name] = made(**told)
+    saved["stops"] = tuple(saved.get("stops", ()))
     changed = options.settings(_OF_USER)
     config = RynnConfig(backbone=backbone_config(content, folder / NETWORK_CONFIG), **{**saved, **changed})
     own = folder / PROCESSOR_FOLDER

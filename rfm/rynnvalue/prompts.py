@@ -15,13 +15,13 @@ import numpy as np
 
 from rfm.checkpoint.content import CheckpointError
 from rfm.engine.predictor import check_type
-from rfm.rynnvalue.batch import RynnBatch
+from rfm.rynnvalue.batch import RynnBatch, RynnRow
 from rfm.rynnvalue.network import RynnConfig
 from rfm.vlm.collator import IMAGE_PAD, VISION_END, VISION_START, VlmCollator, video_of
 from rfm.vlm.images import BoundedImages
 from rfm.vlm.leaves import Leaf, fits
 from rfm.vlm.prompts import KEPT_TEXTS
-from rfm.vlm.row import VlmRow
+from rfm.vlm.row import Spans, VlmRow
 from rfm.vlm.tree import trees
 from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import ProgressSample, Sample
@@ -70,12 +70,15 @@ class Conversation:
 class RynnCollator(VlmCollator):
     """The collator of RynnValue: a conversation about all frames, in dense mode one for each prefix.
 
-    A row ends with the last value token: nothing behind it changes a value. With isolated attention, it has no value
-    tokens at all: nobody sees them, so the groups follow the conversation as leaves.
+    A row ends with the last value token, since nothing behind it changes a value, or with the request for an analysis.
+    With isolated attention, it has no value tokens at all: nobody sees them, so the groups follow the conversation as
+    leaves.
     """
 
     config: RynnConfig  # type: ignore[assignment]  # not a VlmConfig, whose heads differ
     images: BoundedImages
+    draft: Indices = np.zeros(0, np.int64)  # of an analysis: none
+    digits = ()
 
     def __init__(self, config: RynnConfig, tokenizer: Any, images: BoundedImages) -> None:
         super().__init__(config, tokenizer, images)  # type: ignore[arg-type]  # not a VlmConfig
@@ -105,10 +108,14 @@ class RynnCollator(VlmCollator):
         conversation = self.conversation(video, trajectory.task, trajectory.descriptions)
         read = conversation.groups[-1:] if sample.frame_steps else conversation.groups
         of_prefixes = video.conversations if sample.frame_steps else [None]
+        end = len(conversation.input_ids) if sample.analysis else read[-1][-1][1]
         if self.config.attention == "causal":
-            return [_causal(conversation, video, read, picked) for picked in of_prefixes]
-        bare, groups = _without_groups(conversation, read, video.conversations[0][:1])
-        rows = [_bare(bare, video, picked) for picked in of_prefixes]
+            spans = [(of_frame[0][0], of_frame[-1][1]) for of_frame in read]
+            whole = Conversation(conversation.input_ids[:end], conversation.position_ids[:, :end], read)
+            return [_row(whole, video, spans, picked, sample) for picked in of_prefixes]
+        bare, groups = _without_groups(conversation, read, end, video.conversations[0][:1])
+        nothing = len(bare.input_ids), len(bare.input_ids)
+        rows = [_row(bare, video, [nothing], picked, sample) for picked in of_prefixes]
         return [_with_groups(row, groups) for row in trees(rows, self.visual_pad, are_images=True)]
 
     def conversation(self, video: VlmVideo, task: str, descriptions: tuple[str, str] = UNDESCRIBED) -> Conversation:
@@ -133,9 +140,12 @@ class RynnCollator(VlmCollator):
         ids = np.concatenate([*parts, behind]).astype(np.int64)
         return Conversation(ids, self._position_ids(ids, (video,)), groups)
 
-    def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> RynnBatch:
+    def collate(  # type: ignore[override]  # rows of its own
+        self, rows: Sequence[RynnRow], length: int | None = None
+    ) -> RynnBatch:
         """Return the batch of conversations. length: as in ``VlmCollator.collate``"""
-        return RynnBatch.of(super().collate(rows, length), self.config.relative_token, self.config.relative_copies)
+        relative = self.config.relative_token, self.config.relative_copies
+        return RynnBatch.of(super().collate(rows, length), rows, *relative)
 
     def num_groups(self, row: VlmRow) -> tuple[int, int]:
         """Return the number of values and of relative values that are read of a row."""
@@ -163,24 +173,21 @@ class RynnCollator(VlmCollator):
         return " ".join(told) if self.config.use_meta else ""
 
 
-def _causal(
-    conversation: Conversation, video: VlmVideo, read: list[list[tuple[int, int]]], picked: Indices | None
-) -> VlmRow:
-    """Return the row of a conversation whose value tokens are ordinary tokens."""
-    spans = [(of_frame[0][0], of_frame[-1][1]) for of_frame in read]
-    end = spans[-1][1]
-    ids, at = conversation.input_ids[:end], conversation.position_ids[:, :end]
-    return VlmRow(ids, (video,), (spans,), None, False, picked=picked, position_ids=at)
+def _row(
+    conversation: Conversation, video: VlmVideo, spans: Spans, picked: Indices | None, sample: ProgressSample
+) -> RynnRow:
+    ids, at = conversation.input_ids, conversation.position_ids
+    return RynnRow(ids, (video,), (spans,), None, False, picked=picked, position_ids=at, is_analysed=sample.analysis)
 
 
 def _without_groups(
-    conversation: Conversation, read: list[list[tuple[int, int]]], a_frame: Indices
+    conversation: Conversation, read: list[list[tuple[int, int]]], end: int, a_frame: Indices
 ) -> tuple[Conversation, list[Leaf]]:
-    """Return the conversation up to the last frame, without value tokens, and the groups that are read, as leaves.
+    """Return the conversation up to token ``end``, without value tokens, and the groups that are read, as leaves.
 
     a_frame: any frame of the video, for leaves that show none
     """
-    is_kept = (conversation.slots < 0) & (np.arange(len(conversation.slots)) < read[-1][-1][1])
+    is_kept = (conversation.slots < 0) & (np.arange(len(conversation.slots)) < end)
     ids, at = conversation.input_ids, conversation.position_ids
     leaves = [
         Leaf(
@@ -191,13 +198,6 @@ def _without_groups(
         for first, behind in of_frame
     ]  # fmt: skip
     return Conversation(ids[is_kept], at[:, is_kept], []), leaves
-
-
-def _bare(conversation: Conversation, video: VlmVideo, picked: Indices | None) -> VlmRow:
-    """Return the row of a conversation of which nothing is read."""
-    end = len(conversation.input_ids)
-    ids, at = conversation.input_ids, conversation.position_ids
-    return VlmRow(ids, (video,), ([(end, end)],), None, False, picked=picked, position_ids=at)
 
 
 def _with_groups(row: VlmRow, groups: Sequence[Leaf]) -> VlmRow:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,35 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from rfm import families
 from rfm.engine import Engine, Execution
 from rfm.families import CheckpointError
-from rfm.rynnvalue.network import Bins, entropy
-from rfm_client import InvalidSampleError, PreferenceSample, ProgressResult, ProgressSample, Trajectory, UInt8Array
-from rynnvalue import CASES, FOLDER, ISOLATED, OTHERS, RELATIVE_TOLERANCE, USUAL, Asked, Case, Meta, engine_of, said
+from rfm.rynnvalue.network import Bins, RynnConfig, entropy
+from rfm_client import (
+    InvalidSampleError,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    Trajectory,
+    UInt8Array,
+)
+from rfm_client.contract import Analysis
+from rynnvalue import (
+    CASES,
+    FOLDER,
+    ISOLATED,
+    LOGIT_TOLERANCE,
+    OTHERS,
+    RELATIVE_TOLERANCE,
+    USUAL,
+    Asked,
+    Case,
+    Meta,
+    engine_of,
+    said,
+)
 from tolerances import BATCHED_VLM_TOLERANCE
 
 ISOLATED_CONFIG, CAUSAL_CONFIG = "bro_symlog_bf16_tied", "bro_quantile_fp32_tied"
@@ -150,6 +173,45 @@ def test_seconds_in_bfloat16_are_near_the_original_s() -> None:
     assert np.abs(symlog(result.remaining_s) - symlog(expected)).max() < 0.4
 
 
+@pytest.mark.reference
+@pytest.mark.parametrize("case", [each for each in CASES if not each.file.stem.startswith("steps")], ids=str)
+def test_analyses_have_the_tokens_of_the_original_code(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RynnConfig, "max_new_tokens", case.summary["max_new_tokens"])
+    predictor, text_of_answer, written = case.engine.predictor, case.engine.predictor.text, []
+    monkeypatch.setattr(predictor, "text", lambda answer: written.append(answer.tokens) or text_of_answer(answer))
+    for asked in case.asked():
+        (result,) = case.engine.evaluate([replace(asked.sample, analysis=True)])
+        assert isinstance(result, ProgressResult), result
+        check_seconds(result.remaining_s, case.expected(asked.prefix, "value.pred_value"))
+        told = case.generated(asked.prefix)
+        least = 1 if case.summary["dtype"] == "bfloat16" else 2 * LOGIT_TOLERANCE
+        if told is None or told["margin"] < least:
+            continue  # not stored, or another kernel may write another token
+        ended = [*predictor.collator.config.stops] * told["stopped_at_eos"]
+        assert [*written[-1], *ended] == told["new_ids"]
+        assert result.analysis == Analysis(told["text"])
+
+
+# What is unknown here, where the original guesses: from the first letters of a word, or from the next line.
+UNKNOWN = {
+    "- Match: Yesterday": "match",
+    "- Match: Not sure": "match",
+    "- Success: Yes/No": "success",
+    "- Video Description:\n- Match: Yes": "description",
+    "- Video Description:   \n\n- Success: Yes": "description",
+}
+
+
+def test_an_analysis_is_read_as_by_the_original_code_but_not_guessed() -> None:
+    cases = {told["text"]: told["parsed"] for told in json.loads((FOLDER / "parse_cases.json").read_text())}
+    assert cases.keys() > UNKNOWN.keys()
+    for text, parsed in cases.items():
+        said = {name: parsed[name] and parsed[name].lower() == "yes" for name in ("match", "success")}
+        expected = {"description": parsed["description"], **said, **dict.fromkeys([UNKNOWN.get(text)])}
+        expected.pop(None, None)
+        assert Analysis(text).parts == expected, text
+
+
 DECODED = json.loads((FOLDER / "decode_cases.json").read_text())
 
 
@@ -183,8 +245,10 @@ def scored(engine: Engine, *samples: ProgressSample, execution: Execution | None
 
 
 @pytest.mark.parametrize("name", [ISOLATED_CONFIG, CAUSAL_CONFIG])
-def test_a_mixed_batch_gives_the_answers_of_single_samples(name: str) -> None:
+def test_a_mixed_batch_gives_the_answers_of_single_samples(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RynnConfig, "max_new_tokens", 24)
     samples = [progress(noise(n, h, w, n), f"task {n}") for n, h, w in ((1, 24, 40), (5, 48, 80), (3, 33, 120))]
+    samples += [replace(samples[0], analysis=True), replace(samples[1], analysis=True)]
     samples += [progress(noise(9, seed=9), "task 9", 4), progress(noise(1), "task 1", 4)]
     for alone, together in zip(samples, scored(engine(name), *samples), strict=True):
         (expected,) = scored(engine(name), alone)
@@ -192,6 +256,8 @@ def test_a_mixed_batch_gives_the_answers_of_single_samples(name: str) -> None:
         for score in ("remaining_s", "relative_s", "entropy"):
             got, wanted = getattr(together, score), getattr(expected, score)
             np.testing.assert_allclose(got, wanted, rtol=BATCHED_VLM_TOLERANCE, atol=BATCHED_VLM_TOLERANCE)
+        assert together.analysis == expected.analysis
+        assert (expected.analysis is not None) is alone.analysis
 
 
 def test_a_sample_s_descriptions_replace_both_of_the_export() -> None:
@@ -243,6 +309,11 @@ def test_dense_mode_gives_each_prefix_its_own_answer_in_fewer_tokens(name: str) 
         np.testing.assert_allclose(dense.relative_s[last], alone.relative_s[-1], rtol=1e-4, atol=1e-4)
 
 
+def test_analyses_of_prefixes_are_refused() -> None:
+    with pytest.raises(InvalidSampleError, match=r"analysis: expected frame_steps 0 with it, .*, got frame_steps 4"):
+        ProgressSample(Trajectory(frames=noise(3), task=TASK), 4, analysis=True)
+
+
 def test_other_frames_than_progress_are_refused() -> None:
     first = Trajectory(frames=noise(2), task=TASK)
     (refused,) = engine(CAUSAL_CONFIG).evaluate([PreferenceSample(first, first)])
@@ -270,11 +341,28 @@ def test_an_export_gives_the_same_seconds(tmp_path: Path) -> None:
     saved = families.load(tmp_path / "export")
     assert families.choose(tmp_path / "export").name == "rfm.rynnvalue"
     assert saved.config == loaded.config
-    (before,), (after,) = (scored(Engine.of(each), progress(noise(3))) for each in (loaded, saved))
+    asked = replace(progress(noise(3)), analysis=True)
+    (before,), (after,) = (scored(Engine.of(each), asked) for each in (loaded, saved))
     np.testing.assert_array_equal(before.remaining_s, after.remaining_s)
+    assert before.analysis == after.analysis
     other = families.load(tmp_path / "export", reward_model="rynnvalue,robot=a robot of another kind")
     assert other.config.robot == "a robot of another kind"
     assert other.config.camera == USUAL[1]
+
+
+def test_an_export_without_a_language_head_scores_and_refuses_analyses(tmp_path: Path) -> None:
+    """Exports of earlier versions have none."""
+    families.load(NO_META).save(tmp_path / "export")
+    changed(tmp_path / "export" / "config.json", lambda config: config["rfm"].pop("stops"))
+    weights = load_file(tmp_path / "export" / "model.safetensors")
+    del weights["lm_head.weight"]
+    save_file(weights, tmp_path / "export" / "model.safetensors", metadata={"format": "pt"})
+    older = families.load(tmp_path / "export")
+    assert not older.description.writes_analyses
+    usual, refused = Engine.of(older).evaluate([progress(noise(2)), replace(progress(noise(2)), analysis=True)])
+    assert isinstance(usual, ProgressResult)
+    with pytest.raises(InvalidSampleError, match="analysis: expected False, as this checkpoint writes none, got True"):
+        raise refused
 
 
 def test_layers_are_rounded_but_not_the_heads() -> None:

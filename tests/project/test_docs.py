@@ -254,7 +254,8 @@ def options(command: Command) -> Iterator[Parameter]:
 
 def test_every_tensor_of_the_contract_is_documented() -> None:
     contract = CONTRACT.read_text()
-    specs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(), *wire.score_outputs(10, FRAME_SCORES))
+    inputs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(described=True, analysed=True))
+    specs = (*inputs, *wire.score_outputs(10, FRAME_SCORES, analysed=True))
     for spec in specs:
         assert f"| `{spec.name}` |" in contract
 

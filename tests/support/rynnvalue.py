@@ -19,6 +19,7 @@ from rfm_client import ProgressSample, Trajectory
 
 FOLDER = ROOT / "rynnvalue"
 FRAME_STEPS = 8  # of the original's server
+LOGIT_TOLERANCE = 1e-3  # of the language head, in float32
 RELATIVE_TOLERANCE = 2e-4  # of seconds, relative and absolute
 ISOLATED = "pred_slot_isolated_eager"
 # The original's table of descriptions, for a request without them.
@@ -56,6 +57,12 @@ class Case(Reference):
         rounded = "fp32." if self.summary["dtype"] == "bfloat16" else ""
         array = self.arrays[f"{prefix}{rounded}{self.attention}.{name}"]
         return array.mean(0) if name.startswith("value") else array.reshape(-1)
+
+    def generated(self, prefix: str) -> dict[str, Any] | None:
+        """The original's analysis of a sample; None: it is not stored."""
+        sample = self.content["samples"][int(prefix.removeprefix("sample_").removesuffix("."))]
+        found: dict[str, Any] | None = sample["generation"].get(self.attention)
+        return found
 
     def asked(self) -> list[Asked]:
         inputs = self.file.parent / self.content["inputs"]

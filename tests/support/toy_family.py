@@ -106,6 +106,7 @@ class ToyPredictor:
     has_progress: bool = True
     reads_descriptions: bool = False
     reads_views: bool = False
+    writes_analyses: bool = False
     has_success: bool = True
 
     def rows(self, sample: Sample) -> list[list[np.ndarray]]:

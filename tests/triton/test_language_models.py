@@ -108,8 +108,18 @@ def test_remaining_seconds_are_those_of_the_original(asked: Served, protocol: st
     with asked.client("rynn", protocol) as client:
         results = client.evaluate([each.sample for each in samples])
         (dense,) = client.evaluate([ProgressSample(samples[1].sample.trajectory, 8)])
+        asked_of = [replace(each.sample, analysis=each is not samples[1]) for each in samples]
+        analysed = client.evaluate(asked_of)
         info = client.model_info(frames=True)
     assert info.scores == ("remaining_s", "relative_s", "entropy")
+    assert info.writes_analyses
+    for each, sample, result in zip(samples, asked_of, analysed, strict=True):
+        assert isinstance(result, ProgressResult)
+        seconds = told.expected(each.prefix, "value.pred_value")  # also after "Match: No"
+        np.testing.assert_allclose(result.remaining_s, seconds, rtol=2e-4, atol=2e-4)
+        written = told.generated(each.prefix)
+        assert written is not None
+        assert (result.analysis and result.analysis.text) == (written["text"] if sample.analysis else None)
     for each, result in zip(samples, results, strict=True):
         assert isinstance(result, ProgressResult)
         seconds = told.expected(each.prefix, "value.pred_value")
@@ -157,6 +167,33 @@ def test_steps_and_rewards_are_made_of_remaining_seconds(asked: Served) -> None:
     seconds = [info["reward_model"]["remaining_s"] for info in infos]
     assert np.isfinite(seconds).all()
     np.testing.assert_allclose(rewards, -np.diff(seconds), rtol=0, atol=1e-4)
+
+
+def test_other_models_refuse_to_write_an_analysis(asked: Served, protocol: str) -> None:
+    film = Trajectory(frames=np.zeros((2, 48, 80, 3), np.uint8), task=TASK)
+    message = "analysis: expected a model that writes analyses, such as RynnValue, got .*; leave out analysis"
+    with asked.client("top", protocol) as client, pytest.raises(InvalidSampleError, match=message):
+        client.progress(film, analysis=True)
+
+
+def test_score_shows_an_analysis(asked: Served, tmp_path: Path) -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (3, 48, 80, 3), np.uint8)
+    np.save(tmp_path / "video.npy", frames)
+    words = [tmp_path / "video.npy", "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "rynn"]
+    done = rfm_client("score", *words, "--analysis", "--json", tmp_path / "scores.json")
+    assert done.exit_code == 0, done.output
+    told = json.loads((tmp_path / "scores.json").read_text())["videos"][0]["analysis"]
+    with asked.client("rynn") as client:
+        written = client.progress(Trajectory(frames=frames, task=TASK), analysis=True).analysis
+    assert written is not None
+    assert told == {"text": written.text, **written.parts}
+    lines = [line.strip() for line in done.stdout.splitlines()]
+    for name, value in written.parts.items():
+        shown = {None: "not written", True: "Yes", False: "No"}.get(value, value)  # type: ignore[arg-type]  # or a text
+        assert f"{name}: {shown}" in lines
+    refused = rfm_client("score", *words, "--analysis", "--frame-steps", "8")
+    assert refused.exit_code == 2
+    assert "--analysis conflicts with --frame-steps" in refused.stderr
 
 
 def test_a_model_that_reads_no_descriptions_refuses_them(asked: Served, protocol: str) -> None:

@@ -212,6 +212,11 @@ class PrefixOptions(Settings):
             raise ConfigError.like(error) from None
 
     @property
+    def scores_prefixes(self) -> bool:
+        """True if each frame is scored on frames sampled from its prefix."""
+        return self.frame_steps > 0 or self.sampling is not None
+
+    @property
     def rule(self) -> str:
         """A line for the user: which frames decide a frame's score."""
         if self.frame_steps:
@@ -297,6 +302,9 @@ class OutputOptions(PlotOutput):
     )
     rrd: Path | None = setting(
         None, "Record frames and scores on one timeline for Rerun's viewer: .rrd.", metavar="FILE"
+    )
+    analysis: bool = setting(
+        False, "Also show what the model writes about each video (RynnValue): description, match and success."
     )
     npy: Path | None = setting(
         None,

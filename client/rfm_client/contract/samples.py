@@ -140,14 +140,22 @@ class ProgressSample:
 
     frame_steps: 0 scores the trajectory as a whole. N >= 2 is dense mode: frame t is scored on its prefix 0..t alone,
         sampled to N frames, as an RL loop sees it at that step
+    analysis: True: the model also writes an ``Analysis`` of the whole trajectory, which costs a pass for each of its
+        tokens, up to 128. Only RynnValue does, and not in dense mode
     """
 
     trajectory: Trajectory
     frame_steps: int = 0
+    analysis: bool = False
 
     def __post_init__(self) -> None:
         _check_text(self.trajectory, "trajectory")
         check_frame_steps(self.frame_steps)
+        if not isinstance(self.analysis, (bool, np.bool_)):
+            raise InvalidSampleError.at("analysis", "True or False", repr(self.analysis))
+        if self.analysis and self.frame_steps:
+            expected = "frame_steps 0 with it, since an analysis is of the whole trajectory"
+            raise InvalidSampleError.at("analysis", expected, f"frame_steps {self.frame_steps}")
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.contract.results import (
     FRAME_SCORES,
     PAIR_SCORES,
+    Analysis,
     BatchTiming,
     FrameScores,
     PreferenceResult,
@@ -22,7 +24,7 @@ from rfm_client.contract.results import (
     trajectory_scores,
 )
 from rfm_client.contract.samples import Float32Array, PreferenceSample, ProgressSample, Sample, SimilaritySample
-from rfm_client.contract.wire.specs import PREFERENCE, SIMILARITY, TIMING_MS, Tensors, pad_stack
+from rfm_client.contract.wire.specs import ANALYSIS, PREFERENCE, SIMILARITY, TIMING_MS, Tensors, pad_stack
 
 
 def outputs_for(samples: Sequence[Sample], given: Collection[str] = (), *, all_scores: bool = False) -> tuple[str, ...]:
@@ -39,11 +41,15 @@ def outputs_for(samples: Sequence[Sample], given: Collection[str] = (), *, all_s
         if score.asked == "always"
         or (name in given and (score.asked == "if given" or (all_scores and not score.is_per_bin)))
     ]
-    return (*of_frames, *(name for name, kind in asked_by.items() if kind in kinds))
+    is_analysed = any(getattr(sample, "analysis", False) for sample in samples)
+    return (*of_frames, *(name for name, kind in asked_by.items() if kind in kinds), *[ANALYSIS] * is_analysed)
 
 
 def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
-    """Return the requested outputs, float32 [B, ...]; P = ``num_positions``. A missing score is NaN, never 0."""
+    """Return the requested outputs; P = ``num_positions``.
+
+    Scores are float32 [B, ...], and a missing one is NaN, never 0. An analysis is UTF-8, empty if it was not asked for.
+    """
     return {name: _encoded(name, results, num_positions) for name in outputs}
 
 
@@ -67,7 +73,7 @@ def decode_progress(
     return ProgressResult(**scores, timing=_timing(tensors, row), model_version=model_version)
 
 
-def _encoded(name: str, results: Sequence[Result], num_positions: int) -> Float32Array:
+def _encoded(name: str, results: Sequence[Result], num_positions: int) -> npt.NDArray[Any]:
     if name in FRAME_SCORES:
         trajectories = [trajectory_scores(result).values() for result in results]
         rows = [[np.asarray(getattr(each, name), np.float32) for each in of_result] for of_result in trajectories]
@@ -77,6 +83,9 @@ def _encoded(name: str, results: Sequence[Result], num_positions: int) -> Float3
     if name == TIMING_MS:
         timings = [result.timing or BatchTiming(np.nan, np.nan) for result in results]
         return np.array([[timing.collate_ms, timing.forward_ms] for timing in timings], np.float32)
+    if name == ANALYSIS:
+        written = [getattr(result, "analysis", None) for result in results]
+        return np.array([[b"" if each is None else each.text.encode()] for each in written], np.object_)
     raise KeyError(name)
 
 
@@ -85,7 +94,8 @@ def _decode_result(
 ) -> Result:
     num_first, *num_second = (trajectory.num_frames for trajectory in sample.trajectories)
     if isinstance(sample, ProgressSample):
-        return decode_progress(tensors, row, num_first, model_version)
+        result = decode_progress(tensors, row, num_first, model_version)
+        return replace(result, analysis=_analysis(tensors, row)) if sample.analysis else result
     first = _scores_between(tensors, row, slice(0, num_first))
     second = _scores_between(tensors, row, slice(num_first, num_first + sum(num_second)))
     of_request: dict[str, Any] = {"timing": _timing(tensors, row), "model_version": model_version}
@@ -94,6 +104,15 @@ def _decode_result(
         return PreferenceResult(preference=preference, first=first, second=second, **of_request)
     similarity = float(_present(tensors, SIMILARITY, row, slice(0, 1))[0])
     return SimilarityResult(similarity=similarity, reference=first, other=second, **of_request)
+
+
+def _analysis(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Analysis:
+    try:
+        return Analysis(tensors[ANALYSIS][row][0].decode())
+    except (AttributeError, LookupError, UnicodeDecodeError):
+        raise InferenceFailedError(
+            f"{ANALYSIS}: expected UTF-8 text for sample {row}, got something else or nothing"
+        ) from None
 
 
 def _timing(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> BatchTiming | None:

@@ -37,6 +37,7 @@ from rfm_client.contract.wire.specs import (
     UNKNOWN_FRAMES,
     VIDEO_EMBEDDINGS,
     VIEWS,
+    WRITE_ANALYSIS,
     SampleType,
     Tensors,
     encoder_inputs,
@@ -66,6 +67,8 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
         NUM_FRAMES: np.array([_lengths(sample) for sample in samples], np.int32),
         FRAME_STEPS: np.array([[getattr(sample, "frame_steps", 0)] for sample in samples], np.int32),
     }
+    if any(is_analysed := [getattr(sample, "analysis", False) for sample in samples]):
+        tensors[WRITE_ANALYSIS] = np.array(is_analysed, np.uint8)[:, np.newaxis]
     texts = [sample.trajectories[0] for sample in samples]
     has_frames = texts[0].frames is not None
     arrays = zip(*(stackable(sample.trajectories) for sample in samples), strict=True)
@@ -196,10 +199,13 @@ def _decode_rows(
 
 def _decode_sample(row: Row, known: Known) -> Sample:
     sample_type, frame_steps = int(row[SAMPLE_TYPE][0]), int(row[FRAME_STEPS][0])
+    analysis = int(row[WRITE_ANALYSIS][0]) if WRITE_ANALYSIS in row else 0
     lengths = row[NUM_FRAMES].tolist()
     if sample_type not in list(SampleType):
         types = ", ".join(f"{t.value} ({t.name.lower()})" for t in SampleType)
         raise InvalidSampleError.at(SAMPLE_TYPE, f"one of {types}", str(sample_type))
+    if analysis > (sample_type == SampleType.PROGRESS):
+        raise InvalidSampleError.at(WRITE_ANALYSIS, "0, or 1 with a sample of type progress", str(analysis))
     if sample_type == SampleType.PROGRESS:
         if lengths[0] < 1 or lengths[1] != 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
@@ -208,7 +214,7 @@ def _decode_sample(row: Row, known: Known) -> Sample:
         trajectory = _trajectory(row, positions, known)
         if views or GOAL in row:
             trajectory = replace(trajectory, views=views, goal=row.get(GOAL))
-        return ProgressSample(trajectory, frame_steps)
+        return ProgressSample(trajectory, frame_steps, bool(analysis))
     if given := [name for name in (*VIEWS, GOAL) if name in row]:
         raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {given[0]}", SampleType(sample_type).name.lower())
     if FRAME_DIGESTS in row:
