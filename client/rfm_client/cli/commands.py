@@ -35,6 +35,7 @@ from rfm_client.cli.options import (
     OutputOptions,
     PlotOutput,
     PrefixOptions,
+    ScoredVideos,
     ServerOptions,
     StatusOptions,
     VideoOptions,
@@ -90,7 +91,7 @@ def main(
 @with_options
 def score(
     videos: Annotated[list[str], typer.Argument(metavar="VIDEO...", help=VIDEOS)],
-    video: VideoOptions,
+    video: ScoredVideos,
     prefix: PrefixOptions,
     output: OutputOptions,
     server: ServerOptions,
@@ -100,6 +101,7 @@ def score(
     Example: rfm-client score video.mp4 --task "put the block in the bowl"
     """
     output.begin(videos)
+    video.begin(videos)
     if prefix.sampling is not None and video.max_frames is not None:
         raise ConfigError.of_two("sampling", "conflicts with", "max_frames")
     rows = StreamedTable(scoring.COLUMNS, videos)
@@ -120,6 +122,7 @@ def score(
             rows.write(outcome.row)
 
     with scoring.recorder(output.rrd, videos) as record, server.connected() as client:
+        video.check_read(client)
         outcomes = scoring.SourceScorer(client, video, prefix, record).score_all(videos, tell)
     scored = [outcome for outcome in outcomes if isinstance(outcome, scoring.Scored)]
     rows.end(" ".join(filter(None, (prefix.rule, in_place_of_progress(each.result for each in scored)))))
