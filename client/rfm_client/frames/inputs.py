@@ -74,9 +74,12 @@ def load_trajectory(
     trajectory, others = load(source, task=task), []
     for view in views:
         frames = load(view, task="").frames
-        expected = f"{trajectory.num_frames} frames, as {source}"
-        got = "embeddings" if frames is None else len(frames)
-        require(str(view), got == trajectory.num_frames, expected, got, InvalidSampleError)
+        if frames is None or len(frames) != trajectory.num_frames:
+            expected, got = (
+                f"{trajectory.num_frames} frames, as {source}",
+                "embeddings" if frames is None else len(frames),
+            )
+            raise InvalidSampleError.at(str(view), expected, got)
         others.append(frames)
     return replace(
         trajectory,
