@@ -186,11 +186,11 @@ class VideoOptions(FrameRate, VideoFiles):
 class ScoredVideos(VideoOptions):
     """Videos, and what only some models read besides them. Raises ConfigError."""
 
-    TITLE: ClassVar[str] = "Models that read more than one video"
+    TITLE: ClassVar[str] = "Robo-Dopamine and RynnValue"
 
     views: Texts = setting(
         (),
-        "Video of a further camera at the same times, for Robo-Dopamine: of the left wrist, then of the right.",
+        "Video of a further camera at the same times, for Robo-Dopamine; twice: left wrist, right wrist.",
         flag="--view",
         metavar="VIDEO",
     )

@@ -75,11 +75,8 @@ def load_trajectory(
     for view in views:
         frames = load(view, task="").frames
         if frames is None or len(frames) != trajectory.num_frames:
-            expected, got = (
-                f"{trajectory.num_frames} frames, as {source}",
-                "embeddings" if frames is None else len(frames),
-            )
-            raise InvalidSampleError.at(str(view), expected, got)
+            got = "embeddings" if frames is None else len(frames)
+            raise InvalidSampleError.at(view, f"{trajectory.num_frames} frames, as {source}", got)
         others.append(frames)
     return replace(
         trajectory,
