@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from lerobot.configs.rewards import RewardModelConfig
 
@@ -88,7 +88,7 @@ class RfmRewardConfig(RewardModelConfig):
         return Correction(self.orient)  # type: ignore[arg-type]  # checked above; LeRobot's parser knows no Literal
 
     @property
-    def descriptions(self) -> dict[str, str]:
+    def descriptions(self) -> dict[str, Any]:
         """The fields of a Trajectory that describe robot and camera, by name."""
         return {name: getattr(self, name) for name in Trajectory.DESCRIPTION_FIELDS}
 
