@@ -20,6 +20,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
+from google.protobuf.text_format import ParseError
 
 from rfm import families
 from rfm.checkpoint.content import read_run_config
@@ -30,10 +31,14 @@ from rfm.checkpoint.weights import num_values
 from rfm.config import ExportConfig
 from rfm.engine.computation import computation
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, config_fields
+from rfm.launch.repository_folder import CONFIG_FILE
+from rfm.parameters import CHECKPOINT_FOLDER
 from rfm_client.contract import ProgressSample
 from rfm_client.contract.description import Description, Origin
 from rfm_client.contract.synthetic import random_trajectory
 from rfm_export.errors import ExportError
+from rfm_export.layout import description_in
+from rfm_export.pbtxt import parse
 
 Say: TypeAlias = Callable[[str], object]  # takes a line for the user
 
@@ -178,7 +183,7 @@ def typical_sample(checkpoint: Checkpoint) -> ProgressSample:
 
 
 def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
-    """Return the checkpoint's origin: source, commit, training run's config.yaml, licence.
+    """Return the checkpoint's origin: source, commit, training run's config.yaml, licence, effect of rounded weights.
 
     The source of a folder is the end of its path. config.yaml becomes JSON without secrets.
 
@@ -193,7 +198,19 @@ def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
         license=license_of(folder),
         run_config={} if file is None else _public(read_run_config(file)),
         computation=computation,
+        weights_difference=_earlier_difference(folder),
     )
+
+
+def _earlier_difference(folder: Path) -> float | None:
+    """Return the difference that an export measured when it wrote this folder; None: not measured, or no export."""
+    kept = folder.parent / CONFIG_FILE  # in the folder of the version
+    if folder.name != CHECKPOINT_FOLDER or not kept.is_file():
+        return None
+    try:
+        return description_in(parse(kept.read_text())).weights_difference
+    except (ParseError, ValueError):  # an export of before there were descriptions measured nothing
+        return None
 
 
 def origin_in(description: Description) -> Origin:

@@ -2,8 +2,9 @@
 """The frames that Robo-Dopamine is asked about, and what its answers mean.
 
 An answer says how far the images AFTER are from those BEFORE, in percent: ``<score>+37%</score>``. Each sampled frame
-but the first is AFTER in one question of a mode; BEFORE is the sampled frame before it (incremental), frame 0
-(forward), or the goal (backward). Source: ``examples/inference.py`` of ``FlagOpen/Robo-Dopamine``.
+but the first is AFTER in one question of a mode; BEFORE is the sampled frame before it (incremental, benchmark),
+frame 0 (forward), or the goal (backward). Sources: ``examples/inference.py`` and, for ``benchmark``,
+``eval/evaluation_grm.py`` of ``FlagOpen/Robo-Dopamine``.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import numpy as np
 
 from rfm.vlm.qwen import Indices
 
-Question: TypeAlias = Literal["incremental", "forward", "backward"]
-Mode: TypeAlias = Literal["incremental", "forward", "backward", "mean"]
+Question: TypeAlias = Literal["incremental", "benchmark", "forward", "backward"]
+Mode: TypeAlias = Literal["incremental", "benchmark", "forward", "backward", "mean"]
 QUESTIONS: Mapping[Mode, tuple[Question, ...]] = {
     "incremental": ("incremental",),
+    "benchmark": ("benchmark",),
     "forward": ("forward",),
     "backward": ("backward",),
     "mean": ("incremental", "forward", "backward"),
@@ -53,22 +55,25 @@ def parsed(answer: str) -> float | None:
 def fused(scores: Sequence[float], question: Question) -> list[float]:
     """Return the progress at each frame AFTER, from the scores in order.
 
-    As in the original, progress is not clipped: a score of the wrong sign leaves 0..1.
+    As in the original, progress is not clipped: a score of the wrong sign leaves 0..1. In ``benchmark`` it stays
+    within, since the first step begins at 0. The first step of ``incremental`` is the score itself.
     """
     if question == "forward":
         return [*scores]
     if question == "backward":
         return [1 + score for score in scores]
-    progress = [scores[0]]
-    for score in scores[1:]:
+    progress = [0.0]
+    for score in scores:
         before = progress[-1]
-        progress.append(before + (1 - before) * score if score >= 0 else before + before * score)
-    return progress
+        share = 1 - before if score >= 0 else before
+        is_whole = len(progress) == 1 and question == "incremental"
+        progress.append(before + (1 if is_whole else share) * score)
+    return progress[1:]
 
 
 def hops(scores: Sequence[float], question: Question) -> list[float]:
-    """Return the change at each frame AFTER: the incremental score itself, else the difference of progress."""
-    if question == "incremental":
+    """Return the change at each frame AFTER: the score itself if BEFORE was the frame before, else that of progress."""
+    if question in ("incremental", "benchmark"):
         return [*scores]
     progress = fused(scores, question)
     return [after - before for before, after in zip([0.0, *progress], progress, strict=False)]

@@ -85,7 +85,7 @@ class RoboDopamineConfig(ImagesConfig):
     """The configuration of Robo-Dopamine.
 
     least_px, most_px: of an image
-    mode: what each frame is compared with; mean: the mean of the other three
+    mode: what each frame is compared with, and how progress is made of it; mean: that of incremental, forward, backward
     interval: frames from one compared frame to the next; the last is always compared
     """
 

@@ -10,8 +10,9 @@ import torch
 from rfm.engine.pixels import Normalisation
 from rfm.rewind.encoders import ImagePreprocessor
 from rfm.vlm.images import QwenImages, fitted_size
-from rfm_client import FrameSize, UInt8Array
+from rfm_client import FrameSize, ProgressSample, Trajectory, UInt8Array
 from rfm_client.frames import resize_frames
+from rfm_client.frames.fit_to_checkpoint import fitted, snapshot
 
 
 @pytest.mark.parametrize(
@@ -47,12 +48,25 @@ FITTED = {
 }
 
 
-@pytest.mark.parametrize(("text", "size", "fitted"), FITTED.values(), ids=FITTED)
-def test_frames_are_only_ever_made_smaller(text: str, size: tuple[int, int], fitted: tuple[int, int]) -> None:
+@pytest.mark.parametrize(("text", "size", "expected"), FITTED.values(), ids=FITTED)
+def test_frames_are_only_ever_made_smaller(text: str, size: tuple[int, int], expected: tuple[int, int]) -> None:
     frames = np.zeros((1, *size, 3), np.uint8)
     resized = resize_frames(frames, FrameSize.parse(text))
-    assert (resized.shape, resized.dtype) == ((1, *fitted, 3), np.uint8)
-    assert (resized is frames) == (size == fitted)
+    assert (resized.shape, resized.dtype) == ((1, *expected, 3), np.uint8)
+    assert (resized is frames) == (size == expected)
+
+
+def test_views_and_goal_are_fitted_as_the_frames_and_nothing_is_lost() -> None:
+    frames = np.arange(6, dtype=np.uint8).repeat(48 * 64 * 3).reshape(6, 48, 64, 3)
+    given = Trajectory(
+        frames=frames, task="lift", robot_description="an arm", views=(frames + 10, frames[:, :, :40]), goal=frames[5]
+    )
+    (fit,) = fitted(snapshot(ProgressSample(given)), 2, FrameSize("exact", (24, 32))).sample.trajectories
+    assert [array.shape for array in (fit.positions, *fit.views)] == [(2, 24, 32, 3)] * 3
+    assert [array[:, 0, 0, 0].tolist() for array in (fit.positions, *fit.views)] == [[0, 5], [10, 15], [0, 5]]
+    assert fit.goal is not None
+    assert fit.goal.shape == (24, 32, 3)
+    assert (fit.task, fit.descriptions) == (given.task, given.descriptions)
 
 
 NO_COLOURS = Normalisation((0.0,) * 3, (1 / 255,) * 3)  # so that the network reads grey levels

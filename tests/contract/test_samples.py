@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -133,6 +134,10 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "frames against embeddings": (
         lambda: PreferenceSample(embedded(), filmed()),
         "second: expected video_embeddings, as the first trajectory, got frames",
+    ),
+    "a pair with a description, which the wire has for the first alone": (
+        lambda: PreferenceSample(filmed(), replace(filmed(), camera_description="a camera on the wrist")),
+        "second: expected trajectories without views, goal and descriptions, which only progress has, got them",
     ),
     "unequal widths": (
         lambda: PreferenceSample(embedded(), embedded(width=6)),

@@ -58,6 +58,21 @@ def test_progress_is_made_of_scores_as_in_the_original(case: dict[str, Any]) -> 
     assert hops(scores, mode) == case["hop"]
 
 
+@pytest.mark.reference
+@pytest.mark.parametrize("case", json.loads((FOLDER / "fusion_cases_benchmark.json").read_text()))
+def test_the_rule_of_the_benchmark_keeps_progress_within_0_and_1(case: dict[str, Any]) -> None:
+    """``inverse`` begins at 1 with the last answer: what is left is made of the negative scores. Answers without a score
+    are errors here, and change nothing there."""
+    scores = [score for text in case["texts"] if (score := parsed(text)) is not None]
+    expected = [progress for progress in case["progress"] if progress != "Error"]
+    assert scores == [hop for hop in case["hop"] if hop is not None] == hops(scores, "benchmark")
+    if case["inverse"]:
+        left = fused([-score for score in reversed(scores)], "benchmark")
+        np.testing.assert_allclose([1 - each for each in reversed(left)], expected, rtol=0, atol=1e-12)
+    else:
+        assert fused(scores, "benchmark") == expected
+
+
 def test_progress_is_not_clipped() -> None:
     assert fused([-0.5], "forward") == [-0.5]
     assert fused([0.5], "backward") == [1.5]
@@ -196,7 +211,10 @@ def test_other_checkpoints_refuse_views_and_a_goal() -> None:
 
 
 WRONG = {
-    "another mode": ("robodopamine,mode=fused", r"--as: mode: expected one of incremental, forward, backward, mean"),
+    "another mode": (
+        "robodopamine,mode=fused",
+        r"--as: mode: expected one of incremental, benchmark, forward, backward, mean",
+    ),
     "no interval": ("robodopamine,interval=0", "--as: interval: expected at least 1 frame, got 0"),
 }
 

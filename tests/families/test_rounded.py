@@ -164,6 +164,16 @@ def test_an_export_holds_the_rounded_weights_and_says_how_far_scores_are(tmp_pat
     assert {each.source for each in again.decisions() if each.name == "weights"} == {"config.json"}
 
 
+def test_an_export_of_an_export_keeps_the_difference_that_was_measured(tmp_path: Path) -> None:
+    config, first, second = goldens.config(PLAIN), tmp_path / "first", tmp_path / "second"
+    rfm_export.export(config.checkpoint, first, ExportConfig(**{**vars(serve_config(config)), "weights": "int8"}))
+    rfm_export.export(first / "rfm_frames" / "1" / "checkpoint", second, serve_config(config))
+    before, after = (info_of(folder / "rfm_frames") for folder in (first, second))
+    assert before.weights_difference is not None
+    assert (after.weights, after.weights_difference) == (before.weights, before.weights_difference)
+    assert rfm_export.check(second, serve_config(config)) == []
+
+
 def info_of(model: Path) -> ModelInfo:
     from google.protobuf.json_format import MessageToDict
 

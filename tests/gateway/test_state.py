@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -212,5 +213,8 @@ def test_the_client_encodes_a_trajectory_once_for_many_questions(encoders: Gatew
         np.testing.assert_allclose(first.success, second.success, rtol=0, atol=TOLERANCE)
         with pytest.raises(InvalidSampleError, match="trajectory: expected frames, got video_embeddings"):
             client.encode(encoded)
+        for more in (replace(frames, robot_description="an arm"), replace(frames, goal=frames.positions[0])):
+            with pytest.raises(InvalidSampleError, match=r"expected a model .*, got .*; leave out"):
+                client.encode(more)
     with tiny.client() as client, pytest.raises(ModelNotFoundError, match="rfm_encoder"):
         client.encode(frames)

@@ -7,6 +7,7 @@ import json
 import resource
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -17,9 +18,9 @@ from PIL import Image
 from pyarrow import parquet
 
 from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, brightness
-from rfm_client import ProgressResult, ProgressSample, UInt8Array
-from rfm_client.frames import Correction, Orientation
-from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+from rfm_client import FrameSize, InvalidSampleError, ProgressResult, ProgressSample, UInt8Array
+from rfm_client.frames import Correction, Orientation, resize_frames
+from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, label, open_dataset
 
 LENGTHS = (5, 7, 3)
 TASK = "open the drawer"
@@ -518,3 +519,67 @@ def test_a_filter_key_needs_a_file_that_has_it(demos: Path) -> None:
         opened["mask/train"] = np.array([3])  # no names of demonstrations
     with pytest.raises(DatasetError, match="filter_key: expected none, since the dataset has no filter keys, got"):
         label(open_dataset(demos), BrightnessScorer(), LabelOptions(filter_key="train"))
+
+
+class Comparer(BrightnessScorer):
+    """Reads views and a goal, and keeps them."""
+
+    def __init__(self) -> None:
+        super().__init__(max_frames=None)
+        self.shown: list[ProgressSample] = []
+
+    def checkpoint(self) -> CheckpointFacts:
+        return replace(super().checkpoint(), reads_views=True, frame_size=FrameSize("exact", (8, 8)))
+
+    def _result(self, sample: ProgressSample) -> ProgressResult:
+        self.shown.append(sample)
+        return super()._result(sample)
+
+
+def test_views_and_a_goal_are_shown_beside_one_camera_and_stand_in_the_provenance(demos: Path) -> None:
+    picture = demos.with_name("done.png")
+    Image.fromarray(frames_of(0, CAMERAS[0])[1]).save(picture)
+    front, wrist = CAMERAS
+    scorer, several = Comparer(), {"formats": ("progress",), "mode": "whole", "episodes": [1], "views": (wrist, front)}
+    options = LabelOptions(**several, cameras=(front,), goal=str(picture), resize=True)
+    dataset = open_dataset(demos, orient="none")
+    report = label(dataset, scorer, options)
+    (shown,) = (sample.trajectory for sample in scorer.shown)
+    small = [resize_frames(frames_of(1, camera), FrameSize("exact", (8, 8))) for camera in (front, wrist, front)]
+    for array, frames in zip((shown.positions, *shown.views), small, strict=True):
+        np.testing.assert_array_equal(array, frames)
+    assert shown.goal is not None
+    assert shown.goal.shape == (8, 8, 3)
+    provenance = json.loads(parquet.read_schema(report.files[0]).metadata[b"rfm.provenance"])
+    assert (provenance["cameras"], provenance["views"]) == ([front], [wrist, front])
+    assert provenance["goal"]["picture"] == "done.png"
+
+    last = LabelOptions(**several, cameras=(front,), goal="last", output=demos.parent / "last")
+    recipe = label(dataset, scorer, last).plan.recipe
+    np.testing.assert_array_equal(scorer.shown[-1].trajectory.goal, frames_of(1, front)[-1])
+    assert recipe.document()["goal"] == {"picture": "last"}
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (
+            {"views": CAMERAS},
+            "^views: expected none with this model, which reads one camera and no goal, got agentview",
+        ),
+        ({"goal": "last"}, "^goal: expected none with this model, which reads one camera and no goal, got last"),
+    ],
+)
+def test_views_and_a_goal_are_refused_for_a_model_of_one_camera(demos: Path, given: Any, told: str) -> None:
+    with pytest.raises(InvalidSampleError, match=told):
+        label(open_dataset(demos), BrightnessScorer(), LabelOptions(cameras=CAMERAS[:1], **given))
+
+
+def test_views_stand_beside_a_single_camera_and_a_goal_is_a_picture(demos: Path) -> None:
+    with pytest.raises(InvalidSampleError, match=r"^views: expected a single camera, .*; choose one \(--cameras\)$"):
+        label(open_dataset(demos), Comparer(), LabelOptions(cameras=CAMERAS, views=CAMERAS))
+    text = demos.with_name("text.png")
+    text.write_text("no picture")
+    for goal, told in ((text, "an image"), (demos.with_name("gone.png"), "a picture, or last")):
+        with pytest.raises(InvalidSampleError, match=f"^goal: expected {told}, got "):
+            label(open_dataset(demos), Comparer(), LabelOptions(cameras=CAMERAS[:1], mode="whole", goal=str(goal)))

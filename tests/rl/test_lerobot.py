@@ -188,7 +188,9 @@ def test_a_checkpoint_that_does_not_predict_success_gives_none() -> None:
     config = RfmRewardConfig(sampling="all", reward_output="success")
     with Recorder(server=server) as client:
         model = RfmRewardModel(config, client=client)
-        with pytest.raises(ValueError, match=r"^reward_output: expected progress: the checkpoint predicts no success"):
+        with pytest.raises(
+            ValueError, match=r"^reward_output: expected progress, got success, which the checkpoint does"
+        ):
             model.compute_reward({KEY: PIXELS, "task": TASK})
         assert model.predict_progress({KEY: PIXELS, "task": TASK}).success_probability is None
 
@@ -245,7 +247,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "a key of no camera": ({"image_key": "pixels"}, "^image_key: expected observation.image or"),
     "a rule": ({"sampling": "newest"}, "^sampling: expected None or one of linspace_trunc"),
     "a turn": ({"orient": "up"}, "^orient: expected one of none, rotate180"),
-    "an output": ({"reward_output": "delta"}, "^reward_output: expected one of progress, success, got 'delta'$"),
+    "an output": (
+        {"reward_output": "delta"},
+        "^reward_output: expected one of progress, success, remaining_s, got 'delta'$",
+    ),
     "a threshold": ({"success_threshold": 80}, "^success_threshold: expected a probability, 0 to 1, got 80$"),
     "no frames": ({"frames": 0}, "^frames: expected"),
 }

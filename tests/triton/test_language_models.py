@@ -17,6 +17,7 @@ import requests
 from pyarrow import parquet
 from selenium.webdriver.support.select import Select
 
+import fake_lerobot
 import rfm_export
 import rynnvalue
 from browsers import Browser
@@ -43,6 +44,10 @@ from rfm_rl import LiveView, RewardModelWrapper, RewardOptions
 from servers import Endpoints, start_triton
 from transports import Connection
 from viewer_requests import SCORE, curve_of, events, post
+
+fake_lerobot.provide()
+
+from lerobot_reward_rfm import RfmRewardConfig, RfmRewardModel  # noqa: E402
 
 pytestmark = pytest.mark.triton
 
@@ -153,6 +158,11 @@ def test_steps_and_rewards_are_made_of_remaining_seconds(asked: Served) -> None:
             TASK, score="remaining_s", robot_description="an arm", camera_description="a camera"
         ) as episode:
             others = [episode.add(frame) for frame in frames]
+        words = {"robot_description": "an arm", "camera_description": "a camera"}
+        batch = {"observation.images.top": frames[np.newaxis].transpose(0, 1, 4, 2, 3), "task": TASK}
+        paid = RfmRewardModel(RfmRewardConfig(reward_output="remaining_s", **words), client).compute_reward(batch)
+        with pytest.raises(ValueError, match=r"^reward_output: expected remaining_s, got progress, which the check"):
+            RfmRewardModel(RfmRewardConfig(), client).compute_reward(batch)
         options = RewardOptions(mode="shaping", gamma=1.0, score="remaining_s", max_frames=4)
         with RewardModelWrapper(cart_pole(max_episode_steps=3), client, TASK, options) as env:
             rewards, infos = play(env)
@@ -162,6 +172,7 @@ def test_steps_and_rewards_are_made_of_remaining_seconds(asked: Served) -> None:
     np.testing.assert_allclose(
         [step.more_scores["remaining_s"] for step in others], other.remaining_s, rtol=1e-4, atol=1e-4
     )
+    np.testing.assert_allclose(paid, [-others[-1].more_scores["remaining_s"]], rtol=1e-4, atol=1e-4)
     assert np.abs(np.subtract(other.remaining_s, whole.remaining_s)).max() > 1e-2
     assert all(np.isnan(step.progress) and not step.succeeded for step in steps)
     seconds = [info["reward_model"]["remaining_s"] for info in infos]

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import requests
+from PIL import Image
 from pyarrow import parquet
 
 import rfm_export
@@ -113,6 +114,34 @@ def test_the_command_line_writes_null_at_frames_without_an_answer(endpoints: End
     assert told["progress"][0] is None
     assert told["hop"][0] is None
     assert len(told["progress"]) == 3
+
+
+def test_the_command_line_sends_views_and_a_goal_and_only_where_they_are_read(
+    endpoints: Endpoints, tmp_path: Path
+) -> None:
+    case = case_named("forward_T5")
+    given, (expected,) = case.sample.trajectory, case.engine().evaluate([case.sample])
+    files = {name: tmp_path / f"{name}.npy" for name in ("front", "left", "right")}
+    for file, frames in zip(files.values(), (given.positions, *given.views), strict=True):
+        np.save(file, frames)
+    assert given.goal is not None
+    Image.fromarray(given.goal).save(tmp_path / "goal.png")
+    words = ["score", files["front"], "--task", given.task, "--url", endpoints.grpc_url]
+    views = ["--view", files["left"], "--view", files["right"]]
+    done = rfm_client(*words, "--model", "forward", *views, "--goal", tmp_path / "goal.png", "--json", "-")
+    assert done.exit_code == 0, done.output + done.stderr
+    assert isinstance(expected, ProgressResult)
+    told = json.loads(done.stdout)
+    assert told["videos"][0]["progress"][1:] == expected.progress[1:].tolist()
+    assert told["views"] == [str(files["left"]), str(files["right"])]
+    for wrong, fault in (
+        (["--view", files["left"]], "--view: expected none with this model, which reads one camera and no goal"),
+        (["--camera-description", "c"], "--camera-description: expected none with this model, whose prompt names"),
+        ([files["left"], *views], "'--view': expected a single VIDEO, of which they are views, got 2"),
+    ):
+        refused = rfm_client(*words, "--model", "robo", *wrong)
+        assert refused.exit_code != 0
+        assert fault in " ".join((refused.output + refused.stderr).replace("│", "").split())
 
 
 def test_labels_are_nan_at_frames_without_an_answer(endpoints: Endpoints, tmp_path: Path) -> None:

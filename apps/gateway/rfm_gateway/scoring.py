@@ -7,7 +7,7 @@ import asyncio
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 from traceback import clear_frames
@@ -268,8 +268,8 @@ def _prefixes(sample: Sample) -> list[Sample]:
     """Return a sample of raw frames for each prefix of a progress sample; another sample alone."""
     if not isinstance(sample, ProgressSample):
         return [sample]
-    frames, task = sample.trajectory.positions, sample.trajectory.task
-    return [ProgressSample(Trajectory(frames=frames[:end], task=task)) for end in range(1, len(frames) + 1)]
+    trajectory, frames = sample.trajectory, sample.trajectory.positions
+    return [ProgressSample(replace(trajectory, frames=frames[:end])) for end in range(1, len(frames) + 1)]
 
 
 def _results(outcomes: Sequence[Sequence[Result | RewardError]], batch: Batch) -> list[Result]:

@@ -113,7 +113,9 @@ def check(plan: Plan, outputs: Outputs, watch: Watch = QUIET) -> CheckedPlan:
     num_bytes = {}
     with all_faults(dataset, options):
         for item in plan.items:
-            num_bytes[item.episode.index] = sum(dataset.check(item.episode, camera) for camera in plan.recipe.cameras)
+            num_bytes[item.episode.index] = sum(
+                dataset.check(item.episode, camera) for camera in plan.recipe.decoded_cameras
+            )
             watch.checked(item.episode)
     for line in dataset.frame_notes:
         watch.note(line)

@@ -22,6 +22,7 @@ ProgressRule: TypeAlias = Literal["remaining_over_first"]
 Format: TypeAlias = Literal["progress", "signals", "hdf5"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_WORKERS = 4
+LAST = "last"  # in place of a picture of the goal
 _NAME = re.compile(r"[A-Za-z0-9][\w-]{0,63}")
 _RANGE = re.compile(r"(\d+)(?::(\d+))?")
 
@@ -103,6 +104,17 @@ class LabelOptions(Settings):
     )
     cameras: Sequence[str] = setting(
         (), "Cameras to score. Default: all except depth cameras.", metavar="KEY[,KEY...]", parse=_names
+    )
+    views: Sequence[str] = setting(
+        (),
+        "Further cameras to show beside a single one of --cameras, for Robo-Dopamine: the left wrist, then the right.",
+        metavar="KEY,KEY",
+        parse=_names,
+    )
+    goal: str | None = setting(
+        None,
+        f"Picture of the task done, for Robo-Dopamine; {LAST}: the last frame of each episode.",
+        metavar=f"IMAGE|{LAST}",
     )
     fuse: Fuse = setting("mean", "How to combine the scores of several cameras.")
     sampling: Rule | None = setting(None, "Sampling rule of each prefix. Default: as in training.")

@@ -8,16 +8,17 @@ import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any, get_args
 
-from rfm_client import InvalidSampleError, RewardError, Trajectory
-from rfm_client.frames import ChannelOrder, Correction, Fuse, Orientation, Sampling
+from rfm_client import InvalidSampleError, RewardError, Trajectory, UInt8Array
+from rfm_client.frames import ChannelOrder, Correction, FrameFileError, Fuse, Orientation, Picture, Sampling
 from rfm_client.options import InvalidValueError, first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import FaultsError, listed, require
 from rfm_labels.datasets.stored_files import digest_of
-from rfm_labels.options import QUIET, LabelOptions, Mode, ProgressRule, Watch, chosen_numbers
+from rfm_labels.options import LAST, QUIET, LabelOptions, Mode, ProgressRule, Watch, chosen_numbers
 from rfm_labels.scorer import CheckpointFacts, Scorer
 
 _RECIPE_FORMAT = 4  # increased when the same recipe gives other scores or other digests
@@ -27,9 +28,41 @@ _OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most
 
 
 @dataclass(frozen=True)
+class Goal:
+    """A picture of the task done. name: of its file, or ``last``; content: of the file; empty: the last frame"""
+
+    name: str
+    content: bytes = field(default=b"", repr=False)
+
+    @classmethod
+    def of(cls, given: str) -> Goal:
+        """Return the goal of an option. Raises InvalidSampleError for a file that is no picture."""
+        if given == LAST:
+            return cls(given)
+        try:
+            goal = cls(Path(given).name, Path(given).read_bytes())
+            Picture(goal.content).pixels()
+        except FrameFileError as error:
+            raise InvalidSampleError.like(error, where="goal") from error
+        except OSError as error:
+            raise InvalidSampleError.at("goal", f"a picture, or {LAST}", error) from error
+        return goal
+
+    def picture(self, frames: UInt8Array) -> UInt8Array:
+        """Return the picture, uint8 [H, W, 3], for these frames, uint8 [T, H, W, 3]."""
+        return Picture(self.content).pixels() if self.content else frames[-1]
+
+    def document(self) -> dict[str, str]:
+        """Return the goal as it stands in the provenance."""
+        return {"picture": self.name, **({"digest": digest_of([self.content])} if self.content else {})}
+
+
+@dataclass(frozen=True)
 class Recipe:
     """All settings that decide a label, besides the frames.
 
+    cameras: are scored by themselves
+    views: further cameras that are shown beside the only one of ``cameras``
     decoders: library that decodes each camera's frames, with version, since versions differ in colours; None: pixels
     corrections: of the cameras whose frames are turned, or stored as BGR
     verify: True: videos are identified by their content
@@ -49,6 +82,8 @@ class Recipe:
     progress_rule: ProgressRule | None = None
     robot_description: str = ""
     camera_description: str = ""
+    views: tuple[str, ...] = ()
+    goal: Goal | None = None
 
     @classmethod
     def of(cls, options: LabelOptions, dataset: Dataset, checkpoint: CheckpointFacts) -> Recipe:
@@ -58,13 +93,15 @@ class Recipe:
         another mode than ``whole`` with a checkpoint that needs the whole episode.
         """
         numbers = chosen_numbers(dataset, replace(options, shard=None))
-        cameras = dataset.chosen_cameras(options.cameras, numbers)
+        cameras, views = chosen_cameras(dataset, options, numbers)
         require(dataset.source, bool(cameras), "at least one camera", "none")
         if checkpoint.needs_whole_episode and options.mode != "whole":
             why = "of this model, whose scores are relative to the whole episode"
             raise InvalidSampleError.at("mode", f"whole {why}", f"{options.mode}; give --mode whole")
         _check_progress(options.progress_rule, checkpoint)
         _check_descriptions(options, cameras, checkpoint)
+        _check_views(options, cameras, checkpoint)
+        decoded = (*cameras, *views)
         rule = "all" if options.mode == "whole" else options.sampling
         padding = checkpoint.trained_padding
         try:
@@ -76,8 +113,8 @@ class Recipe:
         return cls(
             checkpoint,
             cameras,
-            decoders={camera: dataset.decoder(camera) for camera in cameras},
-            corrections={camera: each for camera, each in dataset.corrections.items() if camera in cameras},
+            decoders={camera: dataset.decoder(camera) for camera in decoded},
+            corrections={camera: each for camera, each in dataset.corrections.items() if camera in decoded},
             sampling=sampling,
             mode=options.mode,
             fuse=options.fuse,
@@ -86,7 +123,14 @@ class Recipe:
             progress_rule=options.progress_rule,
             robot_description=options.robot_description,
             camera_description=options.camera_description,
+            views=views,
+            goal=None if options.goal is None else Goal.of(options.goal),
         )
+
+    @property
+    def decoded_cameras(self) -> tuple[str, ...]:
+        """The cameras and the views, each once."""
+        return tuple(dict.fromkeys((*self.cameras, *self.views)))
 
     @property
     def orientations(self) -> Mapping[str, Orientation]:
@@ -119,11 +163,15 @@ class Recipe:
             "resize": str(self.checkpoint.frame_size) if self.resize else None,
             "verify": self.verify,
             **{name: value for name in _OPTIONAL if (value := getattr(self, name))},
+            **({"views": list(self.views)} if self.views else {}),
+            **({} if self.goal is None else {"goal": self.goal.document()}),
         }
 
     def told(self, options: LabelOptions) -> list[str]:
         """Return a line for each decision, with its reason."""
         lines = [f"cameras: {', '.join(self.cameras)} ({'asked for' if options.cameras else 'all but depth cameras'})"]
+        lines += [f"views: {', '.join(self.views)} (shown beside it)"] if self.views else []
+        lines += [] if self.goal is None else [f"goal: {self.goal.name}"]
         if self.mode == "whole":
             lines.append("mode: whole: the score of frame t may depend on later frames, unless the network is causal")
         else:
@@ -202,6 +250,15 @@ def selected(dataset: Dataset, options: LabelOptions) -> list[DatasetEpisode]:
     return episodes
 
 
+def chosen_cameras(
+    dataset: Dataset, options: LabelOptions, numbers: Sequence[int]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the cameras to score, and the views to show beside them. Raises DatasetError for an unknown camera."""
+    views = dataset.chosen_cameras(options.views, numbers) if options.views else ()
+    cameras = dataset.chosen_cameras(options.cameras, numbers)
+    return cameras if options.cameras else tuple(camera for camera in cameras if camera not in views), views
+
+
 def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisode]) -> Plan:
     """Return the plan of these episodes, without a look at a video's frames. Raises DatasetError for a missing file."""
     document = json.dumps(recipe.document(), sort_keys=True)
@@ -209,7 +266,7 @@ def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisod
     for episode in episodes:
         about = f"{episode.index} {episode.first_index} {episode.num_frames} {episode.task}"
         about += f" {episode.tasks}" if episode.tasks else ""
-        videos = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.cameras]
+        videos = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.decoded_cameras]
         items.append(Item(episode, digest_of(part.encode() for part in (document, about, *videos))))
     return Plan(items, recipe, {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision})
 
@@ -235,6 +292,18 @@ def _check_descriptions(options: LabelOptions, cameras: Sequence[str], checkpoin
         raise InvalidSampleError.at("camera_description", expected, ", ".join(cameras), remedy)
 
 
+def _check_views(options: LabelOptions, cameras: Sequence[str], checkpoint: CheckpointFacts) -> None:
+    """Raise InvalidSampleError for views or a goal that the checkpoint does not read, or views of several cameras."""
+    for name in ("views", "goal"):
+        value = getattr(options, name)
+        if value and not checkpoint.reads_views:
+            got = value if name == "goal" else ", ".join(value)
+            raise InvalidSampleError.at(name, "none with this model, which reads one camera and no goal", got)
+    if options.views and len(cameras) > 1:
+        expected, remedy = "a single camera, beside which the views are shown", "choose one (--cameras)"
+        raise InvalidSampleError.at("views", expected, ", ".join(cameras), remedy)
+
+
 @contextmanager
 def all_faults(dataset: Dataset, options: LabelOptions) -> Iterator[None]:
     """Replace the error of a single episode by FaultsError with the faults of all chosen episodes.
@@ -251,14 +320,14 @@ def all_faults(dataset: Dataset, options: LabelOptions) -> Iterator[None]:
 def check_episodes(dataset: Dataset, options: LabelOptions) -> None:
     """Check the tables and frames of all chosen episodes, without decoding. Raises FaultsError, DatasetError."""
     numbers = chosen_numbers(dataset, replace(options, shard=None))
-    cameras = dataset.chosen_cameras(options.cameras, numbers)
+    cameras, views = chosen_cameras(dataset, options, numbers)
     faults: dict[int, RewardError] = {}
     before: list[DatasetEpisode] = []
     for number in numbers:
         try:
             episode = dataset.episode(number)
             check_order([*before[-1:], episode])
-            for camera in cameras:
+            for camera in (*cameras, *views):
                 dataset.check(episode, camera)
             before.append(episode)
         except RewardError as fault:

@@ -33,6 +33,7 @@ class CheckpointFacts:
     is_causal: True if no frame's score depends on later frames
     has_progress: False if it predicts remaining seconds in place of progress
     reads_descriptions: True if its prompt names the robot and the camera
+    reads_views: True if it reads views of further cameras and a goal
     """
 
     source: str | None
@@ -49,6 +50,7 @@ class CheckpointFacts:
     weights: str | None = None
     has_progress: bool = True
     reads_descriptions: bool = False
+    reads_views: bool = False
 
     @classmethod
     def of(cls, described: object, **own: Any) -> CheckpointFacts:

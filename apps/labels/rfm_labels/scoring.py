@@ -221,18 +221,21 @@ def episode_scores(
     Each stretch of frames with one task is scored by itself, as an episode of this task.
     """
     by_camera: dict[str, list[ProgressResult]] = {}
-    shown = {camera: BlankFrames() for camera in recipe.cameras}
+    shown = {camera: BlankFrames() for camera in recipe.decoded_cameras}
     for camera in recipe.cameras:
-        frames = _checked(dataset.frames(episode, camera), episode, camera, shown[camera])
+        together = [
+            _checked(dataset.frames(episode, each), episode, each, shown[each]) for each in (camera, *recipe.views)
+        ]
         for number, (task, count) in enumerate(episode.stretches, 1):
             is_last = number == len(episode.stretches)  # reads on, to find frames too many
-            chunks = _shrunk(frames if is_last else itertools.islice(frames, count), recipe, go_on)
+            stretch = together if is_last else [itertools.islice(frames, count) for frames in together]
+            chunks = [_shrunk(frames, recipe, go_on) for frames in stretch]
             if recipe.checkpoint.encodes:
-                result = _scores(_joined([scorer.encode(chunk, task) for chunk in chunks]), scorer, recipe, go_on)
+                result = _scores(_joined([scorer.encode(chunk, task) for chunk in chunks[0]]), scorer, recipe, go_on)
             else:
-                first = next(chunks)
-                with memory.holding(first[0].nbytes * count):
-                    result = _scores(_held(first, chunks, task, count, recipe), scorer, recipe, go_on)
+                firsts = [next(each) for each in chunks]
+                with memory.holding(sum(first[0].nbytes for first in firsts) * count):
+                    result = _scores(_held(firsts, chunks, task, count, recipe), scorer, recipe, go_on)
             by_camera.setdefault(camera, []).append(result)
     highest = {camera: frames.highest for camera, frames in shown.items()}
     blank = {camera: value for camera, value in highest.items() if value is not None}
@@ -293,14 +296,25 @@ def _joined(parts: Sequence[Trajectory]) -> Trajectory:
     return Trajectory(video_embeddings=embeddings, text_embedding=parts[0].text_embedding)
 
 
-def _held(first: UInt8Array, others: Iterator[UInt8Array], task: str, count: int, recipe: Recipe) -> Trajectory:
+def _held(
+    firsts: Sequence[UInt8Array], others: Sequence[Iterator[UInt8Array]], task: str, count: int, recipe: Recipe
+) -> Trajectory:
+    """Return the trajectory of a camera and the views, from the first chunk of each and an iterator of the others."""
+    frames, *views = (_filled(first, chunks, count) for first, chunks in zip(firsts, others, strict=True))
+    goal = None if recipe.goal is None else recipe.goal.picture(frames)
+    if goal is not None and recipe.resize and recipe.checkpoint.frame_size is not None:
+        (goal,) = resize_frames(goal[np.newaxis], recipe.checkpoint.frame_size)
+    described = {name: getattr(recipe, name) for name in Trajectory.DESCRIPTION_FIELDS}
+    return Trajectory(frames=frames, task=task, views=tuple(views), goal=goal, **described)
+
+
+def _filled(first: UInt8Array, others: Iterator[UInt8Array], count: int) -> UInt8Array:
     frames = np.empty((count, *first.shape[1:]), np.uint8)
     start = 0
     for chunk in itertools.chain([first], others):
         frames[start : start + len(chunk)] = chunk
         start += len(chunk)
-    described = {name: getattr(recipe, name) for name in Trajectory.DESCRIPTION_FIELDS}
-    return Trajectory(frames=frames, task=task, **described)
+    return frames
 
 
 def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:

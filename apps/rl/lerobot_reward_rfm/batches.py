@@ -36,7 +36,7 @@ def trajectory_of(
     """Return one sample's trajectory. images: [T, 3, H, W] or [T, H, W, 3]. index: of the sample, for errors"""
     step = {config.image_key: images} if pad is None else {config.image_key: images, f"{config.image_key}_is_pad": pad}
     try:
-        return upright(as_trajectory(step, task=task), config)
+        return as_configured(as_trajectory(step, task=task), config)
     except InvalidSampleError as error:
         raise InvalidSampleError(
             f"sample {index} of the batch: {error}. Give images as the dataset or the camera has them, "
@@ -44,11 +44,10 @@ def trajectory_of(
         ) from error
 
 
-def upright(trajectory: Trajectory, config: RfmRewardConfig) -> Trajectory:
-    """Return the trajectory with frames turned as ``config.orient`` says."""
-    if config.orient == "none" or trajectory.frames is None:
-        return trajectory
-    return replace(trajectory, frames=config.correction.applied(trajectory.frames))
+def as_configured(trajectory: Trajectory, config: RfmRewardConfig) -> Trajectory:
+    """Return the trajectory with frames turned as ``config.orient`` says, and with the configuration's descriptions."""
+    frames = None if trajectory.frames is None else config.correction.applied(trajectory.frames)
+    return replace(trajectory, frames=frames, **config.descriptions)
 
 
 def images_of(batch: Mapping[str, Any], key: str) -> Any:

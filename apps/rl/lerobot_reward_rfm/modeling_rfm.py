@@ -15,7 +15,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
 from lerobot_reward_rfm.batches import padding_of, trajectories_of
-from lerobot_reward_rfm.configuration_rfm import RfmRewardConfig
+from lerobot_reward_rfm.configuration_rfm import OUTPUTS, RfmRewardConfig
 from lerobot_reward_rfm.prefixes import newest_scores, scores_of_all_frames
 from rfm_client import Float32Array, RewardClient, Trajectory
 from rfm_client.frames import BlankFrames
@@ -85,14 +85,17 @@ class RfmRewardModel(PreTrainedRewardModel):
         """Return the reward of each sample at its newest frame, float32 [B], on the device of the images.
 
         It is the reward of the Gymnasium wrappers and of labels for the same frames. Raises RewardError, never a
-        number instead; ValueError for ``success`` of a checkpoint that does not predict it.
+        number instead; ValueError for a ``reward_output`` that the checkpoint does not predict.
         """
-        scores = newest_scores(self.client, self._trajectories(batch), self.config)
-        if self.config.reward_output == "progress":
-            return self._tensor(batch, [score.progress for score in scores])
-        success = np.array([score.success for score in scores])
-        require("reward_output", not np.isnan(success).any(), "progress: the checkpoint predicts no success", "success")
-        return self._tensor(batch, success >= self.config.success_threshold)
+        newest, output = newest_scores(self.client, self._trajectories(batch), self.config), self.config.reward_output
+        columns = {name: [each.arrays.get(name, [np.nan])[0] for each in newest] for name in OUTPUTS}
+        predicted = [name for name, scores in columns.items() if not np.isnan(scores).any()]
+        got = f"{output}, which the checkpoint does not predict"
+        require("reward_output", output in predicted, " or ".join(predicted) or "a checkpoint that scores frames", got)
+        scores = np.array(columns[output])
+        if output == "success":
+            return self._tensor(batch, scores >= self.config.success_threshold)
+        return self._tensor(batch, -scores if output == "remaining_s" else scores)
 
     def predict_progress(self, batch: Mapping[str, Any]) -> RfmPrediction:
         """Return the scores of all frames, each on the frames up to it alone, so the last is ``compute_reward``'s.

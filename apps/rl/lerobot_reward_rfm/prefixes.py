@@ -6,20 +6,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain, islice
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 from lerobot_reward_rfm.configuration_rfm import RfmRewardConfig
 from rfm_client import InferenceFailedError, ModelInfo, ProgressResult, ProgressSample, RewardClient, Trajectory
 from rfm_client.frames import Sampling
 
 AT_A_TIME = 32  # samples: each copies its frames, so that those of all prefixes of an episode would fill memory
-
-
-class Score(NamedTuple):
-    """Progress of a frame, and probability of success; NaN: the checkpoint does not predict it."""
-
-    progress: float
-    success: float
 
 
 def rule_of(info: ModelInfo, config: RfmRewardConfig) -> Sampling:
@@ -32,19 +25,21 @@ def rule_of(info: ModelInfo, config: RfmRewardConfig) -> Sampling:
     return Sampling.of(rule, config.frames, info.max_frames, trained_padding=info.trained_padding)
 
 
-def newest_scores(client: RewardClient, trajectories: Sequence[Trajectory], config: RfmRewardConfig) -> list[Score]:
-    """Return the score of each trajectory at its newest frame, from as few requests as possible. Raises RewardError."""
+def newest_scores(
+    client: RewardClient, trajectories: Sequence[Trajectory], config: RfmRewardConfig
+) -> list[ProgressResult]:
+    """Return the scores of the newest frame of each trajectory, [1], from few requests. Raises RewardError."""
     rule = rule_of(client.model_info(frames=True), config)
     prefixes = [rule.prefix(trajectory.num_frames - 1) for trajectory in trajectories]
     samples = [
         ProgressSample(replace(trajectory, frames=cast(Any, trajectory.frames)[prefix.indices]))
         for trajectory, prefix in zip(trajectories, prefixes, strict=True)
     ]
-    results = evaluated(client, samples, config)
-    slots = [prefix.read for prefix in prefixes]
-    for index, (result, slot) in enumerate(zip(results, slots, strict=True)):
-        check_clear(result, slot, f"sample {index} of the batch")
-    return [Score(float(r.progress[slot]), float(r.success[slot])) for r, slot in zip(results, slots, strict=True)]
+    results = zip(evaluated(client, samples, config), prefixes, strict=True)
+    newest = [result.at(slice(prefix.read, prefix.read + 1)) for result, prefix in results]
+    for index, result in enumerate(newest):
+        check_clear(result, 0, f"sample {index} of the batch")
+    return newest
 
 
 def scores_of_all_frames(

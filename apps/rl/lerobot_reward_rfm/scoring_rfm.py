@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_reward_rfm.batches import upright
+from lerobot_reward_rfm.batches import as_configured
 from lerobot_reward_rfm.modeling_rfm import RfmRewardModel
 from lerobot_reward_rfm.prefixes import rule_of, scores_of_all_frames
 from rfm_client import Trajectory, as_trajectory
@@ -40,6 +40,7 @@ class RfmFrameScorer:
         config, info = self.model.config, self.model.client.model_info(frames=True)
         rule = asdict(rule_of(info, config))
         own = {name: getattr(config, name) for name in ("image_key", "default_task", "orient", "resize")}
+        own |= {name: text for name, text in config.descriptions.items() if text}
         checkpoint = {name: getattr(info, name) for name in ("name", "source", "revision", "weights_digest")}
         return {"sampling": rule["rule"], "frames": rule["frames"], **own, "checkpoint": checkpoint}
 
@@ -64,7 +65,7 @@ class RfmFrameScorer:
         task = config.default_task if config.default_task and is_blank(first.get("task")) else ""
         trajectory = as_trajectory(steps_of(dataset, episode_index), task=task, camera=config.camera)
         self.model.tell_blank(trajectory, f"episode {episode_index}")
-        return upright(trajectory, config)
+        return as_configured(trajectory, config)
 
 
 def steps_of(dataset: Any, episode_index: int) -> Iterator[Mapping[str, Any]]:

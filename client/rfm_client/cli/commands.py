@@ -35,6 +35,7 @@ from rfm_client.cli.options import (
     OutputOptions,
     PlotOutput,
     PrefixOptions,
+    ScoredVideos,
     ServerOptions,
     StatusOptions,
     VideoOptions,
@@ -97,7 +98,7 @@ def main(
 @with_options
 def score(
     videos: Annotated[list[str], typer.Argument(metavar="VIDEO...", help=VIDEOS)],
-    video: VideoOptions,
+    video: ScoredVideos,
     prefix: PrefixOptions,
     output: OutputOptions,
     server: ServerOptions,
@@ -107,6 +108,7 @@ def score(
     Example: rfm-client score video.mp4 --task "put the block in the bowl"
     """
     output.begin(videos)
+    video.begin(videos)
     if prefix.sampling is not None and video.max_frames is not None:
         raise ConfigError.of_two("sampling", "conflicts with", "max_frames")
     if output.analysis and prefix.scores_prefixes:
@@ -131,6 +133,7 @@ def score(
                 rows.write_below(analysis_lines(result.analysis))
 
     with scoring.recorder(output.rrd, videos) as record, server.connected() as client:
+        video.check_read(client)
         outcomes = scoring.SourceScorer(client, video, prefix, output.analysis, record).score_all(videos, tell)
     scored = [outcome for outcome in outcomes if isinstance(outcome, scoring.Scored)]
     rows.end(" ".join(filter(None, (prefix.rule, in_place_of_progress(each.result for each in scored)))))

@@ -123,7 +123,8 @@ def status_document(statuses: Sequence[ServerStatus]) -> dict[str, Any]:
 
 
 def _asked(video: VideoOptions) -> dict[str, Any]:
-    return {"task": video.task, "fps": video.fps, "orient": video.orient, "channels": video.channels}
+    asked = {"task": video.task, "fps": video.fps, "orient": video.orient, "channels": video.channels}
+    return {**asked, **{name: value for name, value in video.more.items() if value}}
 
 
 def _outcome(outcome: Outcome) -> dict[str, Any]:

@@ -19,9 +19,10 @@ from rfm_client.cli.command import STANDARD_OUTPUT, usage_errors
 from rfm_client.client import RewardClient
 from rfm_client.client_options import DEFAULT_TIMEOUT_S
 from rfm_client.contract import errors
-from rfm_client.contract.errors import InvalidValueError
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
 from rfm_client.contract.names import DEFAULT_MODEL
-from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
+from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS, Trajectory
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.frames.orientation import ChannelOrder, Orientation
 from rfm_client.frames.sampling import RULES, Rule, Sampling
@@ -174,6 +175,44 @@ class VideoOptions(FrameRate, VideoFiles):
 
     max_frames: int | None = setting(None, "Score at most N evenly spaced frames.", least=1)
     subsample: bool = setting(True, "Reduce each video to the number of frames of training, evenly spaced.")
+
+    @property
+    def more(self) -> dict[str, Any]:
+        """The arguments of ``load_trajectory`` that only some models read."""
+        return {name: getattr(self, name) for name in self.settings() if name not in VideoOptions.settings()}
+
+
+@dataclass(frozen=True)
+class ScoredVideos(VideoOptions):
+    """Videos, and what only some models read besides them. Raises ConfigError."""
+
+    TITLE: ClassVar[str] = "Robo-Dopamine and RynnValue"
+
+    views: Texts = setting(
+        (),
+        "Video of a further camera at the same times, for Robo-Dopamine; twice: left wrist, right wrist.",
+        flag="--view",
+        metavar="VIDEO",
+    )
+    goal: str | None = setting(None, "Picture of the task done, for Robo-Dopamine.", metavar="IMAGE")
+    robot_description: str = setting("", "Words for the robot in RynnValue's prompt. Default: those of the export.")
+    camera_description: str = setting("", "Words for the camera. If either is given, they replace both of the export.")
+
+    def begin(self, videos: Sequence[str]) -> None:
+        """Raise ConfigError for views of more than one video."""
+        if self.views and len(videos) > 1:
+            raise ConfigError.at("views", "a single VIDEO, of which they are views", len(videos))
+
+    def check_read(self, client: RewardClient) -> None:
+        """Raise InvalidSampleError if an option is given that the model does not read."""
+        for name, value in self.more.items():
+            if not value:
+                continue
+            info = client.model_info(frames=True)
+            is_read, why = info.reads_views, "which reads one camera and no goal"
+            if name in Trajectory.DESCRIPTION_FIELDS:
+                is_read, why = info.reads_descriptions, "whose prompt names neither robot nor camera"
+            require(name, is_read, f"none with this model, {why}", repr(value), InvalidSampleError)
 
 
 @dataclass(frozen=True)

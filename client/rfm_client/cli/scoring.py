@@ -71,7 +71,9 @@ class Source:
 
         are_arrays = not is_url(name) and PurePath(name).suffix.lower() in ARRAY_SUFFIXES
         fps = None if are_arrays else video.fps
-        trajectory = load_trajectory(name, task=video.task, fps=fps, orient=video.orient, channels=video.channels)
+        trajectory = load_trajectory(
+            name, task=video.task, fps=fps, orient=video.orient, channels=video.channels, **video.more
+        )
         if trajectory.frames is not None and is_blank(trajectory.task):
             own = repr(trajectory.task) if trajectory.task.strip() else "none"
             raise InvalidSampleError.at("task", "a sentence with frames", f'{own}: add --task "SENTENCE"')

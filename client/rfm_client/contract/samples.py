@@ -7,7 +7,7 @@ Samples check their arrays once, here; all other code relies on it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, ClassVar, TypeAlias, cast
@@ -252,6 +252,17 @@ def with_trajectories(sample: Sample, trajectories: Sequence[Trajectory]) -> Sam
     return type(sample)(first, second)
 
 
+def with_pictures(trajectory: Trajectory, change: Callable[[UInt8Array], UInt8Array]) -> Trajectory:
+    """Return the trajectory with changed frames, views and goal; embeddings as they are.
+
+    change: takes and returns uint8 [T, H, W, 3]; T = 1 for the goal
+    """
+    if trajectory.frames is None:
+        return trajectory
+    goal = None if trajectory.goal is None else change(trajectory.goal[np.newaxis])[0]
+    return replace(trajectory, frames=change(trajectory.frames), views=tuple(map(change, trajectory.views)), goal=goal)
+
+
 def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
     """Return uint8 frames from float frames in 0..255 of the same shape: clip and truncate, as upstream's server does.
 
@@ -348,10 +359,12 @@ def _check_text(trajectory: Trajectory, where: str) -> None:
 
 def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
     """Check that both are of one kind. Embeddings need one width; frames may differ in size."""
-    if first.has_views or (isinstance(second, Trajectory) and second.has_views):
-        raise InvalidSampleError.at(where, "trajectories without views and goal, which only progress has", "them")
     if not isinstance(second, Trajectory):
         raise InvalidSampleError.at(where, "Trajectory", type(second).__name__)
+    for each in (first, second):
+        if each.has_views or any(each.descriptions):
+            expected = "trajectories without views, goal and descriptions, which only progress has"
+            raise InvalidSampleError.at(where, expected, "them")
     if (first.frames is None) != (second.frames is None):
         expected, got = ("video_embeddings", "frames") if first.frames is None else ("frames", "video_embeddings")
         raise InvalidSampleError.at(where, f"{expected}, as the first trajectory", got)

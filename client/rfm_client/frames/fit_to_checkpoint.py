@@ -5,12 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
+
+import numpy as np
 
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.results import ProgressResult, Result, trajectory_scores
-from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, with_trajectories
+from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, with_pictures, with_trajectories
 from rfm_client.frames.resize import resize_frames
 from rfm_client.frames.sampling import FrameIndices, taken, thinned
 
@@ -38,10 +41,9 @@ def snapshot(sample: Sample) -> Sample:
     """Return the sample with copies of its arrays, so that the caller may change the originals before it is sent."""
 
     def copied(trajectory: Trajectory) -> Trajectory:
-        names = ("frames", "video_embeddings", "text_embedding", "goal")
-        arrays = {name: getattr(trajectory, name) for name in names}
+        arrays = {name: getattr(trajectory, name) for name in ("video_embeddings", "text_embedding")}
         copies = {name: array.copy() for name, array in arrays.items() if array is not None}
-        return replace(trajectory, **copies, views=tuple(view.copy() for view in trajectory.views))
+        return replace(with_pictures(trajectory, np.copy), **copies)
 
     return with_trajectories(sample, [copied(t) for t in sample.trajectories]) if isinstance(sample, Sample) else sample
 
@@ -60,9 +62,7 @@ def fitted(sample: Sample, max_frames: int | None, frame_size: FrameSize | None)
         t if indices is None else taken(t, indices) for t, indices in zip(sample.trajectories, kept, strict=True)
     ]
     if frame_size is not None:
-        trajectories = [
-            t if t.frames is None else replace(t, frames=resize_frames(t.frames, frame_size)) for t in trajectories
-        ]
+        trajectories = [with_pictures(each, partial(resize_frames, size=frame_size)) for each in trajectories]
     return FittedSample(with_trajectories(sample, trajectories), kept)
 
 

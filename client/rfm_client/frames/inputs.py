@@ -11,6 +11,7 @@ import tokenize
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -20,9 +21,9 @@ import numpy.typing as npt
 
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.samples import Trajectory, UInt8Array, as_array
+from rfm_client.contract.samples import Trajectory, UInt8Array, as_array, with_pictures
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
-from rfm_client.frames.pictures import upright_picture
+from rfm_client.frames.pictures import FrameFileError, Picture, upright_picture
 from rfm_client.frames.video import is_url, read_video
 
 _BROKEN_NPY = (  # numpy's errors for a broken .npy header
@@ -46,6 +47,10 @@ def load_trajectory(
     end_s: float | None = None,
     orient: Orientation = "none",
     channels: ChannelOrder = "rgb",
+    views: Sequence[str | Path] = (),
+    goal: str | Path | None = None,
+    robot_description: str = "",
+    camera_description: str = "",
 ) -> Trajectory:
     """Return the trajectory in a file or behind an http(s) URL.
 
@@ -55,24 +60,31 @@ def load_trajectory(
     task: replaces the task of the file
     fps: frames a second to take from a video; None: all frames
     start_s, end_s: part of a video, in seconds since its first frame; None: from the start, to the end
-    orient: turn that makes frames upright
+    orient: turn that makes frames and views upright
     channels: order in which their colours are stored
+    views: files or URLs with the frames of further cameras, of which the same part is taken
+    goal: file with a picture, shown as it is stored, upright by its EXIF data. Needs Pillow
+    robot_description, camera_description: as in Trajectory
 
     Raises InvalidSampleError, also for arrays of Python objects, because reading them runs code, and for a video of
     several LeRobot v3.0 episodes, unless ``start_s`` and ``end_s`` select a part.
     """
-    correction = Correction(orient, channels)
-    if is_url(source) or Path(source).suffix.lower() not in ARRAY_SUFFIXES:
-        frames = read_video(source, fps, start_s=start_s, end_s=end_s)
-        return Trajectory(frames=correction.applied(frames), task=task)
-    for name, value in (("fps", fps), ("start_s", start_s), ("end_s", end_s)):
-        if value is not None:
-            raise InvalidSampleError.at(name, "None with arrays, which do not tell their own", repr(value))
-    arrays = _arrays(Path(source))
-    try:
-        return _corrected(as_trajectory(arrays, task=task), correction)
-    except InvalidSampleError as error:
-        raise InvalidSampleError(f"{error} ({source})") from error
+    part: dict[str, Any] = {"fps": fps, "start_s": start_s, "end_s": end_s}
+    load = partial(_loaded, correction=Correction(orient, channels), part=part)
+    trajectory, others = load(source, task=task), []
+    for view in views:
+        frames = load(view, task="").frames
+        if frames is None or len(frames) != trajectory.num_frames:
+            got = "embeddings" if frames is None else len(frames)
+            raise InvalidSampleError.at(view, f"{trajectory.num_frames} frames, as {source}", got)
+        others.append(frames)
+    return replace(
+        trajectory,
+        views=tuple(others),
+        goal=None if goal is None else _picture(goal),
+        robot_description=robot_description,
+        camera_description=camera_description,
+    )
 
 
 def as_trajectory(
@@ -111,6 +123,27 @@ def as_trajectory(
     return Trajectory(frames=_unpadded(columns, key, _frames(key, columns[key])), task=task)
 
 
+def _loaded(source: str | Path, *, task: str, correction: Correction, part: Mapping[str, Any]) -> Trajectory:
+    """Return the trajectory in one file. Raises InvalidSampleError. part: of a video, as ``read_video`` takes it"""
+    if is_url(source) or Path(source).suffix.lower() not in ARRAY_SUFFIXES:
+        return Trajectory(frames=correction.applied(read_video(source, **part)), task=task)
+    for name, value in part.items():
+        if value is not None:
+            raise InvalidSampleError.at(name, "None with arrays, which do not tell their own", repr(value))
+    arrays = _arrays(Path(source))
+    try:
+        return _corrected(as_trajectory(arrays, task=task), correction)
+    except InvalidSampleError as error:
+        raise InvalidSampleError(f"{error} ({source})") from error
+
+
+def _picture(file: str | Path) -> UInt8Array:
+    try:
+        return Picture(Path(file)).pixels()
+    except FrameFileError as error:
+        raise InvalidSampleError.like(error, where=str(file)) from error
+
+
 def _unpadded(columns: Mapping[str, Any], key: str, values: Any) -> Any:
     """Return the values [T, ...] of the steps that are no padding. Without marks, return them unchanged."""
     if key + _IS_PAD not in columns or values is None:
@@ -124,7 +157,7 @@ def _unpadded(columns: Mapping[str, Any], key: str, values: Any) -> Any:
 
 def _corrected(trajectory: Trajectory, correction: Correction) -> Trajectory:
     if trajectory.frames is not None:
-        return replace(trajectory, frames=correction.applied(trajectory.frames))
+        return with_pictures(trajectory, correction.applied)
     for name, default in asdict(Correction()).items():
         if getattr(correction, name) != default:
             expected = f"{default} for embeddings, which cannot be changed so"

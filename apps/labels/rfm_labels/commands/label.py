@@ -345,7 +345,7 @@ def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int, watc
 
 def _plan_rows(plan: Plan, dataset: Dataset, num_bytes: int, took_s: float) -> list[tuple[str, str]]:
     tasks = sorted({task for item in plan.items for task, _ in item.episode.stretches})
-    cameras = plan.recipe.cameras
+    cameras = plan.recipe.decoded_cameras
     return [
         ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),
         ("episodes", str(len(plan.items))),

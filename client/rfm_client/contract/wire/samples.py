@@ -40,7 +40,6 @@ from rfm_client.contract.wire.specs import (
     WRITE_ANALYSIS,
     SampleType,
     Tensors,
-    encoder_inputs,
     frame_digest,
     pad_stack,
 )
@@ -96,9 +95,9 @@ def decode_samples(tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | None = 
 
 
 def encode_frames(trajectory: Trajectory) -> Tensors:
-    """Return a request to the encoder for one trajectory of raw frames."""
+    """Return a request to the encoder for one trajectory of raw frames. The encoder refuses what it does not read."""
     tensors = encode_samples([ProgressSample(trajectory)])
-    return {spec.name: tensors[spec.name] for spec in encoder_inputs() if spec.name in tensors}
+    return {name: tensor for name, tensor in tensors.items() if name not in (SAMPLE_TYPE, FRAME_STEPS)}
 
 
 def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Trajectory) -> Trajectory:
