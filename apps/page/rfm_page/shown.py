@@ -257,7 +257,10 @@ def _rows(summary: Summary) -> list[dict[str, Any]]:
 def _curves(labels: EpisodeLabels, num_frames: int) -> list[dict[str, Any]]:
     """Return the fused curve, which training reads, then the curve of each camera."""
     curves = [(None, labels.fused), *labels.cameras.items()]
-    return [{"camera": camera, **_scores(curve, labels.frames, num_frames)} for camera, curve in curves]
+    answered = np.ones(num_frames, bool)
+    answered[labels.frames] = labels.is_answered
+    told = {"answered": answered.tolist()}  # False: the model skipped the frame; True, too: a frame without labels
+    return [{"camera": camera, **_scores(curve, labels.frames, num_frames), **told} for camera, curve in curves]
 
 
 def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dict[str, Any]:

@@ -510,10 +510,10 @@ export class DatasetTab {
 /** The labelled curves as a chart takes them. file: of other labels, which are dashed; null: the first labels */
 function curvesIn({ times_s: times, curves }, file) {
   const none = times.map(() => null);
-  return curves.map(({ camera, progress, success }, index) => {
+  return curves.map(({ camera, progress, success, answered }, index) => {
     const name = camera ? short(camera) : curves.length > 1 ? "all cameras" : "labels";
     const label = file === null ? name : `${name} (${reward(file)})`;
-    return { index, label, progress, success: success ?? none, times, allTimes: times, dash: file === null ? null : DASHES[1] };
+    return { index, label, progress, success: success ?? none, answered, times, allTimes: times, dash: file === null ? null : DASHES[1] };
   });
 }
 
