@@ -35,17 +35,23 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         import pyarrow  # noqa: F401
 
         from rfm_labels import DatasetError
-        from rfm_labels.datasets import Hdf5Dataset, open_to_show
+        from rfm_labels.datasets import Hdf5Dataset, RldsDataset, open_to_show
         from rfm_page.datasets import ShownLeRobot
         from rfm_page.hdf5_datasets import ShownHdf5
+        from rfm_page.rlds_datasets import ShownRlds
     except ModuleNotFoundError as error:
         expected = f"the package {error.name}, which reads it"
         raise ConfigError.at("dataset", expected, "none: pip install ./apps/labels") from None
     datasets: list[ShownDataset] = []
     try:
         for path in config.dataset:
-            dataset = open_to_show(path)
-            datasets.append(ShownHdf5(dataset) if isinstance(dataset, Hdf5Dataset) else ShownLeRobot(dataset))
+            match open_to_show(path):
+                case Hdf5Dataset() as dataset:
+                    datasets.append(ShownHdf5(dataset))
+                case RldsDataset() as dataset:
+                    datasets.append(ShownRlds(dataset))
+                case dataset:
+                    datasets.append(ShownLeRobot(dataset))
             datasets[-1].check()
     except (DatasetError, ImportError) as error:
         raise ConfigError(str(error), "dataset") from None

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -48,12 +48,8 @@ class ShownDataset(ABC):
     """A dataset for the page.
 
     dataset: as ``open_to_show`` returns it
-    has_stored_pixels: True: its videos have every pixel as stored; False: they are encoded for the page
-
     Its methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
     """
-
-    has_stored_pixels: ClassVar[bool]
 
     dataset: Dataset
 
@@ -70,6 +66,11 @@ class ShownDataset(ABC):
     @abstractmethod
     def check(self) -> None:
         """Raise DatasetError if the dataset would show other files of this machine. Before every reading."""
+
+    @property
+    @abstractmethod
+    def has_stored_pixels(self) -> bool:
+        """True if the videos have every pixel as stored; False: some are encoded for the page."""
 
     @property
     @abstractmethod
