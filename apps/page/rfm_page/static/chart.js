@@ -6,6 +6,7 @@ import { leadingOf, marksOf, numberOf, scaleOf, titleOf } from "./signals.js";
 import uPlot from "./uplot/uPlot.esm.js";
 
 const NUM_COLOURS = 12;
+const LEFT_PX = 60; // of the numbers and names to the left
 const VALUE_PX = 16; // height of a number beside a line
 const VALUE_WIDTH_PX = 48;
 const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
@@ -234,7 +235,7 @@ export class Chart {
     };
     const number = new Map(marks);
     const left = {
-      ...axis, size: 52, splits: () => marks.map(([height]) => height), filter: (_, splits) => splits,
+      ...axis, size: LEFT_PX, splits: () => marks.map(([height]) => height), filter: (_, splits) => splits,
       values: (_, splits) => splits.map((height) => `${number.get(height)}`),
     };
     const series = this.#drawn.flatMap((curve, place) => signals.map((signal) => {
@@ -313,7 +314,7 @@ function drawNames({ ctx, bbox }, panes, letterPx) {
   for (const [signal, { from, to }] of Object.entries(panes)) {
     const title = titleOf(signal);
     ctx.save();
-    ctx.translate(bbox.left - 50 * scale, bbox.top + (1 - (from + to) / 2) * bbox.height);
+    ctx.translate(bbox.left - (LEFT_PX - 2) * scale, bbox.top + (1 - (from + to) / 2) * bbox.height);
     ctx.rotate(-Math.PI / 2);
     if ((to - from) * bbox.height > ctx.measureText(title).width) ctx.fillText(title, 0, 8 * scale);
     ctx.restore();
