@@ -35,7 +35,7 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         import pyarrow  # noqa: F401
 
         from rfm_labels import DatasetError
-        from rfm_labels.datasets import Hdf5Dataset, RldsDataset, open_to_show
+        from rfm_labels.datasets import Hdf5Dataset, LeRobotDataset, open_to_show
         from rfm_page.datasets import ShownLeRobot
         from rfm_page.hdf5_datasets import ShownHdf5
         from rfm_page.rlds_datasets import ShownRlds
@@ -45,13 +45,13 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
     datasets: list[ShownDataset] = []
     try:
         for path in config.dataset:
-            match open_to_show(path):
-                case Hdf5Dataset() as dataset:
-                    datasets.append(ShownHdf5(dataset))
-                case RldsDataset() as dataset:
-                    datasets.append(ShownRlds(dataset))
-                case dataset:
-                    datasets.append(ShownLeRobot(dataset))
+            dataset = open_to_show(path)
+            if isinstance(dataset, LeRobotDataset):
+                datasets.append(ShownLeRobot(dataset))
+            elif isinstance(dataset, Hdf5Dataset):
+                datasets.append(ShownHdf5(dataset))
+            else:
+                datasets.append(ShownRlds(dataset))
             datasets[-1].check()
     except (DatasetError, ImportError) as error:
         raise ConfigError(str(error), "dataset") from None

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_labels import DatasetEpisode
-from rfm_labels.datasets import RldsDataset
 from rfm_page.encoded import encoded
 from rfm_page.links import check_links, links_in
 from rfm_page.shown import ShownDataset
@@ -22,8 +21,6 @@ class ShownRlds(ShownDataset):
 
     has_stored_pixels = False
     fps = 10.0  # the dataset does not say
-
-    dataset: RldsDataset
 
     def check(self) -> None:
         """Raise DatasetError for a link out of the folder."""
