@@ -11,6 +11,7 @@ import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import test_live_browser
 import test_viewer_browser
 import test_viewer_dataset_browser
@@ -29,10 +30,11 @@ from toy_world import Task, make_clip
 
 IMAGES = ROOT / "docs" / "images"
 TASK = Task("red", "bowl")
-SEEDS = {"success": 2_000_000, "dropped": 2_000_001, "rewound": 2_000_002}  # of clips by their kind
-LAST_SEED = 2_000_003
+FIRST_SEED = 2_000_000  # of clips
+SEEDS = {"success": FIRST_SEED, "dropped": FIRST_SEED + 1}
 FPS = 10
-RUN = "policy 7"
+RUNS = ("policy 5", "policy 6", "policy 7")
+NUM_ENDED = 24  # episodes of each run
 
 
 def score(gateway: Gateway, browser: Browser, folder: Path) -> None:
@@ -61,20 +63,24 @@ def show_dataset(gateway: Gateway, browser: Browser, dataset: Path) -> None:
 
 
 def show_episodes(gateway: Gateway, browser: Browser, client: RewardClient) -> None:
-    """Draw the tab of running episodes."""
-    videos = [make_clip(kind, TASK, seed).frames for kind, seed in SEEDS.items()]
-    videos.append(make_clip("success", TASK, LAST_SEED).frames)
-    with LiveView(gateway.url, name=RUN) as view:
-        page = test_live_browser.Page(gateway.url, browser)
-        page.open()
-        episodes = client.episodes(len(videos), TASK.sentence(), live=view)
-        for frames in zip(*videos, strict=True):
-            episodes.add(list(frames))
-        episodes.reset([False, True, False, True])
-        for frame in videos[0][:9]:
-            episodes.add([videos[3][0], frame, frame, videos[2][0]], [False, True, False, False])
-        poll(lambda: len(page.cards(RUN)) == 5 and page.cards(RUN)[1]["Step"] == "8")
-        poll(lambda: len(browser.run(test_live_browser.PICTURES, RUN)) == 5)
+    """Draw the tab of running episodes: three runs whose later episodes succeed more often."""
+    random = np.random.default_rng(0)
+    page = test_live_browser.Page(gateway.url, browser)
+    page.open()
+    with ExitStack() as views:
+        for number, run in enumerate(RUNS):
+            view = views.enter_context(LiveView(gateway.url, name=run))
+            chances = 0.15 * number + np.linspace(0, 0.6, NUM_ENDED)
+            kinds = ["success" if random.random() < chance else "dropped" for chance in chances]
+            videos = [make_clip(kind, TASK, FIRST_SEED + seed).frames for seed, kind in enumerate(kinds)]
+            episodes = client.episodes(NUM_ENDED, TASK.sentence(), live=view)
+            for frames in zip(*videos, strict=True):
+                episodes.add(list(frames))
+            episodes.reset([True] * NUM_ENDED)
+            for frames in [*zip(*reversed(videos), strict=True)][: 15 - 3 * number]:
+                episodes.add(list(frames), [env < 2 for env in range(NUM_ENDED)])
+        browser.until_text("live-told", f"Running: {2 * len(RUNS)}. Ended: {NUM_ENDED * len(RUNS)}.")
+        browser.until(test_viewer_dataset_browser.PICTURES_ARE_THERE)
         browser.picture(IMAGES / "page_live.png")
 
 

@@ -3,16 +3,19 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
+from selenium.webdriver.support.select import Select
 
 from browsers import Browser
 from gateways import free_port, running
 from labelling import BrightnessScorer
+from paths import ROOT
 from rfm_labels import LabelOptions, label, open_dataset
-from servers import Endpoints
-from shown_datasets import copied
+from servers import Endpoints, OneModelServer
+from shown_datasets import copied, large
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -111,6 +114,36 @@ def test_a_dataset_added_by_a_restart_is_shown_without_a_reload(browser: Browser
         browser.all("#dataset-errors .actions button")[0].click()
         browser.until("document.querySelectorAll('#episodes tr').length === 8")
         assert not browser.all("#dataset-errors .state")
+
+
+def test_nothing_to_show_says_what_to_do(browser: Browser, tmp_path: Path) -> None:
+    """Of the demo's models ``rfm`` alone scores no frames; one dataset has no episodes, and the other no cameras."""
+    shutil.copytree(ROOT / "model_repository" / "rfm", tmp_path / "models" / "rfm")
+    empty, bare = large(tmp_path / "empty", 0), large(tmp_path / "bare", 3)
+    (empty / "rfm_progress.parquet").unlink()
+    options = ("--dataset", str(empty), "--dataset", str(bare))
+
+    def check(place: str, title: str, command: str) -> None:
+        told, sentence, line, *_ = wait_for_state(browser, place).split("\n")
+        assert (told, sentence[-1]) == (title, ":")
+        assert line.endswith(command)
+        assert [button.text for button in browser.all(f"#{place} button")] == ["Copy", "Look again"]
+        browser.all(f"#{place} .actions button")[0].click()
+        assert wait_for_state(browser, place).startswith(title)
+
+    with (
+        OneModelServer(tmp_path / "models", Endpoints.free()) as server,
+        running(server.endpoints, tmp_path, "rfm", *options) as gateway,
+    ):
+        browser.driver.get(gateway.url)
+        check("served-state", "No model is served", "rfm export my_checkpoint --repository my_models")
+        browser["dataset-tab"].click()
+        check("no-hits", "No episodes", "-dataset my_dataset")
+        Select(browser["dataset"]).select_by_value("1")
+        browser.until("document.querySelectorAll('#episodes tr').length === 3")
+        browser.all("#episodes button")[0].click()
+        check("episode-errors", "No videos", "-dataset my_dataset")
+        without_violations(browser)
 
 
 def test_a_wrong_key_is_told_from_none(browser: Browser, tmp_path: Path) -> None:

@@ -532,7 +532,8 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page, theme: str
     assert (np.asarray(picture).std(axis=2) > 20).any()  # the coloured lines
     assert svg.attrib["width"] == "252pt"
     texts = [element.text for element in svg.iter(f"{SVG}text")]
-    assert {TASK, "success.mp4", "failure.mp4", "progress", "success", "seconds"} <= set(texts)
+    names = {TASK, "demo_checkpoint/checkpoint", "success.mp4", "failure.mp4", "progress", "success", "seconds"}
+    assert names <= set(texts)
     lines = [
         [tuple(map(float, point.split(","))) for point in line.attrib["points"].split()]
         for line in svg.iter(f"{SVG}polyline")
@@ -544,6 +545,34 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page, theme: str
     for points, (zero, one, values) in zip(lines, of_all, strict=True):
         heights = (zero - np.array([y for _, y in points])) / (zero - one)
         np.testing.assert_allclose(heights, values, rtol=0, atol=1e-3)
+
+
+SKIPPING = """
+const done = arguments[0];
+Promise.all([import("/viewer/curves.js"), import("/viewer/figure.js")]).then(([{ Curve }, { svgFigure }]) => {
+  const settings = { task: "lift", model: "m", rule: "all", fps: 1, descriptions: {} };
+  const curve = new Curve({ title: "a.mp4", id: 1 }, settings);
+  curve.take("video", { num_frames: 7, times_s: null });
+  curve.take("scores", {
+    leading: "progress", success: Array(7).fill(null),
+    progress: [null, 0.25, null, 0.5, null, null, -0.5], answered: [false, true, false, true, true, false, true],
+  });
+  done(svgFigure(document.getElementById("figure"), [curve], { titles: ["lift", "a.mp4"], threshold: 0.5 }));
+});
+"""
+
+
+def test_a_line_leads_over_skipped_frames_and_ends_at_a_missing_score(page: Page) -> None:
+    """Of seven frames the model skips three, and the score of one is missing."""
+    svg = ElementTree.fromstring(page.browser.driver.execute_async_script(SKIPPING))
+    lines = [line.attrib["points"].split() for line in svg.iter(f"{SVG}polyline")]
+    assert [len(points) for points in lines] == [2, 1]
+    markers = [f"{each.attrib['cx']},{each.attrib['cy']}" for each in svg.iter(f"{SVG}circle")]
+    assert markers == [point for points in lines for point in points]
+    texts = [element.text for element in svg.iter(f"{SVG}text")]
+    assert texts[:2] == ["lift", "a.mp4"]
+    assert "-0.5" in texts  # the axis reaches the score below 0
+    assert texts.count("a.mp4") == 1  # a curve alone needs no legend
 
 
 def test_axe_finds_nothing_in_either_theme(page: Page) -> None:

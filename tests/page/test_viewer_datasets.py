@@ -26,7 +26,9 @@ from pyarrow import parquet
 from gateway_requests import failure
 from gateways import free_port, inside
 from labelling import LEROBOT, BrightnessScorer
+from paths import ROOT
 from pictures import TURNS, turn
+from rfm_client.frames import read_video
 from rfm_client.options import ConfigError
 from rfm_gateway import GatewayConfig, check_gateway
 from rfm_labels import LabelOptions, label, open_dataset
@@ -147,6 +149,59 @@ def test_the_curves_are_those_of_the_labels(get: Get, folders: list[Path], numbe
     for curve, (_, progress, success) in zip(told["curves"], names, strict=True):
         np.testing.assert_array_equal(np.float32(curve["progress"]), columns[progress])
         np.testing.assert_array_equal(np.float32(curve["success"]), columns[success])
+
+
+def test_the_curves_tell_which_frames_the_model_skipped(tmp_path: Path) -> None:
+    root = copied("toy_v21", tmp_path)
+    label(open_dataset(root), BrightnessScorer(), LabelOptions())
+    table = parquet.read_table(root / "rfm_progress.parquet")
+    is_answered = table["frame_index"].to_numpy() % 3 == 0
+    hops = pa.array(np.where(is_answered, np.float32(0.1), np.float32("nan")))
+    parquet.write_table(table.append_column("hop", hops), root / "rfm_progress.parquet")
+    with serving(root) as get:
+        curves = get("/0/episodes/7").json()["curves"]
+    assert {tuple(curve["answered"]) for curve in curves} == {
+        tuple(is_answered[table["episode_index"].to_numpy() == 7])
+    }
+
+
+def rlds(folder: Path) -> Path:
+    return Path(shutil.copytree(ROOT / "tests" / "rlds" / "toy_steps_texts", folder / "rlds"))
+
+
+def with_pictures_in_tables(folder: Path) -> Path:
+    """Replace the wrist camera's videos by pictures in the tables."""
+    root = copied("toy_v21", folder)
+    info = json.loads((root / "meta" / "info.json").read_text())
+    info["features"][CAMERAS[1]]["dtype"] = "image"
+    for video in sorted((root / "videos").glob(f"*/{CAMERAS[1]}/*.mp4")):
+        pictures = []
+        for frame in read_video(video, None):
+            Image.fromarray(frame).save(png := io.BytesIO(), "PNG")
+            pictures.append({"bytes": png.getvalue(), "path": None})
+        file = root / "data" / "chunk-000" / f"{video.stem}.parquet"
+        table = parquet.read_table(file, partitioning=None).append_column(CAMERAS[1], pa.array(pictures))
+        parquet.write_table(table, file)
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    return root
+
+
+@pytest.mark.parametrize("make", [rlds, with_pictures_in_tables])
+def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path]) -> None:
+    root = make(tmp_path)
+    dataset = open_dataset(root)
+    with serving(root) as get:
+        table, curves = get("/0").json(), get("/0/episodes/2").json()
+        video = get("/0/episodes/2/videos/1")
+        faults = get("/0/faults").json()
+    assert (table["cameras"], table["has_stored_pixels"]) == ([*dataset.cameras], False)
+    assert [row["task"] for row in table["episodes"]] == [episode.task for episode in dataset.episodes]
+    assert (curves["curves"], faults) == ([], {})
+    expected = np.stack(list(dataset.frames(dataset.episode(2), dataset.cameras[1])))
+    assert curves["times_s"] == pytest.approx(np.arange(len(expected)) / 10)
+    with av.open(io.BytesIO(video.content)) as container:
+        shown = np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+    assert np.abs(shown.astype(int) - expected).mean() < 4  # colours at half the resolution
 
 
 def check_frames(get: Get, root: Path, episode: int, number: int = 0, camera: int = 0) -> None:
@@ -382,7 +437,8 @@ def test_a_video_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
 
 
 REFUSED = {
-    "nowhere": r"expected the folder of a LeRobot dataset \(meta/info\.json\), or an HDF5 file, got .*nowhere",
+    "nowhere": r"expected the folder of a LeRobot \(meta/info\.json\) or RLDS dataset \(features\.json\), or an HDF5 file, "
+    "got .*nowhere",
     "v9": r"codebase_version: expected one of v2.0, v2.1, v3.0, got 'v9.9'",
 }
 

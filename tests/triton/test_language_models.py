@@ -521,8 +521,9 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
             page.write(name, text)
         page.drop([video])
         page.until_text("status", "1 of 1 curves are done.")
-        assert page.cells("#curves tr")[0][5:7] == [f"{seconds[-1]:.3f} s remaining", "-"]
-        assert list(page.values("chart", "remaining_s").values()) == [f"{seconds[0]:.3f}"]
+        assert page.cells("#curves tr")[0][5:7] == [f"{seconds[-1]:.1f}", "-"]
+        assert page.all("#numbers .leading")[0].text == "Final remaining (s)"
+        assert list(page.values("chart", "remaining_s").values()) == [f"{seconds[0]:.1f}"]
         assert page.values("chart", "progress") == {}
         page["json"].click()
         (shown,) = json.loads(page.saved("curves.json"))["videos"]
@@ -533,14 +534,25 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
         np.testing.assert_allclose([float(line["remaining_s"]) for line in lines], seconds, rtol=1e-4, atol=1e-4)
         page["svg"].click()
         assert "remaining (s)" in page.saved("curves.svg").decode()
+        page.run("document.querySelector('#score-panel .side').scrollTo(0, 9999)")
+        page.write("robot", "another robot")
+        page.all("#question .first")[0].click()
+        page.until_text("status", "2 of 2 curves are done.")
+        page["json"].click()
+        _, described = json.loads(page.saved("curves.json"))["videos"]
+        assert described["robot_description"] == "another robot"
+        assert not np.allclose(described["remaining_s"], seconds, rtol=1e-3)
+        Select(page["model"]).select_by_visible_text("robo")
+        assert not page["robot"].is_displayed()
         page["live-tab"].click()
         frame = np.random.default_rng(1).integers(0, 256, (48, 80, 3), np.uint8)
         with asked.client("rynn") as client, LiveView(gateway.url, name="run") as view:
             episode = client.episode(TASK, score="remaining_s", live=view)
-            left_s = f"{episode.add(frame).more_scores['remaining_s']:.3f} s"
+            left_s = f"{episode.add(frame).more_scores['remaining_s']:.1f} s"
         card = "[...document.querySelectorAll('.live dl div')].map((each) => each.textContent)"
         page.until(f"{card}.includes('Remaining{left_s}')")
-        poll(lambda: page.cells("#live-runs tr")[0][5] == f"{left_s} remaining")
+        poll(lambda: page.cells("#live-runs tr")[0][5] == left_s.removesuffix(" s"))
+        assert page["live-leading"].text == "Mean final remaining (s)"
         assert f"final remaining {left_s}" in str(page["live-panel"].get_attribute("innerHTML"))
 
 

@@ -15,6 +15,7 @@ from PIL import Image
 from pyarrow import parquet
 
 import rfm_export
+from encoding import encode_here
 from faulty_servers import url_of
 from gateways import metric_at, poll, running
 from in_process import rfm_client
@@ -23,6 +24,7 @@ from rfm.config import ExportConfig
 from rfm_client import InvalidSampleError, ProgressResult, RewardClient, Trajectory
 from robodopamine import CHECKPOINT, case_named
 from servers import Endpoints, start_triton
+from viewer_requests import SCORE, SERVED, events, post
 
 pytestmark = pytest.mark.triton
 
@@ -90,14 +92,22 @@ def test_what_cannot_be_compared_is_refused_by_name(endpoints: Endpoints, protoc
             client.progress(Trajectory(frames=frames, task="t"), frame_steps=2)
 
 
-def test_the_gateway_answers_null_at_frames_without_an_answer(endpoints: Endpoints, tmp_path: Path) -> None:
+def test_the_gateway_and_the_page_answer_null_at_frames_without_an_answer(endpoints: Endpoints, tmp_path: Path) -> None:
     case = case_named("baseline_T3_forward")
+    video = tmp_path / "video.mp4"
+    encode_here(video, case.sample.trajectory.positions, "libx264rgb", {"qp": "0"}, pixels="rgb24")
     (expected,) = case.engine().evaluate([case.sample])
     assert isinstance(expected, ProgressResult)
     trajectory = {"task": case.sample.trajectory.task, "frames": case.sample.trajectory.positions.tolist()}
     body = {"samples": [{"sample_type": "progress", "trajectory": trajectory}]}
     with running(endpoints, tmp_path, "forward") as gateway:
         answer = requests.post(f"{gateway.url}/evaluate_batch", json=body, timeout=60).json()
+        served = requests.get(f"{gateway.url}/{SERVED}", timeout=60).json()["models"]
+        _, (_, points), _ = events(post(gateway.url, SCORE, {"video": video}, task=trajectory["task"], fps="10"))
+    about = next(model for model in served if model["name"] == "forward")
+    assert (about["rule"], about["reads_views"], about["reads_descriptions"]) == ("all", True, False)
+    assert (points["progress"][0], points["answered"]) == (None, [False, True, True])
+    np.testing.assert_allclose(points["progress"][1:], expected.progress[1:], rtol=0, atol=1e-6)
     (values,) = answer["outputs_progress"]["progress_pred"]
     assert values[0] is None
     np.testing.assert_allclose(values[1:], expected.progress[1:], rtol=0, atol=1e-6)

@@ -25,6 +25,7 @@ from rfm_labels.metadata import (
     Cost,
     blank_from_metadata,
     parsed_object,
+    skipping_in,
 )
 from rfm_labels.plan import Item, Plan, make_plan
 from rfm_labels.writing import (
@@ -84,11 +85,13 @@ class EpisodeLabels:
     frames: int64 [T], numbers of the labelled frames in the episode
     fused: scores fused over all cameras
     cameras: each camera's scores; empty for a single camera
+    is_answered: bool [T], False at the frames that the model skipped
     """
 
     frames: npt.NDArray[np.int64]
     fused: Curve
     cameras: Mapping[str, Curve]
+    is_answered: npt.NDArray[np.bool_]
 
 
 def find_label_files(root: Path) -> list[Path]:
@@ -186,7 +189,10 @@ def read_episode_labels(file: Path, episode: int) -> EpisodeLabels | None:
         return Curve(table[f"{PROGRESS}{dot_camera}"].to_numpy(), table[success].to_numpy() if has_success else None)
 
     cameras = [name.partition(".")[2] for name in table.column_names if name.startswith(f"{PROGRESS}.")]
-    return EpisodeLabels(table["frame_index"].to_numpy(), curve(), {camera: curve(f".{camera}") for camera in cameras})
+    skipping = skipping_in(table.column_names)
+    is_answered = np.ones(len(table), bool) if skipping is None else np.isfinite(table[skipping].to_numpy())
+    curves = {camera: curve(f".{camera}") for camera in cameras}
+    return EpisodeLabels(table["frame_index"].to_numpy(), curve(), curves, is_answered)
 
 
 def _score_columns(file: Path, names: Sequence[str]) -> dict[str, str]:

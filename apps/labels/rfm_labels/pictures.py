@@ -30,9 +30,8 @@ WIDTH_IN = 7.0  # of a page
 SUMMARY_IN, EVALUATION_IN = 1.9, 1.3  # heights of axes
 HEADLINE_IN = 0.5
 BINS = 20
-STYLE = ("default", "rfm_client.figure")  # the style file of all figures says what each colour means
-PROGRESS_COLOUR, SUCCESS_COLOUR, FAILURE_COLOUR = "C0", "C2", "C6"
-THRESHOLD = {"color": "#75808a", "linestyle": ":", "linewidth": 0.9, "zorder": 1}
+STYLE = "rfm_client.figure"  # the style file of all figures says what each colour means
+SUCCESS_COLOUR, FAILURE_COLOUR = "C2", "C6"  # the first colour, of progress, is matplotlib's choice
 
 
 def draw_summary(file: Path, summary: Summary, labels: Path) -> None:
@@ -45,7 +44,7 @@ def draw_summary(file: Path, summary: Summary, labels: Path) -> None:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError('pictures need matplotlib: pip install "./client[cli]", or use --no-picture') from error
-    with matplotlib.style.context([*STYLE]):
+    with matplotlib.style.context(STYLE, after_reset=True):
         figure = Figure(figsize=(WIDTH_IN, HEADLINE_IN + SUMMARY_IN), layout="constrained")
         final, by_success, backwards = figure.subplots(1, 3)
         succeeds = None
@@ -57,13 +56,15 @@ def draw_summary(file: Path, summary: Summary, labels: Path) -> None:
             by_success.scatter(
                 summary.final_progress, summary.best_success, s=10, c=colours, alpha=0.6, lw=0, clip_on=False
             )
-            by_success.axhline(SuccessRule.threshold, **THRESHOLD)
+            by_success.axhline(
+                SuccessRule.threshold, color=matplotlib.rcParams["axes.edgecolor"], linestyle=":", lw=0.9
+            )
         names = {True: "succeed", False: "never succeed"}
         _draw_ends(final, summary.final_progress, succeeds, names)
         final.set_xlabel("final progress")
         by_success.set(xlabel="final progress", ylabel="best success", xlim=(0, 1), ylim=(-0.03, 1.03))
         by_success.set_yticks((0, 0.5, 1))
-        backwards.hist(100 * summary.backwards, bins=BINS, color=PROGRESS_COLOUR)
+        backwards.hist(100 * summary.backwards, bins=BINS)
         backwards.set(xlabel="steps on which progress falls (%)", ylabel="episodes")
         for ax in (final, backwards):
             ax.grid(visible=False, axis="x")
@@ -84,7 +85,7 @@ def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Pa
     from matplotlib.figure import Figure
 
     count = len(comparison.evaluations)
-    with matplotlib.style.context([*STYLE]):
+    with matplotlib.style.context(STYLE, after_reset=True):
         figure = Figure(figsize=(WIDTH_IN, HEADLINE_IN + EVALUATION_IN * count), layout="constrained")
         axes = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         origins = [_origin(each) for each in labels]
@@ -113,7 +114,7 @@ def _draw_ends(
 ) -> None:
     """Draw a histogram of final progress; with outcomes, successes stand on failures."""
     if is_success is None:
-        ax.hist(final, bins=BINS, range=(0, 1), color=PROGRESS_COLOUR)
+        ax.hist(final, bins=BINS, range=(0, 1))
     else:
         parts = {names[outcome]: final[is_success == outcome] for outcome in (False, True)}
         colours = [FAILURE_COLOUR, SUCCESS_COLOUR]

@@ -18,17 +18,21 @@ import numpy.typing as npt
 from rfm_client.frames import FrameFileError, Video
 from rfm_labels import DatasetEpisode
 from rfm_labels.datasets import LeRobotDataset, Span
+from rfm_page.encoded import encoded
 from rfm_page.links import check_links, links_in
 from rfm_page.shown import ShownDataset
 
 
 @dataclass(frozen=True)
 class ShownLeRobot(ShownDataset):
-    """A LeRobot dataset for the page; an episode is cut out of the stored video."""
-
-    has_stored_pixels = True
+    """A LeRobot dataset for the page. An episode is cut out of the stored video; pictures in tables are encoded."""
 
     dataset: LeRobotDataset
+
+    @property
+    def has_stored_pixels(self) -> bool:
+        """True if all cameras have videos."""
+        return not self.dataset.info.images
 
     def check(self) -> None:
         """Raise DatasetError for a link out of the folder."""
@@ -36,8 +40,9 @@ class ShownLeRobot(ShownDataset):
 
     @property
     def cameras(self) -> Sequence[str]:
-        """The cameras with videos; pictures in tables are not shown."""
-        return list(self.dataset.info.videos)
+        """The cameras with videos, and those with pictures in colours."""
+        unused, videos = self.dataset.unused_cameras(self.dataset.cameras), self.dataset.info.videos
+        return [camera for camera in self.dataset.cameras if camera in videos or camera not in unused]
 
     @property
     def fps(self) -> float:
@@ -49,7 +54,9 @@ class ShownLeRobot(ShownDataset):
         return self.dataset.times_s(episode)
 
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
-        """Return the episode's part of the stored video. Raises DatasetError."""
+        """Return the episode's part of the stored video, or its pictures as a video. Raises DatasetError."""
+        if camera not in self.dataset.info.videos:
+            return encoded(self.dataset.stored_frames(episode, camera), self.fps, take)
         return _cut(self.dataset.span(episode, camera), take)
 
 

@@ -6,26 +6,22 @@ A file with links to other files, or with data in them, is refused, since its au
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client import UInt8Array
 from rfm_labels import DatasetEpisode, DatasetError, find_label_files, stored_in
 from rfm_labels.datasets import Hdf5Dataset, opened_hdf5
+from rfm_page.encoded import encoded
 from rfm_page.links import check_links
 from rfm_page.shown import ShownDataset
 
 _FILES_KNOWN = 64  # files whose last check is remembered
-_CODING = {"crf": "12", "g": "10", "preset": "veryfast"}  # of H.264: hardly any loss, and quick to move in
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,7 @@ class ShownHdf5(ShownDataset):
 
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
         """Return the episode's pictures, as stored, as a video of nearly the same colours. Raises DatasetError."""
-        return _encoded(self.dataset.stored_frames(episode, camera), self.fps, take)
+        return encoded(self.dataset.stored_frames(episode, camera), self.fps, take)
 
 
 def _changed_ns(file: Path) -> int:
@@ -91,24 +87,3 @@ def _check_inside(file: Path, _changed_ns: int) -> None:
         name = opened.visititems_links(leaves)
     if name is not None:
         raise DatasetError.at(f"{file}: {name}", "data in the file", "data in another file: copy them into it")
-
-
-def _encoded(frames: Iterator[UInt8Array], fps: float, take: Callable[[int], object]) -> bytes:
-    video = io.BytesIO()
-    with av.open(video, "w", format="mp4") as container:
-        stream: Any = None
-        for frame in frames:
-            even = np.pad(frame, [(0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)], "edge")  # for H.264
-            if stream is None:
-                stream = container.add_stream("libx264", Fraction(fps).limit_denominator(1000), options=_CODING)
-                stream.height, stream.width, stream.pix_fmt = *even.shape[:2], "yuv420p"
-                take(even.nbytes)
-            _mux(container, stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")), take)
-        _mux(container, stream.encode(None), take)
-    return video.getvalue()
-
-
-def _mux(container: Any, packets: Sequence[Any], take: Callable[[int], object]) -> None:
-    for packet in packets:
-        take(packet.size)
-        container.mux(packet)

@@ -35,9 +35,10 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         import pyarrow  # noqa: F401
 
         from rfm_labels import DatasetError
-        from rfm_labels.datasets import Hdf5Dataset, open_to_show
+        from rfm_labels.datasets import Hdf5Dataset, LeRobotDataset, open_to_show
         from rfm_page.datasets import ShownLeRobot
         from rfm_page.hdf5_datasets import ShownHdf5
+        from rfm_page.rlds_datasets import ShownRlds
     except ModuleNotFoundError as error:
         expected = f"the package {error.name}, which reads it"
         raise ConfigError.at("dataset", expected, "none: pip install ./apps/labels") from None
@@ -45,7 +46,12 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
     try:
         for path in config.dataset:
             dataset = open_to_show(path)
-            datasets.append(ShownHdf5(dataset) if isinstance(dataset, Hdf5Dataset) else ShownLeRobot(dataset))
+            if isinstance(dataset, LeRobotDataset):
+                datasets.append(ShownLeRobot(dataset))
+            elif isinstance(dataset, Hdf5Dataset):
+                datasets.append(ShownHdf5(dataset))
+            else:
+                datasets.append(ShownRlds(dataset))
             datasets[-1].check()
     except (DatasetError, ImportError) as error:
         raise ConfigError(str(error), "dataset") from None

@@ -13,7 +13,7 @@ import logging
 import math
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast, get_args
 
@@ -123,7 +123,7 @@ def viewer_routes(host: PageHost) -> APIRouter:
             trajectory, size = video.trajectory, asked.info.frame_size if asked.question.resize else None
             if size is not None:
                 frames = await asyncio.to_thread(resize_frames, trajectory.positions, size)
-                trajectory = Trajectory(frames=frames, task=trajectory.task)
+                trajectory = replace(trajectory, frames=frames)
             async with config.client(asked.question.model) as client:
                 async for points in _curve(client, trajectory, asked):
                     version = points["model_version"]
@@ -153,9 +153,11 @@ async def _infos(config: GatewayConfig) -> list[tuple[str, ModelInfo]]:
 
 
 def _told_of(name: str, info: ModelInfo) -> dict[str, Any]:
-    rule = Sampling.of(None, 1, None, trained_padding=info.trained_padding).rule
+    usual = Sampling.of(None, 1, None, trained_padding=info.trained_padding).rule
+    rule = "all" if info.needs_whole_episode else usual
     about = {"name": name, "max_frames": info.max_frames, "rule": rule}
-    return {**about, "versions": list(info.versions), "source": info.source}
+    reads = {"reads_descriptions": info.reads_descriptions, "reads_views": info.reads_views}
+    return {**about, **reads, "versions": list(info.versions), "source": info.source}
 
 
 def _frames_of(rule: Rule) -> int | str | None:
@@ -199,6 +201,7 @@ def _points(first: int, parts: Sequence[ProgressResult]) -> dict[str, Any]:
         "leading": points.leading,
         **{name: points.arrays[name].tolist() for name in {"progress", points.leading}},
         "success": points.success.tolist(),
+        "answered": points.is_answered.tolist(),
         "model_version": points.model_version,
     }
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -48,12 +48,8 @@ class ShownDataset(ABC):
     """A dataset for the page.
 
     dataset: as ``open_to_show`` returns it
-    has_stored_pixels: True: its videos have every pixel as stored; False: they are encoded for the page
-
     Its methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
     """
-
-    has_stored_pixels: ClassVar[bool]
 
     dataset: Dataset
 
@@ -70,6 +66,11 @@ class ShownDataset(ABC):
     @abstractmethod
     def check(self) -> None:
         """Raise DatasetError if the dataset would show other files of this machine. Before every reading."""
+
+    @property
+    @abstractmethod
+    def has_stored_pixels(self) -> bool:
+        """True if the videos have every pixel as stored; False: some are encoded for the page."""
 
     @property
     @abstractmethod
@@ -257,7 +258,10 @@ def _rows(summary: Summary) -> list[dict[str, Any]]:
 def _curves(labels: EpisodeLabels, num_frames: int) -> list[dict[str, Any]]:
     """Return the fused curve, which training reads, then the curve of each camera."""
     curves = [(None, labels.fused), *labels.cameras.items()]
-    return [{"camera": camera, **_scores(curve, labels.frames, num_frames)} for camera, curve in curves]
+    answered = np.ones(num_frames, bool)
+    answered[labels.frames] = labels.is_answered
+    told = {"answered": answered.tolist()}  # False: the model skipped the frame; True, too: a frame without labels
+    return [{"camera": camera, **_scores(curve, labels.frames, num_frames), **told} for camera, curve in curves]
 
 
 def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dict[str, Any]:

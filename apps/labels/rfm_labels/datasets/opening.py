@@ -119,8 +119,8 @@ def _from_hub(name: str, revision: str | None, **opening: Any) -> LeRobotDataset
     return LeRobotDataset(folder, source=name, revision=commit, **opening)
 
 
-def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset:
-    """Return the dataset of a LeRobot folder or an HDF5 file for a viewer. Raises DatasetError.
+def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset | RldsDataset:
+    """Return the dataset of a LeRobot or RLDS folder or an HDF5 file for a viewer. Raises DatasetError.
 
     Blank and outdated tasks are shown, too, and a row's frame is the nearest, as a player shows it.
     """
@@ -128,7 +128,10 @@ def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset:
     if is_hdf5(path):
         return Hdf5Dataset(path, task=TaskOverride(is_needed=False))
     if not (path / INFO_FILE).is_file():
-        raise DatasetError.at("", f"the folder of a LeRobot dataset ({INFO_FILE}), or an HDF5 file", source)
+        if folder := rlds_folder(path):
+            return RldsDataset(folder, task=TaskOverride(is_needed=False))
+        expected = f"the folder of a LeRobot ({INFO_FILE}) or RLDS dataset ({FEATURES_FILE}), or an HDF5 file"
+        raise DatasetError.at("", expected, source)
     task = TaskOverride(column=TASK_COLUMN, is_needed=False)
     return LeRobotDataset(path, task=task, tolerance_s=0.5 / Info.read(path).fps)
 

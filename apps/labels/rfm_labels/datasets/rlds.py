@@ -20,7 +20,7 @@ from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.rlds_meta import FEATURES_FILE, INSTRUCTIONS, RldsInfo
 from rfm_labels.datasets.stored_files import digest_of, faults_at
-from rfm_labels.datasets.tfrecords import RecordFile, features_of
+from rfm_labels.datasets.tfrecords import RecordFile, check_packages, features_of
 
 
 def rlds_folder(path: Path) -> Path | None:
@@ -68,6 +68,7 @@ class RldsDataset(Dataset):
     def __init__(
         self, root: Path, *, task: TaskOverride = TaskOverride(), corrections: AskedCorrections = AskedCorrections()
     ) -> None:
+        check_packages()
         self.root = root
         self._info = info = RldsInfo.read(root)
         self.source, self.given_task, self.notes = info.source, task, info.notes

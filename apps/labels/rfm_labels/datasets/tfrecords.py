@@ -83,6 +83,15 @@ class RecordFile:
         return int(length)
 
 
+def check_packages() -> None:
+    """Raise ImportError without the packages that read records."""
+    try:
+        import google.protobuf  # noqa: F401
+        import google_crc32c  # noqa: F401
+    except ImportError as error:
+        raise ImportError(NEEDED) from error
+
+
 def features_of(record: bytes, where: object) -> Mapping[str, Any]:
     """Return the features of a ``tf.train.Example`` by name, as messages ``Feature``. Raises DatasetError."""
     from google.protobuf.message import DecodeError
@@ -96,10 +105,8 @@ def features_of(record: bytes, where: object) -> Mapping[str, Any]:
 
 
 def _masked_crc(content: bytes) -> int:
-    try:
-        import google_crc32c
-    except ImportError as error:
-        raise ImportError(NEEDED) from error
+    import google_crc32c
+
     crc = int(google_crc32c.value(content))
     return ((crc >> 15 | crc << 17) + _CRC_CONSTANT) & 0xFFFFFFFF
 
@@ -107,10 +114,8 @@ def _masked_crc(content: bytes) -> int:
 @lru_cache
 def _example_type() -> Any:
     """The message type, in a pool of its own: TensorFlow in the same process registers the same names."""
-    try:
-        from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-    except ImportError as error:
-        raise ImportError(NEEDED) from error
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
     field = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="example.proto", package="rfm", syntax="proto3")
     for name, fields in _SCHEMA.items():

@@ -2,17 +2,18 @@
 // The chart: progress of each curve above, or what its model predicts in place of it, success in a band below, over time or over steps, drawn by uPlot.
 
 import { pointAt } from "./curves.js";
-import { leadingOf, marksOf, scaleOf, titleOf } from "./signals.js";
-import { shown } from "./text.js";
+import { leadingOf, marksOf, numberOf, scaleOf, titleOf } from "./signals.js";
 import uPlot from "./uplot/uPlot.esm.js";
 
 const NUM_COLOURS = 12;
+const LEFT_PX = 60; // of the numbers and names to the left
 const VALUE_PX = 16; // height of a number beside a line
 const VALUE_WIDTH_PX = 48;
 const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
 export const MARK_PX = 72; // at least between the marks of the axis below
 const FAINT = "50"; // opacity, in hexadecimal
 const POINT_PX = 20; // nearer to each other, points are not drawn as dots
+const MARKER_PX = 7; // of a dot at a frame between frames that the model skips
 const LARGE_PX = 400; // a chart so high and so wide has larger letters
 const LOW_PX = 240; // a chart so low has fewer marks
 const WITH_SUCCESS = { leading: [0.37, 0.98], success: [0.03, 0.27] }; // shares of the height
@@ -104,7 +105,8 @@ export class Chart {
   /**
    * Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`; one with a `leading`
    * has the array of this name in place of progress.
-   * Some have a `begin`, a `colour`, a `successIndex` of another colour for success, or a `dash`: lengths of strokes and gaps. One that `isFaint` has no numbers beside it.
+   * Some have a `begin`, a `colour`, a `successIndex` of another colour for success, or a `dash`: lengths of strokes and gaps.
+   * One that `isFaint` has no numbers beside it. One that `skipsFrames` has a dot at each point.
    */
   show(curves) {
     this.#curves = curves.filter(({ times }) => times.length);
@@ -118,7 +120,7 @@ export class Chart {
       curve.times, ...signals.map((signal) => curve.times.map((_, index) => heightOf(this.#panes, signal, curve[signal]?.[index]))),
     ]);
     const data = tables.length ? uPlot.join(tables) : [[], []];
-    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${JSON.stringify(this.#curves.map(({ dash, isFaint }) => [dash, isFaint]))}`;
+    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${JSON.stringify(this.#curves.map(({ dash, isFaint, skipsFrames }) => [dash, isFaint, skipsFrames]))}`;
     if (shape !== this.#shape || !this.#plot) {
       this.#plot?.destroy();
       this.#plot = this.#curves.length ? this.#newPlot(signals, data) : null;
@@ -172,7 +174,7 @@ export class Chart {
       dots.push(...known.map(({ curve, time, value }) => this.#dot(curve, signal, time, value)));
       for (const each of known) each.top = this.#top(signal, each.value) - VALUE_PX / 2;
       const [lowest, highest] = this.#panes[signal].scale.map((value) => this.#top(signal, value));
-      const texts = known.map(({ value }) => shown(value));
+      const texts = known.map(({ value }) => numberOf(signal, value));
       known.forEach((each, place) => { // equal numbers are seen once
         each.isAgain = texts.indexOf(texts[place]) < place;
         each.isShared = texts.lastIndexOf(texts[place]) > place;
@@ -184,7 +186,7 @@ export class Chart {
     while (this.#values.children.length > labels.length) this.#values.lastChild.remove();
     labels.forEach(({ curve, signal, value, top, isAgain, isShared }, place) => {
       const element = this.#values.children[place] ?? this.#values.appendChild(document.createElement("span"));
-      element.textContent = shown(value);
+      element.textContent = numberOf(signal, value);
       element.dataset.signal = signal;
       element.dataset.curve = curve.label;
       element.hidden = isAgain;
@@ -233,12 +235,12 @@ export class Chart {
     };
     const number = new Map(marks);
     const left = {
-      ...axis, size: 52, splits: () => marks.map(([height]) => height), filter: (_, splits) => splits,
+      ...axis, size: LEFT_PX, splits: () => marks.map(([height]) => height), filter: (_, splits) => splits,
       values: (_, splits) => splits.map((height) => `${number.get(height)}`),
     };
     const series = this.#drawn.flatMap((curve, place) => signals.map((signal) => {
       const stroke = () => `${colourOf(this.#drawn[place] ?? curve, signal)}${curve.isFaint ? FAINT : ""}`;
-      const points = { show: isRoomy, size: 5, fill: stroke };
+      const points = { show: curve.skipsFrames ?? isRoomy, size: curve.skipsFrames ? MARKER_PX : 5, fill: stroke };
       return { stroke, width: 2, dash: curve.dash ?? undefined, points };
     }));
     const options = {
@@ -312,7 +314,7 @@ function drawNames({ ctx, bbox }, panes, letterPx) {
   for (const [signal, { from, to }] of Object.entries(panes)) {
     const title = titleOf(signal);
     ctx.save();
-    ctx.translate(bbox.left - 50 * scale, bbox.top + (1 - (from + to) / 2) * bbox.height);
+    ctx.translate(bbox.left - (LEFT_PX - 2) * scale, bbox.top + (1 - (from + to) / 2) * bbox.height);
     ctx.rotate(-Math.PI / 2);
     if ((to - from) * bbox.height > ctx.measureText(title).width) ctx.fillText(title, 0, 8 * scale);
     ctx.restore();

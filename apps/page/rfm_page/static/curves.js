@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 // What is known of each curve: what was asked, the points that have come, and how it stands.
 
+import { leadingOf } from "./signals.js";
 import { cut } from "./text.js";
 
 const SEPARATOR = ", ";
@@ -12,6 +13,7 @@ const ASKED = {
   rule: ({ rule, frames }) => (frames ? `${rule}, ${frames} frames` : rule),
   fps: ({ fps }) => `${fps} fps`,
   resize: ({ resize }) => (resize ? "downscaled" : "full size"),
+  described: ({ descriptions }) => Object.values(descriptions).join("; ") || "as exported",
 };
 
 /** One question about one video, and its points. */
@@ -27,6 +29,7 @@ export class Curve {
   numFrames = null;
   sampledFrames = null;
   blank = null; // what the frames show, if nothing
+  answered = []; // for each point: whether the model answers about this frame
   index = 0; // of its colour
   colour = null; // that somebody gave its video, or its question
   dash = null; // lengths of strokes and gaps; null: a solid line
@@ -34,7 +37,7 @@ export class Curve {
   questionColour = null; // that somebody gave its question
   leaving = new AbortController(); // aborted as soon as the curve is removed
 
-  /** settings: task, model, rule, frames, fps, orient, channels, resize, as in the form */
+  /** settings: task, model, rule, frames, fps, orient, channels, resize, as in the form; descriptions: those that are given */
   constructor(video, settings) {
     Object.assign(this, { video, ...settings, frames: settings.frames || null });
     this.allTimes = null;
@@ -42,8 +45,8 @@ export class Curve {
 
   /** The same for two curves that ask the same. */
   get identity() {
-    const { video, task, model, rule, frames, fps, orient, channels, resize } = this;
-    return JSON.stringify([video.id, task, model, rule, frames, fps, orient, channels, resize]);
+    const { video, task, model, rule, frames, fps, orient, channels, resize, descriptions } = this;
+    return JSON.stringify([video.id, task, model, rule, frames, fps, orient, channels, resize, descriptions]);
   }
 
   get sampling() {
@@ -86,6 +89,7 @@ export class Curve {
       if (this.leading !== "progress") (this[this.leading] ??= []).push(...document[this.leading]);
       this.progress.push(...document.progress);
       this.success.push(...document.success);
+      this.answered.push(...document.answered);
       this.times = this.allTimes.slice(0, this.progress.length);
       this.version = document.model_version;
     } else if (name === "done") {
@@ -103,6 +107,14 @@ export class Curve {
 /** What is changed in the frames of a video before they are scored. */
 function corrections({ orient, channels }) {
   return [orient, channels].filter((value) => value !== "none" && value !== "rgb");
+}
+
+/** The curve at the frames about which its model answers; some models skip frames. Frames whose score is missing stay. */
+export function answeredOf(curve) {
+  if (!curve.answered?.includes(false)) return curve;
+  const names = ["times", "success", leadingOf(curve)];
+  const kept = names.map((name) => [name, curve[name].filter((_, index) => curve.answered[index])]);
+  return Object.assign(Object.create(curve), { skipsFrames: true, ...Object.fromEntries(kept) });
 }
 
 /** The index of the point at a time: the last one that is not after it; null: there is none. */

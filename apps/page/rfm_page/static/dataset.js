@@ -348,7 +348,7 @@ export class DatasetTab {
   #showNoHits() {
     const { hits, errors } = this.#places;
     if (this.#shown.length || !errors.isEmpty) hits.clear();
-    else hits.show(this.#episodes.length ? noHit(this.#episodes.length, () => this.#clearFilters()) : noEpisode());
+    else hits.show(this.#episodes.length ? noHit(this.#episodes.length, () => this.#clearFilters()) : noEpisode(() => this.#load()));
     this.#page["episode-list"].hidden = !this.#shown.length;
   }
 
@@ -484,7 +484,7 @@ export class DatasetTab {
     this.#page["episode-legend"].replaceChildren(...curves.map(legendItem));
     const blobs = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
-    if (!cameras.length) this.#places.episode.show(noVideo());
+    if (!cameras.length) this.#places.episode.show(noVideo(() => this.#watch(this.#watched)));
     const { name } = this.#datasets[this.#number];
     cameras.forEach((camera, index) => {
       const file = `${name}_episode_${`${episode}`.padStart(6, "0")}.${short(camera)}.mp4`;
@@ -510,10 +510,10 @@ export class DatasetTab {
 /** The labelled curves as a chart takes them. file: of other labels, which are dashed; null: the first labels */
 function curvesIn({ times_s: times, curves }, file) {
   const none = times.map(() => null);
-  return curves.map(({ camera, progress, success }, index) => {
+  return curves.map(({ camera, progress, success, answered }, index) => {
     const name = camera ? short(camera) : curves.length > 1 ? "all cameras" : "labels";
     const label = file === null ? name : `${name} (${reward(file)})`;
-    return { index, label, progress, success: success ?? none, times, allTimes: times, dash: file === null ? null : DASHES[1] };
+    return { index, label, progress, success: success ?? none, answered, times, allTimes: times, dash: file === null ? null : DASHES[1] };
   });
 }
 

@@ -134,14 +134,16 @@ export class EpisodeTable {
     const first = cell("", "choose");
     first.append(box);
     first.addEventListener("click", (event) => event.stopPropagation());
-    const task = cell(episode.task, "task");
-    task.title = episode.task;
+    const task = cell("", "task");
+    const words = document.createElement("span");
+    words.textContent = task.title = episode.task;
+    task.append(words);
     if (episode.fault) {
       const fault = document.createElement("span");
       fault.className = "failed";
       fault.textContent = ` ${episode.fault}`;
       task.title = episode.fault;
-      task.prepend(fault, " ");
+      words.prepend(fault, " ");
     }
     row.append(first, header, task, cell(episode.num_frames, "number frames"));
     const scores = [episode.final_progress, episode.best_success, episode.last_success];

@@ -53,15 +53,21 @@ export function noDataset(retry) {
   return {
     kind: "empty",
     title: "No dataset yet",
-    text: "Start the server again with a LeRobot folder or an HDF5 file, and look through its episodes here:",
+    text: "Start the server again with a LeRobot or RLDS folder or an HDF5 file, and look through its episodes here:",
     command: remedies.dataset,
     buttons: [["Look again", retry]],
     note: BY_ITSELF,
   };
 }
 
-export function noEpisode() {
-  return { kind: "empty", title: "No episodes", text: "This dataset is empty." };
+export function noEpisode(retry) {
+  return {
+    kind: "empty",
+    title: "No episodes",
+    text: "This dataset is empty. Record into it, or start the server with another one:",
+    command: remedies.dataset,
+    buttons: [["Look again", retry]],
+  };
 }
 
 export function noHit(numEpisodes, clear) {
@@ -69,8 +75,14 @@ export function noHit(numEpisodes, clear) {
   return { kind: "empty", title: "No episode matches", text, buttons: [["Clear the filters", clear]] };
 }
 
-export function noVideo() {
-  return { kind: "empty", title: "No videos", text: "This episode has no camera; its curves are below." };
+export function noVideo(retry) {
+  return {
+    kind: "empty",
+    title: "No videos",
+    text: "This dataset has no camera; the curves are below. To see episodes, start the server with a dataset that has cameras:",
+    command: remedies.dataset,
+    buttons: [["Look again", retry]],
+  };
 }
 
 /** A link names a model that is not served. */

@@ -2,7 +2,7 @@
 // The curves as a figure for a paper: as wide as a column, on white, with title and legend, as SVG or PNG.
 
 import { colourOf, heightOf, panesOf, themed } from "./chart.js";
-import { shortNames } from "./curves.js";
+import { answeredOf, shortNames } from "./curves.js";
 import { leadingOf, marksOf, titleOf } from "./signals.js";
 import { cut } from "./text.js";
 
@@ -16,14 +16,14 @@ const PNG_WIDTH_PX = 2100; // 600 dots an inch: twice what papers ask of picture
 
 /**
  * The figure as SVG. template: an svg element of the page in light colours
- * title: above the chart; threshold: at which success counts; label: of the axis below
+ * titles: lines above the chart; threshold: at which success counts; label: of the axis below
  */
-export function svgFigure(template, curves, { title, threshold, label = "seconds" }) {
-  const drawn = curves.filter(({ times }) => times.length);
+export function svgFigure(template, curves, { titles, threshold, label = "seconds" }) {
+  const drawn = curves.map(answeredOf).filter(({ times }) => times.length);
   const panes = panesOf(drawn);
-  const titles = title ? [cut(title, LETTERS)] : [];
-  const top = TOP + titles.length * (LINE + 4);
-  const height = top + PLOT_HEIGHT + 2 * LINE + 4 + drawn.length * (LINE + 2);
+  const names = drawn.length > 1 ? shortNames(drawn, LETTERS) : []; // the titles tell what a curve alone is
+  const top = TOP + titles.length * LINE + 4;
+  const height = top + PLOT_HEIGHT + 2 * LINE + 4 + names.length * (LINE + 2);
   const end = Math.max(...drawn.map(({ allTimes }) => allTimes.at(-1))) || 1;
   const x = (time) => LEFT + (time / end) * (WIDTH - LEFT - RIGHT);
   const y = (signal, value) => top + (1 - heightOf(panes, signal, value)) * PLOT_HEIGHT;
@@ -38,7 +38,9 @@ export function svgFigure(template, curves, { title, threshold, label = "seconds
   const svg = made("svg", { ...size, "font-family": FONT, "font-size": 7 });
   const add = (...rest) => svg.append(made(...rest));
   add("rect", { width: WIDTH, height, fill: themed("--page", template) });
-  titles.forEach((text) => add("text", { x: LEFT, y: TOP + 8, "font-size": 8, fill: ink }, text));
+  titles.forEach((text, place) => {
+    add("text", { x: LEFT, y: TOP + 8 + place * LINE, "font-size": place ? 7 : 8, fill: place ? faint : ink }, cut(text, LETTERS));
+  });
   for (const signal of Object.keys(panes)) {
     const { scale } = panes[signal];
     for (const value of marksOf(signal, scale, "few")) {
@@ -62,12 +64,15 @@ export function svgFigure(template, curves, { title, threshold, label = "seconds
     for (const signal of Object.keys(panes)) {
       for (const points of runs(curve, signal)) {
         const path = points.map(([time, value]) => `${x(time).toFixed(2)},${y(signal, value).toFixed(2)}`).join(" ");
-        const look = { fill: "none", stroke: colourOf(curve, signal, template), "stroke-width": 1.1, "stroke-linejoin": "round" };
-        add("polyline", { points: path, ...look, ...dashOf(curve) });
+        const stroke = colourOf(curve, signal, template);
+        add("polyline", { points: path, fill: "none", stroke, "stroke-width": 1.1, "stroke-linejoin": "round", ...dashOf(curve) });
+        for (const [time, value] of curve.skipsFrames ? points : []) {
+          add("circle", { cx: x(time).toFixed(2), cy: y(signal, value).toFixed(2), r: 1.5, fill: stroke });
+        }
       }
     }
   }
-  shortNames(drawn, LETTERS).forEach((name, place) => {
+  names.forEach((name, place) => {
     const at = bottom + 2 * LINE + 8 + place * (LINE + 2);
     const stroke = colourOf(drawn[place], leadingOf(drawn[place]), template);
     add("line", { x1: LEFT, x2: LEFT + 14, y1: at - 2.5, y2: at - 2.5, stroke, "stroke-width": 1.1, ...dashOf(drawn[place]) });

@@ -6,7 +6,7 @@ import { colourName } from "./chart.js";
 import { failure } from "./faults.js";
 import { History, mean } from "./history.js";
 import { LiveCard, titleOfRun } from "./livecard.js";
-import { cellOf, learn } from "./signals.js";
+import { columnOf, learn } from "./signals.js";
 import { Place } from "./states.js";
 import { cell, label, named } from "./table.js";
 import { NONE, shown } from "./text.js";
@@ -117,22 +117,25 @@ export class LiveTab {
     const page = this.#page;
     const last = Math.max(Math.floor(Number(page["live-last"].value)) || 1, 1);
     const head = page["live-runs"].closest("table").querySelectorAll("thead th");
-    const names = [...head].map(({ textContent }) => textContent);
     const runs = [...new Set([...this.#runs, ...this.#history.runs, ...cards.map(({ run }) => run)])];
     this.#runs = runs;
     this.#history.show(last, runs.map((run) => [run, titleOfRun(run)]));
     for (const card of cards) card.mark(colourName(runs.indexOf(card.run)));
     page["live-running-title"].hidden = !cards.some(({ hasEnded }) => !hasEnded);
+    const leadingOfRun = (run) => this.#history.of(run).at(-1)?.leading ?? cards.find((card) => card.run === run)?.leading ?? "progress";
+    const column = columnOf(runs.map(leadingOfRun));
+    page["live-leading"].textContent = `Mean final ${column.title}`;
+    const names = [...head].map(({ textContent }) => textContent);
     const rows = runs.map((run, index) => {
       const all = this.#history.of(run);
       const own = all.slice(-last);
       const numRunning = cards.filter((card) => card.run === run && !card.hasEnded).length;
       const rate = own.length ? `${(100 * mean(own.map(({ succeeded }) => Number(succeeded)))).toFixed(0)} %` : NONE;
-      const leading = own.at(-1)?.leading ?? cards.find((card) => card.run === run)?.leading ?? "progress";
+      const leading = leadingOfRun(run);
       const alike = own.filter((end) => end.leading === leading); // seconds and shares have no mean
       const means = [
         shown(mean(own.map(({ total_reward: paid }) => paid))),
-        cellOf(leading, mean(alike.map(({ value }) => value))),
+        column.text(leading, mean(alike.map(({ value }) => value))),
         shown(mean(own.map(({ success }) => success))),
       ];
       const steps = mean(own.map(({ num_steps: count }) => count));

@@ -144,6 +144,8 @@ function failed(error, title = "That did not work", retry = null) {
 function chooseRule() {
   const model = gateway.models.find(({ name }) => name === page.model.value);
   if (model) page.rule.value = model.rule;
+  page.descriptions.hidden = !model?.reads_descriptions;
+  page["one-view"].hidden = !model?.reads_views;
   showLimits();
 }
 
@@ -192,6 +194,12 @@ function go(params) {
 function settings() {
   const { model, rule, frames, fps, resize } = page;
   return { model: model.value, rule: rule.value, frames: frames.value, fps: Number(fps.value), resize: resize.checked };
+}
+
+/** What is said of the robot and the camera to a model whose prompt names them. */
+function descriptions() {
+  const said = { robot_description: page.robot.value.trim(), camera_description: page.camera.value.trim() };
+  return page.descriptions.hidden ? {} : Object.fromEntries(Object.entries(said).filter(([, text]) => text));
 }
 
 /** How stored frames become upright RGB. */
@@ -262,7 +270,7 @@ function scoreAll() {
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
-      const curve = new Curve(video, { task, ...settings(), orient: video.orient, channels: video.channels });
+      const curve = new Curve(video, { task, ...settings(), descriptions: descriptions(), orient: video.orient, channels: video.channels });
       if (known.has(curve.identity)) continue;
       curves = curves.filter(({ identity }) => identity !== curve.identity); // one that failed is asked again
       curves.push(curve);
@@ -274,8 +282,8 @@ function scoreAll() {
 
 async function ask(curve, signal) {
   if (signal.aborted) return;
-  const { video, task, model, rule, frames, fps, orient, channels, resize } = curve;
-  const fields = { task, model, sampling: rule, frames, fps, orient, channels, resize };
+  const { video, task, model, rule, frames, fps, orient, channels, resize, descriptions: described } = curve;
+  const fields = { task, model, sampling: rule, frames, fps, orient, channels, resize, ...described };
   try {
     await score(form(fields, { video: video.file }), signal, (name, document) => {
       curve.take(name, document);
@@ -424,11 +432,14 @@ function showThreshold() {
   showTable(page.curves, curves, value);
 }
 
-/** The title of the figure: what all curves have in common. */
+/** The figure. Its titles name what all curves share: the task, the episode or video, the checkpoint. */
 function figure() {
   const scored = curves.filter(({ times }) => times.length);
-  const common = new Set(scored.map(({ task }) => task));
-  return svgFigure(page.figure, scored, { title: common.size === 1 ? [...common][0] : "", threshold: Number(page.threshold.value) });
+  const shared = (told) => new Set(scored.map(told)).size === 1 && told(scored[0]);
+  const episodeOf = ({ video: { origin } }) => origin?.dataset && `${origin.dataset}, episode ${origin.episode}`;
+  const checkpointOf = ({ model }) => gateway.models.find(({ name }) => name === model)?.source ?? model;
+  const titles = [shared(({ task }) => task), shared(episodeOf) || shared(({ name }) => name), shared(checkpointOf)].filter(Boolean);
+  return svgFigure(page.figure, scored, { titles, threshold: Number(page.threshold.value) });
 }
 
 /** Shows everything anew that depends on the curves. */

@@ -3,6 +3,7 @@
 
 import { NONE, shown } from "./text.js";
 
+const ROUNDING = 0.005; // by which a score may leave its bounds unseen
 const MOST_MARKS = { few: 3, usual: 5 };
 const SHARE_MARKS = {
   progress: { few: [0, 0.5, 1], usual: [0, 0.25, 0.5, 0.75, 1] },
@@ -32,9 +33,14 @@ export function shortOf(signal) {
   return known[signal].short;
 }
 
+/** A number of a score without the unit: seconds to a tenth, shares to a thousandth. */
+export function numberOf(signal, value) {
+  return known[signal].unit ? shown(value, 1) : shown(value);
+}
+
 /** A number of a score, with the unit. */
 export function measured(signal, value) {
-  const text = shown(value);
+  const text = numberOf(signal, value);
   return text === NONE ? NONE : [text, known[signal].unit].filter(Boolean).join(" ");
 }
 
@@ -44,25 +50,27 @@ export function toldAt(curve, index) {
   return `${shortOf(signal)} ${measured(signal, curve[signal].at(index))}`;
 }
 
-/** A number of a score as a cell below the head "progress". */
-export function cellOf(signal, value) {
-  const text = measured(signal, value);
-  return signal === "progress" || text === NONE ? text : `${text} ${shortOf(signal)}`;
+/** A column of a table: its `title`, and the `text` of a number of a score. signals: the scores of all rows */
+export function columnOf(signals) {
+  const [only = "progress", ...others] = new Set(signals);
+  if (!others.length) return { title: titleOf(only), text: numberOf };
+  const text = (signal, value) => [measured(signal, value), shortOf(signal)].join(" ");
+  return { title: "score", text: (signal, value) => (shown(value) === NONE ? NONE : text(signal, value)) };
 }
 
-/** The smallest and the largest number on the axis of a score: its bounds, or those of the curves with 0 among them. */
+/** The smallest and the largest number on the axis of a score: its bounds with 0, or further where curves leave them, as those of Robo-Dopamine may. */
 export function scaleOf(signal, curves) {
-  const [lowest, highest] = known[signal].bounds;
-  if (lowest !== null && highest !== null) return [lowest, highest];
+  const bounds = known[signal].bounds.filter((bound) => bound !== null);
   const values = curves.flatMap((curve) => curve[signal] ?? []).filter((value) => value !== null);
-  const [low, high] = values.reduce(([least, most], value) => [Math.min(least, value), Math.max(most, value)], [0, 0]);
+  const [low, high] = values.reduce(([least, most], value) => [Math.min(least, value), Math.max(most, value)], [Math.min(0, ...bounds), Math.max(0, ...bounds)]);
+  if (bounds.length === 2 && low > bounds[0] - ROUNDING && high < bounds[1] + ROUNDING) return bounds;
   const step = stepOf(low, high, MOST_MARKS.usual);
   return [Math.floor(low / step) * step, Math.ceil(high / step) * step || step];
 }
 
 /** The numbers that stand beside an axis. kind: few or usual */
 export function marksOf(signal, [low, high], kind) {
-  if (SHARE_MARKS[signal]) return SHARE_MARKS[signal][kind];
+  if (SHARE_MARKS[signal] && low === 0 && high === 1) return SHARE_MARKS[signal][kind];
   const step = stepOf(low, high, MOST_MARKS[kind]);
   const [first, last] = [Math.ceil(low / step - 1e-9), Math.floor(high / step + 1e-9)];
   return Array.from({ length: last - first + 1 }, (_, index) => Number(((first + index) * step).toPrecision(12)));

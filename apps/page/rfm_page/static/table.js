@@ -2,15 +2,19 @@
 // The curves as a table: what was asked, and how each ends.
 
 import { colourName } from "./chart.js";
-import { cellOf, leadingOf } from "./signals.js";
+import { columnOf, leadingOf } from "./signals.js";
 import { cut, NONE, shown } from "./text.js";
 
 const NAME_LETTERS = 28;
 
 /** Writes a row for each curve into `body`. threshold: at which success counts */
 export function showTable(body, curves, threshold) {
-  const names = [...body.closest("table").querySelectorAll("thead th")].map((head) => head.textContent);
-  body.replaceChildren(...curves.map((curve) => label(row(curve, threshold), names)));
+  const table = body.closest("table");
+  const leading = columnOf(curves.map(leadingOf));
+  table.querySelector(".leading").textContent = `Final ${leading.title}`;
+  table.classList.toggle("unjudged", curves.every(({ state, success }) => state === "done" && success.every((value) => value === null)));
+  const names = [...table.querySelectorAll("thead th")].map((head) => head.textContent);
+  body.replaceChildren(...curves.map((curve) => label(row(curve, threshold, leading.text), names)));
 }
 
 /** A row whose cells have the names of their columns, which stand before them where rows are shown as cards. */
@@ -19,13 +23,13 @@ export function label(element, names) {
   return element;
 }
 
-function row(curve, threshold) {
+function row(curve, threshold, leadingText) {
   const element = document.createElement("tr");
   const from = curve.succeedsAt(threshold);
   const frames = curve.numFrames === null ? NONE : `${curve.progress.length} of ${curve.numFrames}`;
   element.append(named(curve, curve.name), ...[curve.task, curve.model, curve.sampling].map((text) => cell(text)), cell(frames, "number"));
   const leading = leadingOf(curve);
-  element.append(...[cellOf(leading, curve[leading].at(-1)), shown(curve.success.at(-1))].map((text) => cell(text, "number")));
+  element.append(...[leadingText(leading, curve[leading].at(-1)), shown(curve.success.at(-1))].map((text) => cell(text, "number")));
   element.append(cell(from === null ? NONE : `${from.toFixed(2)} s`, "number"));
   const warning = curve.blank && `${curve.blank}: the scores mean nothing`;
   element.append(cell(curve.error ?? [curve.state, warning].filter(Boolean).join("; "), curve.error || warning ? "failed" : ""));

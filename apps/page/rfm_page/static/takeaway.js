@@ -3,17 +3,19 @@
 
 import { leadingOf } from "./signals.js";
 
+const DESCRIBED = "# score: no option describes a robot or a camera; rfm-client label has such options";
 const LOOPBACK = /^\w+:\/\/(localhost|127\.[\d.]+|\[::1\])([:/]|$)/;
 
 /** The curves as CSV, one line a point. */
 export function csv(curves) {
   const instead = insteadOf(curves);
-  const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "orient", "channels", "frame", "time_s", "progress", "success", ...instead];
+  const described = [...new Set(curves.flatMap(({ descriptions }) => Object.keys(descriptions)))].sort();
+  const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "orient", "channels", "frame", "time_s", "progress", "success", ...instead, ...described];
   const lines = curves.flatMap((curve) =>
     curve.times.map((time, index) => [
       curve.video.name, curve.task, curve.model, curve.version, curve.rule, curve.sampledFrames, curve.fps,
       curve.orient, curve.channels, index, time, curve.progress[index], curve.success[index],
-      ...instead.map((name) => curve[name]?.[index]),
+      ...instead.map((name) => curve[name]?.[index]), ...described.map((name) => curve.descriptions[name]),
     ]),
   );
   return [columns, ...lines].map((values) => values.map(csvField).join(",") + "\r\n").join("");
@@ -42,6 +44,7 @@ export function json(url, curves, verdicts) {
     orient: curve.orient,
     channels: curve.channels,
     resize: curve.resize,
+    ...curve.descriptions,
     num_frames: curve.numFrames,
     progress: curve.progress,
     success: curve.success,
@@ -65,6 +68,7 @@ export function commands(url, curves, verdicts) {
   const groups = grouped(curves.filter(({ video }) => !video.origin?.dataset), asked);
   const scores = groups.map((group, index) => {
     const [{ rule, sampledFrames }] = group;
+    if (Object.keys(group[0].descriptions).length) return DESCRIBED;
     const target = `scores${groups.length > 1 ? `_${index + 1}` : ""}.json`;
     return line("score", group.map(({ video }) => video), group[0], url, [...sampling(rule, sampledFrames), "--json", target]);
   });
@@ -81,13 +85,13 @@ function grouped(curves, askedOf) {
   return [...alike.values()];
 }
 
-function asked({ task, model, rule, sampledFrames, fps, orient, channels, resize }) {
-  return JSON.stringify([task, model, rule, sampledFrames, fps, orient, channels, resize]);
+function asked({ task, model, rule, sampledFrames, fps, orient, channels, resize, descriptions }) {
+  return JSON.stringify([task, model, rule, sampledFrames, fps, orient, channels, resize, descriptions]);
 }
 
-function askedOfEpisode({ video, task, model, rule, sampledFrames, fps, resize }) {
+function askedOfEpisode({ video, task, model, rule, sampledFrames, fps, resize, descriptions }) {
   const { dataset, episode } = video.origin;
-  return JSON.stringify([dataset, episode, task, model, rule, sampledFrames, fps, resize]);
+  return JSON.stringify([dataset, episode, task, model, rule, sampledFrames, fps, resize, descriptions]);
 }
 
 function sampling(rule, frames) {
@@ -96,14 +100,15 @@ function sampling(rule, frames) {
 
 /** The command that labels an episode of a dataset as the page has scored it. */
 function labelLine(group, url) {
-  const [{ video: { origin }, task, model, rule, sampledFrames, fps, resize }] = group;
+  const [{ video: { origin }, task, model, rule, sampledFrames, fps, resize, descriptions }] = group;
   const about = `episode ${origin.episode} of ${origin.dataset}`;
   if (fps !== origin.fps) return `# ${about}: a command scores all of its frames, ${origin.fps} a second, not ${fps}`;
   const cameras = group.map(({ video }) => video.origin.camera);
   const corrections = group.flatMap(({ video, orient, channels }) => corrected({ orient, channels }, `${video.origin.camera}=`));
   const options = ["--episodes", origin.episode, "--cameras", cameras.join(","), ...corrections, ...sampling(rule, sampledFrames)];
   const given = task === origin.task ? [] : ["--task", task, "--override-task"];
-  const words = ["rfm-client", "label", origin.dataset, ...serverOption(url), "--model", model, ...given, ...options];
+  const described = Object.entries(descriptions).flatMap(([name, text]) => [`--${name.replace("_", "-")}`, text]);
+  const words = ["rfm-client", "label", origin.dataset, ...serverOption(url), "--model", model, ...given, ...described, ...options];
   const target = ["--output", `${origin.dataset}_episode_${origin.episode}`, "--format", "progress"];
   return [...words, ...(resize ? ["--resize"] : []), ...target].map(quoted).join(" ");
 }

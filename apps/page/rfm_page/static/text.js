@@ -4,8 +4,8 @@
 export const NONE = "-";
 
 /** A number as the page writes it. */
-export function shown(value) {
-  return value === null || value === undefined ? NONE : value.toFixed(3);
+export function shown(value, digits = 3) {
+  return value === null || value === undefined ? NONE : value.toFixed(digits);
 }
 
 const MOST_DIGITS = 8;

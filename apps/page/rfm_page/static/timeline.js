@@ -2,7 +2,7 @@
 // One time for a chart, for videos and for the controls below them: whatever moves moves the others.
 
 import { Chart } from "./chart.js";
-import { pointAt } from "./curves.js";
+import { answeredOf, pointAt } from "./curves.js";
 import { toldAt } from "./signals.js";
 import { shown } from "./text.js";
 import { Videos } from "./videos.js";
@@ -38,8 +38,8 @@ export class Timeline {
 
   /** Draws the curves, and lets the controls reach the end of them. */
   show(curves) {
-    this.#curves = curves.filter(({ times }) => times.length);
-    this.chart.show(curves);
+    this.#curves = curves.map(answeredOf).filter(({ times }) => times.length);
+    this.chart.show(this.#curves);
     this.#slider.disabled = this.#button.disabled = !this.#curves.length;
     this.#slider.max = Math.max(0, ...this.#curves.map(({ allTimes }) => allTimes.at(-1))) || 1;
     this.#showTime();
