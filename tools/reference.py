@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``make reference``: write the tables of docs/reference that come from the code: settings and commands.
+"""``make reference``: write the tables of docs/reference that come from the code.
 
 ``--check`` writes nothing and fails if a table is out of date. A table stands between ``<!-- NAME: made by make reference -->`` and ``<!-- end -->``.
 """
@@ -14,12 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from typer.main import get_command
-
 from rfm.vlm.network import VlmConfig
 from rfm.vlm.run_config import SETTINGS, RunConfig
-from rfm_client.contract.settings import Settings
-from rfm_commands.cli import app
+from rfm_client.contract.settings import Setting, Settings
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 
 DOCUMENTS = sorted((Path(__file__).parents[1] / "docs" / "reference").glob("*.md"))
@@ -33,11 +30,15 @@ def current(file: Path) -> str:
 
 
 def _section(kind: type[Settings]) -> str:
-    rows = (
-        (f"`{key}`", f"`{each.option}`" if each.has_option else "", each.help, _text(each.default))
-        for key, each in kind.settings().items()
-    )
-    return _table(("key", "option", "meaning", "default"), rows)
+    rows = ((_key(key, each), each.help, _text(each.default)) for key, each in kind.settings().items())
+    return _table(("key", "meaning", "default"), rows)
+
+
+def _key(key: str, setting: Setting) -> str:
+    """A key as the table names it, with the option if that is not the key with dashes."""
+    if setting.has_option and setting.option == f"--{key.replace('_', '-')}":
+        return f"`{key}`"
+    return f"`{key}` (`{setting.option}`)" if setting.has_option else f"`{key}` (no option)"
 
 
 def _text(value: Any) -> str:
@@ -45,14 +46,6 @@ def _text(value: Any) -> str:
     if value is None or value is MISSING or value == ():
         return ""
     return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _commands() -> str:
-    commands = dict(get_command(app).commands)  # type: ignore[attr-defined]
-    models = commands.pop("models")
-    commands |= {f"models {name}": command for name, command in models.commands.items()}
-    rows = ((f"`rfm {name}`", (command.help or "").partition("\n\n")[0]) for name, command in commands.items())
-    return _table(("command", "does"), ((name, " ".join(told.split())) for name, told in rows))
 
 
 def _run_settings() -> str:
@@ -77,7 +70,6 @@ def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 TABLES: dict[str, Callable[[], str]] = {
     **{name: partial(_section, kind) for name, kind in SECTIONS.items()},
     "fastapi": lambda: _table(("there", "here"), ((f"`{key}`", f"`{here}`") for key, here in FASTAPI_KEYS.items())),
-    "commands": _commands,
     "run settings": _run_settings,
 }
 
