@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``make reference``: write the tables of docs/reference that come from the code.
+"""``make reference``: write the lists and tables of docs/reference that come from the code.
 
 ``--check`` writes nothing and fails if a table is out of date. A table stands between ``<!-- NAME: made by make reference -->`` and ``<!-- end -->``.
 """
@@ -30,15 +30,19 @@ def current(file: Path) -> str:
 
 
 def _section(kind: type[Settings]) -> str:
-    rows = ((_key(key, each), each.help, _text(each.default)) for key, each in kind.settings().items())
-    return _table(("key", "meaning", "default"), rows)
+    return "".join(f"- {_key(key, each)}: {_meaning(each)}\n" for key, each in kind.settings().items())
 
 
 def _key(key: str, setting: Setting) -> str:
-    """A key as the table names it, with the option if that is not the key with dashes."""
+    """A key as the list names it, with the option if that is not the key with dashes."""
     if setting.has_option and setting.option == f"--{key.replace('_', '-')}":
         return f"`{key}`"
     return f"`{key}` (`{setting.option}`)" if setting.has_option else f"`{key}` (no option)"
+
+
+def _meaning(setting: Setting) -> str:
+    default = _text(setting.default)
+    return f"{setting.help} Default: {default}." if default else setting.help
 
 
 def _text(value: Any) -> str:
@@ -69,7 +73,7 @@ def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     **{name: partial(_section, kind) for name, kind in SECTIONS.items()},
-    "fastapi": lambda: _table(("there", "here"), ((f"`{key}`", f"`{here}`") for key, here in FASTAPI_KEYS.items())),
+    "fastapi": lambda: "".join(f"- `{key}`: `{here}`\n" for key, here in FASTAPI_KEYS.items()),
     "run settings": _run_settings,
 }
 
