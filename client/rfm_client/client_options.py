@@ -24,9 +24,10 @@ class ClientOptions:
     model: name of the exported checkpoint; raw frames go to ``<model>_frames``
     timeout_s: longest time of a call, retries included; at most 1e9
     retry: True: until the time is up, retry requests that fail because a server is down, restarting or full
-    max_in_flight: most open requests; further requests wait
+    max_in_flight: most open requests, with at most 256 MiB together; further requests wait
     shared_memory: True: large inputs go through memory that client and server, on one host, both map
-    ca_file: certificates (PEM) of authorities that may vouch for the server; None: the system's
+    ca_file: certificates (PEM) of authorities that may vouch for the server; None: the system's, or over
+        gRPC its own list
     client_certificate, client_key: files (PEM) that identify this client (mutual TLS); both or neither
     headers: sent with each request, over gRPC as metadata
     api_key: sent with each request as ``Authorization: Bearer KEY``
