@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""``make reference``: write the lists and tables of docs/reference that come from the code.
+"""``make reference``: write the lists of docs/reference that come from the code.
 
-``--check`` writes nothing and fails if a table is out of date. A table stands between ``<!-- NAME: made by make reference -->`` and ``<!-- end -->``.
+``--check`` writes nothing and fails if a list is out of date. A list stands between ``<!-- NAME: made by make reference -->`` and ``<!-- end -->``.
 """
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import MISSING
 from functools import partial
 from pathlib import Path
@@ -25,8 +25,8 @@ MEANING = re.compile(r"^ *(\w+): (.*)", re.MULTILINE)  # a line of a docstring
 
 
 def current(file: Path) -> str:
-    """Return the text of a document with tables as the code has them now. Raises KeyError for an unknown table."""
-    return BLOCK.sub(lambda found: f"{found[1]}\n{TABLES[found[2]]()}\n{found[3]}", file.read_text())
+    """Return the text of a document with lists as the code has them now. Raises KeyError for an unknown list."""
+    return BLOCK.sub(lambda found: f"{found[1]}\n{LISTS[found[2]]()}\n{found[3]}", file.read_text())
 
 
 def _section(kind: type[Settings]) -> str:
@@ -59,19 +59,14 @@ def _run_settings() -> str:
     }
     nothing: dict[str, dict[str, Any]] = {key.partition(".")[0]: {} for keys in SETTINGS.values() for key in keys}
     defaults = {"size_px": "refused", **RunConfig(Path(), "", nothing).network()}
-    rows = (
-        (f"`{name}`", meanings[name], ", ".join(f"`{key}`" for key in keys), _text(defaults.get(name)) or "unknown")
+    return "".join(
+        f"- `{name}` ({', '.join(f'`{key}`' for key in keys)}): {meanings[name]}. "
+        f"Without the key: {_text(defaults.get(name)) or 'unknown'}.\n"
         for name, keys in SETTINGS.items()
     )
-    return _table(("setting", "meaning", "key of `config.yaml`", "without the key"), rows)
 
 
-def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    lines = [head, ("---",) * len(head), *rows]
-    return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
-
-
-TABLES: dict[str, Callable[[], str]] = {
+LISTS: dict[str, Callable[[], str]] = {
     **{name: partial(_section, kind) for name, kind in SECTIONS.items()},
     "fastapi": lambda: "".join(f"- `{key}`: `{here}`\n" for key, here in FASTAPI_KEYS.items()),
     "run settings": _run_settings,
@@ -79,11 +74,11 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def main(check: bool) -> None:
-    """Write the tables, or exit with the names of documents whose tables are out of date."""
+    """Write the lists, or exit with the names of documents whose lists are out of date."""
     changed = {file: text for file in DOCUMENTS if (text := current(file)) != file.read_text()}
     if check and changed:
         sys.exit(
-            f"{', '.join(file.name for file in changed)}: expected the tables of the code, got others: make reference"
+            f"{', '.join(file.name for file in changed)}: expected the lists of the code, got others: make reference"
         )
     for file, text in changed.items():
         file.write_text(text)
