@@ -158,7 +158,7 @@ docs: | $(VENV)
 	  "mkdocstrings[python]>=1,<2" ruff
 	NO_MKDOCS_2_WARNING=1 $(VENV)/docs/bin/mkdocs build --strict --quiet
 
-# Write the tables of docs/reference that come from the code.
+# Write the lists of docs/reference that come from the code.
 reference: $(INSTALLED)
 	$(BIN)/python tools/reference.py
 

@@ -1,25 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""``make reference``: write the tables of docs/reference that come from the code: settings and commands.
+"""``make reference``: write the lists of docs/reference that come from the code.
 
-``--check`` writes nothing and fails if a table is out of date. A table stands between ``<!-- NAME: made by make reference -->`` and ``<!-- end -->``.
+``--check`` writes nothing and fails if a list is out of date. A list stands between ``<!-- NAME: made by make reference -->`` and ``<!-- end -->``.
 """
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import MISSING
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from typer.main import get_command
-
 from rfm.vlm.network import VlmConfig
 from rfm.vlm.run_config import SETTINGS, RunConfig
-from rfm_client.contract.settings import Settings
-from rfm_commands.cli import app
+from rfm_client.contract.settings import Setting, Settings
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 
 DOCUMENTS = sorted((Path(__file__).parents[1] / "docs" / "reference").glob("*.md"))
@@ -28,16 +25,24 @@ MEANING = re.compile(r"^ *(\w+): (.*)", re.MULTILINE)  # a line of a docstring
 
 
 def current(file: Path) -> str:
-    """Return the text of a document with tables as the code has them now. Raises KeyError for an unknown table."""
-    return BLOCK.sub(lambda found: f"{found[1]}\n{TABLES[found[2]]()}\n{found[3]}", file.read_text())
+    """Return the text of a document with lists as the code has them now. Raises KeyError for an unknown list."""
+    return BLOCK.sub(lambda found: f"{found[1]}\n{LISTS[found[2]]()}\n{found[3]}", file.read_text())
 
 
 def _section(kind: type[Settings]) -> str:
-    rows = (
-        (f"`{key}`", f"`{each.option}`" if each.has_option else "", each.help, _text(each.default))
-        for key, each in kind.settings().items()
-    )
-    return _table(("key", "option", "meaning", "default"), rows)
+    return "".join(f"- {_key(key, each)}: {_meaning(each)}\n" for key, each in kind.settings().items())
+
+
+def _key(key: str, setting: Setting) -> str:
+    """A key as the list names it, with the option if that is not the key with dashes."""
+    if setting.has_option and setting.option == f"--{key.replace('_', '-')}":
+        return f"`{key}`"
+    return f"`{key}` (`{setting.option}`)" if setting.has_option else f"`{key}` (no option)"
+
+
+def _meaning(setting: Setting) -> str:
+    default = _text(setting.default)
+    return f"{setting.help} Default: {default}." if default else setting.help
 
 
 def _text(value: Any) -> str:
@@ -47,14 +52,6 @@ def _text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _commands() -> str:
-    commands = dict(get_command(app).commands)  # type: ignore[attr-defined]
-    models = commands.pop("models")
-    commands |= {f"models {name}": command for name, command in models.commands.items()}
-    rows = ((f"`rfm {name}`", (command.help or "").partition("\n\n")[0]) for name, command in commands.items())
-    return _table(("command", "does"), ((name, " ".join(told.split())) for name, told in rows))
-
-
 def _run_settings() -> str:
     """The settings of a vision-language checkpoint that its run's config.yaml decides."""
     meanings = {
@@ -62,32 +59,26 @@ def _run_settings() -> str:
     }
     nothing: dict[str, dict[str, Any]] = {key.partition(".")[0]: {} for keys in SETTINGS.values() for key in keys}
     defaults = {"size_px": "refused", **RunConfig(Path(), "", nothing).network()}
-    rows = (
-        (f"`{name}`", meanings[name], ", ".join(f"`{key}`" for key in keys), _text(defaults.get(name)) or "unknown")
+    return "".join(
+        f"- `{name}` ({', '.join(f'`{key}`' for key in keys)}): {meanings[name]}. "
+        f"Without the key: {_text(defaults.get(name)) or 'unknown'}.\n"
         for name, keys in SETTINGS.items()
     )
-    return _table(("setting", "meaning", "key of `config.yaml`", "without the key"), rows)
 
 
-def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    lines = [head, ("---",) * len(head), *rows]
-    return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
-
-
-TABLES: dict[str, Callable[[], str]] = {
+LISTS: dict[str, Callable[[], str]] = {
     **{name: partial(_section, kind) for name, kind in SECTIONS.items()},
-    "fastapi": lambda: _table(("there", "here"), ((f"`{key}`", f"`{here}`") for key, here in FASTAPI_KEYS.items())),
-    "commands": _commands,
+    "fastapi": lambda: "".join(f"- `{key}`: `{here}`\n" for key, here in FASTAPI_KEYS.items()),
     "run settings": _run_settings,
 }
 
 
 def main(check: bool) -> None:
-    """Write the tables, or exit with the names of documents whose tables are out of date."""
+    """Write the lists, or exit with the names of documents whose lists are out of date."""
     changed = {file: text for file in DOCUMENTS if (text := current(file)) != file.read_text()}
     if check and changed:
         sys.exit(
-            f"{', '.join(file.name for file in changed)}: expected the tables of the code, got others: make reference"
+            f"{', '.join(file.name for file in changed)}: expected the lists of the code, got others: make reference"
         )
     for file, text in changed.items():
         file.write_text(text)

@@ -44,10 +44,10 @@ READY_POLL_S = 0.2
 
 
 class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
-    """Client of one or several servers of the same checkpoint, for one event loop.
+    """Client for one or several servers with the same checkpoint, in one event loop.
 
-    ``help(AsyncRewardClient.__init__)`` describes the options. The arrays of a sample must not change while its call is
-    awaited: they are read when it is the request's turn.
+    ``help(AsyncRewardClient.__init__)`` describes the options. Do not change arrays in a sample while you await the
+    call: a queued request reads them late.
     """
 
     def __post_init__(self) -> None:
@@ -76,7 +76,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def preference(
         self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]
     ) -> PreferenceResult:
-        """Return the probability that ``first`` does its task better than ``second``. Raises RewardError.
+        """Return the probability that ``first`` does the task better. Raises RewardError.
 
         both_orders: True: ask the other order, too, since answers may depend on the order; ``preference`` is the mean,
             and if the orders disagree, ``verdict`` is None. Recommended for labels
@@ -109,7 +109,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def evaluate(
         self, samples: Iterable[Sample], *, return_errors: bool = False, **options: Unpack[CallOptions]
     ) -> list[Result] | list[Result | RewardError]:
-        """Return the results of any number and mix of samples, in order.
+        """Score any number and mix of samples; return results in order.
 
         return_errors: True: the error of a failed sample stands in its result's place; False: raise the first error,
             as ``samples[3].num_frames: expected X, got Y``
@@ -119,9 +119,9 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return outcomes if return_errors else results_of(outcomes, "samples[{}]" if len(samples) > 1 else "")
 
     def episode(self, task: str, *, env: int | None = None, **options: Unpack[StepKeywords]) -> AsyncEpisode:
-        """Return an episode to score step by step. A step sends only its new frame, if the server keeps features.
+        """Return an episode to score step by step. A step sends only the new frame, if the server keeps features.
 
-        env: number of its environment, which errors name as ``envs[3]``; None: the only one
+        env: index of the environment, shown in errors as ``envs[3]``; None: the only one
         options: fields of EpisodeOptions. Raises ValueError for contradictory options
         """
         where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
@@ -129,7 +129,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return AsyncEpisode(AsyncEpisodes(self._steps, self._call, [steps]))
 
     def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> AsyncEpisodes:
-        """Return ``num`` parallel episodes, as in vectorised environments. A step takes as few requests as possible.
+        """Return ``num`` parallel episodes, as in vectorised environments. A step needs as few requests as possible.
 
         task: a sentence for all episodes, or a sentence for each
         options: as in ``episode``
@@ -142,13 +142,13 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return AsyncEpisodes(self._steps, self._call, steps)
 
     async def score_steps(self, asked: Sequence[Asked]) -> list[StepScore]:
-        """Return the score of each step of an episode, from as few requests as possible. Raises RewardError."""
+        """Score episodes at their newest steps, in as few requests as possible. Raises RewardError."""
         return await self._steps.scores(asked, self._call({}), time.perf_counter())
 
     async def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
-        """Return the trajectory with embeddings in place of frames, for repeated scoring. Raises RewardError.
+        """Return the trajectory with embeddings instead of frames, for repeated scoring. Raises RewardError.
 
         The checkpoint must be served with encoders.
         """
@@ -176,16 +176,16 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
 
     @property
     def model_names(self) -> dict[Part, str]:
-        """Names of the checkpoint's models on the server, whether they are served or not."""
+        """Model names for the checkpoint on a server, served or not."""
         name = self.model
         return {"embeddings": name, "encoder": encoder_name(name), "frames": frames_name(name)}
 
     async def model_info(
         self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None
     ) -> ModelInfo:
-        """Return the server's description of its model for embeddings or, with ``frames``, for raw frames.
+        """Describe the model for embeddings or, with ``frames``, for raw frames.
 
-        refresh: True: request it again; False: use the known description, until another version of the model answers
+        refresh: True: ask the server again; False: reuse the description until another model version answers
 
         Raises ModelNotFoundError if the model is not served.
         """
@@ -193,7 +193,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return await self._scorer.model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """Return the descriptions of each served part of the checkpoint, by all servers that answer.
+        """Describe each served part of the checkpoint, as every reachable server does.
 
         Raises RewardError if no server answers.
         """

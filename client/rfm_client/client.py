@@ -51,7 +51,7 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     def preference(
         self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]
     ) -> PreferenceResult:
-        """Return the probability that ``first`` does its task better than ``second``. Raises RewardError.
+        """Return the probability that ``first`` does the task better. Raises RewardError.
 
         both_orders: as in AsyncRewardClient
         """
@@ -72,9 +72,9 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     def evaluate(
         self, samples: Iterable[Sample], *, return_errors: bool = False, **options: Unpack[CallOptions]
     ) -> list[Result] | list[Result | RewardError]:
-        """Return the results of any number and mix of samples, in order.
+        """Score any number and mix of samples; return results in order.
 
-        return_errors: True: the error of a failed sample stands in its result's place; False: raise the first error
+        return_errors: True: put a RewardError in place of a failed result; False: raise the first error
         """
         samples = list(samples)  # in this thread: an iterator may be slow, or call this client
         return self._loop.wait(self._client.evaluate(samples, return_errors=return_errors, **options))
@@ -88,24 +88,23 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     def submit(self, sample: Sample, **options: Unpack[CallOptions]) -> Future[Any]:
         """Send the sample and return a future of its result, at once.
 
-        The future raises RewardError; cancelling it cancels the request. The sample's arrays are copied,
-        so the caller may change them. At most ``max_in_flight`` requests are sent at a time; the copies of the others
-        stay in memory.
+        The future raises RewardError; cancelling it cancels the request. Arrays are copied, so the caller may change
+        them. Beyond ``max_in_flight`` open requests, copies wait in memory.
         """
         future = self._loop.start(self._client.score(snapshot(sample), **options))
         future.add_done_callback(lambda _done: self)  # keeps the client alive until then
         return future
 
     def episode(self, task: str, *, env: int | None = None, **options: Unpack[StepKeywords]) -> Episode:
-        """Return an episode to score step by step. A step sends only its new frame, if the server keeps features.
+        """Return an episode to score step by step. A step sends only the new frame, if the server keeps features.
 
-        env: number of its environment, which errors name as ``envs[3]``; None: the only one
+        env: index of the environment, shown in errors as ``envs[3]``; None: the only one
         options: fields of EpisodeOptions. Raises ValueError for contradictory options
         """
         return Episode(self._client.episode(task, env=env, **options), self._loop, self)
 
     def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> Episodes:
-        """Return ``num`` parallel episodes, as in vectorised environments. A step takes as few requests as possible.
+        """Return ``num`` parallel episodes, as in vectorised environments. A step needs as few requests as possible.
 
         task: a sentence for all episodes, or a sentence for each
         options: as in ``episode``
@@ -113,14 +112,14 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         return Episodes(self._client.episodes(num, task, **options), self._loop, self)
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[StepScore]:
-        """Return the score of each episode at its newest frame, from as few requests as possible. Raises RewardError.
+        """Score each episode at the newest frame, in as few requests as possible. Raises RewardError.
 
-        It scores frames of ``Episode.keep``, which stay in the episodes if it fails.
+        Frames come from ``Episode.keep``, and stay in the episodes after a failure.
         """
         return self._loop.wait(self._client.score_steps([each.asked for each in episodes]))
 
     def submit_episodes(self, episodes: Sequence[Episode]) -> Future[list[StepScore]]:
-        """Return a future of the scores of ``score_episodes``, at once. Frames kept later do not change them."""
+        """Start ``score_episodes`` and return a future at once. Frames kept later do not change the scores."""
         future = self._loop.start(self._client.score_steps([each.asked for each in episodes]))
         future.add_done_callback(lambda _done: self)
         return future
@@ -128,7 +127,7 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
-        """Return the trajectory with embeddings in place of frames, for repeated scoring. Raises RewardError.
+        """Return the trajectory with embeddings instead of frames, for repeated scoring. Raises RewardError.
 
         The checkpoint must be served with encoders.
         """
@@ -143,16 +142,16 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         self._loop.wait(self._client.wait_ready(timeout_s))
 
     def model_info(self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None) -> ModelInfo:
-        """Return the server's description of its model for embeddings or, with ``frames``, for raw frames.
+        """Describe the model for embeddings or, with ``frames``, for raw frames.
 
-        refresh: True: request it again; False: use the known description, until another version of the model answers
+        refresh: True: ask the server again; False: reuse the description until another model version answers
 
         Raises ModelNotFoundError if the model is not served.
         """
         return self._loop.wait(self._client.model_info(frames=frames, refresh=refresh, timeout_s=timeout_s))
 
     def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """Return the descriptions of each served part of the checkpoint, by all servers that answer.
+        """Describe each served part of the checkpoint, as every reachable server does.
 
         Raises RewardError if no server answers.
         """

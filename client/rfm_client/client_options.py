@@ -18,16 +18,16 @@ DEFAULT_IN_FLIGHT = 128  # twice the usual batch: the next gathers while a batch
 class ClientOptions:
     """Options of RewardClient and AsyncRewardClient, which do not change later.
 
-    urls: one or several ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``. The server
-        with the fewest open requests gets the next; an episode stays on its server, which keeps features of its frames.
-        A server that fails is left out until it is ready again
-    model: name of the exported checkpoint; raw frames go to ``<model>_frames``
-    timeout_s: longest time of a call, retries included; at most 1e9
-    retry: True: until the time is up, retry requests that fail because a server is down, restarting or full
-    max_in_flight: most open requests; further requests wait
-    shared_memory: True: large inputs go through memory that client and server, on one host, both map
-    ca_file: certificates (PEM) of authorities that may vouch for the server; None: the system's
-    client_certificate, client_key: files (PEM) that identify this client (mutual TLS); both or neither
+    urls: one or several ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``. The least
+        busy server gets the next request; an episode stays on one server, which keeps frame features. A server is left
+        out after a failure until it is ready again
+    model: name used at export; raw frames go to ``<model>_frames``
+    timeout_s: time limit for a call with all retries; at most 1e9
+    retry: True: within the time limit, retry requests while a server is down, restarting or full
+    max_in_flight: open requests at a time, with at most 256 MiB together; further requests wait
+    shared_memory: True: large inputs go through shared memory, if client and server run on one host
+    ca_file: certificate authorities (PEM) to trust; None: the system's, over gRPC its built-in list
+    client_certificate, client_key: files (PEM) to identify this client (mutual TLS); both or neither
     headers: sent with each request, over gRPC as metadata
     api_key: sent with each request as ``Authorization: Bearer KEY``
     transports: used in place of connections to ``urls``, for tests and unusual networks

@@ -137,7 +137,13 @@ def export(
     typer.echo(f"{repository}: {settings.name} version {version}, scores equal to {whose}")
 
 
-@app.command(cls=RfmCommand)
+class ServeCommand(RfmCommand):
+    """``rfm serve``: an error about an unknown option says where options of tritonserver stand."""
+
+    unknown_option = "put options of tritonserver after --, as in rfm serve FOLDER -- {option}=VALUE"
+
+
+@app.command(cls=ServeCommand)
 @with_options
 def serve(
     given: Given[ServeConfig],

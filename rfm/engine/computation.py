@@ -14,9 +14,9 @@ ATTENTION = "scaled_dot_product_attention"
 
 
 def computation(checkpoint: Any, dtype: torch.dtype | None, *, on_gpu: bool) -> str:
-    """Return number type, PyTorch version and attention of the checkpoint's scores, as one line.
+    """Return number type, PyTorch version and attention as one line.
 
-    dtype: of the network; None: float32 on the CPU, else the checkpoint's own
+    dtype: network dtype; None: float32 on the CPU, else the checkpoint's own
     """
     if dtype is None:
         dtype = getattr(checkpoint.config, "torch_dtype", torch.float32) if on_gpu else torch.float32
@@ -24,7 +24,7 @@ def computation(checkpoint: Any, dtype: torch.dtype | None, *, on_gpu: bool) -> 
 
 
 def is_by_this_torch(told: str) -> bool:
-    """Return True if ``told``, a result of ``computation``, names the PyTorch version of this process."""
+    """Return True if ``told``, from ``computation``, names the running PyTorch version."""
     return _torch() in told.split(", ")
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The engine's calls of CUDA for memory, streams and the current device, and errors for a lack of memory.
+"""CUDA calls for memory, streams and the current device, and out-of-memory errors.
 
-``tests/support/pretended.py`` replaces the functions of CUDA, so that tests run the same code without a GPU.
+``tests/support/pretended.py`` replaces CUDA functions, so tests run the same code without a GPU.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def free_unused() -> None:
 def use(device: torch.device) -> None:
     """Make ``device`` the current device of this thread.
 
-    Each thread that computes must call this: some kernels launch on the current device, not on that of their tensors.
+    Call it in each computing thread: some kernels launch on the current device, wherever the tensors are.
     """
     if device.type == "cuda":
         torch.cuda.set_device(device)
@@ -65,7 +65,7 @@ class Copies:
             return pinned(pixels).to(self._stream.device, non_blocking=True)
 
     def wait_for(self, pixels: Iterable[Tensor]) -> None:
-        """Make the current stream, not the host, wait for all copies that were started so far.
+        """Make the current stream, not the host, wait for all copies started so far.
 
         pixels: copies that the current stream reads; PyTorch does not reuse their memory before that
         """

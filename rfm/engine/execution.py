@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The costs of one batch: times, tokens, encoded frames and failures of memory."""
+"""Costs for one batch: times, tokens, encoded frames and memory failures."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class Execution:
-    """The costs of a batch, added up while it is scored.
+    """Costs for a batch, added up during scoring.
 
-    collate_s: seconds in which rows and batches were made, without a forward pass
-    forward_s: seconds in forward passes, including the reading of results
+    collate_s: seconds to make rows and batches, without forward passes
+    forward_s: seconds in forward passes, with reading the results
     num_tokens, num_slots: tokens in forward passes, without and with padding
     num_encoded, num_found: frames read by an encoder or vision tower; frames with cached features
     cache_bytes: size of the cached features; None: no cache
-    out_of_memory_count: forward passes that did not fit in memory and were tried again in halves
-    num_unclear: written answers whose score is unclear
+    out_of_memory_count: forward passes repeated in halves for lack of memory
+    num_unclear: written answers with an unclear score
     num_unreadable: written answers without a score
     on_forward: called after each forward pass, even if it did not fit in memory
     """
@@ -58,7 +58,7 @@ class Execution:
         If the rows do not fit in memory, each half is tried. A row that does not fit alone gets an error.
 
         rows: a sequence, or a tensor with the rows along its first axis
-        divided: returns the output of a row that does not fit alone; None: the row cannot be divided
+        divided: handles a row too large to fit alone; None: the row cannot be divided
         """
         try:
             with memory_errors():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A cache of the features of frames and tasks, by digest, in bounded memory."""
+"""A bounded cache for features of frames and tasks, by digest."""
 
 from __future__ import annotations
 
@@ -31,10 +31,9 @@ class _Array(Protocol):  # a NumPy array, or a tensor on any device
 class FeatureCache(Generic[Kept]):
     """Arrays by key, thread-safe. The least recently used arrays are removed first.
 
-    limit_bytes: largest size of all arrays together, with a fixed overhead for each
+    limit_bytes: total size limit, with a fixed overhead for each array
 
-    Each key must contain a digest that this process computed from the array's source. A digest from a caller could
-    name other content.
+    Compute the digest in a key here, from the array's source: a caller's digest could name other content.
     """
 
     def __init__(self, limit_bytes: int) -> None:
@@ -88,10 +87,10 @@ def get_or_make(
     make: Callable[[Sequence[Source]], Sequence[Float32Array | RewardError]],
     is_always_made: Callable[[Source], bool] = lambda _: False,
 ) -> tuple[dict[bytes, Float32Array | RewardError], int]:
-    """Return the features of the wanted keys, from the cache or made from their sources, and how many were made.
+    """Return features for the wanted keys, cached or newly made, and how many were made.
 
     Each feature is made once. Keys without cached features and without a source are left out. Errors and features
-    with values that are not finite are not cached.
+    with NaN or infinite values are not cached.
 
     is_always_made: True for a source whose cached features must not be used
     """

@@ -14,9 +14,9 @@ from rfm_client.contract.results import answer, trajectory_scores
 
 
 def finite(outcomes: Sequence[Result | RewardError], *, lacks: Collection[str]) -> list[Result | RewardError]:
-    """Return the outcomes, with an error in place of each result with a score that is not finite.
+    """Return the outcomes, with an error in place of each result with a NaN or infinite score.
 
-    lacks: scores that the network does not predict, which are NaN then
+    lacks: scores the network does not predict, which are NaN
 
     Frames that the model does not answer about are not checked. Neither are logits of progress: RoboReward has none for
     an answer without a digit, and progress shows the others' faults.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""CUDA graphs: a call that occurs again with tensors of the same shapes becomes one launch instead of thousands.
+"""CUDA graphs: a repeated call with tensors of the same shapes becomes one launch instead of thousands.
 
 In a pass over a few samples, the host takes longer to launch the kernels than the device takes to run them.
 
@@ -35,10 +35,10 @@ _log = logging.getLogger(__name__)
 class Captured:
     """A captured call.
 
-    inputs: the tensors that ``replay`` reads
-    output: the tensor that it writes
-    pool: handle of the memory that graphs share
-    last_call: number of the last call that used it
+    inputs: tensors read by ``replay``
+    output: tensor written by ``replay``
+    pool: handle of the memory shared by graphs
+    last_call: number of the last call to use this graph
     """
 
     inputs: Sequence[Tensor]
@@ -66,7 +66,7 @@ class Capture(Protocol):
 
 
 class CudaCapture:
-    """Captures calls on a CUDA device, all on one stream, as PyTorch requires of graphs that share memory."""
+    """Captures calls on a CUDA device, all on one stream, as PyTorch requires if graphs share memory."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
@@ -127,9 +127,9 @@ class Graphs:
         return captured(tensors)
 
     def padded(self, num_rows: int, length: int) -> int:
-        """Return the length to which rows of ``length`` tokens are padded, so that other lengths share their graph.
+        """Return the padded length for rows of ``length`` tokens, so other lengths share a graph.
 
-        A batch that would be too large for a graph is not padded.
+        A batch too large for a graph is not padded.
         """
         padded = -(-length // STEP_TOKENS) * STEP_TOKENS
         return padded if num_rows * padded <= MAX_TOKENS and not self.has_failed else length

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Layers that several families share, and the precision of their computation."""
+"""Layers shared by several families, and the precision of computation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Linear(nn.Linear):
     """An ``nn.Linear`` that computes large float32 products on the CPU with oneDNN.
 
     PyTorch uses MKL, which is slow on processors other than Intel's (docs/explanation/performance.md), and oneDNN only
-    for bfloat16. torch.compile uses the same operation. oneDNN builds a kernel for each new shape, so ReWiND pads its
+    for bfloat16. torch.compile uses the same operation. oneDNN builds a kernel for each new shape, so ReWiND pads
     tokens to few shapes (``rfm.rewind.network.rounded_up``).
     """
 
@@ -62,7 +62,7 @@ class RmsNorm(nn.Module):
 
 
 def speed_up(network: nn.Module) -> None:
-    """Replace layers of the network by faster ones with the same parameters.
+    """Replace layers by faster ones with the same parameters.
 
     Every ``nn.Linear`` becomes a ``Linear``. On other devices than the CPU, ``RmsNorm`` replaces the RMSNorms of
     transformers; on the CPU ``F.rms_norm`` is slower in bfloat16.
@@ -110,10 +110,10 @@ class PredictionHead(nn.Sequential):
 
 
 def progress_from_logits(logits: Tensor) -> Tensor:
-    """Return progress, float32 [...] from 0 to 1, of the progress head's logits [..., K].
+    """Return progress, float32 [...] from 0 to 1, from progress logits [..., K].
 
     K = 1: the sigmoid. K > 1 bins: the mean of the bin centres linspace(0, 1, K) under the softmax, in float32 for
-    every dtype of the model.
+    every model dtype.
     """
     if logits.shape[-1] == 1:
         return logits.squeeze(-1).sigmoid().float()

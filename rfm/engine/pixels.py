@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Normalise pixels, on the device of the network that reads them: frames travel as uint8."""
+"""Normalise pixels on the network's device: frames travel as uint8."""
 
 from __future__ import annotations
 

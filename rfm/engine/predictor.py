@@ -30,7 +30,7 @@ Batch = TypeVar("Batch")
 
 
 class Predictor(Protocol[Row, Batch]):
-    """A network on a device, with the collation of its batches.
+    """A network on a device, with batch collation.
 
     A row is one token sequence, or several that begin alike.
     """
@@ -66,7 +66,7 @@ class Predictor(Protocol[Row, Batch]):
         """
 
     def num_tokens(self, row: Row) -> int:
-        """Return the number of tokens that the network computes. Rows with similar numbers share a batch."""
+        """Return the number of computed tokens. Rows with similar numbers share a batch."""
 
     def sequences(self, row: Row) -> Sequence[Row]:
         """Return the row's token sequences, each as a row. Most rows have one."""
@@ -83,11 +83,11 @@ class Predictor(Protocol[Row, Batch]):
     def score(self, rows: Sequence[Row], batch: Batch, execution: Execution) -> list[RowScores | RewardError]:
         """Run one forward pass; return each row's scores on the CPU, or its error.
 
-        execution: a predictor of several passes calls its ``on_forward`` after each
+        execution: with several passes, call ``on_forward`` after each
         """
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        """Return the scores of a progress sample's frames, from those of all its rows."""
+        """Return frame scores for a progress sample, from all row scores."""
 
 
 class GraphedPredictor(Predictor[Row, Batch], Protocol):
@@ -101,7 +101,7 @@ class GraphedPredictor(Predictor[Row, Batch], Protocol):
 class RowScores:
     """Scores of one row.
 
-    frames: of each trajectory
+    frames: scores for each trajectory
     query: the preference or similarity of two trajectories; None: the row asks for neither
     is_of_prefixes: the row has several prefixes (dense mode), with one value for the last frame of each
     analysis: of the trajectory; None: the row asks for none
@@ -126,7 +126,7 @@ def check_type(sample: Sample, config: Any) -> None:
 
 
 def no_success(progress: Float32Array) -> Float32Array:
-    """Return NaN in the shape of ``progress``, as the success of a network without a success head."""
+    """Return NaN in the shape of ``progress``: success without a success head."""
     return np.full_like(progress, np.nan)
 
 
@@ -142,12 +142,12 @@ def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> Fram
 
 
 def of_rows(sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-    """Return the scores of a progress sample: those of the only row; in dense mode, of each prefix's last frame."""
+    """Return scores for a progress sample: the only row's; in dense mode, each prefix's last frame."""
     return of_prefixes(rows) if getattr(sample, "frame_steps", 0) else rows[0].frames[0]
 
 
 def of_prefixes(rows: Sequence[RowScores]) -> FrameScores:
-    """Return the scores of the last frame of each prefix."""
+    """Return scores for the last frame of each prefix."""
     newest = slice(-1, None)
     return FrameScores.joined([row.frames[0] if row.is_of_prefixes else row.frames[0].at(newest) for row in rows])
 

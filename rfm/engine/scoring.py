@@ -40,9 +40,9 @@ Outcome: TypeAlias = Result | RewardError
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A sample that is ready for its forward pass.
+    """A sample, ready for a forward pass.
 
-    rows: the sample's rows, or the error that says why the network cannot score it
+    rows: the rows, or the error why the network cannot score the sample
     num_tokens: tokens in all rows
     """
 
@@ -54,11 +54,11 @@ class Prepared:
 class Engine:
     """Scores samples with one network on one device.
 
-    predictor: the network, with the collation of its batches
-    encoders: on the same device, for samples of raw frames if the network scores embeddings
-    token_budget: maximum tokens, with padding, of a forward pass of several rows; a larger row runs alone
-    max_sample_tokens: maximum tokens of one sequence; a sample with a longer one is refused
-    cache: the predictor's, of frames and their features; None: it keeps none
+    predictor: the network, with batch collation
+    encoders: on the same device, for raw frames if the network scores embeddings
+    token_budget: maximum tokens, with padding, in a forward pass over several rows; a larger row runs alone
+    max_sample_tokens: maximum tokens in one sequence; longer samples are refused
+    cache: the predictor's cache for frame features; None: no cache
     graphs: CUDA graphs for small batches, if the predictor can use them; None: all passes are plain
     """
 
@@ -96,7 +96,7 @@ class Engine:
     ) -> Engine:
         """Return the engine for a checkpoint in memory.
 
-        dtype: of the network; None: a vision-language checkpoint's own on a GPU, else float32
+        dtype: network dtype; None: a vision-language checkpoint's own on a GPU, else float32
         feature_cache_mib: MiB for features of raw frames; 0: no cache
         cuda_graphs: run small batches as CUDA graphs; no effect on the CPU or without ``Description.uses_graphs``
         others: as in the class
@@ -135,7 +135,7 @@ class Engine:
     def prepare(self, sample: Sample) -> Prepared:
         """Make the rows of a sample, without encoders or a forward pass; may run while another thread scores.
 
-        sample: in the form that the network reads; the encoders are not used
+        sample: frames or embeddings as the network reads them; the encoders are not used
         """
         return self._prepared(sample, sample)
 
@@ -154,7 +154,7 @@ class Engine:
         return self._results(prepared, execution, replace(execution))
 
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
-        """Encode the raw frames of all samples together; an error replaces a sample that cannot be encoded."""
+        """Encode raw frames for all samples together; an error replaces a sample if encoding fails."""
         outcomes: list[Sample | RewardError] = list(samples)
         raw = {
             i: EncoderSample(s.trajectories)
@@ -245,9 +245,9 @@ class Engine:
             return None
 
     def _score(self, rows: Sequence[Any], batch: Any, execution: Execution) -> Sequence[RowScores | RewardError]:
-        """Return the scores of each row from one forward pass, or several if memory is short.
+        """Score rows in one forward pass, or several if memory is short.
 
-        batch: of all rows; None: it did not fit in memory, and is made again here
+        batch: all rows collated; None: they did not fit in memory, and are collated again here
         """
 
         def forward(part: Sequence[Any]) -> Sequence[RowScores | RewardError]:
@@ -263,7 +263,7 @@ class Engine:
         return execution.run(forward, rows, divided)
 
     def _micro_batches(self, rows: Sequence[Any]) -> Iterator[list[int]]:
-        """Yield the indices of the rows of each forward pass: similar in length, within the token budget."""
+        """Yield row indices for each forward pass: similar in length, within the token budget."""
         num_tokens = [self.predictor.num_tokens(row) for row in rows]
         part: list[int] = []
         for index in sorted(range(len(rows)), key=num_tokens.__getitem__):
@@ -295,7 +295,7 @@ class Engine:
 
 
 def _of_sequences(outcomes: Sequence[RowScores | RewardError]) -> RowScores | RewardError:
-    """Return the scores of a row from those of its sequences, which are prefixes, or the first error."""
+    """Join scores of sequences, which are prefixes, to those of a row, or return the first error."""
     error = next((outcome for outcome in outcomes if isinstance(outcome, RewardError)), None)
     if error is not None:
         return error

@@ -31,7 +31,7 @@ def num_preparing(device: torch.device, num_threads: int) -> int:
 class FrameThreads:
     """Threads that prepare frames. Any thread may call ``parts``, and waits for the result.
 
-    number: of threads; 1: the calling thread does the work
+    number: thread count; 1: the calling thread does the work
     """
 
     def __init__(self, number: int) -> None:

@@ -124,6 +124,10 @@ USAGE = {
     "rfm serve": "Invalid value: give FOLDER or --repository",
     "rfm serve repository other": ("Invalid value: expected one FOLDER, and after it -- --OPTION=VALUE, got other"),
     "rfm serve repository --port-http 8000": "No such option: --port-http (Possible options: --http-port)",
+    "rfm serve repository --log-verbose=1": (
+        "No such option: --log-verbose: put options of tritonserver after --, as in rfm serve FOLDER -- "
+        "--log-verbose=VALUE"
+    ),
     "rfm serve repository --http-port abc": "Invalid value for '--http-port': expected a whole number, got 'abc'",
     "rfm serve repository --gateway-dataset nope": (
         "Invalid value: --gateway-dataset needs --gateway-port, which starts the gateway"

@@ -302,7 +302,6 @@ def test_the_fastapi_servers_file_starts_a_gateway_on_its_port(started: Any, tmp
 WORDS: dict[str, tuple[list[str], str]] = {
     "no folder": ([], "Invalid value: give FOLDER or --repository\n"),
     "two folders": (["a", "--repository", "b"], "Invalid value: give FOLDER or --repository, not both"),
-    "an option of Triton alone": (["a", "--log-verbose=1"], "No such option: --log-verbose"),
 }
 
 

@@ -102,6 +102,7 @@ class Command(TyperCommand):
 
     program = "rfm-client"
     has_codes = True  # False: every error ends the command with 1
+    unknown_option = ""  # what the error about an unknown {option} also says
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Give ``--json`` without a value the value ``-``, which the parser cannot do. Raises typer.BadParameter."""
@@ -120,6 +121,8 @@ class Command(TyperCommand):
             if unknown := getattr(error, "option_name", ""):
                 same = same_words(unknown, [option for each in self.params for option in each.opts])
                 vars(error)["possibilities"] = same or vars(error)["possibilities"]
+                if self.unknown_option and not same:
+                    vars(error)["message"] += f": {self.unknown_option.format(option=unknown)}"
             raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:

@@ -28,12 +28,12 @@ from rfm_client.transport.loop_thread import LoopThread
 
 
 class AsyncEpisodes(AsyncClosing, OneProcess):
-    """N episodes that grow together, as in vectorised environments. An async context manager.
+    """N episodes in step, as in vectorised environments. An async context manager.
 
-    A step takes as few requests as possible. All frames are kept until the episode ends, because later steps show them
+    A step needs as few requests as possible. Episodes keep all frames until they end, because later steps show them
     again.
 
-    begin: method of the client that returns a call which begins now
+    begin: client method to start a call now
     steps: each episode
     """
 
@@ -48,9 +48,9 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         return len(self.steps)
 
     async def add(self, frames: Any, mask: npt.ArrayLike | None = None) -> StepScores:
-        """Add a frame to each episode, and return the scores of the episodes so far.
+        """Add a frame to each episode, and score the episodes so far.
 
-        frames: uint8 [N, H, W, 3], an array, a torch tensor or a sequence of frames; with cameras, a dict of these
+        frames: uint8 [N, H, W, 3], an array, torch tensor or sequence; with cameras, a dict
         mask: bool [N], True for episodes with a new frame; None: all
 
         Raises RewardError, ``episodes[3].frame: expected X, got Y``. Then no episode has grown, and the step may be
@@ -75,7 +75,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         """Begin new episodes, once no step is open.
 
         mask: bool [N], True for episodes that begin anew; None: all
-        task: of all new episodes, or a sequence with a task for each; None: as before
+        task: one for all new episodes, or a sequence; None: as before
         """
         async with self._adding:
             indices = _indices(mask, len(self))
@@ -92,7 +92,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
                 steps.end()
 
     async def frame_size(self, call: Call | None = None) -> FrameSize | None:
-        """Return the size to which frames shrink; None: no change. Raises RewardError."""
+        """Return the target size for frames; None: no change. Raises RewardError."""
         if not self._options.resize:
             return None
         return (await self._scorer.model_info(call or self._begin(self._timed))).frame_size
@@ -111,7 +111,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         return [frame for part in making for frame in part.result()]
 
     def _given(self, frames: Any, indices: Sequence[int]) -> dict[int, Any]:
-        """The new frame of each of these episodes; with cameras, a dict of frames."""
+        """The new frame for each episode; with cameras, a dict."""
         cameras = self._options.cameras
         check_cameras("frames", frames, cameras)
         of_cameras = {f"frames[{camera!r}]": frames[camera] for camera in cameras} or {"frames": frames}
@@ -146,11 +146,11 @@ class AsyncEpisode(AsyncClosing, OneProcess):
         self._waiting: asyncio.Task[StepScore] | None = None  # for the open request to end
 
     async def add(self, frame: Any) -> StepScore:
-        """Add a frame, and return the score of the episode so far.
+        """Add a frame, and score the episode so far.
 
-        Waits for an open request. Drops a frame of ``add_nowait`` that waits for it, too.
+        Waits for an open request. Drops a frame from ``add_nowait`` if one waits, too.
 
-        frame: uint8 [H, W, 3]; with cameras, a dict of these
+        frame: uint8 [H, W, 3]; with cameras, a dict
 
         Raises RewardError. Then the episode has not grown, and the step may be repeated.
         """
@@ -158,7 +158,7 @@ class AsyncEpisode(AsyncClosing, OneProcess):
         return await self._add(frame)
 
     def add_nowait(self, frame: Any) -> asyncio.Future[StepScore]:
-        """Add a frame, as in ``add``, and return the future of its score.
+        """Add a frame, as in ``add``, and return a future score.
 
         While a request is open, the frame waits. A newer frame replaces it, and cancels its future. A frame with a
         cancelled future is not part of the episode.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Options of an episode, and the scores of its steps. N episodes, H x W pixels."""
+"""Options for an episode, and the scores at each step. N episodes, H x W pixels."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ StepValue: TypeAlias = Literal["progress", "remaining_s"]
 class StepScore:
     """The score of one episode at its newest frame.
 
-    progress: how much of the task is done, 0..1; NaN with ``score="remaining_s"`` if the checkpoint does not predict it
-    success: probability that the task is done; NaN: the checkpoint does not predict it
+    progress: share of the task done, 0..1; NaN with ``score="remaining_s"`` if the checkpoint does not predict progress
+    success: probability that the task is done; NaN: the checkpoint does not predict success
     succeeded: True if the success rule holds; False where success is NaN
     step: index of the scored frame in the episode, from 0
     ms: milliseconds to the answer, without the wait for an open ``add_nowait`` request
-    more_scores: the frame's other scores that the checkpoint gives unasked, by name in ``FRAME_SCORES``: marks as bool,
-        numbers as float. Of several cameras, numbers are fused, and a mark is True if one camera has it
+    more_scores: other scores for the frame, by name in ``FRAME_SCORES``: marks as bool, numbers as float. With several
+        cameras, numbers are fused, and a mark is True if any camera has it
     """
 
     progress: float
@@ -44,7 +44,7 @@ class StepScore:
 
     @property
     def unclear(self) -> bool:
-        """True if a camera's written answer states no single whole score (RoboReward only)."""
+        """True if a written answer states no single whole score (RoboReward only)."""
         return bool(self.more_scores.get("unclear"))
 
     def value(self, score: StepValue) -> float:
@@ -54,11 +54,11 @@ class StepScore:
 
 @dataclass(frozen=True, eq=False)
 class StepScores:
-    """The scores of N episodes, each at its newest frame.
+    """The scores of N episodes at the newest frames.
 
     progress, success: float32 [N], as in StepScore; NaN where ``mask`` left an episode out
     succeeded: bool [N]; False where ``mask`` left an episode out, or success is NaN
-    step: int64 [N], number of each newest frame, from 0; -1: none yet
+    step: int64 [N], index of the newest frame, from 0; -1: none yet
     ms: time to the answer, milliseconds
     more_scores: by name an array [N], as in StepScore: bool for marks, else float32 with NaN where there is none
     """
@@ -84,10 +84,10 @@ class StepScores:
 
 @dataclass(frozen=True)
 class SuccessRule:
-    """A step succeeds if most of the last distinct frames of its own sample reach ``threshold``.
+    """A step succeeds if most of the last distinct frames in the sample reach ``threshold``.
 
     threshold: least success of such a frame, 0..1
-    last: number of frames that vote; each distinct frame votes once, however often it is repeated or padded
+    last: number of voting frames; each distinct frame votes once, even if it is repeated or padded
 
     Raises ValueError.
     """
@@ -104,7 +104,7 @@ class StepReport(Protocol):
     """One episode in a view."""
 
     def add(self, frame: UInt8Array, score: StepScore) -> None:
-        """Take a step. Return at once, and raise nothing. frame: uint8 [H, W, 3], which will not change any more."""
+        """Take a step. Return at once, and raise nothing. frame: uint8 [H, W, 3], which never changes again."""
 
     def end(self) -> None:
         """Take the end of the episode. Return at once, and raise nothing."""
@@ -114,7 +114,7 @@ class StepView(Protocol):
     """A view to which episodes report each step, such as ``rfm_rl.LiveView``."""
 
     def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> StepReport:
-        """Return a new episode. env: its number among those that grow together, from 0; threshold: of success"""
+        """Return a new episode. env: index among parallel episodes, from 0; threshold: for success"""
 
 
 class StepKeywords(TypedDict, total=False):
@@ -139,20 +139,20 @@ class StepKeywords(TypedDict, total=False):
 class FrameOptions:
     """How the frames of an episode are read. Raises ValueError for contradictory options.
 
-    sampling: a rule of ``rfm_client.frames.sampling``; None: the rule of the checkpoint's training
-    cameras: names of the cameras with a frame in each step; empty: a single camera without a name
-    fuse: how to combine the scores of several cameras
-    orient: rotation or flip that makes frames upright, applied first: an Orientation, or a dict by camera; cameras that
-        it omits are not turned
-    channels: order of the colours in the given frames, ``rgb`` or ``bgr``: one for all cameras, or a dict by camera
+    sampling: a rule in ``rfm_client.frames.sampling``; None: as in training
+    cameras: camera names, one frame each per step; empty: a single camera without a name
+    fuse: how to combine scores from several cameras
+    orient: rotation or flip to make frames upright, applied first: an Orientation, or a dict by camera; omitted cameras
+        are not turned
+    channels: colour order in the given frames, ``rgb`` or ``bgr``: one for all cameras, or a dict by camera
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
-    live: view to which each step is reported, with the first camera's frame; it delays no step
-    robot_description: the words for the robot in RynnValue's prompt; empty: those of the export
-    camera_description: the words for the camera: one text for all cameras, or a dict by camera. If either is given,
-        they replace both of the export
-    score: the score that each step must have, ``progress`` or ``remaining_s``; a step of a checkpoint that does not
-        predict it raises ValueError
+    live: view for each step and the first camera's frame; it delays no step
+    robot_description: words for the robot in RynnValue's prompt; empty: as exported
+    camera_description: words for the camera: one text for all cameras, or a dict by camera. If either description is
+        given, both exported ones are replaced
+    score: the score to make rewards from, ``progress`` or ``remaining_s``; a step raises ValueError if the checkpoint
+        does not predict it
     """
 
     sampling: Rule | None = None
@@ -188,14 +188,14 @@ class FrameOptions:
 
     @property
     def descriptions(self) -> list[tuple[str, str]]:
-        """Descriptions of the robot and of each camera, in the order of the cameras."""
+        """Descriptions of the robot and each camera, in camera order."""
         given, cameras = self.camera_description, self.cameras or ("",)
         of_cameras = [given.get(camera, "") if isinstance(given, Mapping) else given for camera in cameras]
         return [(self.robot_description, text) for text in of_cameras]
 
     @property
     def corrections(self) -> list[Correction]:
-        """Correction of each camera's frames, in the order of the cameras."""
+        """Correction for each camera, in camera order."""
         return [Correction.of(camera, self.orient, self.channels) for camera in self.cameras or ("",)]
 
 
@@ -203,10 +203,10 @@ class FrameOptions:
 class EpisodeOptions(FrameOptions):
     """How each step of an episode is scored. Raises ValueError for contradictory options.
 
-    frames: the rule's number of frames; None: the rule's own if fixed, else ``ModelInfo.max_frames``. If the rule needs
-        a number and the checkpoint has none, the first step raises ValueError
-    success: rule of a step's success
-    timeout_s: longest time of a step, retries included; None: the client's
+    frames: number of frames for the rule; None: fixed by the rule, else ``ModelInfo.max_frames``. If neither gives a
+        number, the first step raises ValueError
+    success: decides whether a step succeeds
+    timeout_s: time limit for a step with all retries; None: the client's
     """
 
     frames: int | None = None
@@ -218,7 +218,7 @@ class EpisodeOptions(FrameOptions):
         Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
 
     def sampling_for(self, info: ModelInfo) -> Sampling:
-        """Return the rule with its number of frames for a checkpoint.
+        """Return the rule and number of frames for a checkpoint.
 
         Raises ValueError without a needed number, InvalidSampleError if the checkpoint needs the whole episode.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The steps of one episode: frames, the windows that are scored, and scores. H x W pixels."""
+"""The steps of one episode: frames, scored windows, and scores. H x W pixels."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ logger = logging.getLogger("rfm_client")
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame, uint8 [H, W, 3], that must not change, and its digest."""
+    """A frame, uint8 [H, W, 3], and the digest. The frame must not change."""
 
     pixels: UInt8Array
 
@@ -46,10 +46,10 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Frames of one size with their task, to be scored for progress. Raises InvalidSampleError for an invalid task.
+    """Frames of one size and a task, to be scored for progress. Raises InvalidSampleError for an invalid task.
 
-    episode: identifies the episode of the frames; all windows of an episode go to one server
-    descriptions: of robot and camera, as in Trajectory
+    episode: identifies the episode; all windows of an episode go to one server
+    descriptions: robot and camera, as in Trajectory
     """
 
     frames: tuple[Frame, ...]
@@ -83,10 +83,10 @@ class Window:
 
 
 class Steps:
-    """The steps of one episode so far: its frames, and reports to the live view.
+    """The steps of one episode so far: frames, and reports to the live view.
 
-    env: number of its environment, from 0, for the live view
-    where: its name in errors, such as ``episodes[3]``; empty: no name
+    env: index of the environment, from 0, for the live view
+    where: name in errors, such as ``episodes[3]``; empty: no name
     """
 
     def __init__(self, task: str, options: EpisodeOptions, env: int = 0, where: str = "") -> None:
@@ -110,8 +110,8 @@ class Steps:
     def checked(self, frame: Any, size: FrameSize | None = None) -> tuple[Frame, ...]:
         """Return a copy of the next frame of each camera, upright. Raises InvalidSampleError.
 
-        frame: uint8 [H, W, 3]; with cameras, a dict of these
-        size: size to which frames shrink; None: no change
+        frame: uint8 [H, W, 3]; with cameras, a dict
+        size: target size; None: no change
         """
         cameras = self.options.cameras
         kept = []

@@ -52,7 +52,7 @@ _WITH_PREVIEWS = "MPO"  # Pillow's name of a JPEG file with further, smaller pic
 
 
 def frame_indices(total: int, native_fps: float, fps: float) -> npt.NDArray[np.int64]:
-    """Return int64 [T], the indices of the frames that show a video of ``total`` frames at ``fps``.
+    """Return int64 [T], frame indices to show a video of ``total`` frames at ``fps``.
 
     As in upstream's example client: T = round(total * fps / native_fps), at least 1 and at most ``total``, evenly
     spaced from first to last, rounded down.
@@ -85,9 +85,9 @@ def read_video(
 
     start_s, end_s: part from ``start_s`` to before ``end_s``, in seconds since the first frame;
         None: from the start, to the end
-    timeout_s: longest silence of a URL's server
+    timeout_s: longest silence from a URL's server
     take: called before each frame takes memory, with the number of bytes; its error ends the reading
-    container: FFmpeg's name of the file's format; None: FFmpeg guesses it. Name it for untrusted files, because some
+    container: FFmpeg's name for the file format; None: FFmpeg guesses. Name it for untrusted files, because some
         formats make FFmpeg open other files or addresses
 
     Raises InvalidSampleError for a missing or truncated file, a file of no video, several videos or depth maps, fewer
@@ -121,7 +121,7 @@ def read_video(
 
 
 def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = None) -> npt.NDArray[np.float64] | None:
-    """Return float64 [T], the times of the frames that ``read_video`` took of a file, from 0; None: unknown.
+    """Return float64 [T], frame times from 0 for ``read_video``; None: unknown.
 
     num_frames: T
     container: as in ``read_video``

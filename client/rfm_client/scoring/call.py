@@ -18,16 +18,16 @@ _ID_BYTES = 8  # random bytes in the ids of a call's requests
 class CallOptions(TypedDict, total=False):
     """Options of every call.
 
-    timeout_s: longest time of the call; None: the client's
-    logits: True: add the raw scores of the progress bins (discrete checkpoints only)
-    log_prob: True: add the log-probability of each frame (TOPReward only)
-    all_scores: True: add each score of frames that the model gives, but for ``logits``
+    timeout_s: time limit; None: the client's
+    logits: True: add the raw scores for the progress bins (checkpoints with bins only)
+    log_prob: True: add a log-probability for each frame (TOPReward only)
+    all_scores: True: add every other score for frames, except ``logits``
     timing: True: add the server's time for the batch
-    subsample: True: score at most ``ModelInfo.max_frames`` frames of a trajectory, evenly spaced from first to last, as
-        in training; the result's ``frame_indices`` lists them
-    resize: True: shrink frames to the checkpoint's size before they are sent (needs Pillow); ReWiND's scores then
-        differ slightly
-    request_id: start of the ids of the call's requests, in errors and in the server's log; None: random
+    subsample: True: score at most ``ModelInfo.max_frames`` frames, evenly spaced from first to last, as in training;
+        ``frame_indices`` in the result lists them
+    resize: True: shrink frames to the checkpoint's size before sending (needs Pillow); ReWiND's scores then differ
+        slightly
+    request_id: prefix for request ids in errors and in the server's log; None: random
     """
 
     timeout_s: float | None
@@ -41,11 +41,11 @@ class CallOptions(TypedDict, total=False):
 
 
 class Call:
-    """Values that the requests of one call share. Raises ValueError for an invalid request id.
+    """Values shared by all requests in one call. Raises ValueError for an invalid request id.
 
-    outputs: outputs that options ask for by name
+    outputs: outputs requested by name
     request_ids: an id for each request
-    server: number of the server to ask first; None: the least busy
+    server: index of the server to ask first; None: the least busy
     """
 
     server: int | None = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scoring of samples: the requests of a call, and each sample's outcome."""
+"""Scoring samples: requests for a call, and an outcome for each sample."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ _EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
 
 
 class SampleScorer:
-    """Scorer of samples on a client's servers, for one event loop.
+    """Scores samples on a client's servers, in one event loop.
 
-    model: name of the model that scores embeddings
+    model: name of the model for embeddings
     """
 
     def __init__(self, model: str, servers: Servers, concurrency: ConcurrencyLimiter) -> None:
@@ -74,7 +74,7 @@ class SampleScorer:
         return [outcomes[index] for index in range(len(samples))]
 
     async def embeddings(self, trajectory: Trajectory, call: Call) -> Trajectory:
-        """Return the trajectory with embeddings in place of its frames. Raises RewardError."""
+        """Return the trajectory with embeddings instead of frames. Raises RewardError."""
         if trajectory.frames is None:
             raise InvalidSampleError.at("trajectory", "frames", "video_embeddings")
         tensors, model = partial(wire.encode_frames, trajectory), encoder_name(self._model)
@@ -136,7 +136,7 @@ class SampleScorer:
     async def _scored(
         self, model: str, group: Sequence[int], samples: Mapping[int, Sample], call: Call
     ) -> Iterable[tuple[int, Outcome]]:
-        """Indices and outcomes of a group of samples that fit the same arrays."""
+        """Indices and outcomes for samples in the same arrays."""
         if len(group) == 1:
             return zip(group, await self._request(model, [samples[group[0]]], call), strict=True)
         try:
@@ -176,7 +176,7 @@ class SampleScorer:
         return [outcome for (outcome,) in alone]
 
     async def _given(self, model: str, samples: Sequence[Sample], call: Call) -> tuple[str, ...]:
-        """Names of the scores that the model gives, as its description says. Raises RewardError."""
+        """Names of all scores in the model's description. Raises RewardError."""
         if samples[0].trajectories[0].frames is None and not call.all_scores:
             return ()  # the description would cost a request, and models of embeddings give no more unasked
         try:

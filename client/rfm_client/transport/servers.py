@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Servers of one checkpoint, and the loop that retries a request until its deadline.
+"""Servers with one checkpoint, and the retry loop for a request.
 
 The least busy server gets a request, unless the caller names the one to ask first. A server that fails is left out
 until it reports ready; after more failures, it is asked later. A score depends on the request alone, so a request may
@@ -55,9 +55,9 @@ logger = logging.getLogger("rfm_client")
 
 
 class KnownServer:
-    """One of several servers: its transport, load and failures.
+    """One of several servers: transport, load and failures.
 
-    failures: number of times that the server was left out since its last success
+    failures: how often the server was left out since the last success
     has_answered: True after the first success
     comeback: ends when the server reports ready again; None: never left out
     """
@@ -85,7 +85,7 @@ class KnownServer:
             self.outstanding -= 1
 
     async def rested(self, model: str) -> None:
-        """Return when the failed server reports ready, after a pause that grows with its failures."""
+        """Return when the failed server reports ready, after a pause that grows with each failure."""
         await asyncio.sleep(pause_s(self.failures - 1, LONGEST_REST_S))
         for attempt in itertools.count():
             if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
@@ -140,7 +140,7 @@ class Servers:
     ) -> Answer:
         """Return the named ``outputs`` of ``model`` for ``inputs``. Raises RewardError with the request's id.
 
-        first: number of the server to ask; if it fails, the next in the list. None: the least busy
+        first: index of the server to ask; after a failure, the next in the list. None: the least busy
         """
 
         def request(server: Transport, left_s: float) -> Awaitable[Answer]:
@@ -157,7 +157,7 @@ class Servers:
         return await self._request(model, lambda server, left_s: server.model_info(model, left_s), deadline)
 
     async def model_infos(self, model: str, deadline: Deadline) -> list[ModelInfo]:
-        """Return the descriptions of ``model`` by all servers that answer; the first may appear twice.
+        """Return what every reachable server says about ``model``; the first may appear twice.
 
         Raises RewardError if no server answers.
         """
@@ -308,6 +308,6 @@ def _is_task_cancelled() -> bool:
 
 
 def pause_s(attempt: int, longest_s: float) -> float:
-    """Return a pause that doubles with each try; up to half is random, so that callers do not return together."""
+    """Return a pause that doubles with each try; up to half is random, lest callers return together."""
     pause_s = min(longest_s, FIRST_PAUSE_S * 2.0 ** min(attempt, 16))
     return random.uniform(pause_s / 2, pause_s)

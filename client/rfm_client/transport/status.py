@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The state of a Triton server: its models, their work, and its devices. Read-only.
+"""The state of a Triton server: models, work and devices. Read-only.
 
 Where the repository's index needs a key (``rfm serve``), only loaded models are listed.
 """
@@ -52,10 +52,10 @@ _Told: TypeAlias = tuple[str, bool, list[dict[str, Any]], list[dict[str, Any]]] 
 
 @dataclass(frozen=True)
 class Batches:
-    """The batches of callers' requests that a model reports, over all its instances.
+    """Batches of callers' requests, as a model reports them for all instances.
 
-    count, samples: numbers of batches, and of samples in them
-    scoring_ms: time for collating and forward passes, of all batches
+    count, samples: how many batches and samples
+    scoring_ms: total time for collating and forward passes
     """
 
     count: int
@@ -71,10 +71,10 @@ class ModelStatus:
     from Triton's start. A model that prepares ahead forms its own batches, which only ``batches`` counts.
 
     requests_pending: requests in Triton's queue now; None: not in the metrics
-    samples, executions: numbers of samples and batches that Triton handed over
-    queue_ms, compute_ms: time of all requests in Triton's queue, and of all executions until Triton could go on
+    samples, executions: how many samples and batches Triton handed over
+    queue_ms, compute_ms: total time in Triton's queue, and in executions until Triton could go on
     last_used_s: Unix time of the last request; None: no request yet
-    batches, samples_refused: batches of callers, and their invalid samples; None: not in the metrics
+    batches, samples_refused: callers' batches and invalid samples; None: not in the metrics
     """
 
     name: str
@@ -122,10 +122,10 @@ class ModelStatus:
 
 @dataclass(frozen=True)
 class Device:
-    """The processor (``CPU``), or a GPU by its UUID. Values that Triton does not report are None.
+    """The processor (``CPU``), or a GPU by UUID. None: Triton does not report the value.
 
     utilization: 0..1
-    work: each model's work there, by name of the model
+    work: work on this device, by model name
     """
 
     name: str
@@ -137,7 +137,7 @@ class Device:
 
 @dataclass(frozen=True)
 class DeviceWork:
-    """The work of all versions of one model on one device.
+    """The work of one model, all versions, on one device.
 
     requests: number of answered requests
     compute_s: seconds of computation; a batch counts once for each of its requests
@@ -149,7 +149,7 @@ class DeviceWork:
 
 @dataclass(frozen=True)
 class ServerStatus:
-    """State of a server that answers.
+    """State of a responding server.
 
     metrics_error: why ``devices`` and other metrics are missing; None: they are not
     """
@@ -174,8 +174,8 @@ class ServerStatus:
         """Return the state of a server at ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or
         ``https://``.
 
-        metrics_url: URL of its metrics; None: port METRICS_PORT of the same host. Unreadable metrics are left out
-        credentials: used for the server, not for its metrics
+        metrics_url: where to read metrics; None: port METRICS_PORT on the same host. Unreadable metrics are left out
+        credentials: used for the server, not for the metrics
 
         Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for an answer
         that is not Triton's.
@@ -343,7 +343,7 @@ def _scrape(url: str, timeout_s: float) -> list[Any]:
 
 
 def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
-    """The sum of these metrics over the instances of each version."""
+    """The sum of these metrics over all instances, by version."""
     totals: dict[_Version, float] = {}
     for sample in samples:
         if sample.name in names:
