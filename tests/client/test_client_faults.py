@@ -44,6 +44,7 @@ def calling(client: RewardClient, scores: list[np.ndarray[Any, Any]]) -> Callers
     return Callers(progress_of(client), Exam(samples, scores), 2, PAUSE_S)
 
 
+@pytest.mark.nightly  # a minute; make chaos also does it
 def test_calls_survive_restarts_and_kills_of_servers(tmp_path: Path, repository: Path) -> None:
     both = [Endpoints.free(), Endpoints.free()]
     repositories = [repository, shutil.copytree(repository, tmp_path / "other" / "model_repository")]

@@ -26,7 +26,7 @@ DATASET = (
     "org/name[@revision], got"
 )
 PAIR = "expected a certificate and its key (PEM, unencrypted) at"
-SHOWN = "expected the folder of a LeRobot dataset (meta/info.json), or an HDF5 file, got"
+SHOWN = "expected the folder of a LeRobot (meta/info.json) or RLDS dataset (features.json), or an HDF5 file, got"
 SOURCE = "checkpoint: expected a folder that exists or a Hugging Face id org/name[/subfolder][@tag], got"
 
 

@@ -755,6 +755,7 @@ print(json.dumps(told))
 """
 
 
+@pytest.mark.nightly  # a minute
 def test_a_base_model_of_the_hub_is_read_from_the_cache_once_the_hub_is_gone(tmp_path: Path) -> None:
     golden = goldens.config(WITH_IMAGES)
     base = shutil.copytree(golden.sources["base_model"], tmp_path / "base", copy_function=shutil.copyfile)

@@ -112,6 +112,7 @@ EXCEPTIONS = {
     "benchmarks/gpus.py": {"rfm", "rfm_export"},  # what is served
     "benchmarks/perf_analyzer.py": {"rfm"},
     "benchmarks/memory.py": {"rfm"},
+    "benchmarks/random_checkpoints.py": {"rfm"},
     "benchmarks/real_size.py": {"rfm"},
     "benchmarks/serving.py": {"rfm", "rfm_export"},
     "benchmarks/peers/engines.py": {"rfm"},  # the peers score with our engine, or weights

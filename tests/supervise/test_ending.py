@@ -17,7 +17,7 @@ from commands import RFM, is_alive
 from patients import make_repository
 from rfm.launch import cleanup
 from rfm.launch.ending import ProcessGroup, how_it_ended
-from servers import PATIENCE_S, Endpoints, Serving, children, wait_for
+from servers import PATIENCE_S, START_S, Endpoints, Serving, children, wait_for
 
 AT_ONCE_S = 10.0  # a model process used to stay for two minutes
 GROUP = """
@@ -88,7 +88,7 @@ def test_notes_of_requests_in_dead_processes_come_first_and_empty_notes_hide_non
 
 @pytest.mark.triton
 @pytest.mark.slow
-@pytest.mark.parametrize("log", ["full disk", "closed pipe"])
+@pytest.mark.parametrize("log", ["full disk", pytest.param("closed pipe", marks=pytest.mark.nightly)])
 def test_rfm_serve_heals_without_a_log_and_if_it_is_killed_no_process_stays(tmp_path: Path, log: str) -> None:
     ends, more = Endpoints.free(), Endpoints.free()
     ports = {"http": ends.http_port, "grpc": ends.grpc_port, "metrics": ends.metrics_port}
@@ -101,7 +101,7 @@ def test_rfm_serve_heals_without_a_log_and_if_it_is_killed_no_process_stays(tmp_
         process = subprocess.Popen(words, stdout=broken, stderr=broken)
     served = Serving(process, ends, f"http://127.0.0.1:{more.http_port}", tmp_path / "log")
     try:
-        served.wait_ready()
+        served.wait_ready(within_s=START_S)
         os.kill(served.model_processes()[0], signal.SIGKILL)
         wait_for(lambda: served.restarts("rfm", "triton") == 1)
         served.wait_ready()

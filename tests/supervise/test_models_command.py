@@ -197,6 +197,7 @@ def test_an_unusable_certificate_is_told_with_its_option(file: str) -> None:
     assert f"Invalid value for '--ca-file': expected certificates (PEM) at {file}" in done.stderr
 
 
+@pytest.mark.nightly  # minutes; make chaos also does it
 def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(
     running: Running, other: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

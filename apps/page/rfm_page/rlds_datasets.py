@@ -28,7 +28,7 @@ class ShownRlds(ShownDataset):
 
     @property
     def cameras(self) -> Sequence[str]:
-        """All cameras."""
+        """All cameras of the dataset."""
         return self.dataset.cameras
 
     def times_s(self, episode: DatasetEpisode) -> npt.NDArray[np.float64]:
