@@ -227,7 +227,7 @@ def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
         better = preference if place == "first" else 1 - preference
         assert float(told[1]) == pytest.approx(better, abs=SHOWN + TOLERANCE)
     assert page.browser.all("#pairs h2")[0].text == "success.mp4 does the task better"
-    assert page.browser.all("#pairs p")[0].text == f"Both orders agree. {TASK} (rfm)"
+    assert page.browser.all("#pairs p")[0].text == f"{TASK} (rfm). Both orders agree."
     assert (answer["verdict"], answer["orders_agree"]) == ("first", True)
 
 

@@ -12,7 +12,7 @@ const LEFT_PX = 60; // of the numbers and names to the left
 const VALUE_PX = 16; // height of a number beside the chart
 const RIGHT_PX = { one: 48, several: 64 }; // of the numbers to the right; of several curves each with a piece of its line
 const STUB_PX = 12; // length of such a piece
-const MOST_VALUES = 6; // beside one part of the chart
+const MOST_VALUES = 6; // of more curves those of one colour have numbers
 const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
 export const MARK_PX = 72; // at least between the marks of the axis below
 const FAINT = "50"; // opacity, in hexadecimal
@@ -81,7 +81,7 @@ export class Chart {
   #end = 1;
   #threshold = 0.5;
   #time = 0;
-  #pointedTop = null; // height of the pointer
+  #pointedTop = 0; // height of the pointer
   #playhead = made("playhead");
   #line = made("threshold");
   #values = made("values");
@@ -176,8 +176,7 @@ export class Chart {
     const chosen = this.#chosen(points);
     const numbers = Object.entries(this.#panes).flatMap(([signal, { scale }]) => {
       const [lowest, highest] = scale.map((value) => this.#top(signal, value));
-      const own = chosen.filter((point) => point.signal === signal).slice(0, MOST_VALUES);
-      return apart(own, highest - VALUE_PX / 2, lowest + VALUE_PX / 2);
+      return apart(chosen.filter((point) => point.signal === signal), highest - VALUE_PX / 2, lowest + VALUE_PX / 2);
     });
     this.#values.replaceChildren(...numbers.map(({ curve, signal, value, top }) => {
       const element = document.createElement("span");
@@ -191,9 +190,9 @@ export class Chart {
     }));
   }
 
-  /** The points that have numbers: of many curves those in the colour that the pointer is nearest to. */
+  /** The points that have numbers: of many curves those of one colour, the one that the pointer is nearest to. */
   #chosen(points) {
-    if (this.#told.length <= MOST_VALUES || this.#pointedTop === null || !points.length) return points;
+    if (this.#told.length <= MOST_VALUES || !points.length) return points;
     const distance = ({ top }) => Math.abs(top - this.#pointedTop);
     const nearest = points.reduce((one, other) => (distance(other) < distance(one) ? other : one));
     return points.filter(({ curve }) => colourOf(curve) === colourOf(nearest.curve));

@@ -459,7 +459,7 @@ function update() {
   page["served-state"].classList.toggle("whole", !videos.all.length);
   page.clear.hidden = !videos.all.length;
   page.stage.hidden = !videos.all.length;
-  page.stage.classList.toggle("failed", curves.length > 0 && curves.every(({ state, times }) => state === "failed" && !times.length));
+  page.stage.classList.toggle("unscored", curves.length > 0 && curves.every(({ state, times }) => state === "failed" && !times.length));
   page.numbers.hidden = !curves.length;
   giveLooks(curves);
   timeline.show(curves);
@@ -480,7 +480,7 @@ function update() {
   told();
   showWhetherReady();
   page.scored.textContent = curves.length ? howMany() : "";
-  page["scored-by"].textContent = curves.length ? `by ${[...new Set(curves.map(checkpointOf))].join(", ")}` : "";
+  page["scored-by"].textContent = scored.length ? `by ${[...new Set(curves.map(checkpointOf))].join(", ")}` : "";
   page.chart.setAttribute("aria-label", scored.length
     ? scored.map((curve) => `${curve.label}: final ${toldAt(curve, -1)}`).join("; ")
     : "No curves yet.");

@@ -18,7 +18,7 @@ export function sentenceOf({ videos, answer }) {
 export function addVerdict(host, verdict) {
   const { videos, task, model, answer } = verdict;
   const box = document.createElement("div");
-  const about = answer ? `${answer.verdict ? "Both orders agree. " : ""}${task} (${model})` : "The files have the same bytes. The model was not asked.";
+  const about = answer ? `${task} (${model}).${answer.verdict ? " Both orders agree." : ""}` : "The files have the same bytes. The model was not asked.";
   box.className = "verdict";
   box.append(element("h2", sentenceOf(verdict).replace(/\.$/, "")), element("p", about));
   box.lastChild.className = "about";
