@@ -81,7 +81,7 @@ def test_what_a_model_predicts_in_place_of_progress_is_kept_and_other_scores_are
     steps = [step(number, None, None, instead={"remaining_s": 30.0 - number}) for number in range(2)]
     assert post(gateway, report(episode(40, *steps))).status_code == 204
     assert of(told(gateway), 40)["instead"] == {"remaining_s": [30.0, 29.0]}
-    assert told(gateway)["scores"] == {"remaining_s": {"short": "remaining", "unit": "s", "bounds": [None, None]}}
+    assert told(gateway)["scores"] == {"remaining_s": {"short": "time remaining", "unit": "s", "bounds": [None, None]}}
     assert of(told(gateway), 40)["newest"]["instead"] == {"remaining_s": 29.0}
     answer = post(gateway, report(episode(41, step(0, instead={"log_prob": -1.0}))))
     assert "expected only remaining_s, got 'log_prob'" in failure(answer, 422)

@@ -147,7 +147,7 @@ def test_a_curve_has_the_numbers_that_add_returned(page: Page, client: RewardCli
             scores.append(newest)
             if len(scores) in (1, len(FRAMES)):
                 told = {
-                    "state": "running, succeeded" if newest.succeeded else "running",
+                    "state": "running, succeeded ✓" if newest.succeeded else "running",
                     "task": SENTENCE,
                     "Step": f"{newest.step}",
                     "Progress": number(newest.progress),
@@ -178,7 +178,7 @@ def test_two_environments_and_a_reset(page: Page, client: RewardClient) -> None:
         poll(lambda: page.has_pictures("pair", FRAMES[-1], DROPPED[-1]))
         episodes.reset([True, False])
         again = {"Step": "0", "Progress": number(episodes.add([DROPPED[0]] * 2, [True, False]).progress[0])}
-        ended = {**titles[0], "state": "ended, succeeded", **ends[0]}
+        ended = {**titles[0], "state": "ended, succeeded ✓", **ends[0]}
         page.shows("pair", {**titles[0], **again}, {**titles[1], **last}, ended)
     page.shows("pair", {"Step": "0"}, last, last)
     poll(lambda: all(card["state"].startswith("ended") for card in page.cards("pair")))
@@ -267,6 +267,7 @@ def test_a_chart_and_the_runs_show_returns_and_success_of_ended_episodes(page: P
         page.browser.write("live-last", "2")
         told = "paid: return 2.500, success 1.000"
         page.browser.until(f"document.getElementById('live-history').getAttribute('aria-label')?.includes('{told}')")
+        assert "paid" in page.browser["live-legend"].text.split("\n")
         row = next(row for row in page.browser.run(RUNS) if row[0] == "paid")
         assert (row[3], row[4]) == ("100 %", "2.500")
 
@@ -286,7 +287,7 @@ def test_an_ended_episode_is_a_small_picture_that_opens(page: Page) -> None:
         assert page.browser.all("#live-ended button")[0].get_attribute("aria-expanded") == "true"
 
 
-def test_progress_and_success_have_one_colour_each_and_numbers_at_the_pointer(page: Page) -> None:
+def test_progress_and_success_have_the_colour_of_the_run_and_numbers_at_the_pointer(page: Page) -> None:
     with LiveView(page.url, name="colours") as view:
         view.episode("go").add(FRAMES[0], StepScore(0.5, 0.25, False, 0, 3.0))
         page.shows("colours", {"Step": "0"})
@@ -300,12 +301,10 @@ def test_progress_and_success_have_one_colour_each_and_numbers_at_the_pointer(pa
             f"{over}.querySelectorAll('.values span').length === 2 && "
             f"[...{over}.querySelectorAll('.values span')].map((each) => [each.textContent, each.style.color])"
         )
-        colours = {
-            page.browser.run(f"return getComputedStyle(document.documentElement).getPropertyValue('--curve-{n}')")
-            for n in (0, 2)
-        }
+        card = f"{over}.closest('article')"
+        colour = page.browser.run(f"return getComputedStyle({card}).getPropertyValue('--run')")
         assert [text for text, _ in shown] == ["0.500", "0.250"]
-        assert {hex_of(colour) for _, colour in shown} == colours
+        assert {hex_of(each) for _, each in shown} == {colour}
 
 
 def hex_of(colour: str) -> str:
@@ -326,7 +325,7 @@ def test_axe_finds_nothing_in_either_theme(page: Page) -> None:
         for episode in episodes:
             episode.add(FRAMES[0], StepScore(0.5, 0.25, True, 0, 3.0))
         episodes[1].end()
-        page.shows("axe", {"state": "running, succeeded"}, {"state": "ended, succeeded"})
+        page.shows("axe", {"state": "running, succeeded ✓"}, {"state": "ended, succeeded ✓"})
         poll(lambda: page.has_pictures("axe", FRAMES[0], FRAMES[0]))
         for theme in ("light", "dark"):
             with page.browser.theme(theme):

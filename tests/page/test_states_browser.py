@@ -47,7 +47,7 @@ def test_the_page_works_where_the_browser_blocks_cookies(
             quiet_browser["fold"].click()
             assert not quiet_browser["question"].is_displayed()
             quiet_browser.all("#examples [data-example=success]")[0].click()
-            quiet_browser.until_text("status", "1 of 1 curves are done.")
+            quiet_browser.until_text("scored", "1 of 1 scored")
             quiet_browser.driver.get("about:blank")  # before the gateway ends
     finally:
         quiet_browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", blocking)
@@ -60,7 +60,7 @@ def test_a_page_opened_before_triton_goes_on_when_triton_is_there(
     with running(NOWHERE, tmp_path, port=port) as gateway:
         browser.driver.get(gateway.url)
         told = wait_for_state(browser, "served-state")
-        assert told.startswith("Triton is not ready\nIt starts, or starts again, by itself.")
+        assert told.startswith("Triton is not ready\nIt restarts automatically.")
         assert "rfm-client status --url grpc://127.0.0.1:1\nCopy" in told
         assert "Connection refused" not in told  # it stands behind Details
         browser.all("#served-state summary")[0].click()
@@ -127,7 +127,7 @@ def test_nothing_to_show_says_what_to_do(browser: Browser, tmp_path: Path) -> No
         told, sentence, line, *_ = wait_for_state(browser, place).split("\n")
         assert (told, sentence[-1]) == (title, ":")
         assert line.endswith(command)
-        assert [button.text for button in browser.all(f"#{place} button")] == ["Copy", "Look again"]
+        assert [button.text for button in browser.all(f"#{place} button")] == ["Copy", "Check now"]
         browser.all(f"#{place} .actions button")[0].click()
         assert wait_for_state(browser, place).startswith(title)
 

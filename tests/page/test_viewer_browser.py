@@ -7,6 +7,7 @@ import csv
 import io
 import itertools
 import json
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -54,7 +55,7 @@ class Page:
     def score(self, *names: str) -> None:
         """Drop videos and wait for the curves."""
         self.drop(*names)
-        self.browser.until_text("status", f"{len(names)} of {len(names)} curves are done.")
+        self.browser.until_text("scored", f"{len(names)} of {len(names)} scored")
 
     def compare(self) -> Any:
         self.browser["compare"].click()
@@ -173,7 +174,7 @@ def test_tasks_are_overlaid_and_taken_along(page: Page) -> None:
     Select(page.browser["rule"]).select_by_visible_text("linspace_trunc")
     page.browser.write("frames", "4")
     page.drop("success")
-    page.browser.until_text("status", "2 of 2 curves are done.")
+    page.browser.until_text("scored", "2 of 2 scored")
     first, second = page.saved()["videos"]
     assert (first["task"], second["task"]) == (TASK, OTHER_TASK)
     assert first["progress"] != second["progress"]
@@ -218,11 +219,15 @@ def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
     answer = page.compare()
     commands = [line for line in page.browser["command"].text.splitlines() if line.startswith("rfm-client compare")]
     shown = [item.text for item in page.browser.all("#pairs li")]
-    for order, command, line in zip(answer["orders"], commands, shown, strict=True):
+    for place, order, command, line in zip(("first", "second"), answer["orders"], commands, shown, strict=True):
         preference = by_command_line(page.videos, f"{command} --json pair.json")["preference"]
         assert order["preference"] == pytest.approx(preference, abs=TOLERANCE)
-        assert float(line.rpartition(" ")[2]) == pytest.approx(preference, abs=SHOWN + TOLERANCE)
-    assert page.browser.all("#pairs p")[0].text == "success.mp4 does the task better. Both orders agree."
+        told = re.fullmatch(rf"P\(success\.mp4 is better\) = ([\d.]+) \(shown {place}\)", line)
+        assert told
+        better = preference if place == "first" else 1 - preference
+        assert float(told[1]) == pytest.approx(better, abs=SHOWN + TOLERANCE)
+    assert page.browser.all("#pairs h2")[0].text == "success.mp4 does the task better"
+    assert page.browser.all("#pairs p")[0].text == f"{TASK} (rfm). Both orders agree."
     assert (answer["verdict"], answer["orders_agree"]) == ("first", True)
 
 
@@ -242,27 +247,24 @@ def test_a_file_and_its_copy_are_one_file(page: Page) -> None:
     page.browser["compare"].click()
     told = "success.mp4 and copy.mp4 are one file, so neither is better."
     page.browser.until_text("status", told)
-    assert page.browser.all("#pairs p")[0].text == told
+    assert page.browser.all("#pairs h2")[0].text == told.removesuffix(".")
     assert page.saved()["comparisons"] == []
     assert "compare" not in page.browser["command"].text
 
 
 def test_what_is_missing_or_broken_is_named_and_the_others_are_scored(page: Page) -> None:
     submit = page.browser.all("#question .first")[0]
-    submit.click()
-    assert page.browser["files-wanted"].text == "Choose a video, or drop one on the page."
+    assert not submit.is_enabled()
     page.browser.write("tasks", " ")
     page.drop("broken", "success")
     page.browser.until_text("task-wanted", "What is the robot to do? Type it, then press Score.")
     assert page.browser.run("return document.activeElement.id") == "tasks"
-    assert page.browser["files-wanted"].text == ""
-    submit.click()
-    assert page.browser["task-wanted"].text == "What is the robot to do? Type it, then press Score."
+    assert not submit.is_enabled()
     assert page.browser.cells("#curves tr") == []
     page.browser.write("tasks", TASK)
-    submit.click()
     assert page.browser["task-wanted"].text == ""
-    page.browser.until_text("status", "1 of 2 curves are done.")
+    submit.click()
+    page.browser.until_text("scored", "1 of 2 scored, 1 failed")
     kinds = "MP4, MOV, WebM, Matroska, Ogg or AVI"
     told = f"video: expected a file of the kind {kinds}, got another kind (broken.mp4)"
     page.browser.until_text("errors", f"broken.mp4 could not be scored\n{told}")
@@ -375,7 +377,7 @@ def test_twelve_videos_have_twelve_colours_and_whole_names(page: Page) -> None:
     with page.browser.window(1440, 900):
         for _ in range(4):
             page.drop("success", "failure", "copy")
-        page.browser.until_text("status", "12 of 12 curves are done.")
+        page.browser.until_text("scored", "12 of 12 scored")
         assert captions(page)[:4] == ["success.mp4", "failure.mp4", "copy.mp4", "success.mp4 (2)"]
         assert len({colour for colour, _ in lines(page)}) == 12
         assert legend(page) == []
@@ -389,15 +391,25 @@ def test_twelve_videos_have_twelve_colours_and_whole_names(page: Page) -> None:
 def test_colours_tell_videos_apart_and_lines_tell_tasks_apart(page: Page) -> None:
     page.browser.write("tasks", f"{TASK}\n{OTHER_TASK}")
     page.drop("success")
-    page.browser.until_text("status", "2 of 2 curves are done.")
+    page.browser.until_text("scored", "2 of 2 scored")
     assert legend(page) == [TASK, OTHER_TASK]
     assert len({colour for colour, _ in lines(page)}) == 2  # there is only one video
     page.drop("failure")
-    page.browser.until_text("status", "4 of 4 curves are done.")
+    page.browser.until_text("scored", "4 of 4 scored")
     assert legend(page) == [TASK, OTHER_TASK]
     found = lines(page)
     assert len(found) == 4
     assert [len({line[part] for line in found}) for part in (0, 1)] == [2, 2]
+    page.browser["svg"].click()
+    svg = ElementTree.fromstring(page.browser.saved("curves.svg"))
+    texts = [element.text for element in svg.iter(f"{SVG}text")]
+    assert texts[:3] == ["2 tasks", "2 videos", "demo_checkpoint/checkpoint"]
+    assert texts[-4:] == [
+        "success.mp4",
+        "failure.mp4",
+        TASK,
+        OTHER_TASK,
+    ]  # a colour for each video, then a line for each task
     page.browser.all("#legend .remove")[1].click()
     assert [row[1] for row in page.browser.cells("#curves tr")] == [TASK, TASK]
     assert legend(page) == []
@@ -453,7 +465,7 @@ def test_what_was_cleared_comes_back(page: Page) -> None:
     page.browser["undo"].click()
     assert captions(page) == ["success.mp4", "failure.mp4"]
     assert page.saved() == before
-    assert page.browser.all("#pairs p")[0].text.startswith("success.mp4 does the task better.")
+    assert page.browser.all("#pairs h2")[0].text == "success.mp4 does the task better"
     assert not page.browser["undo"].is_displayed()
 
 
@@ -462,6 +474,8 @@ def test_a_video_that_the_browser_cannot_show_tells_whether_it_was_scored(page: 
     frames = [Image.fromarray(frame) for frame in make_clip("success", Task("red", "bowl"), 1).frames]
     frames[0].save(gif, save_all=True, append_images=frames[1:])
     page.browser.drop([gif])
+    page.browser.until_text("scored", "1 of 1 failed")
+    assert not page.browser["chart"].is_displayed()
     told = "This browser cannot show this file, and it was not scored: see the numbers below."
     page.browser.until(f"document.querySelector('#videos figure p').textContent === '{told}'")
     assert page.browser.all("#videos figure p")[0].is_displayed()
@@ -483,9 +497,9 @@ def test_a_slow_upload_tells_how_far_it_is_and_then_the_curve_comes(page: Page) 
     page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link)
     try:
         page.drop("large")
-        page.browser.until("/ Uploading: [1-9]\\d? %\\.$/.test(document.getElementById('status').textContent)")
+        page.browser.until("/, uploading [1-9]\\d? %$/.test(document.getElementById('scored').textContent)")
         assert page.browser.cells("#curves tr")[0][-1].startswith("uploading, ")
-        page.browser.until_text("status", "1 of 1 curves are done.")
+        page.browser.until_text("scored", "1 of 1 scored")
     finally:
         page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link | {"uploadThroughput": -1})
 
@@ -494,7 +508,7 @@ def test_an_example_is_scored_with_a_click_and_its_command_line_runs(page: Page)
     page.browser.write("tasks", "")
     page.browser.write("fps", "3")
     page.browser.all("#examples [data-example=success]")[0].click()
-    page.browser.until_text("status", "1 of 1 curves are done.")
+    page.browser.until_text("scored", "1 of 1 scored")
     (shown,) = page.saved()["videos"]
     (video,) = by_command_line(page.videos, page.browser["command"].text)["videos"]
     np.testing.assert_allclose(shown["progress"], video["progress"], rtol=0, atol=TOLERANCE)
@@ -532,7 +546,7 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page, theme: str
     assert (np.asarray(picture).std(axis=2) > 20).any()  # the coloured lines
     assert svg.attrib["width"] == "252pt"
     texts = [element.text for element in svg.iter(f"{SVG}text")]
-    names = {TASK, "demo_checkpoint/checkpoint", "success.mp4", "failure.mp4", "progress", "success", "seconds"}
+    names = {TASK, "demo_checkpoint/checkpoint", "success.mp4", "failure.mp4", "progress", "success", "time (s)"}
     assert names <= set(texts)
     lines = [
         [tuple(map(float, point.split(","))) for point in line.attrib["points"].split()]
@@ -571,7 +585,7 @@ def test_a_line_leads_over_skipped_frames_and_ends_at_a_missing_score(page: Page
     assert markers == [point for points in lines for point in points]
     texts = [element.text for element in svg.iter(f"{SVG}text")]
     assert texts[:2] == ["lift", "a.mp4"]
-    assert "-0.5" in texts  # the axis reaches the score below 0
+    assert "\N{MINUS SIGN}0.5" in texts  # the axis reaches the score below 0
     assert texts.count("a.mp4") == 1  # a curve alone needs no legend
 
 

@@ -121,7 +121,7 @@ class Page:
         """Put the episode into the score tab and wait for the curves."""
         self.browser["score-episode"].click()
         assert self.browser["score-panel"].is_displayed()
-        self.browser.until_text("status", "2 of 2 curves are done.")
+        self.browser.until_text("scored", "2 of 2 scored")
 
 
 @pytest.fixture(scope="module")
@@ -601,7 +601,7 @@ def test_no_tab_is_wider_than_the_window_in_either_theme(page: Page, size: tuple
         page.browser.until("!document.getElementById('examples').hidden")
         fits("empty")
         page.browser.all("#examples > button")[0].click()
-        page.browser.until_text("status", "3 of 3 curves are done.")
+        page.browser.until_text("scored", "3 of 3 scored")
         page.browser["play"].click()
         page.browser.until("Number(document.getElementById('time').value) > 1")
         page.browser["play"].click()
@@ -673,4 +673,6 @@ def test_broken_episodes_are_marked_and_an_hdf5_dataset_is_watched(
         browser.run("document.querySelector('#episodes tr[data-episode=\"1\"] button').click()")
         browser.until(f"document.querySelectorAll('{VIDEOS}').length === 1 && {ARE_THERE}")
         assert not browser["score-episode"].is_enabled()
+        assert "rfm-client label" in browser["score-episode"].get_attribute("title")
+        assert not browser["use-copy"].is_enabled()
         assert browser["use-words"].text.startswith("# LeRobot does not read HDF5")

@@ -520,9 +520,9 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
         for name, text in {"tasks": TASK, "fps": "0.5", "frames": "4"}.items():
             page.write(name, text)
         page.drop([video])
-        page.until_text("status", "1 of 1 curves are done.")
+        page.until_text("scored", "1 of 1 scored")
         assert page.cells("#curves tr")[0][5:7] == [f"{seconds[-1]:.1f}", "-"]
-        assert page.all("#numbers .leading")[0].text == "Final remaining (s)"
+        assert page.all("#numbers .leading")[0].text == "Final time remaining (s)"
         assert list(page.values("chart", "remaining_s").values()) == [f"{seconds[0]:.1f}"]
         assert page.values("chart", "progress") == {}
         page["json"].click()
@@ -533,11 +533,12 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
         assert [line["progress"] for line in lines] == [""] * len(seconds)
         np.testing.assert_allclose([float(line["remaining_s"]) for line in lines], seconds, rtol=1e-4, atol=1e-4)
         page["svg"].click()
-        assert "remaining (s)" in page.saved("curves.svg").decode()
+        assert "time remaining (s)" in page.saved("curves.svg").decode()
+        assert not page["threshold"].is_displayed()
         page.run("document.querySelector('#score-panel .side').scrollTo(0, 9999)")
         page.write("robot", "another robot")
         page.all("#question .first")[0].click()
-        page.until_text("status", "2 of 2 curves are done.")
+        page.until_text("scored", "2 of 2 scored")
         page["json"].click()
         _, described = json.loads(page.saved("curves.json"))["videos"]
         assert described["robot_description"] == "another robot"
@@ -550,10 +551,10 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
             episode = client.episode(TASK, score="remaining_s", live=view)
             left_s = f"{episode.add(frame).more_scores['remaining_s']:.1f} s"
         card = "[...document.querySelectorAll('.live dl div')].map((each) => each.textContent)"
-        page.until(f"{card}.includes('Remaining{left_s}')")
+        page.until(f"{card}.includes('Time remaining{left_s}')")
         poll(lambda: page.cells("#live-runs tr")[0][5] == left_s.removesuffix(" s"))
-        assert page["live-leading"].text == "Mean final remaining (s)"
-        assert f"final remaining {left_s}" in str(page["live-panel"].get_attribute("innerHTML"))
+        assert page["live-leading"].text == "Mean final time remaining (s)"
+        assert f"final time remaining {left_s}" in str(page["live-panel"].get_attribute("innerHTML"))
 
 
 def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ def _told_of(name: str, info: ModelInfo) -> dict[str, Any]:
     rule = "all" if info.needs_whole_episode else usual
     about = {"name": name, "max_frames": info.max_frames, "rule": rule}
     reads = {"reads_descriptions": info.reads_descriptions, "reads_views": info.reads_views}
-    return {**about, **reads, "versions": list(info.versions), "source": info.source}
+    return {**about, **reads, "has_success": info.has_success, "versions": list(info.versions), "source": info.source}
 
 
 def _frames_of(rule: Rule) -> int | str | None:

@@ -9,5 +9,10 @@ from rfm_client import FRAME_SCORES
 
 INSTEAD = {name: FRAME_SCORES[name] for name in (score.replaced_by for score in FRAME_SCORES.values()) if name}
 ABOUT: dict[str, dict[str, Any]] = {  # what the page's axes need
-    name: {"short": score.short(name), "unit": score.unit, "bounds": [*score.bounds]} for name, score in INSTEAD.items()
+    name: {
+        "short": f"time {score.short(name)}" if score.unit == "s" else score.short(name),
+        "unit": score.unit,
+        "bounds": [*score.bounds],
+    }
+    for name, score in INSTEAD.items()
 }

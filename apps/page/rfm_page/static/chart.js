@@ -3,12 +3,16 @@
 
 import { pointAt } from "./curves.js";
 import { leadingOf, marksOf, numberOf, scaleOf, titleOf } from "./signals.js";
+import { sampleOf } from "./svg.js";
+import { signed } from "./text.js";
 import uPlot from "./uplot/uPlot.esm.js";
 
 const NUM_COLOURS = 12;
 const LEFT_PX = 60; // of the numbers and names to the left
-const VALUE_PX = 16; // height of a number beside a line
-const VALUE_WIDTH_PX = 48;
+const VALUE_PX = 16; // height of a number beside the chart
+const RIGHT_PX = { one: 48, several: 64 }; // of the numbers to the right; of several curves each with a piece of its line
+const STUB_PX = 12; // length of such a piece
+const MOST_VALUES = 6; // of more curves those of one colour have numbers
 const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
 export const MARK_PX = 72; // at least between the marks of the axis below
 const FAINT = "50"; // opacity, in hexadecimal
@@ -31,9 +35,9 @@ export function themed(name, element = document.documentElement) {
   return getComputedStyle(element).getPropertyValue(name).trim();
 }
 
-/** The colour of a signal of a curve: its own, or that of its number. */
-export function colourOf({ colour, index, successIndex }, signal = "progress", element = undefined) {
-  return colour ?? themed(`--${colourName(signal === "success" ? successIndex ?? index : index)}`, element);
+/** The colour of a curve: its own, or that of its number. */
+export function colourOf({ colour, index }, element = undefined) {
+  return colour ?? themed(`--${colourName(index)}`, element);
 }
 
 /** Where each signal of the curves lies in a chart: `from` and `to`, shares of its height, stand for `scale`. */
@@ -77,6 +81,7 @@ export class Chart {
   #end = 1;
   #threshold = 0.5;
   #time = 0;
+  #pointedTop = 0; // height of the pointer
   #playhead = made("playhead");
   #line = made("threshold");
   #values = made("values");
@@ -84,7 +89,7 @@ export class Chart {
   #leaving = new AbortController();
   #resizing = new ResizeObserver(() => this.#host.clientWidth && this.#plot?.setSize(this.#size()));
 
-  constructor(host, onTime, { label = "seconds", onThreshold = null, isOfSteps = false } = {}) {
+  constructor(host, onTime, { label = "time (s)", onThreshold = null, isOfSteps = false } = {}) {
     this.#host = host;
     this.#label = label;
     this.#isOfSteps = isOfSteps;
@@ -105,7 +110,7 @@ export class Chart {
   /**
    * Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`; one with a `leading`
    * has the array of this name in place of progress.
-   * Some have a `begin`, a `colour`, a `successIndex` of another colour for success, or a `dash`: lengths of strokes and gaps.
+   * Some have a `begin`, a `colour`, or a `dash`: lengths of strokes and gaps.
    * One that `isFaint` has no numbers beside it. One that `skipsFrames` has a dot at each point.
    */
   show(curves) {
@@ -120,7 +125,7 @@ export class Chart {
       curve.times, ...signals.map((signal) => curve.times.map((_, index) => heightOf(this.#panes, signal, curve[signal]?.[index]))),
     ]);
     const data = tables.length ? uPlot.join(tables) : [[], []];
-    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${JSON.stringify(this.#curves.map(({ dash, isFaint, skipsFrames }) => [dash, isFaint, skipsFrames]))}`;
+    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${this.#rightPx} ${JSON.stringify(this.#curves.map(({ dash, isFaint, skipsFrames }) => [dash, isFaint, skipsFrames]))}`;
     if (shape !== this.#shape || !this.#plot) {
       this.#plot?.destroy();
       this.#plot = this.#curves.length ? this.#newPlot(signals, data) : null;
@@ -147,7 +152,7 @@ export class Chart {
     this.#line.style.transform = `translateY(${this.#top("success", value)}px)`;
   }
 
-  /** Moves the vertical line to a time, and the numbers beside it. */
+  /** Moves the vertical line to a time, and shows the numbers of this time. */
   moveTo(seconds) {
     this.#time = seconds;
     if (!this.#plot) return;
@@ -157,50 +162,62 @@ export class Chart {
     this.#playhead.hidden = this.#values.hidden = this.#dots.hidden = isHidden;
     this.#playhead.style.transform = `translateX(${left}px)`;
     if (isHidden) return;
-    this.#values.classList.toggle("left", left > width - VALUE_WIDTH_PX - 8);
-    this.#values.style.transform = `translateX(${left}px)`;
     this.#showValues(seconds);
   }
 
-  /** Writes the number of each curve beside its line, one below the other where lines meet. */
+  /** Writes the number of each curve to the right of the chart, at the height of its line if there is room. */
   #showValues(seconds) {
-    const dots = [];
-    const labels = Object.keys(this.#panes).flatMap((signal) => {
-      const here = this.#curves.filter(({ isFaint }) => !isFaint).map((curve) => {
-        const index = pointAt(curve.times, seconds);
-        return { curve, signal, time: curve.times[index], value: index === null ? null : curve[signal]?.[index] };
-      });
-      const known = here.filter(({ value }) => value !== null && value !== undefined);
-      dots.push(...known.map(({ curve, time, value }) => this.#dot(curve, signal, time, value)));
-      for (const each of known) each.top = this.#top(signal, each.value) - VALUE_PX / 2;
-      const [lowest, highest] = this.#panes[signal].scale.map((value) => this.#top(signal, value));
-      const texts = known.map(({ value }) => numberOf(signal, value));
-      known.forEach((each, place) => { // equal numbers are seen once
-        each.isAgain = texts.indexOf(texts[place]) < place;
-        each.isShared = texts.lastIndexOf(texts[place]) > place;
-      });
-      const seen = apart(known.filter(({ isAgain }) => !isAgain), highest - VALUE_PX, lowest + VALUE_PX / 2);
-      return known.filter((each) => each.isAgain || seen.includes(each));
+    const points = Object.keys(this.#panes).flatMap((signal) => this.#told.map((curve) => {
+      const index = pointAt(curve.times, seconds);
+      return { curve, signal, time: curve.times[index], value: index === null ? null : curve[signal]?.[index] };
+    })).filter(({ value }) => value !== null && value !== undefined);
+    for (const point of points) point.top = this.#top(point.signal, point.value);
+    this.#dots.replaceChildren(...points.map((point) => this.#dot(point)).reverse()); // as the lines: the first one on top
+    const chosen = this.#chosen(points);
+    const numbers = Object.entries(this.#panes).flatMap(([signal, { scale }]) => {
+      const [lowest, highest] = scale.map((value) => this.#top(signal, value));
+      return apart(chosen.filter((point) => point.signal === signal), highest - VALUE_PX / 2, lowest + VALUE_PX / 2);
     });
-    this.#dots.replaceChildren(...dots.reverse()); // as the lines: the first one on top
-    while (this.#values.children.length > labels.length) this.#values.lastChild.remove();
-    labels.forEach(({ curve, signal, value, top, isAgain, isShared }, place) => {
-      const element = this.#values.children[place] ?? this.#values.appendChild(document.createElement("span"));
-      element.textContent = numberOf(signal, value);
+    this.#values.replaceChildren(...numbers.map(({ curve, signal, value, top }) => {
+      const element = document.createElement("span");
+      if (this.#hasSeveral) element.append(sampleOf(curve.dash?.map((length) => length / 2), STUB_PX));
+      element.append(numberOf(signal, value));
       element.dataset.signal = signal;
       element.dataset.curve = curve.label;
-      element.hidden = isAgain;
-      element.style.color = isShared ? themed("--text") : colourOf(curve, signal);
+      element.style.color = colourOf(curve);
       element.style.transform = `translateY(${top.toFixed(1)}px)`;
-    });
+      return element;
+    }));
   }
 
-  /** The point of a curve that a number beside it tells. */
-  #dot(curve, signal, time, value) {
+  /** The points that have numbers: of many curves those of one colour, the one that the pointer is nearest to. */
+  #chosen(points) {
+    if (this.#told.length <= MOST_VALUES || !points.length) return points;
+    const distance = ({ top }) => Math.abs(top - this.#pointedTop);
+    const nearest = points.reduce((one, other) => (distance(other) < distance(one) ? other : one));
+    return points.filter(({ curve }) => colourOf(curve) === colourOf(nearest.curve));
+  }
+
+  /** The curves that have numbers. */
+  get #told() {
+    return this.#curves.filter(({ isFaint }) => !isFaint);
+  }
+
+  /** Whether pieces of lines tell which number is whose. */
+  get #hasSeveral() {
+    return this.#told.length > 1;
+  }
+
+  /** The point of a curve that a number tells. */
+  #dot({ curve, time, top }) {
     const element = document.createElement("i");
-    element.style.background = colourOf(curve, signal);
-    element.style.transform = `translate(${this.#plot.valToPos(time, "x").toFixed(1)}px, ${this.#top(signal, value).toFixed(1)}px)`;
+    element.style.background = colourOf(curve);
+    element.style.transform = `translate(${this.#plot.valToPos(time, "x").toFixed(1)}px, ${top.toFixed(1)}px)`;
     return element;
+  }
+
+  get #rightPx() {
+    return this.#hasSeveral || this.#onThreshold ? RIGHT_PX.several : RIGHT_PX.one; // the slider is as wide as a chart with a threshold
   }
 
   get #isLow() {
@@ -236,16 +253,16 @@ export class Chart {
     const number = new Map(marks);
     const left = {
       ...axis, size: LEFT_PX, splits: () => marks.map(([height]) => height), filter: (_, splits) => splits,
-      values: (_, splits) => splits.map((height) => `${number.get(height)}`),
+      values: (_, splits) => splits.map((height) => signed(number.get(height))),
     };
-    const series = this.#drawn.flatMap((curve, place) => signals.map((signal) => {
-      const stroke = () => `${colourOf(this.#drawn[place] ?? curve, signal)}${curve.isFaint ? FAINT : ""}`;
+    const series = this.#drawn.flatMap((curve, place) => signals.map(() => {
+      const stroke = () => `${colourOf(this.#drawn[place] ?? curve)}${curve.isFaint ? FAINT : ""}`;
       const points = { show: curve.skipsFrames ?? isRoomy, size: curve.skipsFrames ? MARKER_PX : 5, fill: stroke };
       return { stroke, width: 2, dash: curve.dash ?? undefined, points };
     }));
     const options = {
       ...this.#size(),
-      padding: [4, this.#onThreshold ? 44 : 12, this.#label === null ? 0 : 4, 0], // to the right the threshold is written
+      padding: [4, this.#rightPx, this.#label === null ? 0 : 4, 0],
       legend: { show: false },
       cursor: { x: false, y: false, points: { show: false }, drag: { x: false, y: false } },
       scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [0, 1] } },
@@ -269,6 +286,7 @@ export class Chart {
     const tell = (event) => {
       const bounds = plot.over.getBoundingClientRect();
       const seconds = plot.posToVal(event.clientX - bounds.left, "x");
+      this.#pointedTop = event.clientY - bounds.top;
       this.#onTime(Math.min(Math.max(seconds, this.#begin), this.#end), event.buttons > 0);
     };
     plot.over.addEventListener("pointerdown", (event) => {
@@ -328,10 +346,9 @@ function made(name) {
   return element;
 }
 
-/** Those numbers that fit between two heights, moved so that none hides another. */
+/** Those numbers that fit between two heights, moved so that none hides another. Each has the height of its middle as `top`. */
 function apart(labels, from, to) {
-  const fitting = Math.max(Math.floor((to - from) / VALUE_PX), 1);
-  const placed = [...labels].sort((one, other) => one.top - other.top).slice(0, fitting);
+  const placed = [...labels].sort((one, other) => one.top - other.top).slice(0, Math.floor((to - from) / VALUE_PX) + 1);
   let free = from;
   for (const each of placed) {
     each.top = Math.max(each.top, free);
@@ -339,8 +356,8 @@ function apart(labels, from, to) {
   }
   let end = to;
   for (const each of placed.reverse()) {
-    each.top = Math.min(each.top, end - VALUE_PX);
-    end = each.top;
+    each.top = Math.min(each.top, end);
+    end = each.top - VALUE_PX;
   }
   return labels.filter((each) => placed.includes(each));
 }

@@ -2,7 +2,6 @@
 // What is known of each curve: what was asked, the points that have come, and how it stands.
 
 import { leadingOf } from "./signals.js";
-import { cut } from "./text.js";
 
 const SEPARATOR = ", ";
 
@@ -148,17 +147,5 @@ export function questionsOf(curves) {
     const title = own.find((curve) => curve.title)?.title ?? null;
     const colour = own.find((curve) => curve.questionColour)?.questionColour ?? null;
     return { key, curves: own, title, colour, name: title ?? (differing.map((told) => told(own[0])).join(SEPARATOR) || own[0].task) };
-  });
-}
-
-/** A short name of each curve: its video, its question, or both, in at most `most` letters. */
-export function shortNames(curves, most) {
-  const questions = questionsOf(curves);
-  const hasVideos = new Set(curves.map(({ video }) => video)).size > 1 || questions.length < 2;
-  return curves.map((curve) => {
-    const question = questions.find((each) => each.curves.includes(curve));
-    const parts = [...(hasVideos ? [curve.name] : []), ...(questions.length > 1 ? [question.name] : [])];
-    const each = Math.floor((most + SEPARATOR.length) / parts.length) - SEPARATOR.length;
-    return parts.map((part) => cut(part, each)).join(SEPARATOR);
   });
 }

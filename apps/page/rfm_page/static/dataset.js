@@ -3,13 +3,12 @@
 
 import { curvesOf, datasets, episodesOf, faultsOf, previewOf, videoOf } from "./api.js";
 import { Asking } from "./asking.js";
-import { colourName } from "./chart.js";
 import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, WORST_FIRST } from "./episodes.js";
 import { deadLink, failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
 import { onKeys } from "./keys.js";
-import { DASHES } from "./looks.js";
+import { DASHES, namedLine } from "./looks.js";
 import { Previews } from "./previews.js";
 import { Place } from "./states.js";
 import { save } from "./takeaway.js";
@@ -377,6 +376,7 @@ export class DatasetTab {
     const dataset = this.#datasets[this.#number];
     const all = this.#episodes.map(({ episode }) => episode);
     this.#words = dataset ? lerobotWords(page.use.value, dataset, numbers, all) : "";
+    page["use-copy"].disabled = !/^[^#]/m.test(this.#words); // there are only comments
     page["use-words"].textContent = this.#words.split("\n").map((line) => cut(line, MOST_LETTERS)).join("\n");
   }
 
@@ -481,7 +481,7 @@ export class DatasetTab {
     this.#timeline.time = 0;
     this.#timeline.show(curves.length ? curves : [emptyCurve(told[0])]);
     this.#page["episode-chart"].setAttribute("aria-label", describe(curves));
-    this.#page["episode-legend"].replaceChildren(...curves.map(legendItem));
+    this.#page["episode-legend"].replaceChildren(...curves.map(namedLine));
     const blobs = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
     if (!cameras.length) this.#places.episode.show(noVideo(() => this.#watch(this.#watched)));
@@ -493,7 +493,10 @@ export class DatasetTab {
       const video = this.#timeline.videos.add(this.#watched.files.at(-1), title, corrections[index]);
       this.#timeline.videos.mark(video, curves.find(({ label }) => label === short(camera)));
     });
-    this.#page["score-episode"].disabled = unused.every(Boolean) || !this.#told.has_stored_pixels; // of no camera, too
+    const reason = !this.#told.has_stored_pixels
+      ? "Off: the page encodes these frames for the browser, which changes their scores slightly. Use rfm-client label."
+      : unused.every(Boolean) ? "Off: no camera of this episode has colours" : ""; // of no camera, too
+    Object.assign(this.#page["score-episode"], { disabled: reason !== "", title: reason });
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
   }
 
@@ -526,14 +529,6 @@ function emptyCurve({ times_s: times }) {
 function describe(curves) {
   const told = curves.map(({ label, progress }) => `${label}: final progress ${shown(progress.at(-1))}`);
   return told.length ? told.join("; ") : "This episode has no labels.";
-}
-
-function legendItem({ index, label, dash }) {
-  const item = document.createElement("li");
-  const swatch = document.createElement("span");
-  swatch.className = `swatch ${colourName(index)}${dash ? " dashed" : ""}`;
-  item.append(swatch, label);
-  return item;
 }
 
 function element(name, text) {

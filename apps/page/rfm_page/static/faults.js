@@ -3,7 +3,7 @@
 
 import { ServerError } from "./api.js";
 
-const BY_ITSELF = "This page asks again by itself.";
+const BY_ITSELF = "Checking automatically.";
 let remedies = {}; // command lines of this server, by what is missing
 
 /** From now on, states name the command lines of this server. */
@@ -15,10 +15,10 @@ export function useRemedies(told) {
 export function serverAway(error, retry) {
   return {
     title: "The server does not answer",
-    text: "It has stopped, or the network is down. If it does not come back, start it again with your options, for example:",
+    text: "It has stopped, or the network is down. If it does not come back, restart it with your options, for example:",
     command: remedies.start,
     details: error.message,
-    buttons: [["Try again", retry]],
+    buttons: [["Check now", retry]],
     note: BY_ITSELF,
   };
 }
@@ -26,14 +26,14 @@ export function serverAway(error, retry) {
 /** Triton is away behind the server. */
 export function tritonAway(error, retry) {
   const text = remedies.starts_triton
-    ? "It starts, or starts again, by itself. If that takes longer than a minute, ask how it is:"
+    ? "It restarts automatically. If this takes more than a minute, check it:"
     : "The server reaches no Triton. Start one where the server looks for it, for example:";
   return {
     title: "Triton is not ready",
     text,
     command: remedies.triton,
     details: error.message,
-    buttons: [["Try again", retry]],
+    buttons: [["Check now", retry]],
     note: BY_ITSELF,
   };
 }
@@ -44,7 +44,7 @@ export function noModel(retry) {
     title: "No model is served",
     text: "Triton runs, but has no model that scores videos. Export a checkpoint into its repository:",
     command: remedies.model,
-    buttons: [["Look again", retry]],
+    buttons: [["Check now", retry]],
     note: BY_ITSELF,
   };
 }
@@ -53,9 +53,9 @@ export function noDataset(retry) {
   return {
     kind: "empty",
     title: "No dataset yet",
-    text: "Start the server again with a LeRobot or RLDS folder or an HDF5 file, and look through its episodes here:",
+    text: "Restart the server with a LeRobot or RLDS folder or an HDF5 file, and look through its episodes here:",
     command: remedies.dataset,
-    buttons: [["Look again", retry]],
+    buttons: [["Check now", retry]],
     note: BY_ITSELF,
   };
 }
@@ -64,9 +64,9 @@ export function noEpisode(retry) {
   return {
     kind: "empty",
     title: "No episodes",
-    text: "This dataset is empty. Record into it, or start the server with another one:",
+    text: "This dataset is empty. Record into it, or restart the server with another one:",
     command: remedies.dataset,
-    buttons: [["Look again", retry]],
+    buttons: [["Check now", retry]],
   };
 }
 
@@ -79,9 +79,9 @@ export function noVideo(retry) {
   return {
     kind: "empty",
     title: "No videos",
-    text: "This dataset has no camera; the curves are below. To see episodes, start the server with a dataset that has cameras:",
+    text: "This dataset has no camera; the curves are below. To see episodes, restart the server with a dataset that has cameras:",
     command: remedies.dataset,
-    buttons: [["Look again", retry]],
+    buttons: [["Check now", retry]],
   };
 }
 

@@ -2,9 +2,9 @@
 // The curves as a figure for a paper: as wide as a column, on white, with title and legend, as SVG or PNG.
 
 import { colourOf, heightOf, panesOf, themed } from "./chart.js";
-import { answeredOf, shortNames } from "./curves.js";
-import { leadingOf, marksOf, titleOf } from "./signals.js";
-import { cut } from "./text.js";
+import { answeredOf, questionsOf } from "./curves.js";
+import { marksOf, titleOf } from "./signals.js";
+import { cut, signed } from "./text.js";
 
 const [WIDTH, PLOT_HEIGHT] = [252, 150]; // points; 3.5 inches, the column of a two-column paper
 const [LEFT, RIGHT, TOP] = [34, 10, 6];
@@ -18,12 +18,12 @@ const PNG_WIDTH_PX = 2100; // 600 dots an inch: twice what papers ask of picture
  * The figure as SVG. template: an svg element of the page in light colours
  * titles: lines above the chart; threshold: at which success counts; label: of the axis below
  */
-export function svgFigure(template, curves, { titles, threshold, label = "seconds" }) {
+export function svgFigure(template, curves, { titles, threshold, label = "time (s)" }) {
   const drawn = curves.map(answeredOf).filter(({ times }) => times.length);
   const panes = panesOf(drawn);
-  const names = drawn.length > 1 ? shortNames(drawn, LETTERS) : []; // the titles tell what a curve alone is
+  const entries = entriesOf(drawn);
   const top = TOP + titles.length * LINE + 4;
-  const height = top + PLOT_HEIGHT + 2 * LINE + 4 + names.length * (LINE + 2);
+  const height = top + PLOT_HEIGHT + 2 * LINE + 4 + entries.length * (LINE + 2);
   const end = Math.max(...drawn.map(({ allTimes }) => allTimes.at(-1))) || 1;
   const x = (time) => LEFT + (time / end) * (WIDTH - LEFT - RIGHT);
   const y = (signal, value) => top + (1 - heightOf(panes, signal, value)) * PLOT_HEIGHT;
@@ -45,7 +45,7 @@ export function svgFigure(template, curves, { titles, threshold, label = "second
     const { scale } = panes[signal];
     for (const value of marksOf(signal, scale, "few")) {
       add("line", { x1: LEFT, x2: WIDTH - RIGHT, y1: y(signal, value), y2: y(signal, value), stroke: grid, "stroke-width": 0.5 });
-      add("text", { x: LEFT - 3, y: y(signal, value) + 2.5, "text-anchor": "end", fill: faint }, `${value}`);
+      add("text", { x: LEFT - 3, y: y(signal, value) + 2.5, "text-anchor": "end", fill: faint }, signed(value));
     }
     const middle = (y(signal, scale[0]) + y(signal, scale[1])) / 2;
     add("text", { x: 0, y: 0, transform: `translate(9 ${middle}) rotate(-90)`, "text-anchor": "middle", fill: ink }, titleOf(signal));
@@ -64,7 +64,7 @@ export function svgFigure(template, curves, { titles, threshold, label = "second
     for (const signal of Object.keys(panes)) {
       for (const points of runs(curve, signal)) {
         const path = points.map(([time, value]) => `${x(time).toFixed(2)},${y(signal, value).toFixed(2)}`).join(" ");
-        const stroke = colourOf(curve, signal, template);
+        const stroke = colourOf(curve, template);
         add("polyline", { points: path, fill: "none", stroke, "stroke-width": 1.1, "stroke-linejoin": "round", ...dashOf(curve) });
         for (const [time, value] of curve.skipsFrames ? points : []) {
           add("circle", { cx: x(time).toFixed(2), cy: y(signal, value).toFixed(2), r: 1.5, fill: stroke });
@@ -72,11 +72,11 @@ export function svgFigure(template, curves, { titles, threshold, label = "second
       }
     }
   }
-  names.forEach((name, place) => {
+  entries.forEach(({ name, curve, dash }, place) => {
     const at = bottom + 2 * LINE + 8 + place * (LINE + 2);
-    const stroke = colourOf(drawn[place], leadingOf(drawn[place]), template);
-    add("line", { x1: LEFT, x2: LEFT + 14, y1: at - 2.5, y2: at - 2.5, stroke, "stroke-width": 1.1, ...dashOf(drawn[place]) });
-    add("text", { x: LEFT + 18, y: at, fill: ink }, name);
+    const stroke = curve ? colourOf(curve, template) : ink;
+    add("line", { x1: LEFT, x2: LEFT + 14, y1: at - 2.5, y2: at - 2.5, stroke, "stroke-width": 1.1, ...dashOf({ dash }) });
+    add("text", { x: LEFT + 18, y: at, fill: ink }, cut(name, LETTERS));
   });
   return new XMLSerializer().serializeToString(svg);
 }
@@ -95,6 +95,14 @@ export async function pngFigure(svg) {
   } finally {
     URL.revokeObjectURL(image.src);
   }
+}
+
+/** What the legend names, as on the page: the colour of each video, then the line of each question; none where there is only one. */
+function entriesOf(curves) {
+  const [videos, questions] = [[...new Set(curves.map(({ video }) => video))], questionsOf(curves)];
+  const ofVideos = videos.map((video) => ({ name: video.title, curve: curves.find((curve) => curve.video === video), dash: null }));
+  const ofQuestions = questions.map(({ name, curves: [curve] }) => ({ name, curve: videos.length > 1 ? null : curve, dash: curve.dash }));
+  return [ofVideos, ofQuestions].filter(({ length }) => length > 1).flat();
 }
 
 /** The line of a curve: half as large as on the page. */

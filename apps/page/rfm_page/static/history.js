@@ -2,6 +2,7 @@
 // How the episodes of each run have ended: a chart of return and success, and the means of the last ones.
 
 import { Chart } from "./chart.js";
+import { namedLine } from "./looks.js";
 import { learn, shortOf } from "./signals.js";
 
 const FEWEST_IN_A_CHART = 2;
@@ -9,12 +10,14 @@ const AXES = { final_progress: { short: "progress", unit: "", bounds: [0, 1] }, 
 
 export class History {
   #host;
+  #legend;
   #chart;
   #ends = new Map(); // by id of the episode, the oldest first
   #drawn = "";
 
-  constructor(host) {
+  constructor(host, legend) {
     this.#host = host;
+    this.#legend = legend;
     this.#chart = new Chart(host, (number) => this.#chart.moveTo(number), { label: "ended episodes; bold: means", isOfSteps: true });
     this.#chart.setThreshold(null);
     this.#chart.moveTo(NaN); // there is no episode to mark
@@ -42,13 +45,14 @@ export class History {
   show(last, names) {
     const runs = names.map(([run, title], index) => ({ index, title, ends: this.of(run) })).filter(({ ends }) => ends.length);
     const isThere = runs.some(({ ends }) => ends.length >= FEWEST_IN_A_CHART);
-    this.#host.hidden = !isThere;
+    this.#host.hidden = this.#legend.hidden = !isThere;
     const state = JSON.stringify([last, [...this.#ends.values()]]);
     if (!isThere || state === this.#drawn) return;
     this.#drawn = state;
     const curves = runs.map((run) => curveOf(run, last));
     const single = runs.map((run) => ({ ...curveOf(run, 1), success: run.ends.map(() => null), isFaint: true }));
     this.#chart.show([...curves, ...single]);
+    this.#legend.replaceChildren(...curves.map(namedLine));
     const told = curves.map((curve) => `${curve.label}: ${shortOf(curve.leading)} ${curve[curve.leading].at(-1)?.toFixed(3)}, success ${curve.success.at(-1).toFixed(3)}`);
     this.#host.setAttribute("aria-label", `Means over the last ${last} episodes. ${told.join("; ")}`);
   }

@@ -3,8 +3,9 @@
 
 import { colourOf } from "./chart.js";
 import { questionsOf } from "./curves.js";
-import { byQuestion, sampleOf } from "./looks.js";
+import { byQuestion } from "./looks.js";
 import { nameable, remover } from "./nameable.js";
+import { sampleOf } from "./svg.js";
 
 const NAME_LETTERS = 48;
 

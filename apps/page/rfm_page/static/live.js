@@ -2,7 +2,6 @@
 // The tab of running episodes: each with its newest frame, its curve and its numbers, as clients report them.
 
 import { hasKey, KeyWanted, liveNews } from "./api.js";
-import { colourName } from "./chart.js";
 import { failure } from "./faults.js";
 import { History, mean } from "./history.js";
 import { LiveCard, titleOfRun } from "./livecard.js";
@@ -32,7 +31,7 @@ export class LiveTab {
     this.#page = page;
     this.#failedAnywhere = failedAnywhere;
     this.#errors = new Place(page["live-errors"]);
-    this.#history = new History(page["live-history"]);
+    this.#history = new History(page["live-history"], page["live-legend"]);
     page["live-more"].addEventListener("click", () => {
       this.#mostEnded += ENDED_AT_A_TIME;
       this.#show();
@@ -96,6 +95,8 @@ export class LiveTab {
     const running = cards.filter(({ hasEnded }) => !hasEnded);
     const ended = cards.filter(({ hasEnded }) => hasEnded).sort((one, other) => other.rank - one.rank);
     running.sort((one, other) => one.title.localeCompare(other.title, "en", { numeric: true }));
+    this.#runs = [...new Set([...this.#runs, ...this.#history.runs, ...cards.map(({ run }) => run)])];
+    for (const card of cards) card.mark(this.#runs.indexOf(card.run));
     const visible = [...running, ...ended.slice(0, this.#mostEnded)];
     const page = this.#page;
     place(page["live-episodes"], running);
@@ -117,10 +118,8 @@ export class LiveTab {
     const page = this.#page;
     const last = Math.max(Math.floor(Number(page["live-last"].value)) || 1, 1);
     const head = page["live-runs"].closest("table").querySelectorAll("thead th");
-    const runs = [...new Set([...this.#runs, ...this.#history.runs, ...cards.map(({ run }) => run)])];
-    this.#runs = runs;
+    const runs = this.#runs;
     this.#history.show(last, runs.map((run) => [run, titleOfRun(run)]));
-    for (const card of cards) card.mark(colourName(runs.indexOf(card.run)));
     page["live-running-title"].hidden = !cards.some(({ hasEnded }) => !hasEnded);
     const leadingOfRun = (run) => this.#history.of(run).at(-1)?.leading ?? cards.find((card) => card.run === run)?.leading ?? "progress";
     const column = columnOf(runs.map(leadingOfRun));

@@ -2,7 +2,7 @@
 // One running episode: its newest frame, its curve and its numbers.
 
 import { liveFrame } from "./api.js";
-import { Chart } from "./chart.js";
+import { Chart, colourName } from "./chart.js";
 import { leadingOf, shortOf, measured, toldAt } from "./signals.js";
 import { shown } from "./text.js";
 
@@ -17,8 +17,9 @@ export function titleOfRun(run) {
 export class LiveCard {
   #id;
   #mostPoints;
+  #index = 0; // of the colour of its run
   #about = {};
-  #curve = { index: 0, successIndex: 2, times: [], progress: [], success: [] };
+  #curve = { times: [], progress: [], success: [] };
   #newest = null;
   #heardMs = 0;
   #frame = null;
@@ -54,6 +55,7 @@ export class LiveCard {
     }
     const head = document.createElement("div");
     head.className = "head";
+    this.#state.className = "state";
     head.append(this.#heading, this.#state);
     this.#opener.type = "button";
     this.#opener.addEventListener("click", () => this.#open(!this.element.classList.contains("open")));
@@ -90,9 +92,10 @@ export class LiveCard {
     return this.#rank;
   }
 
-  /** Shows the colour of its run. */
-  mark(colour) {
-    this.element.style.setProperty("--run", `var(--${colour})`);
+  /** From now on it has the colour of its run. */
+  mark(index) {
+    this.#index = index;
+    this.element.style.setProperty("--run", `var(--${colourName(index)})`);
   }
 
   /** Takes over what is new, and its rank. */
@@ -105,7 +108,7 @@ export class LiveCard {
     const [leading = "progress"] = Object.keys(instead);
     const news = { times: steps, progress, success, ...instead };
     const joined = Object.entries(news).map(([name, values]) => [name, most([...(old[name] ?? []), ...values])]);
-    this.#curve = { index: 0, successIndex: 2, leading, ...Object.fromEntries(joined) };
+    this.#curve = { leading, ...Object.fromEntries(joined) };
     this.#about = about;
     this.#newest = newest;
     this.#frame = frame;
@@ -135,11 +138,9 @@ export class LiveCard {
       this.#opener.textContent = this.title;
       if (!this.#opener.isConnected) this.#heading.replaceChildren(this.#opener);
     } else this.#heading.textContent = this.title;
-    this.#state.textContent = `${hasEnded ? "ended" : "running"}${succeeded ? ", succeeded" : hasEnded ? ", no success" : ""}`;
-    this.#state.className = `state ${succeeded ? "good" : ""}`;
+    this.#state.textContent = `${hasEnded ? "ended" : "running"}${succeeded ? ", succeeded ✓" : hasEnded ? ", no success" : ""}`;
     this.#task.textContent = task;
     this.element.classList.toggle("ended", hasEnded);
-    this.element.classList.toggle("succeeded", Boolean(succeeded));
     this.#image.alt = `Newest frame of ${this.title}: ${task}`;
     const texts = { Step: `${step ?? "-"}`, Progress: measured(this.leading, this.lastLeading), Success: shown(success), Reward: shown(reward), Return: shown(total), Lag: ms === undefined ? "-" : `${ms.toFixed(0)} ms` };
     for (const [name, text] of Object.entries(texts)) this.#numbers.get(name).textContent = text;
@@ -160,7 +161,7 @@ export class LiveCard {
   #draw() {
     const { times } = this.#curve;
     this.#chart.setThreshold(this.#about.threshold);
-    this.#chart.show([{ ...this.#curve, label: this.title, begin: times[0], allTimes: times }]);
+    this.#chart.show([{ ...this.#curve, index: this.#index, label: this.title, begin: times[0], allTimes: times }]);
   }
 
   /** Shows an ended episode whole, or as a small picture. */

@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: MIT
 // What curves look like: a colour for each video, and a line for each question, so that no two look alike.
 
+import { colourName } from "./chart.js";
 import { questionsOf } from "./curves.js";
-import { svgElement } from "./svg.js";
-
-const SAMPLE_PX = 32; // length of the line in a legend
+import { sampleOf } from "./svg.js";
 
 /** Lines: lengths of strokes and gaps; the first one is solid. */
 export const DASHES = [null, [8, 4], [2, 3], [12, 3, 2, 3], [5, 2], [16, 4]];
@@ -26,10 +25,12 @@ export function byQuestion(curves, questions = questionsOf(curves)) {
   return questions.length > 1 && new Set(curves.map(({ video }) => video)).size === 1;
 }
 
-/** A piece of a line as a picture, in the colour of the text around it. */
-export function sampleOf(dash) {
-  const svg = svgElement("svg", { class: "sample", width: SAMPLE_PX, height: 4, "aria-hidden": "true" });
-  const look = { stroke: "currentColor", "stroke-width": 2, "stroke-dasharray": (dash ?? []).join(" ") };
-  svg.append(svgElement("line", { x2: SAMPLE_PX, y1: 2, y2: 2, ...look }));
-  return svg;
+/** An item of a legend: a piece of a curve's line, and its label. */
+export function namedLine({ index, label, dash }) {
+  const item = document.createElement("li");
+  const line = document.createElement("span");
+  line.style.color = `var(--${colourName(index)})`; // of either theme
+  line.append(sampleOf(dash));
+  item.append(line, label);
+  return item;
 }

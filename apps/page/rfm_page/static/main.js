@@ -25,7 +25,6 @@ import { learn, toldAt } from "./signals.js";
 import { addVerdict, areOneFile, sentenceOf } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
-const TASK_WANTED = "What is the robot to do? Type it, then press Score.";
 
 const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((element) => [element.id, element]));
 const queue = new Queue(CURVES_AT_A_TIME);
@@ -106,6 +105,7 @@ async function askServed(isCurrent) {
   if (gateway.models.some(({ name }) => name === gateway.model)) page.model.value = gateway.model;
   chooseRule();
   if (gateway.models.length) warnOfModel(choices.begin());
+  showWhetherReady();
   page.examples.hidden = !gateway.models.length;
   page.status.textContent = "";
   if (gateway.models.length) places.served.clear();
@@ -146,6 +146,7 @@ function chooseRule() {
   if (model) page.rule.value = model.rule;
   page.descriptions.hidden = !model?.reads_descriptions;
   page["one-view"].hidden = !model?.reads_views;
+  page.threshold.parentElement.hidden = model?.has_success === false;
   showLimits();
 }
 
@@ -211,6 +212,14 @@ function tasks() {
   return [...new Set(page.tasks.value.split("\n").map((line) => line.trim()).filter(Boolean))];
 }
 
+/** Says whether there is something to score, and a model to score it with. */
+function showWhetherReady() {
+  const isTaskThere = tasks().length > 0;
+  if (isTaskThere || !videos.all.length) page["task-wanted"].textContent = "";
+  page.score.disabled = !videos.all.length || !isTaskThere || !page.model.value;
+  page.score.title = page.score.disabled ? "Needs a task, a video, and a model that is served" : "";
+}
+
 function form(fields, files) {
   const data = new FormData();
   for (const [name, value] of Object.entries(fields)) data.append(name, value ?? "");
@@ -235,7 +244,7 @@ function addFiles(files, about = []) {
 /** Asks for the task of videos that are there without one. */
 function askForTask() {
   sidebar.open();
-  page["task-wanted"].textContent = TASK_WANTED;
+  page["task-wanted"].textContent = "What is the robot to do? Type it, then press Score.";
   page.tasks.focus();
 }
 
@@ -263,10 +272,8 @@ async function scoreExamples(names) {
 /** Asks about each video and task that was not yet asked about with these settings. */
 function scoreAll() {
   places.errors.clear();
-  page["files-wanted"].textContent = videos.all.length ? "" : "Choose a video, or drop one on the page.";
-  page["task-wanted"].textContent = tasks().length ? "" : TASK_WANTED;
-  if (!page.model.value) askingModels.begin(); // the page says why there is none
-  if (!videos.all.length || !tasks().length || !page.model.value) return;
+  page.status.textContent = "";
+  if (page.score.disabled) return;
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
@@ -348,7 +355,6 @@ function clear() {
   verdicts = [];
   page.pairs.replaceChildren();
   places.errors.clear();
-  page["files-wanted"].textContent = page["task-wanted"].textContent = "";
   page.status.textContent = "";
   timeline.moveTo(0);
   update();
@@ -380,6 +386,7 @@ function restore({ entries, curves: old, verdicts: oldVerdicts }) {
   curves.push(...old);
   verdicts.push(...oldVerdicts);
   page.undo.hidden = true;
+  page.status.textContent = "";
   showNames();
 }
 
@@ -387,6 +394,7 @@ function removeVideo(video) {
   videos.remove(video);
   for (const curve of curves.filter((each) => each.video === video)) forget(curve);
   verdicts = verdicts.filter((verdict) => !verdict.videos.includes(video));
+  page.status.textContent = "";
   showNames();
 }
 
@@ -432,13 +440,15 @@ function showThreshold() {
   showTable(page.curves, curves, value);
 }
 
-/** The figure. Its titles name what all curves share: the task, the episode or video, the checkpoint. */
+/** The figure. Its titles name the task, the episode or video, and the checkpoint, or say how many there are. */
 function figure() {
   const scored = curves.filter(({ times }) => times.length);
-  const shared = (told) => new Set(scored.map(told)).size === 1 && told(scored[0]);
-  const episodeOf = ({ video: { origin } }) => origin?.dataset && `${origin.dataset}, episode ${origin.episode}`;
-  const checkpointOf = ({ model }) => gateway.models.find(({ name }) => name === model)?.source ?? model;
-  const titles = [shared(({ task }) => task), shared(episodeOf) || shared(({ name }) => name), shared(checkpointOf)].filter(Boolean);
+  const named = (told, kind) => {
+    const names = new Set(scored.map(told));
+    return names.size === 1 ? told(scored[0]) : `${names.size} ${kind}`;
+  };
+  const episodeOf = ({ name, video: { origin } }) => (origin?.dataset ? `${origin.dataset}, episode ${origin.episode}` : name);
+  const titles = [named(({ task }) => task, "tasks"), named(episodeOf, "videos"), named(checkpointOf, "checkpoints")];
   return svgFigure(page.figure, scored, { titles, threshold: Number(page.threshold.value) });
 }
 
@@ -447,9 +457,9 @@ function update() {
   const scored = curves.filter(({ times }) => times.length);
   page.empty.hidden = videos.all.length > 0;
   page["served-state"].classList.toggle("whole", !videos.all.length);
-  if (videos.all.length) page["files-wanted"].textContent = "";
   page.clear.hidden = !videos.all.length;
   page.stage.hidden = !videos.all.length;
+  page.stage.classList.toggle("unscored", curves.length > 0 && curves.every(({ state, times }) => state === "failed" && !times.length));
   page.numbers.hidden = !curves.length;
   giveLooks(curves);
   timeline.show(curves);
@@ -468,17 +478,27 @@ function update() {
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
   page.command.textContent = commands(gateway.url, scored, answered());
   told();
-  const done = curves.filter(({ state }) => state === "done").length;
-  if (curves.length && !page["score-panel"].hidden) page.status.textContent = `${done} of ${curves.length} curves are done.${uploading()}`;
+  showWhetherReady();
+  page.scored.textContent = curves.length ? howMany() : "";
+  page["scored-by"].textContent = scored.length ? `by ${[...new Set(curves.map(checkpointOf))].join(", ")}` : "";
   page.chart.setAttribute("aria-label", scored.length
     ? scored.map((curve) => `${curve.label}: final ${toldAt(curve, -1)}`).join("; ")
     : "No curves yet.");
 }
 
-/** How much of the videos that are on the way has been sent, in words. */
-function uploading() {
+/** How many curves are there, how many failed, and how much of the videos on the way has been sent. */
+function howMany() {
+  const [done, failed] = ["done", "failed"].map((name) => curves.filter(({ state }) => state === name).length);
   const percents = curves.filter(({ isUploading }) => isUploading).map(({ sentPercent }) => sentPercent);
-  return percents.length ? ` Uploading: ${Math.floor(percents.reduce((sum, each) => sum + each) / percents.length)} %.` : "";
+  const told = failed < curves.length ? [`${done} of ${curves.length} scored`] : [];
+  if (failed) told.push(told.length ? `${failed} failed` : `${failed} of ${failed} failed`);
+  if (percents.length) told.push(`uploading ${Math.floor(percents.reduce((sum, each) => sum + each) / percents.length)} %`);
+  return told.join(", ");
+}
+
+/** The checkpoint that answers a question. */
+function checkpointOf({ model }) {
+  return gateway.models.find(({ name }) => name === model)?.source ?? model;
 }
 
 /** The settings belong to the tabs that have some, and what is said of curves to the first. */
@@ -503,7 +523,7 @@ function listen(element, events) {
 
 listen(page.question, {
   submit: (event) => { event.preventDefault(); scoreAll(); },
-  input: () => told(),
+  input: () => { told(); showWhetherReady(); },
   change: () => told(),
 });
 listen(page["live-last"], { input: () => told() });

@@ -12,7 +12,7 @@ export function showTable(body, curves, threshold) {
   const table = body.closest("table");
   const leading = columnOf(curves.map(leadingOf));
   table.querySelector(".leading").textContent = `Final ${leading.title}`;
-  table.classList.toggle("unjudged", curves.every(({ state, success }) => state === "done" && success.every((value) => value === null)));
+  table.classList.toggle("unjudged", curves.some(({ state }) => state === "done") && curves.every(({ success }) => success.every((value) => value === null)));
   const names = [...table.querySelectorAll("thead th")].map((head) => head.textContent);
   body.replaceChildren(...curves.map((curve) => label(row(curve, threshold, leading.text), names)));
 }

@@ -5,7 +5,12 @@ export const NONE = "-";
 
 /** A number as the page writes it. */
 export function shown(value, digits = 3) {
-  return value === null || value === undefined ? NONE : value.toFixed(digits);
+  return value === null || value === undefined ? NONE : signed(value.toFixed(digits));
+}
+
+/** The digits of a number behind a minus sign, which is longer than a hyphen. */
+export function signed(number) {
+  return `${number}`.replace("-", "−");
 }
 
 const MOST_DIGITS = 8;

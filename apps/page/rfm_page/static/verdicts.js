@@ -14,35 +14,33 @@ export function sentenceOf({ videos, answer }) {
   return answer.orders_agree ? "No verdict: both answers are exactly 0.5." : "No verdict: the answer changes with the order.";
 }
 
-/** Writes the verdict on a pair into `host`, the sentence first, and returns the box. */
+/** Writes the verdict on a pair into `host`, with the sentence as its title, and returns the box. */
 export function addVerdict(host, verdict) {
   const { videos, task, model, answer } = verdict;
   const box = document.createElement("div");
-  const said = element("p", "");
-  said.append(element("strong", sentenceOf(verdict)));
-  if (answer?.verdict) said.append(" Both orders agree.");
+  const about = answer ? `${task} (${model}).${answer.verdict ? " Both orders agree." : ""}` : "The files have the same bytes. The model was not asked.";
   box.className = "verdict";
-  box.append(said, element("p", answer ? `${task} (${model})` : "The files have the same bytes. The model was not asked."));
+  box.append(element("h2", sentenceOf(verdict).replace(/\.$/, "")), element("p", about));
   box.lastChild.className = "about";
   if (answer) box.append(answersOf(videos, answer));
   host.append(box);
   return box;
 }
 
-/** Both answers, each with a bar: how much of it speaks for the first video, and how much for the second. */
-function answersOf(videos, { orders }) {
+/** Both answers, each as a number and a bar: how likely the better video is better, or the first one if none is. */
+function answersOf(videos, { orders, verdict }) {
   const list = document.createElement("ul");
-  const titles = { first: videos[0].title, second: videos[1].title };
+  const better = verdict ?? "first";
+  const ordered = better === "first" ? videos : [...videos].reverse();
   for (const { asked, preference } of orders) {
-    const [one, other] = asked.map((side) => titles[side]);
-    const item = element("li", `Asked as ${one}, then ${other}: P(${one} is better) = ${shown(preference)}`);
+    const [place, probability] = asked[0] === better ? ["first", preference] : ["second", 1 - preference];
+    const item = element("li", `P(${ordered[0].title} is better) = ${shown(probability)} (shown ${place})`);
     const bar = document.createElement("span");
     bar.className = "shares";
-    const ofFirst = asked[0] === "first" ? preference : 1 - preference;
-    [ofFirst, 1 - ofFirst].forEach((share, place) => {
+    [probability, 1 - probability].forEach((share, index) => {
       const part = bar.appendChild(document.createElement("span"));
       part.style.width = `${100 * share}%`;
-      part.style.background = videos[place].colour ?? `var(--${colourName(videos[place].place)})`;
+      part.style.background = ordered[index].colour ?? `var(--${colourName(ordered[index].place)})`;
     });
     item.prepend(bar);
     list.append(item);

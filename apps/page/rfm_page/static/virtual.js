@@ -4,7 +4,7 @@
 const BEYOND = 8; // rows above and below those that can be seen
 
 /**
- * Rows in `body`, which scrolls in `scroller` between the table bodies `above` and `below`.
+ * Rows in `body`, which scrolls in `scroller`, or with the page, between the table bodies `above` and `below`.
  * All rows are as high as `--row` says. newRow(item): the row of an item
  */
 export class VirtualRows {
@@ -20,7 +20,7 @@ export class VirtualRows {
     this.#body = body;
     this.#gaps = [above, below].map((gap) => gap.appendChild(document.createElement("tr")).appendChild(document.createElement("td")));
     this.#newRow = newRow;
-    scroller.addEventListener("scroll", () => this.#draw());
+    document.addEventListener("scroll", () => this.#draw(), true); // of any element
     new ResizeObserver(() => this.#draw()).observe(scroller);
   }
 
@@ -54,9 +54,12 @@ export class VirtualRows {
 
   #draw() {
     const height = this.#height;
-    const { scrollTop, clientHeight } = this.#scroller;
-    const first = Math.max(Math.floor(scrollTop / height) - BEYOND, 0);
-    const end = Math.min(Math.ceil((scrollTop + clientHeight) / height) + BEYOND, this.#items.length);
+    const { top, bottom } = this.#scroller.getBoundingClientRect();
+    if (top === bottom) return; // nobody sees it
+    const begin = this.#body.closest("table").getBoundingClientRect().top;
+    const [from, to] = [Math.max(top, 0), Math.min(bottom, innerHeight)].map((edge) => Math.max(Math.round((edge - begin) / height), 0));
+    const first = Math.max(Math.min(from, this.#items.length) - BEYOND, 0);
+    const end = Math.min(to + BEYOND, this.#items.length);
     const seen = this.#items.slice(first, end);
     const before = this.#rows;
     this.#rows = new Map(seen.map((item) => [item, before.get(item) ?? this.#newRow(item)]));
