@@ -34,11 +34,12 @@ from tritonclient.grpc import model_config_pb2 as pb
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm.launch.repository_check import fault_in
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
-from rfm_client import PreferenceSample, ProgressSample, RewardError
+from rfm_client import PreferenceSample, ProgressSample, RewardError, Sample
 from rfm_client.contract import wire
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_client.contract.synthetic import random_trajectory
 from rfm_export.errors import ExportError
+from rfm_export.layout import description_in
 from rfm_export.pbtxt import serving_versions
 from rfm_export.publish import alone, config_of, read_config, replace_config, staging
 
@@ -47,7 +48,6 @@ POLL_S = 1.0
 PROBE_FRAMES = 2
 PROBE_SEED = 0
 PROBE_TASK = "pick up the red cup"
-SCORES = (wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE)
 EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
 
 Configs = Mapping[str, pb.ModelConfig]
@@ -174,7 +174,10 @@ class Rollout:
 
 
 def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
-    """Raise RepositoryApiError or RewardError unless the version answers synthetic samples with numbers."""
+    """Raise RepositoryApiError or RewardError unless the version answers synthetic samples with numbers.
+
+    A model that writes its answers may also refuse a sample because the answer holds no score.
+    """
     reads = _dims(config.input)
     widths = None if wire.FRAMES in reads else (reads[wire.VIDEO_EMBEDDINGS], reads[wire.TEXT_EMBEDDING])
     trajectory = random_trajectory(np.random.default_rng(PROBE_SEED), PROBE_FRAMES, widths, task=PROBE_TASK)
@@ -182,9 +185,19 @@ def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
         embeddings = server.infer(config.name, version, wire.encode_frames(trajectory), EMBEDDINGS)
         wire.decode_embeddings(embeddings, trajectory)
         return
-    for sample in (ProgressSample(trajectory), PreferenceSample(trajectory, trajectory)):
-        scores = server.infer(config.name, version, wire.encode_samples([sample]), SCORES)
-        wire.decode_results(scores, [sample])
+    description = description_in(config)
+    samples: list[Sample] = [ProgressSample(trajectory)]
+    if description.has_preference:
+        samples.append(PreferenceSample(trajectory, trajectory))
+    for sample in samples:
+        outputs = wire.outputs_for([sample], description.scores)
+        try:
+            scores = server.infer(config.name, version, wire.encode_samples([sample]), outputs)
+        except RepositoryApiError as error:
+            if not (description.may_not_answer and error.is_refusal):
+                raise
+        else:
+            wire.decode_results(scores, [sample])
 
 
 def check_files(repository: Path, models: Mapping[str, pb.ModelConfig | None]) -> None:

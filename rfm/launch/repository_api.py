@@ -43,6 +43,12 @@ _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
 class RepositoryApiError(LocatedError):
     """A failed request of the repository API, with the reason."""
 
+    @property
+    def is_refusal(self) -> bool:
+        """True if the server answered that the request is at fault."""
+        answer = self.__cause__
+        return isinstance(answer, InferenceServerException) and answer.status() == "StatusCode.INVALID_ARGUMENT"
+
 
 @dataclass(frozen=True)
 class ModelVersion:

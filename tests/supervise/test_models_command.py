@@ -23,6 +23,8 @@ import rfm_export
 import rollout
 from engines import load_engine, serve_config
 from in_process import rfm
+from reward_models import ROOT
+from rfm.config import ExportConfig
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm.supervise.status import NO_REASON
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
@@ -118,6 +120,20 @@ def test_a_name_is_loaded_listed_and_unloaded_beside_the_others(running: Running
     with running.client("listed") as client:
         assert np.isfinite(client.progress(random_trajectory(0, 3)).progress).all()
     running.models("unload", "listed")
+
+
+@pytest.mark.parametrize("said", ["rynnvalue,robot=an arm", "robodopamine"])
+def test_a_model_whose_progress_may_be_missing_is_rolled_out(running: Running, said: str) -> None:
+    """The small Robo-Dopamine also writes answers without a score."""
+    family = said.partition(",")[0]
+    checkpoint = {"rynnvalue": "bro_symlog_bf16_tied", "robodopamine": "grm_qwen3vl_bf16_tied"}[family]
+    config = ExportConfig(name=family, reward_model=said, num_gpus=0)
+    for version in ("1", "2"):
+        rfm_export.export(ROOT / family / checkpoint / "checkpoint", running.repository, config)
+        if version == "1":
+            running.models("load", family)
+    assert running.models("rollout", family, "2").endswith(f"{family}: version 2 is served\n")
+    running.models("unload", family)
 
 
 @contextmanager
