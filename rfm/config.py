@@ -55,8 +55,8 @@ class CheckpointConfig(Settings):
     )
     reward_model: str | None = setting(
         None,
-        "Reward model that an ordinary Qwen3-VL is asked as: topreward, topreward-robometer, roboreward or "
-        "roboreward-expected; settings follow: topreward,num_prefixes=15.",
+        "How to ask a model that has no config.yaml: topreward, topreward-robometer, roboreward, roboreward-expected, "
+        "rynnvalue, robodopamine or procvlm; settings follow: topreward,num_prefixes=15.",
         flag="--as",
         metavar="NAME",
     )

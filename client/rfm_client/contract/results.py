@@ -95,7 +95,9 @@ class FrameScores:
     relative_s: float32 [T], RynnValue's seconds from the frame before to each frame, negative where the task went
         backwards; 0 at the first frame
     entropy: float32 [T], entropy in nats of the probabilities behind ``remaining_s``; larger: less sure
-    hop: float32 [T], change of progress at each frame that Robo-Dopamine compared with another; NaN: not compared
+    hop: float32 [T], the change at each frame that Robo-Dopamine compared: in the modes incremental and benchmark the
+        share of what remained that it closed, or, negative, of what was reached that it lost; in the others the
+        difference of progress; NaN: not compared
     frame_indices: int64 [T], indices of the scored frames in the trajectory; None: all frames
     """
 
@@ -148,7 +150,7 @@ class FrameScores:
     hop: Annotated[
         Float32Array | None,
         Score(
-            "Change of progress at each frame that the model compared with another",
+            "Change at each frame that the model compared with another",
             asked="if given",
             bounds=(None, None),
             skips_frames=True,
