@@ -36,6 +36,7 @@ from rfm.launch.repository_check import fault_in
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm_client import PreferenceSample, ProgressSample, RewardError, Sample
 from rfm_client.contract import wire
+from rfm_client.contract.errors import LocatedError
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_client.contract.synthetic import random_trajectory
 from rfm_export.errors import ExportError
@@ -113,7 +114,7 @@ class Rollout:
         check_files(self.repository, new)
         try:
             self._switch(new, served, version)
-        except (RepositoryApiError, RewardError, OSError) as error:
+        except (LocatedError, RewardError, OSError) as error:
             became = self._go_back(old, served)
             raise RolloutError(f"{self.name} version {version}: {error} ({became})") from error
         except BaseException:  # a signal to stop

@@ -542,6 +542,7 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
         page["json"].click()
         _, described = json.loads(page.saved("curves.json"))["videos"]
         assert described["robot_description"] == "another robot"
+        assert "--robot-description 'another robot' --sampling rint_pad" in page["command"].text
         assert not np.allclose(described["remaining_s"], seconds, rtol=1e-3)
         Select(page["model"]).select_by_visible_text("robo")
         assert not page["robot"].is_displayed()

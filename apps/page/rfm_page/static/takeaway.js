@@ -3,19 +3,18 @@
 
 import { leadingOf } from "./signals.js";
 
-const DESCRIBED = "# score: no option describes a robot or a camera; rfm-client label has such options";
 const LOOPBACK = /^\w+:\/\/(localhost|127\.[\d.]+|\[::1\])([:/]|$)/;
 
 /** The curves as CSV, one line a point. */
 export function csv(curves) {
   const instead = insteadOf(curves);
-  const described = [...new Set(curves.flatMap(({ descriptions }) => Object.keys(descriptions)))].sort();
-  const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "orient", "channels", "frame", "time_s", "progress", "success", ...instead, ...described];
+  const names = [...new Set(curves.flatMap(({ descriptions }) => Object.keys(descriptions)))].sort();
+  const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "orient", "channels", "frame", "time_s", "progress", "success", ...instead, ...names];
   const lines = curves.flatMap((curve) =>
     curve.times.map((time, index) => [
       curve.video.name, curve.task, curve.model, curve.version, curve.rule, curve.sampledFrames, curve.fps,
       curve.orient, curve.channels, index, time, curve.progress[index], curve.success[index],
-      ...instead.map((name) => curve[name]?.[index]), ...described.map((name) => curve.descriptions[name]),
+      ...instead.map((name) => curve[name]?.[index]), ...names.map((name) => curve.descriptions[name]),
     ]),
   );
   return [columns, ...lines].map((values) => values.map(csvField).join(",") + "\r\n").join("");
@@ -68,9 +67,8 @@ export function commands(url, curves, verdicts) {
   const groups = grouped(curves.filter(({ video }) => !video.origin?.dataset), asked);
   const scores = groups.map((group, index) => {
     const [{ rule, sampledFrames }] = group;
-    if (Object.keys(group[0].descriptions).length) return DESCRIBED;
     const target = `scores${groups.length > 1 ? `_${index + 1}` : ""}.json`;
-    return line("score", group.map(({ video }) => video), group[0], url, [...sampling(rule, sampledFrames), "--json", target]);
+    return line("score", group.map(({ video }) => video), group[0], url, [...described(group[0]), ...sampling(rule, sampledFrames), "--json", target]);
   });
   const comparisons = verdicts.flatMap((verdict) => [
     line("compare", verdict.videos, verdict, url, []),
@@ -98,17 +96,21 @@ function sampling(rule, frames) {
   return ["--sampling", rule, ...(frames === null ? [] : ["--frames", frames])];
 }
 
+/** The options that describe robot and camera, if any are given. */
+function described({ descriptions }) {
+  return Object.entries(descriptions).flatMap(([name, text]) => [`--${name.replace("_", "-")}`, text]);
+}
+
 /** The command that labels an episode of a dataset as the page has scored it. */
 function labelLine(group, url) {
-  const [{ video: { origin }, task, model, rule, sampledFrames, fps, resize, descriptions }] = group;
+  const [{ video: { origin }, task, model, rule, sampledFrames, fps, resize }] = group;
   const about = `episode ${origin.episode} of ${origin.dataset}`;
   if (fps !== origin.fps) return `# ${about}: a command scores all of its frames, ${origin.fps} a second, not ${fps}`;
   const cameras = group.map(({ video }) => video.origin.camera);
   const corrections = group.flatMap(({ video, orient, channels }) => corrected({ orient, channels }, `${video.origin.camera}=`));
   const options = ["--episodes", origin.episode, "--cameras", cameras.join(","), ...corrections, ...sampling(rule, sampledFrames)];
   const given = task === origin.task ? [] : ["--task", task, "--override-task"];
-  const described = Object.entries(descriptions).flatMap(([name, text]) => [`--${name.replace("_", "-")}`, text]);
-  const words = ["rfm-client", "label", origin.dataset, ...serverOption(url), "--model", model, ...given, ...described, ...options];
+  const words = ["rfm-client", "label", origin.dataset, ...serverOption(url), "--model", model, ...given, ...described(group[0]), ...options];
   const target = ["--output", `${origin.dataset}_episode_${origin.episode}`, "--format", "progress"];
   return [...words, ...(resize ? ["--resize"] : []), ...target].map(quoted).join(" ");
 }
