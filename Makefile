@@ -1,12 +1,15 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+UV := 0.13.9
+# Stamp files: what make demo runs is installed; everything is installed, which tests and tools need.
+RUNS := $(VENV)/runs
 INSTALLED := $(VENV)/installed
 WORKERS := --numprocesses 3 --dist loadgroup --no-loadscope-reorder
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
-.PHONY: help demo test test-all nightly test-newest check parity differences bench bench-full gpu gpu-packages perf chaos soak format model_repository \
+.PHONY: help demo install test fast test-more test-all nightly test-newest check parity differences bench bench-full gpu gpu-packages perf chaos soak format model_repository \
   clean ops-check ops-tools audit lock mutate docs reference prose internal-imports pictures version
 
 # What can be made: this list.
@@ -15,19 +18,28 @@ help:
 	  /^[a-z_-]+:/ { split($$1, target, ":"); printf "make %-18s%s\n", target[1], comment } { comment = "" }' Makefile
 
 # A first look: serve a small trained checkpoint, score clips, draw their curves.
-demo: $(INSTALLED)
+demo: $(RUNS)
 	$(BIN)/python examples/demo.py
 
-# Lint, types, generated files, and the tests that take minutes.
-test: check
-	$(BIN)/pytest $(WORKERS) -m "not gpu and not slow and not nightly"
+# Install everything into .venv: packages for development, tests, labels, RL. make test does it, too.
+install: $(INSTALLED)
 
-# All that CI runs: also the tests that kill, wait or restart, or need programs of Debian.
-# The site of the documents is built beside the installation and the checks.
-test-all:
-	+$(MAKE) --jobs 2 --output-sync check docs ops-tools
-	$(BIN)/pytest $(WORKERS) -m "not gpu and not alone and not nightly"
+# Lint, types, generated files, and tests against a real Triton: at most four minutes. Needs no programs but the server's.
+test: $(INSTALLED)
+	+$(MAKE) --jobs 2 check fast
+
+# The tests of make test, without lint and types.
+fast: $(INSTALLED)
+	$(BIN)/pytest $(WORKERS) --durations 10 --durations-min 1 -m "not gpu and not alone and not slow and not debian and not nightly"
+
+# The other tests of CI: they kill, wait or restart, or need programs of Debian. Builds the documents, too.
+test-more: $(INSTALLED)
+	+$(MAKE) --jobs 2 docs ops-tools
+	$(BIN)/pytest $(WORKERS) --durations 10 -m "(slow or debian) and not gpu and not alone and not nightly"
 	$(BIN)/pytest -m "alone and not nightly" $$(grep --recursive --files-with-matches mark.alone tests)
+
+# All tests of CI.
+test-all: test test-more
 
 # What takes too long for CI: chaos, a cold install, every snippet of the documents, more reference cases.
 # RFM_GOLDENS names a folder with more reference cases.
@@ -62,13 +74,13 @@ differences: $(INSTALLED)
 
 # Measure this server beside the bare engine, the FastAPI server's design, LitServe and mosec.
 bench: $(INSTALLED)
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
+	$(INSTALL) --editable ".[bench]"
 	$(BIN)/python benchmarks/bench.py
 
 # The same with all loads, half an hour.
 # Before it the engine without a server: beside the original's forward, and as the work grows.
 bench-full: $(INSTALLED)
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
+	$(INSTALL) --editable ".[bench]"
 	$(BIN)/python benchmarks/engine.py forward
 	$(BIN)/python benchmarks/bench.py --full
 
@@ -118,8 +130,8 @@ soak: $(INSTALLED)
 # Do the tests see small faults? An hour or two.
 # 200 changes of the wire, the collators, the networks and the batch model, made by cosmic-ray.
 mutate: $(INSTALLED)
-	$(PYTHON) -m venv $(VENV)/mutate
-	$(VENV)/mutate/bin/pip install --quiet --disable-pip-version-check "cosmic-ray>=8.7,<9"
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(VENV)/mutate
+	$(BIN)/uv pip install --quiet --python $(VENV)/mutate "cosmic-ray>=8.7,<9"
 	$(VENV)/mutate/bin/python tools/mutate.py
 
 # Test what docker/ holds: alerts, dashboard, image, compose file, Kubernetes.
@@ -128,34 +140,26 @@ ops-check: ops-tools
 	$(BIN)/pytest tests/ops
 
 AS_ROOT = $(shell if [ "$$(id -u)" = 0 ]; then :; elif sudo -n true 2>/dev/null; then echo sudo -n; else echo false; fi)
-MISSING = { echo "make ops-tools: expected $(1) in PATH, got none; install it (Debian, Ubuntu: $(2))" >&2; exit 1; }
+PROGRAMS := chromium/chromium chromedriver/chromium-driver curl/curl docker-compose/docker-compose ffmpeg/ffmpeg nginx/nginx \
+  prometheus/prometheus promtool/prometheus
 
-# Get the programs of Debian and Ubuntu that tests run: Prometheus, nginx, docker-compose, Chromium.
-# Prometheus and nginx are unpacked into $(VENV), since their packages start a service when they are installed.
+# Get the programs of Debian and Ubuntu that tests run: Chromium, curl, docker-compose, ffmpeg, nginx, Prometheus.
+# nginx and Prometheus are unpacked into $(VENV), since their packages start a service when they are installed.
 ops-tools: $(INSTALLED)
-	@test -x $(BIN)/promtool || { command -v promtool && command -v prometheus; } >/dev/null || \
-	  { $(AS_ROOT) apt-get update -qq; cd $(VENV) && apt-get -qq -o APT::Sandbox::User=root download prometheus && \
-	  dpkg-deb --fsys-tarfile prometheus_*.deb | \
-	  tar -x -C bin --strip-components=3 ./usr/bin/prometheus ./usr/bin/promtool && rm prometheus_*.deb; } || \
-	  $(call MISSING,prometheus and promtool,apt-get install prometheus)
-	@test -x $(BIN)/nginx || PATH=$$PATH:/usr/sbin command -v nginx >/dev/null || \
-	  { $(AS_ROOT) apt-get update -qq; cd $(VENV) && apt-get -qq -o APT::Sandbox::User=root download nginx && \
-	  dpkg-deb --fsys-tarfile nginx_*.deb | tar -x -C bin --strip-components=3 ./usr/sbin/nginx && rm nginx_*.deb; } || \
-	  $(call MISSING,nginx,apt-get install nginx)
-	@docker compose version >/dev/null 2>&1 || command -v docker-compose >/dev/null || \
-	  { $(AS_ROOT) apt-get update -qq && \
-	  $(AS_ROOT) apt-get install --yes -qq --no-install-recommends docker-compose; } || \
-	  $(call MISSING,docker-compose,apt-get install docker-compose)
-	@{ command -v chromium && command -v chromedriver; } >/dev/null || \
-	  { $(AS_ROOT) apt-get update -qq && \
-	  $(AS_ROOT) apt-get install --yes -qq --no-install-recommends chromium chromium-driver; } || \
-	  $(call MISSING,chromium and chromedriver,apt-get install chromium chromium-driver)
+	@missing=$$(for each in $(PROGRAMS); do PATH=$(CURDIR)/$(BIN):$$PATH:/usr/sbin command -v $${each%/*} >/dev/null || \
+	  echo $${each#*/}; done | sort -u); \
+	test -z "$$missing" || $(AS_ROOT) apt-get update -qq; \
+	for package in $$missing; do case $$package in \
+	  nginx|prometheus) cd $(VENV) && apt-get -qq -o APT::Sandbox::User=root download $$package && \
+	    dpkg-deb --fsys-tarfile $${package}_*.deb | tar -x -C bin --strip-components=3 --wildcards "./usr/*bin/*" && \
+	    rm $${package}_*.deb && cd ..;; \
+	  *) $(AS_ROOT) apt-get install --yes -qq --no-install-recommends $$package >/dev/null;; \
+	esac || { echo "make ops-tools: expected Debian's package $$package, got none; put its programs into PATH" >&2; exit 1; }; done
 
 # Build the documents as a site, build/site, with the Python API. A broken link is an error.
-docs: | $(VENV)
-	$(PYTHON) -m venv $(VENV)/docs
-	$(VENV)/docs/bin/pip install --quiet --disable-pip-version-check "mkdocs-material>=9.8,<10" \
-	  "mkdocstrings[python]>=1,<2" ruff
+docs: | $(BIN)/uv
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(VENV)/docs
+	$(BIN)/uv pip install --quiet --python $(VENV)/docs "mkdocs-material>=9.8,<10" "mkdocstrings[python]>=1,<2" ruff
 	NO_MKDOCS_2_WARNING=1 $(VENV)/docs/bin/mkdocs build --strict --quiet
 
 # Write the lists of docs/reference that come from the code.
@@ -176,21 +180,17 @@ pictures: $(INSTALLED)
 
 # Report known vulnerabilities of the pinned packages. Needs the network.
 audit: $(INSTALLED)
-	$(PYTHON) -m venv $(VENV)/audit
-	$(VENV)/audit/bin/pip install --quiet --disable-pip-version-check pip-audit
-	$(VENV)/audit/bin/pip-audit --strict --requirement constraints.txt --no-deps --disable-pip
+	$(BIN)/uv tool run --quiet pip-audit --strict --requirement constraints.txt --no-deps --disable-pip
 
 # Write docker/requirements.txt: the hashes of the image's packages. Needs the network.
-lock:
-	$(PYTHON) -m venv $(VENV)/lock
-	$(VENV)/lock/bin/pip install --quiet --disable-pip-version-check uv
+lock: | $(BIN)/uv
 	{ echo '# What the image installs beside torch, in the versions of constraints.txt, with the hashes of all files.'; \
 	  echo '# Made by: make lock'; \
 	  echo '# Not here: torch, whose build and so whose hash depends on TORCH_INDEX, and what only torch needs.'; \
-	  printf 'torch\nrfm-client\nrfm-gateway\nrfm-page\n' | $(VENV)/lock/bin/uv pip compile --quiet --no-python-downloads --no-header \
+	  printf 'torch\nrfm-client\nrfm-gateway\nrfm-page\n' | $(BIN)/uv pip compile --quiet --no-python-downloads --no-header \
 	  --no-annotate --universal --python-version 3.10 --generate-hashes --constraints constraints.txt --excludes - \
-	  --extra encoders --extra vlm --extra quantized client/pyproject.toml apps/gateway/pyproject.toml apps/page/pyproject.toml pyproject.toml; } > $(VENV)/lock/requirements.txt
-	mv $(VENV)/lock/requirements.txt docker/requirements.txt
+	  --extra encoders --extra vlm --extra quantized client/pyproject.toml apps/gateway/pyproject.toml apps/page/pyproject.toml pyproject.toml; } > $(VENV)/requirements.txt
+	mv $(VENV)/requirements.txt docker/requirements.txt
 
 PROJECTS := pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.toml)
 VERSIONED := $(PROJECTS) CITATION.cff docker/.env.example docker/compose.yaml \
@@ -216,18 +216,25 @@ model_repository: $(INSTALLED)
 
 CHECK_PYTHON = 'import sys; own = sys.version_info[:2]; sys.exit("make: expected Python 3.10, 3.11 or 3.12, got %d.%d:" % own \
   + " make $(MAKECMDGOALS) PYTHON=python3.12" if not (3, 10) <= own <= (3, 12) else 0)'
+PINS := pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.toml) constraints.txt
+# uv reads no settings of pip: a package index and folders of wheels are handed on.
+PIP_SETTING = $(shell $(BIN)/pip config list | sed -n "s/^[^=]*[.]$(1)='\(.*\)'$$/$(2)=\1/p" | head -n 1)
+INSTALL = $(call PIP_SETTING,index-url,UV_DEFAULT_INDEX) $(call PIP_SETTING,find-links,UV_FIND_LINKS) \
+  $(BIN)/uv pip install --quiet --python $(BIN)/python --constraint constraints.txt
 
-$(VENV):
-	mkdir -p $@
-
-$(INSTALLED): pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.toml) constraints.txt | $(VENV)
+$(BIN)/uv:
 	@$(PYTHON) -c $(CHECK_PYTHON)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	  --editable "client[cli,rerun]" --editable apps/gateway --editable "apps/labels[hdf5,ray,rerun,rlds]" \
-	  --editable apps/page --editable "apps/rl[sb3]" --editable ".[encoders,vlm,quantized,triton,demo,dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check uv==$(UV)
+
+$(RUNS): $(PINS) | $(BIN)/uv
+	$(INSTALL) --editable "client[cli]" --editable apps/gateway --editable apps/page --editable ".[encoders,vlm,triton,demo]"
 	touch $@
+
+$(INSTALLED): $(PINS) | $(BIN)/uv
+	$(INSTALL) --editable "client[cli,rerun]" --editable apps/gateway --editable "apps/labels[hdf5,ray,rerun,rlds]" \
+	  --editable apps/page --editable "apps/rl[sb3]" --editable ".[encoders,vlm,quantized,triton,demo,dev]"
+	touch $(RUNS) $@
 
 # Remove what make has made.
 clean:

@@ -22,8 +22,9 @@ from rfm.launch import endpoints
 from rfm_client import RewardClient
 from servers import CRASHES, Endpoints, Served, start_triton
 
-pytest_plugins = ("gateway_fixtures",)
+pytest_plugins = ("debian", "gateway_fixtures")
 SHARED = ("served", "triton")  # fixtures that start a server for the tests of many files
+ALONE_WITH_IT = {"client"}
 LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the others run meanwhile
 
 torch.set_num_threads(1)
@@ -42,9 +43,8 @@ def engine() -> Callable[[str], Engine]:
 
 @pytest.fixture(scope="session")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """The shared server: a reference checkpoint of each kind, and the demo's as ``rfm``."""
-    folder = tmp_path_factory.mktemp("served")
-    repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
+    """The shared server: two reference checkpoints, and the demo's as ``rfm``. A test may have it serve others, too."""
+    repository = shutil.copytree(ROOT / "model_repository", tmp_path_factory.mktemp("served") / "model_repository")
     for config in goldens.SERVED:
         rfm_export.export(config.checkpoint, repository, serve_config(config, config.name))
     with start_triton(repository) as server:
@@ -103,13 +103,16 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests with a shared server ``triton``, and keep them in one of the test processes.
+    """Mark tests with a shared server ``triton``, and keep those of a folder in one of the test processes.
 
-    The tests of a file also stay together, since they share servers.
+    The folders in ``ALONE_WITH_IT`` have a server each, the others one together: with one for all, most tests would
+    wait in one process. The tests of a file also stay together, since they share servers.
     """
     for item in items:
         shared = next((name for name in SHARED if name in getattr(item, "fixturenames", ())), None)
         if shared:
             item.add_marker("triton")
+            folder = item.path.parent.name
+            shared += folder if folder in ALONE_WITH_IT else ""
         item.add_marker(pytest.mark.xdist_group(shared or str(item.path)))
     items.sort(key=lambda item: item.path.parent.name not in LONGEST)

@@ -24,7 +24,10 @@ import psutil
 import tritonclient.grpc
 from prometheus_client.parser import text_string_to_metric_families
 
+import goldens
+import rfm_export
 from commands import RFM, own_regions, running
+from engines import serve_config
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.endpoints import GrpcTls as GrpcTls
 from rfm.launch.installation import Installation, find_installation
@@ -130,7 +133,17 @@ class Served:
         return self.endpoints.grpc_url if protocol == "grpc" else self.endpoints.http_url
 
     def client(self, protocol: str, model: str = "c1_t1_disc10") -> RewardClient:
+        self.has(model)
         return RewardClient(self.url(protocol), model=model)
+
+    def has(self, name: str) -> None:
+        """Have the server serve a reference checkpoint, too."""
+        if name in {config.name for config in goldens.ON_DEMAND} and not (self.repository / name).exists():
+            before = set(self.repository.iterdir())
+            rfm_export.export(goldens.config(name).checkpoint, self.repository, serve_config(goldens.config(name), name))
+            with RepositoryApi(self.url("grpc"), self.server.admin_key) as api:
+                for model in sorted(set(self.repository.iterdir()) - before):
+                    api.load(model.name)
 
     def revive(self) -> None:
         """Starts the server again if it has crashed, as ``rfm serve`` would: Triton 2.51 does, once in thousands of

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: MIT
+"""Programs of Debian that tests run, each a fixture. A test that asks for one is marked ``debian`` by that.
+
+``make test`` runs none of these tests, and its last lines count them. ``make test-more`` runs them, and fails where a
+program is missing.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+PACKAGES = {  # fixture -> packages of Debian and Ubuntu
+    "browser": "chromium chromium-driver",
+    "curl": "curl",
+    "docker_compose": "docker-compose",
+    "ffmpeg": "ffmpeg",
+    "nginx": "nginx",
+    "prometheus": "prometheus",
+    "promtool": "prometheus",
+}
+WAITING = pytest.StashKey[Counter[str]]()  # tests of this run that were left out, by packages
+PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"], "/usr/sbin"])
+
+
+def find(name: str) -> str:
+    """Return the path of a program. Fails the test if there is none."""
+    found = shutil.which(name, path=PATH)
+    if found is None:
+        pytest.fail(f"{name}: expected in PATH, got nothing (make ops-tools)")
+    return found
+
+
+def _program(fixture: str) -> Any:
+    @pytest.fixture(scope="session", name=fixture)
+    def path() -> str:
+        return find(fixture.replace("_", "-"))
+
+    return path
+
+
+curl, docker_compose, ffmpeg, nginx, prometheus, promtool = (
+    _program(name) for name in sorted(PACKAGES) if name != "browser"
+)
+
+
+def _packages(item: pytest.Item) -> str:
+    """Return the packages that a test needs."""
+    asked = [PACKAGES[name] for name in getattr(item, "fixturenames", ()) if name in PACKAGES]
+    return " ".join(sorted(set(asked)))
+
+
+@pytest.hookimpl(tryfirst=True)  # before marks are selected
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if _packages(item):
+            item.add_marker("debian")
+
+
+def pytest_deselected(items: list[pytest.Item]) -> None:
+    for item in items:
+        if packages := _packages(item):
+            item.config.stash.setdefault(WAITING, Counter())[packages] += 1
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Every process of pytest-xdist collects all tests: the counts of one are those of all."""
+    node.config.stash[WAITING] = Counter(getattr(node, "workeroutput", {}).get("waiting", {}))
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if (output := getattr(session.config, "workeroutput", None)) is not None:
+        output["waiting"] = dict(session.config.stash.get(WAITING, Counter()))
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    for packages, count in sorted(config.stash.get(WAITING, Counter()).items()):
+        terminalreporter.write_line(f"not run: {count} tests that need {packages} (make test-more)")
