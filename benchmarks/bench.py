@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Compare this server with alternatives: same weights, same samples, one run.
 
-    bench.py servers          the bare engine, the FastAPI server's design, LitServe and mosec; --full: all loads
-    bench.py accelerator      how busy each server keeps a simulated accelerator, whose forward passes only sleep
+    bench.py servers          the bare engine, the FastAPI server's design and mosec; --full: all loads
     bench.py commits --server before=OTHER_VENV/bin/python --server after=.venv/bin/python
                               this server at several commits, each from the environment where it is installed
 
@@ -14,9 +13,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
-import shutil
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
@@ -26,10 +22,8 @@ from tempfile import TemporaryDirectory
 import report
 import torch
 from contestants import (
-    DEMO,
     PEERS,
     VLM_BASE,
-    VLM_CHECKPOINT,
     BareEngine,
     Checkpoint,
     Contestant,
@@ -41,15 +35,10 @@ from contestants import (
 from load import SHARED_MEMORY, Load
 from report import Row
 
-import rfm_export
-from rfm.config import ExportConfig
 from rfm.launch.temporary import temporary_server
 from rfm.launch.triton_server import Endpoints
 from rfm_gateway.command import gateway_command
 from rfm_gateway.config import GatewayConfig
-
-sys.path.insert(0, str(Path(__file__).parent / "peers"))
-from engines import SIMULATION, Ledger
 
 UNIFORM, MIXED, AS_LONG_AS_MIXED = (16, 16), (1, 16), (8, 9)
 OURS = ("gRPC", "HTTP", SHARED_MEMORY, "gateway")
@@ -67,26 +56,6 @@ FULL = {
     "8 callers, 8 raw frames of 256 x 256": (Load(8, 0, (8, 8), frame_px=(256, 256)), OURS[:3], False),
     "Poisson, half of the bare engine's rate": (Load(0, 0, UNIFORM, rate_per_s=0.5), ("gRPC",), True),
 }
-BATCH_S, ROW_S, VLM_ROW_S = 4e-3, 0.5e-3, 30e-3  # sleep for a batch, a sample, a sample of frames
-SIMULATED = """
-
-import sys
-
-sys.path.insert(0, {peers!r})
-_load = TritonPythonModel.load
-
-
-def load(self, *arguments):
-    from pathlib import Path
-
-    from engines import simulate
-
-    _load(self, *arguments)
-    simulate(self.engine, Path({file!r}), {batch_s}, {row_s})
-
-
-TritonPythonModel.load = load
-"""
 
 
 def servers(arguments: argparse.Namespace, folder: Path) -> None:
@@ -149,71 +118,12 @@ def commits(arguments: argparse.Namespace, folder: Path) -> None:
     report.write("before_after", about, rows, ("checkpoint", "callers", "way"), "samples_per_s", arguments.output)
 
 
-def accelerator(arguments: argparse.Namespace, folder: Path) -> None:
-    """Measure servers with a simulated accelerator.
-
-    All servers get embeddings. This server also gets frames, for a vision-language checkpoint, and prepares them for
-    real.
-    """
-    source = DEMO / "rfm" / "1" / "checkpoint"
-    config = ExportConfig(num_gpus=0, torch_threads=1)
-    of_vlm = replace(config, base_model=str(VLM_BASE))
-    ours = {
-        "this server, two instances": (source, replace(config, instances=2), BATCH_S, ROW_S),
-        "this server, one instance": (source, config, BATCH_S, ROW_S),
-        "this server, frames": (VLM_CHECKPOINT, of_vlm, 0.0, VLM_ROW_S),
-    }
-    made, ledgers = {}, {}
-    for name, (of, settings, batch_s, row_s) in ours.items():
-        place = folder / _path(name)
-        rfm_export.export(of, place / "repository", settings)
-        (model,) = (place / "repository").glob("*/1/model.py")
-        told = {"peers": sys.path[0], "file": str(place / "ledger"), "batch_s": batch_s, "row_s": row_s}
-        model.write_text(model.read_text() + SIMULATED.format(**told))
-        made[name] = Contestant("gRPC", _ours(place), (64, 32))
-    for name in ("LitServe", "mosec"):
-        copied = shutil.copytree(source, folder / name / "checkpoint")
-        (copied / SIMULATION).write_text(json.dumps([str(folder / name / "ledger"), BATCH_S, ROW_S]))
-        made[name] = Contestant(name, peer(name, {"checkpoint": copied}, folder / f"{name}.log"), (64, 32))
-    loads = [("embeddings", Load(callers, arguments.seconds, UNIFORM)) for callers in arguments.callers]
-    for callers, px in ((16, 256), (4, 256), (16, 480)):
-        loads.append((f"frames of {px} x {px}", Load(callers, 2 * arguments.seconds, (8, 8), frame_px=(px, px))))
-    rows: list[Row] = []
-    with ExitStack() as stack:
-        for name, contestant in made.items():
-            ledgers[name] = Ledger(folder / _path(name) / "ledger")
-            stack.enter_context(contestant)
-        for number, (name, load) in itertools.product(range(arguments.rounds), loads):
-            of_round = {}
-            for way in (way for way in made if ("frames" in way) == bool(load.frame_px)):
-                before_s = ledgers[way].busy_s()
-                told = made[way].measure(load)
-                of_round[way] = {"busy": (ledgers[way].busy_s() - before_s) / told["took_s"], **told}
-            rows += _rows({"load": name, "callers": load.callers}, number, of_round)
-    about = (
-        f"A simulated accelerator: {1e3 * BATCH_S:g} ms a batch and {1e3 * ROW_S:g} ms a sample, asleep\n"
-        f"busy: share of the time. Frames: 8 a sample, a tiny checkpoint on Qwen3-VL, {1e3 * VLM_ROW_S:g} ms a sample."
-    )
-    report.write("accelerator", about, rows, ("load", "callers", "way"), folder=arguments.output)
-
-
 def _rows(of: Row, number: int, measured: Mapping[str, Row]) -> list[Row]:
     """Return a row for each way, and print the rates."""
     rows = [{**of, "way": way, "round": number, **figures} for way, figures in measured.items()]
     rates = ", ".join(f"{row['way']} {row['samples_per_s']:.0f}" for row in rows)
     print(f"{', '.join(map(str, of.values()))}, round {number + 1}: {rates} samples/s", flush=True)
     return rows
-
-
-def _path(way: str) -> str:
-    """Return a folder name without spaces, which Triton does not accept."""
-    return way.replace(" ", "_")
-
-
-@contextmanager
-def _ours(place: Path) -> Iterator[str]:
-    with temporary_server(place / "repository", place / "triton.log") as endpoints:
-        yield endpoints.grpc_url
 
 
 @contextmanager
@@ -226,7 +136,7 @@ def _commit(python: str, measured: Checkpoint, base_model: str, place: Path) -> 
 def main() -> None:
     """Run the chosen benchmark, then write and print its results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    programs = {each.__name__: each for each in (servers, accelerator, commits)}
+    programs = {each.__name__: each for each in (servers, commits)}
     parser.add_argument("what", choices=programs, nargs="?", default="servers")
     parser.add_argument("--full", action="store_true", help="servers: all loads, half an hour instead of eight minutes")
     parser.add_argument("--server", action="append", default=[], metavar="NAME=PYTHON", help="commits: one of them")
@@ -234,7 +144,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement")
     parser.add_argument("--callers", type=int, nargs="+", default=[1, 8, 32])
     parser.add_argument("--sizes", nargs="+", default=["default", "small"], choices=["default", "small", "vlm"])
-    parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
+    parser.add_argument("--output", type=Path, default=report.OUTPUT, help="folder for the results")
     arguments = parser.parse_args()
     torch.set_num_threads(torch.get_num_threads())
     with TemporaryDirectory(prefix="rfm-bench-") as folder:

@@ -390,7 +390,7 @@ def main() -> None:
     parser.add_argument("--checkout", type=Path, help="measure the packages of another checkout, as the run 'before'")
     parser.add_argument("--tiny", action="store_true", help="tiny networks on the CPU: shows that the program runs")
     parser.add_argument("--limit-s", type=int, default=LIMIT_S, help=f"stop after these seconds (default: {LIMIT_S})")
-    parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
+    parser.add_argument("--output", type=Path, default=report.OUTPUT, help="folder for the results")
     arguments = parser.parse_args()
     sys.modules.update(dict.fromkeys(HIDDEN))  # type: ignore[arg-type]  # None: an import says that there is none
     scale, checkout = SMALLEST if arguments.tiny else FULL, arguments.checkout

@@ -16,7 +16,6 @@ import json
 import sys
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
 
@@ -32,7 +31,6 @@ from rfm_client import (
     ProgressResult,
     ProgressSample,
     Result,
-    RewardClient,
     Sample,
     SimilaritySample,
     Trajectory,
@@ -46,10 +44,9 @@ MS_PER_S = 1e3
 PEERS = {
     "FastAPI": clients.fastapi_npy,
     "gateway": clients.fastapi_npy,
-    "LitServe": lambda session, url: clients.by_msgpack(session, f"{url}/predict"),
     "mosec": lambda session, url: clients.by_msgpack(session, f"{url}/inference"),
 }
-SHARED_MEMORY, THREADS = "shared memory", "threads"  # ways; "threads": the blocking client in each thread
+SHARED_MEMORY = "shared memory"  # a way
 
 
 @dataclass(frozen=True)
@@ -179,14 +176,6 @@ async def connected(way: str, url: str) -> AsyncIterator[Ask]:
         ) as session:
             yield PEERS[way](session, url)
         return
-    if way == THREADS:
-        with RewardClient(url, max_in_flight=IN_FLIGHT, retry=False) as blocking:
-
-            async def ask_blocking(samples: Sequence[Sample]) -> list[float]:
-                return [_score(result) for result in blocking.evaluate(samples)]
-
-            yield ask_blocking
-        return
     memory = way == SHARED_MEMORY
     async with AsyncRewardClient(url, shared_memory=memory, max_in_flight=IN_FLIGHT, retry=False) as client:
 
@@ -203,8 +192,8 @@ def _score(result: Result) -> float:
     return result.preference if isinstance(result, PreferenceResult) else result.similarity
 
 
-async def measure(ask: Ask, load: Load, sample: Callable[[int], Sample], *, threads: bool = False) -> Calls:
-    """Apply a load to a server, with each caller in its own task or thread, and measure it."""
+async def measure(ask: Ask, load: Load, sample: Callable[[int], Sample]) -> Calls:
+    """Apply a load to a server, with each caller in its own task, and measure it."""
     latencies_s: list[float] = []
     failed = 0
     started_s = time.perf_counter() + load.warm_up_s
@@ -236,9 +225,6 @@ async def measure(ask: Ask, load: Load, sample: Callable[[int], Sample], *, thre
             await asyncio.sleep(max(moment_s - time.perf_counter(), 0))
             calls.append(asyncio.create_task(answered(index, moment_s)))
         await asyncio.gather(*calls)
-    elif threads:
-        with ThreadPoolExecutor(load.callers) as pool:
-            list(pool.map(lambda index: asyncio.run(call(index)), range(load.callers)))
     else:
         await asyncio.gather(*map(call, range(load.callers)))
     return Calls(latencies_s, failed, time.perf_counter() - started_s)
@@ -252,7 +238,7 @@ async def main(way: str, url: str, video_dim: int, text_dim: int) -> None:
             sample = samples(load, video_dim, text_dim)
             for index in range(3):  # opens connections, and warms up each sample type
                 await ask([sample(index)])
-            print(json.dumps(asdict(await measure(ask, load, sample, threads=way == THREADS))), flush=True)
+            print(json.dumps(asdict(await measure(ask, load, sample))), flush=True)
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("--concurrency", type=int, nargs="+", default=[1, 8, 32])
     parser.add_argument("--poisson", type=float, nargs="*", default=[0.3], help="rates, as shares of the bare engine's")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--output", type=Path, default=report.RESULTS)
+    parser.add_argument("--output", type=Path, default=report.OUTPUT)
     arguments = parser.parse_args()
     rows = []
     with TemporaryDirectory(prefix="rfm-perf-") as name:

@@ -18,8 +18,8 @@ from typing import Any
 from rich.console import Console
 
 ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
-PACKAGES = ("torch", "numpy", "tritonclient", "nvidia-pytriton", "fastapi", "uvicorn", "litserve", "mosec")
+OUTPUT = ROOT / "build" / "benchmarks"
+PACKAGES = ("torch", "numpy", "tritonclient", "nvidia-pytriton", "fastapi", "uvicorn", "mosec")
 
 Row = Mapping[str, Any]
 
@@ -46,9 +46,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-def write(
-    name: str, told: str, rows: Sequence[Row], by: Sequence[str], ratio: str = "", folder: Path = RESULTS
-) -> None:
+def write(name: str, told: str, rows: Sequence[Row], by: Sequence[str], ratio: str = "", folder: Path = OUTPUT) -> None:
     """Write NAME.json and NAME.md, and print the latter.
 
     told: a title line, then lines of explanation

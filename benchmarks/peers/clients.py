@@ -46,7 +46,7 @@ def fastapi_npy(session: aiohttp.ClientSession, base_url: str) -> Ask:
 
 
 def by_msgpack(session: aiohttp.ClientSession, url: str) -> Ask:
-    """Return a client of the LitServe or mosec server, with a message for each sample (see ``engines``)."""
+    """Return a client of the mosec server, with a message for each sample (see ``engines``)."""
 
     async def ask_one(sample: Sample) -> float:
         videos = [_video(trajectory) for trajectory in sample.trajectories]

@@ -90,20 +90,6 @@ def test_model_info_shows_a_client_that_it_asks_a_qwen3(gateway: Gateway) -> Non
     )
 
 
-def test_the_table_of_differences_to_the_original_server_shows_none_between_a_server_and_itself(
-    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    import original_differences
-
-    for name, there, here, difference in original_differences.rows(gateway.url, gateway.url):
-        assert there == here, name
-        assert not difference or float(difference) <= TOLERANCE, name
-    (row, *_) = original_differences.rows(gateway.url, None)
-    assert row[1:3] == ("200", "200")
-    assert float(row[3]) <= PROBABILITY
-
-
 NAMED = {str(request): request for request in EVALUATIONS}
 
 
