@@ -11,8 +11,6 @@ import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
-import numpy as np
-import test_live_browser
 import test_viewer_browser
 import test_viewer_dataset_browser
 from selenium.webdriver import Keys
@@ -23,7 +21,6 @@ from gateways import Gateway, poll, running
 from paths import ROOT
 from rfm_client import RewardClient
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
-from rfm_rl import LiveView
 from servers import start_triton
 from shown_datasets import copied
 from toy_world import Task, make_clip
@@ -33,8 +30,6 @@ TASK = Task("red", "bowl")
 FIRST_SEED = 2_000_000  # of clips
 SEEDS = {"success": FIRST_SEED, "dropped": FIRST_SEED + 1}
 FPS = 10
-RUNS = ("policy 5", "policy 6", "policy 7")
-NUM_ENDED = 24  # episodes of each run
 
 
 def score(gateway: Gateway, browser: Browser, folder: Path) -> None:
@@ -62,28 +57,6 @@ def show_dataset(gateway: Gateway, browser: Browser, dataset: Path) -> None:
     browser.picture(IMAGES / "page_dataset.png")
 
 
-def show_episodes(gateway: Gateway, browser: Browser, client: RewardClient) -> None:
-    """Draw the tab of running episodes: three runs whose later episodes succeed more often."""
-    random = np.random.default_rng(0)
-    page = test_live_browser.Page(gateway.url, browser)
-    page.open()
-    with ExitStack() as views:
-        for number, run in enumerate(RUNS):
-            view = views.enter_context(LiveView(gateway.url, name=run))
-            chances = 0.15 * number + np.linspace(0, 0.6, NUM_ENDED)
-            kinds = ["success" if random.random() < chance else "dropped" for chance in chances]
-            videos = [make_clip(kind, TASK, FIRST_SEED + seed).frames for seed, kind in enumerate(kinds)]
-            episodes = client.episodes(NUM_ENDED, TASK.sentence(), live=view)
-            for frames in zip(*videos, strict=True):
-                episodes.add(list(frames))
-            episodes.reset([True] * NUM_ENDED)
-            for frames in [*zip(*reversed(videos), strict=True)][: 15 - 3 * number]:
-                episodes.add(list(frames), [env < 2 for env in range(NUM_ENDED)])
-        browser.until_text("live-told", f"Running: {2 * len(RUNS)}. Ended: {NUM_ENDED * len(RUNS)}.")
-        browser.until(test_viewer_dataset_browser.PICTURES_ARE_THERE)
-        browser.picture(IMAGES / "page_live.png")
-
-
 def main() -> None:
     """Start a server, a gateway and a browser, and draw each tab."""
     with tempfile.TemporaryDirectory(prefix="rfm-pictures-") as name, ExitStack() as stack:
@@ -98,7 +71,6 @@ def main() -> None:
         browser = stack.enter_context(chromium(folder))
         score(gateway, browser, folder)
         show_dataset(gateway, browser, dataset)
-        show_episodes(gateway, browser, client)
 
 
 if __name__ == "__main__":

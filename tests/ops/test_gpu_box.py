@@ -299,7 +299,7 @@ def test_the_page_s_files_need_no_key_and_all_else_does(box: Box) -> None:
             assert stranger.get(f"/{name}").status_code == 200, name
         paths = stranger.get("/openapi.json").json()["paths"]
         assert "/evaluate_batch" in paths
-        for path in {*paths, "/metrics", "/viewer/served", "/viewer/live", "/viewer/datasets"} - {"/health"}:
+        for path in {*paths, "/metrics", "/viewer/served", "/viewer/datasets"} - {"/health"}:
             assert stranger.get(path).status_code == 401, path
 
 

@@ -182,7 +182,7 @@ def test_the_step_in_which_autoreset_resets_begins_an_episode_and_pays_nothing(r
     assert told[1][1] > 1
     assert told[2][1] == 0
     assert told[2][4]["reward_model"]["step"] == 0
-    assert "env_reward" not in told[2][4]["reward_model"]
+    assert np.isnan(told[2][4]["reward_model"]["env_reward"])
     assert recorder.calls[-1] == [([(0, 1, 0)], TASKS[1])]
 
 
