@@ -13,9 +13,9 @@ last step waits, too, and cancels older requests; without ``blocking``, ``await_
 
 ``info["reward_model"]`` has the same keys after a reset and after a step: the returned ``reward`` and the environment's
 own ``env_reward`` (NaN at a reset), ``progress`` and ``success`` of the newest known score (success is NaN if the
-checkpoint does not predict it), its ``step``, its ``lag`` in steps, the steps ``skipped`` in this episode, and the other
-scores that the checkpoint gives unasked (``StepScore.more_scores``). With ``terminate_on_success`` or ``success_bonus``
-it has ``succeeded``.
+checkpoint does not predict it), its ``step``, its ``lag`` in steps, the steps ``skipped`` in this episode, and the
+other scores that the checkpoint gives unasked (``StepScore.more_scores``). With ``terminate_on_success`` or
+``success_bonus`` it has ``succeeded``.
 
 ``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
 frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
