@@ -186,16 +186,6 @@ def test_shaping_of_another_reward_leaves_its_best_policies_as_they_are(
     assert sums == pytest.approx([left - 2 * PROGRESS[0] for left in kept], abs=1e-6)
 
 
-@pytest.mark.parametrize("every", [1, 2, 3])
-def test_a_policy_that_hovers_earns_nothing_by_shaping(judge: Recorder, every: int) -> None:
-    """The discounted sum depends on both ends alone, also with old scores."""
-    asked = options(mode="shaping", gamma=GAMMA, every=every)
-    with opened(DOORS["single"], judge, [CodedEnv(TERMINATES, (LAST,))], asked) as door:
-        rewards = played(door, LAST)[0][0].rewards
-    discounted = sum(GAMMA**t * reward for t, reward in enumerate(rewards))
-    assert discounted == pytest.approx(GAMMA**LAST * PROGRESS[LAST] - PROGRESS[0], abs=1e-6)
-
-
 @pytest.mark.parametrize(("bonus", "steps"), [(0.0, [0, LAST]), (1.0, list(range(LAST + 1)))])
 @at_each_door
 def test_final_scores_only_the_ends_unless_a_success_is_looked_for(

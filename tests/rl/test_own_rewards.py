@@ -230,23 +230,6 @@ def test_statistics_inside_a_vector_that_would_miss_an_end_by_success_are_refuse
         RewardModelVectorWrapper(env, recorder, TASK, options)
 
 
-def test_statistics_outside_a_vector_are_of_the_reward_model_s_rewards() -> None:
-    """CleanRL's scripts count returns in the outermost wrapper, by ``infos["episode"]``."""
-    makers = [lambda: CodedEnv(0, (3,)), lambda: CodedEnv(1, (4,))]
-    with Recorder(server=Varied()) as client:
-        options = RewardOptions(sampling="all", mode="delta")
-        envs = RecordVectorStatistics(RewardModelVectorWrapper(SyncVectorEnv(makers), client, TASK, options))
-        envs.reset()
-        returns, num_ended = np.zeros(2), 0
-        for _ in range(12):
-            _, rewards, terminations, truncations, infos = envs.step(np.zeros(2, int))
-            returns += rewards
-            for index in np.flatnonzero(terminations | truncations).tolist():
-                assert infos["episode"]["r"][index] == pytest.approx(returns[index], abs=1e-5)
-                returns[index], num_ended = 0, num_ended + 1
-    assert num_ended >= 5
-
-
 def test_a_subprocess_gets_the_class_of_a_monitor_that_writes() -> None:
     """A SubprocVecEnv pickles it."""
     assert pickle.loads(pickle.dumps(WritingMonitor)) is WritingMonitor
