@@ -2,7 +2,6 @@
 """Train a policy from pixels in the toy world. Its only reward comes from the served demo checkpoint.
 
     python examples/train_policy.py
-    python examples/train_policy.py --live http://localhost:8100    # a gateway's page shows its episodes
 
 The policy sees the first frame of a scene. It has two colours as parameters. The gripper closes at the columns most
 like the first colour, and opens at the columns most like the second. The cross-entropy method (CEM) tries colours,
@@ -13,7 +12,6 @@ progress of the episode so far. The true state of the world serves only to print
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +21,6 @@ import typer
 
 from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm_client import RewardClient
-from rfm_rl import LiveView
 from toy_world import Task, forward, pick_and_place, random_scene, render, resting
 
 TASK = Task("red", "plate")
@@ -47,9 +44,7 @@ def places(policies: Policies, picture: np.ndarray) -> np.ndarray:
     return (smooth.argmax(axis=2) + 4.5) / picture.shape[1]
 
 
-def rewards(
-    client: RewardClient, live: LiveView | None, policies: Policies, seeds: range
-) -> tuple[np.ndarray, np.ndarray]:
+def rewards(client: RewardClient, policies: Policies, seeds: range) -> tuple[np.ndarray, np.ndarray]:
     """Return each policy's mean reward of a step and share of successful episodes, float64 [P] each."""
     videos, successes = [], []
     for seed in seeds:
@@ -59,7 +54,7 @@ def rewards(
             videos.append(render(episode))
             successes.append(episode.success(TASK)[-1])
     steps = np.stack(videos, axis=1)  # [T, N, H, W, 3]
-    with client.episodes(len(videos), TASK.sentence(), frames=FRAMES, live=live) as episodes:
+    with client.episodes(len(videos), TASK.sentence(), frames=FRAMES) as episodes:
         progress = np.mean([episodes.add(frames).progress for frames in steps], axis=0)
     shape = len(seeds), len(policies)
     return progress.reshape(shape).mean(axis=0), np.reshape(successes, shape).mean(axis=0)
@@ -90,16 +85,14 @@ def main(
     tests: Annotated[int, typer.Option(help="Scenes that training did not see, to tell success.")] = 50,
     seed: Annotated[int, typer.Option(help="Of the policies.")] = 0,
     log: Annotated[Path, typer.Option(help="File for Triton's log.")] = Path("tritonserver.log"),
-    live: Annotated[str | None, typer.Option(help="URL of a gateway, whose page shows the episodes.")] = None,
 ) -> None:
     """Print success rates before and after training."""
     with (
         stopped_by_signals(),
         temporary_server(REPOSITORY, log) as endpoints,
         RewardClient(endpoints.grpc_url) as client,
-        LiveView(live, name="train_policy") if live else nullcontext() as view,
     ):
-        paid = partial(rewards, client, view)
+        paid = partial(rewards, client)
         untrained = any_policies(20, np.random.default_rng(seed + 1))
         trained = train(paid, rounds, population, scenes, seed)
         held_out = range(10**6, 10**6 + tests)

@@ -125,7 +125,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         options: fields of EpisodeOptions. Raises ValueError for contradictory options
         """
         where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
-        steps = Steps(task, EpisodeOptions(**options), env or 0, where)
+        steps = Steps(task, EpisodeOptions(**options), where)
         return AsyncEpisode(AsyncEpisodes(self._steps, self._call, [steps]))
 
     def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> AsyncEpisodes:
@@ -138,7 +138,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         if len(tasks) != num:
             raise InvalidValueError.at("task", f"one for each of {num} episodes", len(tasks))
         each, where = EpisodeOptions(**options), "episodes[{}]" if num > 1 else ""
-        steps = [Steps(sentence, each, env, where.format(env)) for env, sentence in enumerate(tasks)]
+        steps = [Steps(sentence, each, where.format(env)) for env, sentence in enumerate(tasks)]
         return AsyncEpisodes(self._steps, self._call, steps)
 
     async def score_steps(self, asked: Sequence[Asked]) -> list[StepScore]:

@@ -130,7 +130,7 @@ def test_what_is_no_multipart_is_refused(
     assert failure(gateway.post(NPY, content=body, headers={"Content-Type": content_type}), code).startswith(message)
 
 
-@pytest.mark.parametrize("path", ["/evaluate_batch", NPY, "/viewer/score", "/live/reports"])
+@pytest.mark.parametrize("path", ["/evaluate_batch", NPY, "/viewer/score"])
 @pytest.mark.parametrize("content", [b" " * (2**20 + 1), [b" " * 2**19] * 3], ids=["announced", "in chunks"])
 def test_too_large_a_body_is_a_413(gateway: TestClient, path: str, content: Any) -> None:
     is_form = path in (NPY, "/viewer/score")
@@ -198,10 +198,10 @@ KEYS: dict[str, tuple[dict[str, Any], bool]] = {
 }
 EPISODE = "/viewer/datasets/0/episodes/0"
 GUARDED = {
-    "POST": ("/evaluate_batch", NPY, "/viewer/score", "/viewer/compare", "/live/reports"),
+    "POST": ("/evaluate_batch", NPY, "/viewer/score", "/viewer/compare"),
     "GET": (
-        *("/gpu_status", "/model_info", "/metrics", "/viewer/served", "/viewer/live", "/viewer/live/0/frame"),
-        *("/viewer/datasets", "/viewer/datasets/0", EPISODE, f"{EPISODE}/videos/0"),
+        *("/gpu_status", "/model_info", "/metrics", "/viewer/served", "/viewer/datasets", "/viewer/datasets/0"),
+        *(EPISODE, f"{EPISODE}/videos/0"),
     ),
 }
 

@@ -30,8 +30,8 @@ def test_an_open_address_without_a_key_is_warned_of(tmp_path: Path, has_key: boo
     (tmp_path / "key.txt").write_text(f"{KEY}\n")
     options = ("--host", "0.0.0.0", *(["--api-key-file", str(tmp_path / "key.txt")] if has_key else []))
     with running(Endpoints.free(), tmp_path, "rfm", *options) as gateway:
-        assert gateway.get("/viewer/live", headers={"X-API-Key": KEY}).ok
-        assert gateway.get("/viewer/live").ok is not has_key
+        assert gateway.get("/viewer/datasets", headers={"X-API-Key": KEY}).ok
+        assert gateway.get("/viewer/datasets").ok is not has_key
         warning = "]: 0.0.0.0 is no loopback address, and no key is required"
         assert (warning in gateway.log) is not has_key
         assert f"look at rewards in the browser: {gateway.url}/\n" in gateway.log

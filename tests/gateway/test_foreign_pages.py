@@ -7,22 +7,19 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from gateway_requests import FIRST, dumped, failure, progress
 from gateways import TestClient, inside, running
-from rfm_client.episodes import StepScore
 from rfm_client.options import ConfigError
 from rfm_gateway import GatewayConfig
-from rfm_rl import LiveView
 from servers import Endpoints
 from shown_datasets import copied
 
 SAMPLE, KEY, LAB = dumped(progress(FIRST)), "open sesame", "http://lab.example"
 OWN = "http://127.0.0.1"
-GETS = ("/", "/docs", "/openapi.json", "/metrics", "/viewer/live", "/viewer/datasets", "/viewer/main.js")
-POSTS = ("/evaluate_batch", "/evaluate_batch_npy", "/viewer/score", "/viewer/compare", "/live/reports")
+GETS = ("/", "/docs", "/openapi.json", "/metrics", "/viewer/datasets", "/viewer/main.js")
+POSTS = ("/evaluate_batch", "/evaluate_batch_npy", "/viewer/score", "/viewer/compare")
 
 
 @pytest.fixture(scope="module")
@@ -62,19 +59,19 @@ def test_a_name_that_anybody_could_own_gets_nothing_without_a_key(gateway: TestC
 def test_on_other_addresses_names_of_the_local_network_are_answered_too() -> None:
     with inside(host="0.0.0.0", allow_host=("GPU.lab.example", "box.lab.example.")) as client:
         for host in (*HOSTS_OF_LOOPBACK, *ADDRESSES, *HOSTS_OF_NETWORK, "gpu.lab.example:8100", "box.lab.example"):
-            assert client.get("/viewer/live", headers={"Host": host}).status_code == 200, host
+            assert client.get("/viewer/datasets", headers={"Host": host}).status_code == 200, host
         for host in (*FOREIGN_HOSTS, "other.lab.example", ""):
-            told = failure(client.get("/viewer/live", headers={"Host": host}), 421)
+            told = failure(client.get("/viewer/datasets", headers={"Host": host}), 421)
             assert told.startswith(f"host: expected a local name or an IP address, got {host!r}; ")
     with inside(host="robot.lab.example") as client:
-        assert client.get("/viewer/live", headers={"Host": "robot.lab.example:8100"}).status_code == 200
+        assert client.get("/viewer/datasets", headers={"Host": "robot.lab.example:8100"}).status_code == 200
 
 
 def test_with_a_key_every_host_is_answered_and_the_key_alone_opens() -> None:
     with inside(KEY) as client:
         host = {"Host": FOREIGN_HOSTS[0]}
-        assert client.get("/viewer/live", headers=host | {"X-API-Key": KEY}).status_code == 200
-        assert client.get("/viewer/live", headers=host).status_code == 401
+        assert client.get("/viewer/datasets", headers=host | {"X-API-Key": KEY}).status_code == 200
+        assert client.get("/viewer/datasets", headers=host).status_code == 401
 
 
 @pytest.mark.parametrize("name", ["http://robot", "robot:8100", "a b", ""])
@@ -144,12 +141,12 @@ def test_the_page_and_programs_are_answered(gateway: TestClient, headers: dict[s
 
 def test_a_link_elsewhere_opens_the_page_and_a_form_elsewhere_posts_nothing(gateway: TestClient) -> None:
     assert gateway.get("/", headers=A_LINK).status_code == 200
-    assert gateway.post("/live/reports", content=b"", headers=A_LINK).status_code == 403
+    assert gateway.post("/evaluate_batch", content=b"", headers=A_LINK).status_code == 403
 
 
 def test_browsers_that_tell_no_site_embed_pictures_and_videos_of_ours_in_our_page_alone(tmp_path: Path) -> None:
     with inside(dataset=(str(copied("toy_v30_many", tmp_path)),)) as client:
-        for path in ("/", "/health", "/viewer/live", "/viewer/datasets/0/episodes/0/videos/0"):
+        for path in ("/", "/health", "/viewer/datasets", "/viewer/datasets/0/episodes/0/videos/0"):
             headers = client.get(path).headers
             assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
             assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
@@ -165,14 +162,10 @@ def test_an_allowed_origin_may_post(allowed: str) -> None:
         assert (other.status_code == 403) is (allowed != "*")
 
 
-def test_requests_without_a_host_are_of_programs_and_a_refused_report_says_what_to_do(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    with running(Endpoints.free(), tmp_path) as gateway:
-        with socket.create_connection(("127.0.0.1", int(gateway.url.rpartition(":")[2]))) as caller:
-            caller.sendall(b"GET /viewer/live HTTP/1.0\r\n\r\n")
-            assert caller.makefile("rb").readline().split()[1] == b"200"
-        with LiveView(gateway.url, headers={"Host": "robot.lab.example"}) as view:
-            view.episode("stack the cups").add(np.zeros((8, 8, 3), np.uint8), StepScore(0.5, 0.25, False, 0, 3.0))
-    assert "got 421" in caplog.text
-    assert "--allow-host" in caplog.text
+def test_requests_without_a_host_are_of_programs(tmp_path: Path) -> None:
+    with (
+        running(Endpoints.free(), tmp_path) as gateway,
+        socket.create_connection(("127.0.0.1", int(gateway.url.rpartition(":")[2]))) as caller,
+    ):
+        caller.sendall(b"GET /viewer/datasets HTTP/1.0\r\n\r\n")
+        assert caller.makefile("rb").readline().split()[1] == b"200"

@@ -7,30 +7,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 
 from browsers import REBOUND, Browser
 from gateway_requests import Json
-from gateways import Gateway, poll, running
-from rfm_client.episodes import StepScore
-from rfm_rl import LiveView
+from gateways import Gateway, running
 from servers import Endpoints, folder_server
 from shown_datasets import copied
 
 pytestmark = pytest.mark.slow
 
-DATASETS, VIDEO, LIVE = "/viewer/datasets", "/viewer/datasets/0/episodes/0/videos/0", "/viewer/live"
-REPORT = '{"episodes": [], "frames": {}}'
+DATASETS, VIDEO = "/viewer/datasets", "/viewer/datasets/0/episodes/0/videos/0"
+PAIR = "{}"
 TRY = """
-const [base, paths, video, report, done] = arguments;
+const [base, paths, video, pair, done] = arguments;
 const told = async (request) => {
   try {
     const response = await request;
     return response.type === "opaque" ? null : [response.status, await response.text()];
   } catch { return null; }
 };
-const post = (path, options) => told(fetch(base + path, { method: "POST", body: report, ...options }));
+const post = (path, options) => told(fetch(base + path, { method: "POST", body: pair, ...options }));
 const shown = (element) => new Promise((resolve) => {
   element.onloadedmetadata = () => resolve(true);
   element.onerror = () => resolve(false);
@@ -39,9 +36,9 @@ const shown = (element) => new Promise((resolve) => {
 (async () => done({
   read: await Promise.all(paths.map((path) => told(fetch(base + path)))),
   shown: await shown(document.createElement("video")),
-  json: await post("/live/reports", { headers: { "Content-Type": "application/json" } }),
-  plain: await post("/live/reports", {}),
-  unread: await post("/live/reports", { mode: "no-cors" }),
+  json: await post("/viewer/compare", { headers: { "Content-Type": "application/json" } }),
+  plain: await post("/viewer/compare", {}),
+  unread: await post("/viewer/compare", { mode: "no-cors" }),
   scored: await post("/evaluate_batch", { mode: "no-cors" }),
 }))();
 """
@@ -74,7 +71,7 @@ def loud_browser(browser: Browser) -> Iterator[Browser]:
 
 def tried(browser: Browser, base: str) -> Json:
     """Return the results of a script in the open page."""
-    return dict(browser.driver.execute_async_script(TRY, base, [DATASETS, VIDEO, LIVE, "/metrics"], VIDEO, REPORT))
+    return dict(browser.driver.execute_async_script(TRY, base, [DATASETS, VIDEO, "/metrics"], VIDEO, PAIR))
 
 
 def passed_on(gateway: Gateway) -> float:
@@ -88,9 +85,6 @@ def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
     gateway: Gateway, loud_browser: Browser, other_port: int
 ) -> None:
     browser = loud_browser
-    with LiveView(gateway.url) as view:
-        view.episode("stack the cups").add(np.zeros((8, 8, 3), np.uint8), StepScore(0.5, 0.25, False, 0, 3.0))
-    poll(lambda: bool(gateway.get(LIVE).json()["episodes"]))
     port, answered = int(gateway.url.rpartition(":")[2]), passed_on(gateway)
     asked: Json = {}
     for host in ("127.0.0.1", REBOUND):
@@ -101,17 +95,17 @@ def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
     rebound = tried(browser, "")
     for found in asked.values():
         assert found == dict.fromkeys(("json", "plain", "unread", "scored"), None) | {
-            "read": [None] * 4,
+            "read": [None] * 3,
             "shown": False,
         }
     assert rebound.pop("shown") is False
     answers = [*rebound.pop("read"), *rebound.values()]
-    assert [status for status, _ in answers] == [421] * 8
+    assert [status for status, _ in answers] == [421] * 7
     assert not [text for _, text in answers if "expected localhost or an IP address" not in text]
     assert passed_on(gateway) == answered + 3  # reads of the metrics
 
     browser.driver.get(f"{gateway.url}/")
     own = tried(browser, "")
-    assert [status for status, _ in own["read"]] == [200] * 4
+    assert [status for status, _ in own["read"]] == [200] * 3
     assert own["shown"]
-    assert [own[name][0] for name in ("json", "plain", "unread", "scored")] == [204, 204, 204, 422]
+    assert [own[name][0] for name in ("json", "plain", "unread", "scored")] == [422] * 4

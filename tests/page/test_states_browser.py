@@ -69,7 +69,7 @@ def test_a_page_opened_before_triton_goes_on_when_triton_is_there(
         without_violations(browser)
         browser.run("window.isFirst = true")
 
-        browser["live-tab"].click()  # which asks for news, and finds that the server is away
+        browser["dataset-tab"].click()  # the page asks on, and finds that the server is away
     assert wait_for_state(browser, "away").startswith("The server does not answer")
     assert "connection refused" not in browser["away"].text.lower()
     without_violations(browser)

@@ -24,11 +24,9 @@ from labelling import BrightnessScorer
 from rfm_client import RewardClient
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset, summarise
 from rfm_labels.datasets import LeRobotDataset
-from rfm_rl import LiveView
 from servers import Endpoints
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, large
 from tolerances import SHOWN, TOLERANCE
-from toy_world import Task, make_clip
 from viewer_requests import run_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -36,16 +34,12 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 KEY = "open sesame"
 OTHER = "brightness"  # the second reward of the first dataset
 NUM_LARGE = 10_000
-CLIP_TASK, CLIP_SEED = Task("red", "bowl"), 2_000_000
 DEMO, BRIGHT, PLAIN, *CODED = range(3 + len(CODINGS))  # labelled by the demo, by brightness, not; coded otherwise
 VIDEOS = "#episode-videos video"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
 BEYOND = """
 return [document.documentElement, ...document.querySelectorAll(".work")].map((each) => each.scrollWidth - each.clientWidth);
 """  # pixels by which the page and each tab overflow to the right
-PICTURES_ARE_THERE = """[...document.querySelectorAll("#live-episodes article")]
-  .filter((card) => card.getBoundingClientRect().top < innerHeight)
-  .every((card) => card.querySelector("img").naturalWidth)"""  # the page fetches only visible pictures
 ARE_THERE = f"[...document.querySelectorAll('{VIDEOS}')].every((video) => !video.seeking && video.readyState >= 2)"
 
 
@@ -567,23 +561,7 @@ def test_episodes_without_labels_can_be_watched_and_scored(page: Page) -> None:
     page.score_episode()
 
 
-@pytest.fixture
-def running_episodes(url: str, demo_server: Endpoints) -> Iterator[None]:
-    """Episodes of four environments; three still run."""
-    kinds = ("success", "dropped", "rewound", "success")
-    clips = [make_clip(kind, CLIP_TASK, CLIP_SEED + n).frames for n, kind in enumerate(kinds)]
-    with RewardClient(demo_server.grpc_url) as client, LiveView(url, name="policy 7") as view:
-        episodes = client.episodes(len(clips), CLIP_TASK.sentence(), live=view)
-        for frames in zip(*clips, strict=True):
-            episodes.add(list(frames))
-        episodes.reset([True, False, False, False])
-        for t in range(9):
-            episodes.add([frames[t] for frames in clips], [True, False, False, False])
-        yield
-
-
 @pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
-@pytest.mark.usefixtures("running_episodes")
 def test_no_tab_is_wider_than_the_window_in_either_theme(page: Page, size: tuple[int, int]) -> None:
     """Leaves a picture of each tab among the downloads."""
 
@@ -593,7 +571,7 @@ def test_no_tab_is_wider_than_the_window_in_either_theme(page: Page, size: tuple
             with page.browser.theme(theme):
                 page.browser.draw()
                 assert page.browser.driver.save_screenshot(str(file))
-                assert page.browser.run(BEYOND) == [0] * 4, (name, theme)
+                assert page.browser.run(BEYOND) == [0] * 3, (name, theme)
 
     with page.browser.window(*size):
         page.browser.run("localStorage.clear()")
@@ -612,9 +590,6 @@ def test_no_tab_is_wider_than_the_window_in_either_theme(page: Page, size: tuple
         page.at_rest(1)
         page.move_to(1.2)
         fits("episode")
-        page.browser["live-tab"].click()
-        page.browser.until(f"document.querySelector('#live-episodes article') && {PICTURES_ARE_THERE}")
-        fits("live")
 
 
 def test_axe_finds_nothing_in_either_theme(page: Page) -> None:

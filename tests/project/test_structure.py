@@ -55,7 +55,7 @@ PUBLIC = {  # modules; each lists the names in __all__
     "rfm_client": {"", "command_line", "episodes", "frames", "options", "plot", "recording", "serving"},
     "rfm_gateway": {"", "mounting"},
     "rfm_labels": {"", "commands", "datasets"},
-    "rfm_rl": {"", "rlinf", "robovalue", "sb3"},
+    "rfm_rl": {"", "rlinf", "sb3"},
     "rfm_export": {""},
     "rfm": {"config", "engine", "families"},
 }

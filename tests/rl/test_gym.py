@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rewards for a Gymnasium environment, with and without waiting for answers."""
+"""Rewards for a Gymnasium environment, with and without waiting for answers of a real server."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from gymnasium.wrappers import RecordEpisodeStatistics
+from gymnasium.wrappers import Autoreset, RecordEpisodeStatistics, TimeLimit
 
+from coded_env import CodedEnv, Recorder
 from environments import (
     MAX_FRAMES,
     MODEL,
@@ -27,9 +29,15 @@ from environments import (
     scores,
     two_cameras,
 )
-from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError
-from rfm_rl import RewardModelWrapper, RewardOptions, SuccessRule
+from rfm_client import InvalidSampleError, RewardClient
+from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 from servers import Served
+
+TASKS = ["task 0", "task 1"]
+
+
+def options(source: Any, **more: Any) -> RewardOptions:
+    return RewardOptions(sampling="all", frames_from=source, **more)
 
 
 @pytest.mark.parametrize(
@@ -62,7 +70,7 @@ def test_each_step_is_paid_by_the_scores_of_its_episode(client: RewardClient, op
             told = info["reward_model"]
             assert_close([told["progress"], told["success"]], [answers[known].progress[-1], answers[known].success[-1]])
             assert (told["step"], told["lag"], told["skipped"]) == (known, step - known, 0)
-            assert told.get("env_reward") == (1.0 if step else None)
+            np.testing.assert_equal(told["env_reward"], 1.0 if step else np.nan)
 
 
 def test_an_episode_ends_where_most_of_the_last_frames_succeed(client: RewardClient) -> None:
@@ -76,13 +84,6 @@ def test_an_episode_ends_where_most_of_the_last_frames_succeed(client: RewardCli
     env = RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(terminate_on_success=SuccessRule(threshold, 3)))
     rewards, _ = play(env)
     assert len(rewards) == expected < len(video) - 1
-
-
-@pytest.mark.parametrize(("threshold", "every", "steps"), [(0.0, 1, 1), (0.0, 4, 4), (1.0, 1, 8)])
-def test_only_a_scored_step_can_succeed(client: RewardClient, threshold: float, every: int, steps: int) -> None:
-    options = RewardOptions(every=every, terminate_on_success=SuccessRule(threshold))
-    rewards, _ = play(RewardModelWrapper(cart_pole(), client, TASK, options))
-    assert len(rewards) == steps
 
 
 def test_gymnasium_s_own_check_passes_and_close_closes_only_a_client_that_it_made(served: Served) -> None:
@@ -125,50 +126,6 @@ def test_several_cameras_are_scored_apart_and_fused(client: RewardClient, fuse: 
     expected = getattr(np, fuse)(of_cameras, axis=0)
     assert info["reward_model"]["step"] == steps[-1]  # the last is waited for
     assert_close(rewards if blocking else rewards[-1], expected if blocking else expected[-1])
-
-
-REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
-    "mode": ({"mode": "relative"}, "^mode: expected one of absolute, delta, shaping, final, got 'relative'$"),
-    "cameras": ({"cameras": ["front"]}, r"^cameras: expected keys of the observation \[\], got \['front'\]$"),
-    "fuse": ({"fuse": "sum"}, "^fuse: expected one of mean, min, max, got 'sum'$"),
-    "orient": ({"orient": "upside-down"}, "^orient: expected one of none, rotate180, .*, got 'upside-down'$"),
-    "orient of a camera": (
-        {"orient": {"front": "rotate180"}},
-        "^orient: expected one for all frames, .*, got 'front'$",
-    ),
-    "channels": ({"channels": "gbr"}, "^channels: expected one of rgb, bgr, got 'gbr'$"),
-    "channels of a camera": (
-        {"channels": {"front": "bgr"}},
-        "^channels: expected one for all frames, .*, got 'front'$",
-    ),
-    "frames_from": ({"frames_from": "pixels"}, r"^frames_from: expected a key of the observation \[\], got 'pixels'$"),
-    "render_mode": ({}, r"^render_mode: expected 'rgb_array', .* got None$"),
-}
-
-
-@pytest.mark.parametrize(("options", "message"), REFUSED_OPTIONS.values(), ids=REFUSED_OPTIONS)
-def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], message: str) -> None:
-    env = cart_pole() if options else gym.make("CartPole-v1")
-    with RewardClient("grpc://127.0.0.1:1") as client, pytest.raises(ValueError, match=message):
-        RewardModelWrapper(env, client, TASK, RewardOptions(**options))
-
-
-REFUSED_FRAMES: dict[str, tuple[dict[str, Any], str]] = {
-    "none": ({"frames_from": lambda seen: seen["state"]}, r"^frame: expected uint8 \[H, W, 3\], got float32 \[4\]$"),
-    "a camera is missing": (
-        {"frames_from": two_cameras, "cameras": ["front", "top"]},
-        r"^frames: expected a frame of each of the cameras \['front', 'top'\], got \['front', 'wrist', 'state'\]$",
-    ),
-    "no cameras": ({"frames_from": "pixels", "cameras": ["front"]}, r"the cameras \['front'\], got ndarray$"),
-}
-
-
-@pytest.mark.parametrize(("options", "message"), REFUSED_FRAMES.values(), ids=REFUSED_FRAMES)
-def test_an_observation_without_the_frame_is_refused(options: dict[str, Any], message: str) -> None:
-    with RewardClient("grpc://127.0.0.1:1") as client:
-        env = RewardModelWrapper(cart_pole_with_pixels(), client, TASK, RewardOptions(**options))
-        with pytest.raises(InvalidSampleError, match=message):
-            env.reset()
 
 
 # Steps that do not wait: the test lets answers come when it wants.
@@ -261,19 +218,6 @@ def test_an_episode_ends_at_the_step_at_which_success_is_known_and_stays_a_succe
     assert_close(reward, progress(client, camera.videos[0], [later], None))
 
 
-def test_after_an_error_delta_pays_what_was_missed(client: RewardClient, late: LateClient) -> None:
-    camera = Camera(cart_pole())
-    env = RewardModelWrapper(camera, late, TASK, RewardOptions(sampling="all", mode="delta"))
-    env.reset(seed=0)
-    late.hold(1)
-    late.connection.held[2].set_exception(ServerUnavailableError("the server is restarting"))
-    with pytest.raises(ServerUnavailableError, match=r"^the server is restarting \(request \w+-\d+\)$"):
-        env.step(PUSH_RIGHT)
-    reward = env.step(PUSH_RIGHT)[1]
-    first, _, newest = progress(client, camera.videos[0], range(3), None)
-    assert_close(reward, newest - first)
-
-
 def test_an_error_comes_out_at_the_latest_where_the_episode_ends(client: RewardClient) -> None:
     steps = MAX_FRAMES + 4
     options = RewardOptions(sampling="all", blocking=False, max_pending=steps)
@@ -282,3 +226,78 @@ def test_an_error_comes_out_at_the_latest_where_the_episode_ends(client: RewardC
     with pytest.raises(InvalidSampleError, match=f"^num_frames: expected at most {MAX_FRAMES} .*, got"):
         for step in range(steps):
             env.step(step % 2)
+
+
+def test_a_reset_while_a_score_is_open_warns(late: LateClient, caplog: pytest.LogCaptureFixture) -> None:
+    env = RewardModelWrapper(cart_pole(), late, TASK, RewardOptions(sampling="all", blocking=False))
+    env.reset(seed=0)
+    late.hold(1, 2)
+    env.step(0)
+    env.step(0)
+    env.reset(seed=0)
+    env.close()
+    (record,) = caplog.records
+    assert record.message.startswith(
+        "reset: expected the end of the episode before it, got one after 2 steps, whose reward"
+    )
+
+
+# What only a wrapper of one environment has to do.
+
+
+def test_the_step_in_which_autoreset_resets_begins_an_episode_and_pays_nothing(recorder: Recorder) -> None:
+    coded = CodedEnv(0, (2,))
+    tasks = iter(TASKS)
+    env = RewardModelWrapper(
+        TimeLimit(Autoreset(coded), 9), recorder, lambda info: next(tasks), options("pixels", add_to_env_reward=True)
+    )
+    env.reset()
+    told = [env.step(0) for _ in range(3)]
+    assert [terminated for _, _, terminated, _, _ in told] == [False, True, False]
+    assert told[1][1] > 1
+    assert told[2][1] == 0
+    assert told[2][4]["reward_model"]["step"] == 0
+    assert np.isnan(told[2][4]["reward_model"]["env_reward"])
+    assert recorder.calls[-1] == [([(0, 1, 0)], TASKS[1])]
+
+
+@pytest.mark.parametrize("rule", [None, SuccessRule(threshold=0.0)], ids=["truncated", "succeeded"])
+def test_a_step_after_an_end_that_an_autoreset_below_does_not_learn_of_is_refused(
+    recorder: Recorder, rule: SuccessRule | None
+) -> None:
+    coded = CodedEnv()
+    inside: gym.Env[Any, Any] = Autoreset(coded) if rule else TimeLimit(Autoreset(coded), 1)
+    env = RewardModelWrapper(inside, recorder, TASKS[0], options("pixels", terminate_on_success=rule))
+    env.reset()
+    assert any(env.step(0)[2:4])
+    for _ in range(2):
+        with pytest.raises(ResetNeeded, match=r"^step: expected a reset, since the episode has ended, .*Autoreset"):
+            env.step(0)
+    assert coded.code == (0, 0, 1)  # it was not stepped
+    env.reset()
+    assert recorder.calls[-1] == [([(0, 1, 0)], TASKS[0])]
+
+
+def test_an_environment_that_resets_in_its_last_step_is_refused(recorder: Recorder) -> None:
+    class Resetting(CodedEnv):
+        def step(self, action: Any) -> Any:
+            observation, reward, terminated, truncated, info = super().step(action)
+            if terminated:
+                return self.reset()[0], reward, terminated, truncated, {"final_observation": observation}
+            return observation, reward, terminated, truncated, info
+
+    env = RewardModelWrapper(Resetting(0, (1,)), recorder, TASKS[0], options("pixels"))
+    env.reset()
+    with pytest.raises(InvalidSampleError, match=r"^info: expected none of .*, got final_observation; .*Autoreset"):
+        env.step(0)
+    with pytest.raises(ResetNeeded):
+        env.step(0)
+    assert len(recorder.calls) == 1
+
+
+@pytest.mark.parametrize("wrapper", [RewardModelWrapper, RewardModelVectorWrapper])
+def test_another_kind_of_vector_is_refused(recorder: Recorder, wrapper: Any) -> None:
+    with pytest.raises(
+        TypeError, match=r"^env: expected a gymnasium \w+, got .*object; .*wrap each environment in Rew"
+    ):
+        wrapper(object(), recorder, TASKS[0])

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Rewards for vectors of environments."""
+"""Rewards for vectors of environments, also with torch tensors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -11,8 +12,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import batch_space
 
+from coded_env import SIZE_PX, CodedEnv, Recorder
 from environments import MODEL, TASK, LateClient, assert_close, cart_pole, cart_pole_with_pixels, progress, two_cameras
 from rfm_client import InvalidSampleError, RewardClient
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
@@ -20,6 +24,13 @@ from servers import Served
 from tolerances import TOLERANCE
 
 NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
+TASKS = ["task 0", "task 1"]
+LENGTHS = (3,), (4, 1, 2)  # steps of the episodes by environment, in turn
+ACTIONS = np.zeros(2, int)
+
+
+def options(**more: Any) -> RewardOptions:
+    return RewardOptions(sampling="all", **{"frames_from": "pixels", **more})
 
 
 def vector_env(env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], mode: AutoresetMode) -> SyncVectorEnv:
@@ -54,21 +65,15 @@ def arrays(told: Any, where: str = "") -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
-@pytest.mark.parametrize(
-    ("reward_mode", "cameras"), [("absolute", ("front", "wrist")), ("delta", ())], ids=["two cameras", "one camera"]
-)
-def test_a_vector_is_paid_as_its_environments_would_be(
-    client: RewardClient, mode: AutoresetMode, reward_mode: Any, cameras: tuple[str, ...]
-) -> None:
-    source: Any = two_cameras if cameras else "pixels"
-    options = RewardOptions(mode=reward_mode, every=2, frames_from=source, cameras=cameras, fuse="min")
+def test_a_vector_is_paid_as_its_environments_would_be(client: RewardClient, mode: AutoresetMode) -> None:
+    options = RewardOptions(mode="delta", every=2, frames_from=two_cameras, cameras=("front", "wrist"), fuse="min")
     tasks = [TASK, "let the pole fall"]
     singles = [
         partial(lambda task: RewardModelWrapper(cart_pole_with_pixels(), client, task, options), task) for task in tasks
     ]
     vector = RewardModelVectorWrapper(vector_env([cart_pole_with_pixels] * 2, mode), client, tasks, options)
     left, right = arrays(roll(vector, mode)), arrays(roll(vector_env(singles, mode), mode))
-    torch.testing.assert_close(left, right, rtol=0, atol=TOLERANCE)
+    torch.testing.assert_close(left, right, rtol=0, atol=TOLERANCE, equal_nan=True)
 
 
 def test_a_reset_of_a_vector_takes_back_what_is_open_about_what_it_resets(late: LateClient) -> None:
@@ -83,25 +88,8 @@ def test_a_reset_of_a_vector_takes_back_what_is_open_about_what_it_resets(late: 
     assert [answer.cancelled() for answer in late.submitted] == [True, True]
 
 
-def test_success_ends_an_episode_of_a_vector_that_the_caller_resets(client: RewardClient) -> None:
-    options = RewardOptions(every=2, terminate_on_success=SuccessRule(threshold=0.0))
-    env = RewardModelVectorWrapper(vector_env([cart_pole] * 2, DISABLED), client, TASK, options)
-    env.reset(seed=0)
-    actions = np.array([0, 1])
-    assert [env.step(actions)[2].tolist() for _ in range(2)] == [[False, False], [True, True]]
-    infos = env.reset(options={"reset_mask": np.array([True, False])})[1]
-    assert infos["reward_model"]["_progress"].tolist() == [True, False]
-    with pytest.raises(gym.error.ResetNeeded, match=r"^step: expected a reset of the environments \[1\], since their"):
-        env.step(actions)
-    env.reset(options={"reset_mask": np.array([False, True])})
-    assert env.step(actions)[2].tolist() == [False, False]
-    told = env.step(actions)
-    assert told[2].tolist() == [True, True]
-    assert told[4]["reward_model"]["step"].tolist() == [2, 2]
-
-
-def test_a_mask_of_a_reset_may_be_a_list(client: RewardClient) -> None:
-    env = RewardModelVectorWrapper(vector_env([cart_pole] * 2, DISABLED), client, TASK)
+def test_a_mask_of_a_reset_may_be_a_list(recorder: Recorder) -> None:
+    env = RewardModelVectorWrapper(vector_env([CodedEnv] * 2, DISABLED), recorder, TASK, options())
     env.reset(seed=0)
     given = {"reset_mask": [True, False]}
     infos = env.reset(options=given)[1]
@@ -111,37 +99,7 @@ def test_a_mask_of_a_reset_may_be_a_list(client: RewardClient) -> None:
         env.reset(options={"reset_mask": [0]})
 
 
-REFUSED_VECTORS: dict[str, tuple[AutoresetMode, Any, dict[str, Any], str]] = {
-    "tasks": (DISABLED, [TASK] * 3, {}, "^task: expected one for each of the 2 environments, got 3$"),
-    "rendered, SAME_STEP": (
-        SAME_STEP,
-        TASK,
-        {},
-        r"^autoreset_mode: expected NEXT_STEP or DISABLED with frames from render\(\), .* got SAME_STEP; wrap each",
-    ),
-    "success, NEXT_STEP": (
-        NEXT_STEP,
-        TASK,
-        {"terminate_on_success": SuccessRule()},
-        "^autoreset_mode: expected DISABLED with terminate_on_success, got NEXT_STEP; wrap each environment",
-    ),
-}
-
-
-@pytest.mark.parametrize(("mode", "task", "options", "message"), REFUSED_VECTORS.values(), ids=REFUSED_VECTORS)
-def test_what_cannot_be_right_in_a_vector_is_refused(
-    mode: AutoresetMode, task: Any, options: dict[str, Any], message: str
-) -> None:
-    with RewardClient("grpc://127.0.0.1:1") as client, pytest.raises(ValueError, match=message):
-        RewardModelVectorWrapper(vector_env([cart_pole] * 2, mode), client, task, RewardOptions(**options))
-
-
-def test_an_error_tells_which_environment_of_the_vector_it_is_about(client: RewardClient) -> None:
-    env = RewardModelVectorWrapper(vector_env([cart_pole] * 2, DISABLED), client, [TASK, "lift " * 50])
-    with pytest.raises(InvalidSampleError, match=r"^envs\[1\]\.task: expected at most 32 tokens"):
-        env.reset()
-
-
+@pytest.mark.slow
 def test_wrapped_environments_work_in_processes_of_their_own(served: Served, client: RewardClient) -> None:
     connect = partial(RewardClient, served.url("grpc"), model=MODEL)
 
@@ -158,3 +116,178 @@ def test_wrapped_environments_work_in_processes_of_their_own(served: Served, cli
             video.append(frame)
     env.close()
     assert_close(rewards, [progress(client, video, [2], max_frames=4)[0] for video in videos])
+
+
+def test_a_vector_that_does_not_tell_the_last_frame_is_refused(recorder: Recorder) -> None:
+    class Silent(SyncVectorEnv):
+        def step(self, actions: Any) -> Any:
+            *told, _ = super().step(actions)
+            return *told, {}
+
+    env = RewardModelVectorWrapper(Silent([CodedEnv] * 2, autoreset_mode=SAME_STEP), recorder, TASKS, options())
+    env.reset(seed=0)
+    for _ in range(2):
+        env.step(ACTIONS)
+    with pytest.raises(
+        InvalidSampleError,
+        match=r"^infos: expected final_obs of the environments \[0, 1\], .*NEXT_STEP, or .*auto_reset=True$",
+    ):
+        env.step(ACTIONS)
+    with pytest.raises(
+        ResetNeeded, match=r"^step: expected a reset of the environments \[0, 1\], since an earlier call failed"
+    ):
+        env.step(ACTIONS)
+
+
+@pytest.mark.slow
+def test_a_reset_that_workers_would_do_twice_is_refused(recorder: Recorder) -> None:
+    makers = [partial(CodedEnv, number, (1,)) for number in range(2)]
+    workers = AsyncVectorEnv(makers, autoreset_mode=NEXT_STEP, shared_memory=False, context="spawn")
+    with closing(RewardModelVectorWrapper(workers, recorder, TASKS, options())) as env:
+        env.reset()
+        env.step(ACTIONS)
+        with pytest.raises(ValueError, match=r"^reset: expected none .* environments \[0, 1\], .*shared_memory=True$"):
+            env.reset()
+        env.step(ACTIONS)
+        env.reset()
+        env.step(ACTIONS)
+    assert recorder.calls[-1] == [([(number, 2, 0), (number, 2, 1)], TASKS[number]) for number in range(2)]
+
+
+# Vectors of torch tensors, and batches of environments in a single environment.
+
+
+class OnDevice(torch.Tensor):
+    """A tensor as if on a GPU: numpy cannot read it."""
+
+    def __array__(self, *_args: Any, **_options: Any) -> Any:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu()")
+
+    def numpy(self, **_options: Any) -> Any:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu()")
+
+    def cpu(self, *_args: Any) -> torch.Tensor:
+        return self.as_subclass(torch.Tensor)
+
+
+def on_device(array: Any) -> OnDevice:
+    return torch.tensor(np.asarray(array)).as_subclass(OnDevice)
+
+
+class TensorVector(SyncVectorEnv):
+    """Returns tensors, with SAME_STEP as ManiSkillVectorEnv does, and integers for terminations."""
+
+    def __init__(self, mode: AutoresetMode) -> None:
+        super().__init__([partial(CodedEnv, *each) for each in enumerate(LENGTHS)], autoreset_mode=mode)
+        self.render_mode = "rgb_array"
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        if self.metadata["autoreset_mode"] is SAME_STEP:
+            options = None  # which it does not read
+        observations, infos = super().reset(seed=seed, options=options)
+        return {"pixels": on_device(observations["pixels"])}, infos
+
+    def step(self, actions: Any) -> Any:
+        assert isinstance(actions, torch.Tensor)
+        observations, rewards, terminations, truncations, infos = super().step(actions.cpu().numpy())
+        final = infos.pop("final_obs", None)
+        if final is not None:
+            shown = [observations["pixels"][n] if each is None else each["pixels"] for n, each in enumerate(final)]
+            infos["final_observation"] = {"pixels": on_device(np.stack(shown))}
+            infos["_final_observation"] = on_device(infos.pop("_final_obs"))
+        told = {"pixels": on_device(observations["pixels"])}, on_device(rewards > 0)  # as a sparse reward of ManiSkill
+        return *told, on_device(terminations.astype(int)), on_device(truncations), infos
+
+    def render(self) -> Any:
+        return on_device(super().render())
+
+
+def rolled(env: Any, mode: AutoresetMode, actions: Any) -> list[tuple[Any, ...]]:
+    env.reset()
+    told = []
+    for _ in range(9):
+        told.append(env.step(actions))
+        ended = np.flatnonzero([bool(end) for end in told[-1][2] | told[-1][3]])
+        if ended.size and mode is DISABLED:
+            env.reset(options={"reset_mask": [number in ended for number in range(2)]})
+    return told
+
+
+SHOWN = [(NEXT_STEP, None), (SAME_STEP, "pixels"), (DISABLED, "pixels")]
+
+
+@pytest.mark.parametrize(("mode", "source"), SHOWN)
+def test_tensors_are_paid_as_arrays_would_be(mode: AutoresetMode, source: str | None) -> None:
+    rewarded = options(frames_from=source, mode="delta", add_to_env_reward=True)
+    arrays = SyncVectorEnv([partial(CodedEnv, *each) for each in enumerate(LENGTHS)], autoreset_mode=mode)
+    with Recorder() as left, Recorder() as right:
+        expected = rolled(RewardModelVectorWrapper(arrays, left, TASKS, rewarded), mode, ACTIONS)
+        env = RewardModelVectorWrapper(TensorVector(mode), right, TASKS, rewarded)
+        told = rolled(env, mode, on_device([0, 0]))
+    assert right.calls == left.calls
+    for step, wanted in zip(told, expected, strict=True):
+        assert [type(each) for each in step[1:4]] == [OnDevice] * 3
+        assert [each.dtype for each in step[1:4]] == [torch.float32, torch.bool, torch.bool]
+        for each, array in zip(step[1:4], wanted[1:4], strict=True):
+            np.testing.assert_allclose(each.cpu().numpy(), array, atol=1e-6)
+        of_model, wanted_of_model = step[4].get("final_info", step[4]), wanted[4].get("final_info", wanted[4])
+        np.testing.assert_array_equal(of_model["reward_model"]["progress"], wanted_of_model["reward_model"]["progress"])
+
+
+def test_a_success_ends_an_episode_of_a_tensor_vector(recorder: Recorder) -> None:
+    rewarded = options(terminate_on_success=SuccessRule(threshold=0.0))
+    env = RewardModelVectorWrapper(TensorVector(DISABLED), recorder, TASKS, rewarded)
+    env.reset()
+    terminations = env.step(on_device([0, 0]))[2]
+    assert isinstance(terminations, OnDevice)
+    assert terminations.tolist() == [True, True]
+
+
+def test_a_partial_reset_that_a_vector_does_not_read_is_refused(recorder: Recorder) -> None:
+    env = RewardModelVectorWrapper(TensorVector(SAME_STEP), recorder, TASKS, options())
+    env.reset()
+    with pytest.raises(ValueError, match=r"^options: expected a reset of all environments, got env_idx; ManiSkill"):
+        env.reset(options={"env_idx": torch.tensor([0])})
+    env.step(on_device([0, 0]))
+    with pytest.raises(ValueError, match=r"^reset_mask: expected a vector that takes it .*; reset all environments$"):
+        env.reset(options={"reset_mask": [True, False]})
+    with pytest.raises(ResetNeeded):
+        env.step(on_device([0, 0]))
+    env.reset()
+    env.step(on_device([0, 0]))
+
+
+class Batch(gym.Env[Any, Any]):
+    """A batch of environments in a single environment, as in ManiSkill and Isaac Lab."""
+
+    single_observation_space = gym.spaces.Dict({"pixels": gym.spaces.Box(0, 255, (SIZE_PX, SIZE_PX, 3), np.uint8)})
+
+    def __init__(self, num_envs: int) -> None:
+        self.num_envs, self.render_mode = num_envs, "rgb_array"
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = gym.spaces.Discrete(2)
+
+
+class Unbatched(gym.Wrapper[Any, Any, Any, Any]):
+    """A batch's only environment, as in ManiSkill's CPUGymWrapper."""
+
+    def __init__(self, env: Batch) -> None:
+        super().__init__(env)
+        self.observation_space = env.single_observation_space
+
+
+@pytest.mark.parametrize("wrapper", [RewardModelWrapper, RewardModelVectorWrapper])
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_a_batch_of_environments_in_one_is_refused_with_the_remedy(
+    recorder: Recorder, wrapper: Any, num_envs: int
+) -> None:
+    message = (
+        r"^env: expected a gymnasium \w+, got an Env that is a batch .*\.Batch; ManiSkill: .*Isaac Lab .*episodes\("
+    )
+    with pytest.raises(TypeError, match=message):
+        wrapper(gym.wrappers.TimeLimit(Batch(num_envs), 5), recorder, TASKS[0])
+
+
+def test_the_only_environment_of_a_batch_is_taken(recorder: Recorder) -> None:
+    only = gym.wrappers.FlattenObservation(Unbatched(Batch(1)))
+    assert RewardModelWrapper(only, recorder, TASKS[0]).unwrapped.num_envs == 1  # type: ignore[attr-defined]

@@ -40,7 +40,7 @@ from rfm_client import (
     RewardClient,
     Trajectory,
 )
-from rfm_rl import LiveView, RewardModelWrapper, RewardOptions
+from rfm_rl import RewardModelWrapper, RewardOptions
 from servers import Endpoints, start_triton
 from transports import Connection
 from viewer_requests import SCORE, curve_of, events, post
@@ -546,16 +546,6 @@ def test_tables_pictures_and_the_page_show_remaining_seconds(
         assert not np.allclose(described["remaining_s"], seconds, rtol=1e-3)
         Select(page["model"]).select_by_visible_text("robo")
         assert not page["robot"].is_displayed()
-        page["live-tab"].click()
-        frame = np.random.default_rng(1).integers(0, 256, (48, 80, 3), np.uint8)
-        with asked.client("rynn") as client, LiveView(gateway.url, name="run") as view:
-            episode = client.episode(TASK, score="remaining_s", live=view)
-            left_s = f"{episode.add(frame).more_scores['remaining_s']:.1f} s"
-        card = "[...document.querySelectorAll('.live dl div')].map((each) => each.textContent)"
-        page.until(f"{card}.includes('Time remaining{left_s}')")
-        poll(lambda: page.cells("#live-runs tr")[0][5] == left_s.removesuffix(" s"))
-        assert page["live-leading"].text == "Mean final time remaining (s)"
-        assert f"final time remaining {left_s}" in str(page["live-panel"].get_attribute("innerHTML"))
 
 
 def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from rfm_client.options import ConfigError
 from rfm_gateway.mounting import GatewayConfig, PageHost
 from rfm_page.dataset_routes import dataset_routes
-from rfm_page.live import live_routes
 from rfm_page.routes import viewer_routes
 
 if TYPE_CHECKING:
@@ -22,7 +21,6 @@ def add_page(host: PageHost) -> None:
     """Add the page's endpoints and files to a gateway. Raises ConfigError for a dataset that cannot be shown."""
     host.add_endpoints(viewer_routes(host))
     host.add_endpoints(dataset_routes(shown_datasets(host.config), host.limits))
-    host.add_endpoints(live_routes(host.limits))
     folders = {"uplot": _PACKAGE / "vendored" / "uplot", "examples": _PACKAGE / "examples"}
     host.add_files(_PACKAGE / "static", **folders)
 

@@ -11,10 +11,11 @@ an episode. With ``blocking``, a step waits for its score. Without ``blocking``,
 requests its own only if fewer than ``max_pending`` steps have open requests. The reset always waits for its score. The
 last step waits, too, and cancels older requests; without ``blocking``, ``await_last=False`` leaves it unscored.
 
-``info["reward_model"]`` has ``progress`` and ``success`` of the newest known score (success is NaN if the checkpoint
-does not predict it), its ``step``, its ``lag`` in steps, the steps ``skipped`` in this episode, and the other scores
-that the checkpoint gives unasked (``StepScore.more_scores``). With ``terminate_on_success`` or ``success_bonus`` it has
-``succeeded``; after a step, ``env_reward``.
+``info["reward_model"]`` has the same keys after a reset and after a step: the returned ``reward`` and the environment's
+own ``env_reward`` (NaN at a reset), ``progress`` and ``success`` of the newest known score (success is NaN if the
+checkpoint does not predict it), its ``step``, its ``lag`` in steps, the steps ``skipped`` in this episode, and the
+other scores that the checkpoint gives unasked (``StepScore.more_scores``). With ``terminate_on_success`` or
+``success_bonus`` it has ``succeeded``.
 
 ``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
 frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
@@ -125,14 +126,8 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._is_whole = True
         self._rewarder.score({episode: self._has_ended})
         reward = episode.reward(float(env_reward), bool(terminated))
-        scores = {**episode.info(), "env_reward": float(env_reward)}
-        return (
-            observation,
-            reward,
-            bool(terminated or episode.succeeded),
-            truncated,
-            {**with_statistics(info, episode), INFO: scores},
-        )
+        ends = bool(terminated or episode.succeeded)
+        return observation, reward, ends, truncated, {**with_statistics(info, episode), INFO: episode.info()}
 
     compute_reward = refuse_relabelling
 

@@ -115,7 +115,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         for index, episode in stepped.items():
             rewards[index] = episode.reward(float(paid[index]), bool(terminated[index]))
             correct_statistics(infos, index, episode)
-            scores: Info = {INFO: episode.info() | {"env_reward": float(paid[index])}}
+            scores: Info = {INFO: episode.info()}
             infos = self._add_info(infos, {"final_info": scores} if index in final else scores, index)
         terminated = terminated | self._succeeded()
         infos = self._with_scores(infos, fresh)

@@ -14,7 +14,6 @@ import numpy as np
 from rfm_client import InvalidSampleError, RewardClient, UInt8Array
 from rfm_client.episodes import Episode, EpisodeOptions, FrameOptions, StepScore, SuccessRule
 from rfm_client.options import InvalidValueError, checked_count, checked_finite, require
-from rfm_rl.live import LiveEpisode
 
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
@@ -61,7 +60,7 @@ class RewardOptions(FrameOptions):
         camera without a name
     score: what rewards are made of: ``progress``, or ``remaining_s``: minus the remaining seconds, in place of progress
         in each mode, so that a step pays the seconds that it gains
-    sampling, fuse, orient, channels, resize, live: as in ``rfm_client.episodes.FrameOptions``; rendered frames are
+    sampling, fuse, orient, channels, resize: as in ``rfm_client.episodes.FrameOptions``; rendered frames are
         changed alike
     max_frames: ``frames`` of EpisodeOptions: the rule's number of frames
     blocking: True: a step waits for its score
@@ -154,19 +153,6 @@ class RewardOptions(FrameOptions):
         return {camera: found[camera] for camera in self.cameras}
 
 
-class PaidView:
-    """A view that reports one episode, and keeps it, so that it hears of the rewards, too."""
-
-    def __init__(self, view: Any) -> None:
-        self._view = view
-        self.reported: Any = None
-
-    def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> Any:
-        """Return a new episode of the view."""
-        self.reported = self._view.episode(task, env, threshold)
-        return self.reported
-
-
 class RewardedEpisode:
     """The rewards of one episode: its newest known score, and open requests.
 
@@ -176,15 +162,14 @@ class RewardedEpisode:
     total_reward: sum of its rewards until now
     """
 
-    def __init__(
-        self, options: RewardOptions, episode: Episode, index: int | None, view: PaidView | None = None
-    ) -> None:
+    def __init__(self, options: RewardOptions, episode: Episode, index: int | None) -> None:
         self.index = index
         self.steps = episode
-        self._options, self._view = options, view
+        self._options = options
         self.pending: list[Future[list[StepScore]]] = []
         self.known: StepScore | None = None
         self._paid_progress = np.nan
+        self._paid = {"reward": np.nan, "env_reward": np.nan}
         self.total_reward = 0.0
         self.num_skipped = 0
         self.succeeded = False  # ends the episode
@@ -249,15 +234,13 @@ class RewardedEpisode:
             reward += options.success_bonus
         reward += env_reward if options.add_to_env_reward else 0.0
         self.total_reward += reward
-        reported = None if self._view is None else self._view.reported
-        if isinstance(reported, LiveEpisode):  # other views take steps only
-            reported.pay(reward)
+        self._paid = {"reward": reward, "env_reward": env_reward}
         return reward
 
     def info(self) -> Info:
-        """Return the newest known scores, and their lag in steps."""
+        """Return the newest reward and the newest known scores, under the same keys at a reset and at a step."""
         known = self.known or StepScore(np.nan, np.nan, False, -1, np.nan)
-        told = {"progress": known.progress, "success": known.success, "step": known.step}
+        told: Info = {**self._paid, "progress": known.progress, "success": known.success, "step": known.step}
         told |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped, **known.more_scores}
         return told if self._options.success_rule is None else told | {"succeeded": self._has_succeeded}
 
@@ -301,10 +284,9 @@ class Rewarder:
         frame: uint8 [H, W, 3]; with cameras, a dict of these
         index: number of its environment; None: the only environment
         """
-        view = None if self._options.live is None else PaidView(self._options.live)
-        episode = self._client.episode(task, env=index, **{**self._options.scoring, "live": view})
+        episode = self._client.episode(task, env=index, **self._options.scoring)
         episode.keep(frame)
-        return RewardedEpisode(self._options, episode, index, view)
+        return RewardedEpisode(self._options, episode, index)
 
     def score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
         """Collect known scores, and request those of newest frames that are due. Raises RewardError.

@@ -157,8 +157,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         for index, episode in enumerate(stepped):
             terminated = bool(dones[index]) and not infos[index].get("TimeLimit.truncated", False)
             rewards[index] = episode.reward(float(env_rewards[index]), terminated)
-            infos[index] = with_statistics(infos[index], episode)
-            infos[index][INFO] = episode.info() | {"env_reward": float(env_rewards[index])}
+            infos[index] = {**with_statistics(infos[index], episode), INFO: episode.info()}
         for index in ended:
             self.reset_infos[index] |= {INFO: self._episodes[index].info()}
         return observations, rewards, dones, infos

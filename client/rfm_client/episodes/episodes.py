@@ -86,7 +86,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
                 self.steps[index] = self.steps[index].anew(new)
 
     async def close(self) -> None:
-        """End the episodes, also in the live view, once no step is open."""
+        """End the episodes, once no step is open."""
         async with self._adding:
             for steps in self.steps:
                 steps.end()
@@ -177,7 +177,7 @@ class AsyncEpisode(AsyncClosing, OneProcess):
         await self.episodes.reset(task=task)
 
     async def close(self) -> None:
-        """End the episode, also in the live view, once no request is open; drop a waiting frame."""
+        """End the episode, once no request is open; drop a waiting frame."""
         await self._settle()
         await self.episodes.close()
 

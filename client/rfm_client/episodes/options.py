@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, TypeAlias, TypedDict, get_args
+from typing import Any, Literal, TypeAlias, TypedDict, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.results import SUCCESS_THRESHOLD
-from rfm_client.contract.samples import Float32Array, Trajectory, UInt8Array
+from rfm_client.contract.samples import Float32Array, Trajectory
 from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.sampling import Rule, Sampling
@@ -100,23 +100,6 @@ class SuccessRule:
         checked_count("last", self.last)
 
 
-class StepReport(Protocol):
-    """One episode in a view."""
-
-    def add(self, frame: UInt8Array, score: StepScore) -> None:
-        """Take a step. Return at once, and raise nothing. frame: uint8 [H, W, 3], which never changes again."""
-
-    def end(self) -> None:
-        """Take the end of the episode. Return at once, and raise nothing."""
-
-
-class StepView(Protocol):
-    """A view to which episodes report each step, such as ``rfm_rl.LiveView``."""
-
-    def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> StepReport:
-        """Return a new episode. env: index among parallel episodes, from 0; threshold: for success"""
-
-
 class StepKeywords(TypedDict, total=False):
     """The fields of EpisodeOptions, as keyword arguments."""
 
@@ -128,7 +111,6 @@ class StepKeywords(TypedDict, total=False):
     channels: ChannelOrder | Mapping[str, ChannelOrder]
     resize: bool
     success: SuccessRule
-    live: StepView | None
     robot_description: str
     camera_description: str | Mapping[str, str]
     timeout_s: float | None
@@ -147,7 +129,6 @@ class FrameOptions:
     channels: colour order in the given frames, ``rgb`` or ``bgr``: one for all cameras, or a dict by camera
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
-    live: view for each step and the first camera's frame; it delays no step
     robot_description: words for the robot in RynnValue's prompt; empty: as exported
     camera_description: words for the camera: one text for all cameras, or a dict by camera. If either description is
         given, both exported ones are replaced
@@ -161,7 +142,6 @@ class FrameOptions:
     orient: Orientation | Mapping[str, Orientation] = "none"
     channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
     resize: bool = False
-    live: StepView | None = None
     robot_description: str = ""
     camera_description: str | Mapping[str, str] = ""
     score: StepValue = "progress"

@@ -75,7 +75,7 @@ class StepScorer:
         return await self._scorer.model_info(self._model, call.deadline)
 
     async def scores(self, asked: Sequence[Asked], call: Call, asked_s: float) -> list[StepScore]:
-        """Return and report the score of each step, from as few requests as possible. Raises RewardError, ValueError.
+        """Return the score of each step, from as few requests as possible. Raises RewardError, ValueError.
 
         asked_s: start of the caller's wait, by ``time.perf_counter``
         """
@@ -83,13 +83,10 @@ class StepScorer:
         shown = [steps.windows(step, info) for steps, step in asked]
         outcomes = iter(await self._all_outcomes([each for _, windows in shown for each in windows], info, call))
         ms = (time.perf_counter() - asked_s) * 1e3
-        scores = [
+        return [
             steps.score(step, prefix, list(islice(outcomes, len(windows))), ms)
             for (steps, step), (prefix, windows) in zip(asked, shown, strict=True)
         ]
-        for (steps, _), score in zip(asked, scores, strict=True):
-            steps.report(score)
-        return scores
 
     async def _all_outcomes(self, windows: Sequence[Window], info: ModelInfo, call: Call) -> list[Result | RewardError]:
         self._scorer.tell_of_length(max((len(window.frames) for window in windows), default=0), info)

@@ -18,7 +18,7 @@ from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import FRAME_SCORES, FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, as_array, check_task
-from rfm_client.episodes.options import EpisodeOptions, StepReport, StepScore, StepValue
+from rfm_client.episodes.options import EpisodeOptions, StepScore, StepValue
 from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW, BlankFrames, is_black, is_blank
 from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.resize import resize_frames
@@ -83,19 +83,16 @@ class Window:
 
 
 class Steps:
-    """The steps of one episode so far: frames, and reports to the live view.
+    """The frames of one episode so far.
 
-    env: index of the environment, from 0, for the live view
     where: name in errors, such as ``episodes[3]``; empty: no name
     """
 
-    def __init__(self, task: str, options: EpisodeOptions, env: int = 0, where: str = "") -> None:
+    def __init__(self, task: str, options: EpisodeOptions, where: str = "") -> None:
         self.task, self.options = task, options
-        self._env, self._where = env, where
+        self._where = where
         self._corrections = options.corrections
         self._frames: list[tuple[Frame, ...]] = []  # by step and camera
-        self._live: StepReport | None = None
-        self._reported = -1  # newest step in the live view
         self._has_ended = self._has_warned = False
 
     @property
@@ -105,7 +102,7 @@ class Steps:
 
     def anew(self, task: str | None) -> Steps:
         """Return the next episode, without frames. task: None: as before"""
-        return Steps(self.task if task is None else task, self.options, self._env, self._where)
+        return Steps(self.task if task is None else task, self.options, self._where)
 
     def checked(self, frame: Any, size: FrameSize | None = None) -> tuple[Frame, ...]:
         """Return a copy of the next frame of each camera, upright. Raises InvalidSampleError.
@@ -193,24 +190,11 @@ class Steps:
         got = f"NaN: this checkpoint does not predict it{remedy}"
         require(name, name in predicted, "a score of each frame", got)
 
-    def report(self, score: StepScore) -> None:
-        """Report a score to the live view, unless the episode has ended or a newer score was reported."""
-        view = self.options.live
-        if view is None or self._has_ended or score.step <= self._reported:
-            return
-        self._reported = score.step
-        self._live = self._live or view.episode(self.task, self._env, self.options.success.threshold)
-        self._live.add(self._frames[score.step][0].pixels, score)
-
     def end(self) -> None:
-        """Tell the live view that no step will follow. Warn if no frame of a short episode shows anything."""
-        if self._has_ended:
-            return
-        self._has_ended = True
-        if 0 < len(self._frames) < FRAMES_IN_A_ROW:
+        """Warn if no frame of a short episode shows anything."""
+        if not self._has_ended and 0 < len(self._frames) < FRAMES_IN_A_ROW:
             self._warn_of(self._frames)
-        if self._live is not None:
-            self._live.end()
+        self._has_ended = True
 
     def _located(self, error: RewardError) -> RewardError:
         """Return the error, with the episode's name if a sample is at fault."""

@@ -88,16 +88,6 @@ export async function exampleVideo(path) {
   return (await answer(path)).blob();
 }
 
-/** The running episodes, and what is new of them since a cursor. */
-export async function liveNews(cursor) {
-  return (await answer(`viewer/live?after=${encodeURIComponent(cursor)}`)).json();
-}
-
-/** The newest frame of a running episode, as a Blob. */
-export async function liveFrame(id) {
-  return (await answer(`viewer/live/${encodeURIComponent(id)}/frame`)).blob();
-}
-
 function chosen(labels) {
   return labels === null ? "" : `?labels=${encodeURIComponent(labels)}`;
 }

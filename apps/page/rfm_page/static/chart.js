@@ -13,9 +13,7 @@ const VALUE_PX = 16; // height of a number beside the chart
 const RIGHT_PX = { one: 48, several: 64 }; // of the numbers to the right; of several curves each with a piece of its line
 const STUB_PX = 12; // length of such a piece
 const MOST_VALUES = 6; // of more curves those of one colour have numbers
-const FEWEST_STEPS = 10; // on an axis of steps, so that it stays as it is from the first step on
 export const MARK_PX = 72; // at least between the marks of the axis below
-const FAINT = "50"; // opacity, in hexadecimal
 const POINT_PX = 20; // nearer to each other, points are not drawn as dots
 const MARKER_PX = 7; // of a dot at a frame between frames that the model skips
 const LARGE_PX = 400; // a chart so high and so wide has larger letters
@@ -64,15 +62,12 @@ export function heightOf(panes, signal, value) {
 
 /**
  * A chart in `host`. `onTime(seconds, isDragged)` is called when somebody points at it or drags in it.
- * label: of the axis below; null: none. onThreshold(value): somebody drags the line at which success counts
- * isOfSteps: the axis below counts steps
+ * onThreshold(value): somebody drags the line at which success counts
  */
 export class Chart {
   #host;
   #onTime;
   #onThreshold;
-  #label;
-  #isOfSteps;
   #plot = null;
   #curves = [];
   #panes = panesOf([]);
@@ -86,46 +81,35 @@ export class Chart {
   #line = made("threshold");
   #values = made("values");
   #dots = made("dots");
-  #leaving = new AbortController();
   #resizing = new ResizeObserver(() => this.#host.clientWidth && this.#plot?.setSize(this.#size()));
 
-  constructor(host, onTime, { label = "time (s)", onThreshold = null, isOfSteps = false } = {}) {
+  constructor(host, onTime, { onThreshold = null } = {}) {
     this.#host = host;
-    this.#label = label;
-    this.#isOfSteps = isOfSteps;
     this.#onTime = onTime;
     this.#onThreshold = onThreshold;
     this.#line.classList.toggle("movable", onThreshold !== null);
     this.#resizing.observe(host);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw(), this.#leaving);
-  }
-
-  /** Frees what it holds. */
-  remove() {
-    this.#resizing.disconnect();
-    this.#leaving.abort();
-    this.#plot?.destroy();
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw());
   }
 
   /**
    * Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`; one with a `leading`
    * has the array of this name in place of progress.
    * Some have a `begin`, a `colour`, or a `dash`: lengths of strokes and gaps.
-   * One that `isFaint` has no numbers beside it. One that `skipsFrames` has a dot at each point.
+   * One that `skipsFrames` has a dot at each point.
    */
   show(curves) {
     this.#curves = curves.filter(({ times }) => times.length);
     this.#panes = panesOf(this.#curves, this.#isLow);
     this.#begin = Math.min(...this.#curves.map(({ begin }) => begin ?? 0), Infinity);
     this.#end = Math.max(0, ...this.#curves.map(({ allTimes }) => allTimes.at(-1))); // so that the axis does not grow
-    if (this.#isOfSteps) this.#end = Math.max(this.#end, this.#begin + FEWEST_STEPS);
     if (this.#end <= this.#begin) this.#end = this.#begin + 1; // uPlot divides an axis of no length for ever
     const signals = Object.keys(this.#panes);
     const tables = this.#drawn.map((curve) => [
       curve.times, ...signals.map((signal) => curve.times.map((_, index) => heightOf(this.#panes, signal, curve[signal]?.[index]))),
     ]);
     const data = tables.length ? uPlot.join(tables) : [[], []];
-    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${this.#rightPx} ${JSON.stringify(this.#curves.map(({ dash, isFaint, skipsFrames }) => [dash, isFaint, skipsFrames]))}`;
+    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${this.#rightPx} ${JSON.stringify(this.#curves.map(({ dash, skipsFrames }) => [dash, skipsFrames]))}`;
     if (shape !== this.#shape || !this.#plot) {
       this.#plot?.destroy();
       this.#plot = this.#curves.length ? this.#newPlot(signals, data) : null;
@@ -167,7 +151,7 @@ export class Chart {
 
   /** Writes the number of each curve to the right of the chart, at the height of its line if there is room. */
   #showValues(seconds) {
-    const points = Object.keys(this.#panes).flatMap((signal) => this.#told.map((curve) => {
+    const points = Object.keys(this.#panes).flatMap((signal) => this.#curves.map((curve) => {
       const index = pointAt(curve.times, seconds);
       return { curve, signal, time: curve.times[index], value: index === null ? null : curve[signal]?.[index] };
     })).filter(({ value }) => value !== null && value !== undefined);
@@ -192,20 +176,15 @@ export class Chart {
 
   /** The points that have numbers: of many curves those of one colour, the one that the pointer is nearest to. */
   #chosen(points) {
-    if (this.#told.length <= MOST_VALUES || !points.length) return points;
+    if (this.#curves.length <= MOST_VALUES || !points.length) return points;
     const distance = ({ top }) => Math.abs(top - this.#pointedTop);
     const nearest = points.reduce((one, other) => (distance(other) < distance(one) ? other : one));
     return points.filter(({ curve }) => colourOf(curve) === colourOf(nearest.curve));
   }
 
-  /** The curves that have numbers. */
-  get #told() {
-    return this.#curves.filter(({ isFaint }) => !isFaint);
-  }
-
   /** Whether pieces of lines tell which number is whose. */
   get #hasSeveral() {
-    return this.#told.length > 1;
+    return this.#curves.length > 1;
   }
 
   /** The point of a curve that a number tells. */
@@ -256,17 +235,17 @@ export class Chart {
       values: (_, splits) => splits.map((height) => signed(number.get(height))),
     };
     const series = this.#drawn.flatMap((curve, place) => signals.map(() => {
-      const stroke = () => `${colourOf(this.#drawn[place] ?? curve)}${curve.isFaint ? FAINT : ""}`;
+      const stroke = () => colourOf(this.#drawn[place] ?? curve);
       const points = { show: curve.skipsFrames ?? isRoomy, size: curve.skipsFrames ? MARKER_PX : 5, fill: stroke };
       return { stroke, width: 2, dash: curve.dash ?? undefined, points };
     }));
     const options = {
       ...this.#size(),
-      padding: [4, this.#rightPx, this.#label === null ? 0 : 4, 0],
+      padding: [4, this.#rightPx, 4, 0],
       legend: { show: false },
       cursor: { x: false, y: false, points: { show: false }, drag: { x: false, y: false } },
       scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [0, 1] } },
-      axes: [{ ...axis, size: 24, space: MARK_PX, label: this.#label, ...(this.#isOfSteps ? { incrs: STEPS } : {}) }, left],
+      axes: [{ ...axis, size: 24, space: MARK_PX, label: "time (s)" }, left],
       series: [{}, ...series],
       hooks: { drawAxes: [(plot) => clearBetween(plot, panes)], draw: [(plot) => drawNames(plot, panes, letterPx)], setSize: [() => this.#placeAgain()] },
     };
@@ -309,9 +288,6 @@ export class Chart {
     };
   }
 }
-
-const STEPS = [1, 2, 5].flatMap((digit) => [1, 10, 100, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8].map((power) => digit * power))
-  .sort((one, other) => one - other);
 
 /** Ends the grid between signals. */
 function clearBetween({ ctx, bbox }, panes) {

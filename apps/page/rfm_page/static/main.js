@@ -11,7 +11,6 @@ import { failure, noModel, otherModel, serverAway, tritonAway, useRemedies } fro
 import { pngFigure, svgFigure } from "./figure.js";
 import { onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
-import { LiveTab } from "./live.js";
 import { byQuestion, giveLooks } from "./looks.js";
 import { Queue } from "./queue.js";
 import { Settings } from "./settings.js";
@@ -35,11 +34,10 @@ const timeline = new Timeline(
 const legend = new Legend(page.legend, { onChange: changed, onRemove: removeCurves });
 const sidebar = new Sidebar(page.fold);
 const { videos, chart } = timeline;
-const TABS = ["score", "dataset", "live"];
+const TABS = ["score", "dataset"];
 const tabs = new Tabs(TABS.map((name) => [page[`${name}-tab`], page[`${name}-panel`]]), shownTab);
 const places = { away: new Place(page.away), errors: new Place(page.errors), served: new Place(page["served-state"]) };
 const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, onShown: told, failedAnywhere });
-const liveTab = new LiveTab(page, { failedAnywhere });
 const choices = new Settings(page, chooseRule);
 const address = new Address(go);
 let shownIndex = 0; // of the tab
@@ -72,7 +70,6 @@ async function askServer(isCurrent) {
   places.away.clear();
   page["key-form"].hidden = true;
   datasetTab.begin();
-  liveTab.begin();
   if (!gateway.models.length) askingModels.begin();
   return true;
 }
@@ -168,9 +165,7 @@ function warnOfModel(wanted) {
 
 /** What the address of the page is now. */
 function shownParams() {
-  const last = page["live-last"];
-  const ofLive = () => (last.value === last.defaultValue ? [] : [["last", last.value]]);
-  const ofTab = [() => choices.params, () => datasetTab.params, ofLive][shownIndex]();
+  const ofTab = shownIndex ? datasetTab.params : choices.params;
   return [...(shownIndex ? [["tab", TABS[shownIndex]]] : []), ...ofTab];
 }
 
@@ -186,10 +181,6 @@ function go(params) {
   tabs.select(shownIndex);
   if (shownIndex === 0) warnOfModel(choices.show(params));
   if (shownIndex === 1) datasetTab.show(params);
-  if (shownIndex === 2) {
-    page["live-last"].value = params.get("last") ?? page["live-last"].defaultValue;
-    page["live-last"].dispatchEvent(new Event("input"));
-  }
 }
 
 function settings() {
@@ -526,7 +517,6 @@ listen(page.question, {
   input: () => { told(); showWhetherReady(); },
   change: () => told(),
 });
-listen(page["live-last"], { input: () => told() });
 listen(page["key-form"], { submit: (event) => { event.preventDefault(); useKey(page.key.value.trim()); begin(); } });
 listen(page.files, { change: () => addFiles(page.files.files) });
 listen(page.model, { change: chooseRule });
@@ -547,7 +537,6 @@ listen(page.png, { click: async () => save("curves.png", await pngFigure(figure(
 listen(page.svg, { click: () => save("curves.svg", figure(), "image/svg+xml") });
 listen(page.copy, { click: () => copy(page.command.textContent, "command line is", page.command) });
 listen(page["use-copy"], { click: () => copy(datasetTab.words, "words are", page["use-words"]) });
-listen(page["live-copy"], { click: () => copy(page["live-code"].textContent, "lines are", page["live-code"]) });
 listen(document, {
   dragover: (event) => { event.preventDefault(); page.dropping.hidden = false; },
   dragleave: (event) => { if (!event.relatedTarget) page.dropping.hidden = true; },

@@ -29,7 +29,7 @@ export function titleOf(signal) {
 }
 
 /** The name of a score in words, without the unit. */
-export function shortOf(signal) {
+function shortOf(signal) {
   return known[signal].short;
 }
 
@@ -39,7 +39,7 @@ export function numberOf(signal, value) {
 }
 
 /** A number of a score, with the unit. */
-export function measured(signal, value) {
+function measured(signal, value) {
   const text = numberOf(signal, value);
   return text === NONE ? NONE : [text, known[signal].unit].filter(Boolean).join(" ");
 }

@@ -37,7 +37,7 @@ function row(curve, threshold, leadingText) {
 }
 
 /** The head of a curve's row: its colour and a name. */
-export function named(curve, name) {
+function named(curve, name) {
   const header = document.createElement("th");
   const swatch = document.createElement("span");
   header.scope = "row";

@@ -1,0 +1,623 @@
+# SPDX-License-Identifier: MIT
+"""The rules of the rewards, at each door: single environments, vectors in each autoreset mode, Stable-Baselines3."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
+from functools import partial
+from itertools import cycle, islice, pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+
+from coded_env import Code, CodedEnv, CodeReader, Recorder, frame_of
+from reward_doors import (
+    BY_CALLER,
+    DOORS,
+    ENDED_BY_SUCCESS,
+    SAME_STEP,
+    TASKS,
+    VECTORS,
+    AutoresetAbove,
+    Door,
+    InProcesses,
+    Sb3InProcesses,
+    go_on,
+    makers_of,
+    played,
+)
+from rfm_client import InvalidSampleError, ServerUnavailableError
+from rfm_rl import RewardOptions, SuccessRule
+
+PROGRESS = (0.1, 0.4, 0.3, 0.3, 0.8)  # of an episode's frames
+SUCCESS = (0.9, 0.2, 0.6, 0.1, 0.7)
+LAST = len(PROGRESS) - 1
+GAMMA = 0.9
+LENGTHS = (3, 1), (4, 1, 2)  # steps of the episodes by environment, in turn
+CALLS = 10
+RESETS = (4, 6)  # calls that reset a single environment of these lengths
+TERMINATES, TRUNCATES = 0, 1  # numbers of environments
+
+at_each_door = pytest.mark.parametrize("kind", DOORS.values(), ids=DOORS)
+
+
+class Judging(CodeReader):
+    """Scores each frame by the step."""
+
+    predicts_success = True
+
+    def scores(self, codes: list[Code]) -> dict[str, Any]:
+        steps = [step for *_, step in codes]
+        success = np.array(SUCCESS)[steps] if self.predicts_success else np.nan
+        return {"progress": np.array(PROGRESS)[steps], "success": success}
+
+
+@pytest.fixture
+def judge() -> Iterator[Recorder]:
+    with Recorder(server=Judging()) as client:
+        yield client
+
+
+@pytest.fixture
+def warnings(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
+    return lambda: [record.message for record in caplog.records if record.levelno == logging.WARNING]
+
+
+def options(**more: Any) -> RewardOptions:
+    return RewardOptions(**{"sampling": "all", "frames_from": "pixels", **more})
+
+
+def opened(kind: type[Door], client: Recorder, envs: Sequence[CodedEnv], asked: RewardOptions) -> Door:
+    return kind(makers_of(envs), client, asked)
+
+
+def changes(factor: float, values: Sequence[float] = PROGRESS) -> list[float]:
+    return [factor * now - before for before, now in pairwise(values)]
+
+
+STALE = [PROGRESS[t] for t in (0, 0, 2, 2, 4)]  # with a score every second step
+ENDS = SuccessRule(0.5)
+PAID: dict[str, tuple[dict[str, Any], list[float]]] = {
+    "absolute": ({}, list(PROGRESS[1:])),
+    "delta": ({"mode": "delta"}, changes(1)),
+    "shaping": ({"mode": "shaping", "gamma": GAMMA}, changes(GAMMA)),
+    "shaping with a bonus": (
+        {"mode": "shaping", "gamma": GAMMA, "success_bonus": 10.0, "success": SuccessRule(0.65)},
+        [*changes(GAMMA)[:-1], 10 - PROGRESS[3]],
+    ),
+    "shaping of the environment's own, ended by a success": (
+        {"mode": "shaping", "gamma": GAMMA, "add_to_env_reward": True, "terminate_on_success": ENDS},
+        [1 + changes(GAMMA)[0], 1 - PROGRESS[1]],
+    ),
+    "shaping, ended by a success": (
+        {"mode": "shaping", "gamma": GAMMA, "terminate_on_success": ENDS},
+        changes(GAMMA)[:2],
+    ),
+    "shaping, every second step": ({"mode": "shaping", "gamma": GAMMA, "every": 2}, changes(GAMMA, STALE)),
+    "shaping of the environment's own": (
+        {"mode": "shaping", "gamma": GAMMA, "scale": 2.0, "add_to_env_reward": True},
+        [*(1 + 2 * change for change in changes(GAMMA)[:-1]), 1 - 2 * PROGRESS[3]],
+    ),
+    "final": ({"mode": "final"}, [0, 0, 0, PROGRESS[LAST]]),
+    "final, scaled": ({"mode": "final", "scale": 3.0}, [0, 0, 0, 3 * PROGRESS[LAST]]),
+    "final, ended by a success": ({"mode": "final", "terminate_on_success": ENDS}, [0, PROGRESS[2]]),
+    "ended by a success that is scored": (
+        {"every": 2, "terminate_on_success": SuccessRule(0.0)},
+        [PROGRESS[0], PROGRESS[2]],
+    ),
+    "a bonus once": ({"mode": "delta", "success_bonus": 10.0}, [0.3, 9.9, 0, 0.5]),
+    "a bonus by its own rule": (
+        {"mode": "delta", "success_bonus": 10.0, "success": SuccessRule(0.65)},
+        [0.3, -0.1, 0, 10.5],
+    ),
+    "a bonus at the end alone": (
+        {"mode": "final", "success_bonus": 2.0, "success": SuccessRule(0.65)},
+        [0, 0, 0, 2.8],
+    ),
+    "a bonus that is not scaled": ({"scale": 0.0, "success_bonus": 1.0}, [0, 1, 0, 0]),
+    "a bonus at the success that ends": (
+        {"mode": "delta", "success_bonus": 10.0, "terminate_on_success": ENDS},
+        [0.3, 9.9],
+    ),
+    "no bonus without a success": (
+        {"mode": "final", "success_bonus": 2.0, "success": SuccessRule(0.95)},
+        [0, 0, 0, 0.8],
+    ),
+}
+PAID_AT = [
+    pytest.param(kind, asked, expected, id=f"{door}-{name}")
+    for name, (asked, expected) in PAID.items()
+    for door, kind in (ENDED_BY_SUCCESS if "terminate_on_success" in asked else DOORS).items()
+]
+
+
+@pytest.mark.parametrize(("kind", "asked", "expected"), PAID_AT)
+def test_an_episode_is_paid_by_its_mode(
+    judge: Recorder, kind: type[Door], asked: dict[str, Any], expected: list[float]
+) -> None:
+    envs = [CodedEnv(TERMINATES, (LAST,)), CodedEnv(TERMINATES, (2,))]
+    with opened(kind, judge, envs, options(**asked)) as door:
+        episodes = [episode for episode in played(door, 3 * LAST)[0] if episode.terminated]
+    assert len(episodes) >= 2
+    for episode in episodes:
+        np.testing.assert_allclose(episode.rewards, expected, atol=1e-6)
+
+
+@at_each_door
+def test_info_has_the_same_keys_at_a_reset_and_at_a_step(judge: Recorder, kind: type[Door]) -> None:
+    with opened(kind, judge, [CodedEnv(TERMINATES, (3,))], options(scale=2.0, success_bonus=5.0, every=2)) as door:
+        ((first, second, *_),) = played(door, 8)
+    for episode in (first, second):
+        of_reset, *of_steps = (info["reward_model"] for info in episode.infos)
+        assert {key: type(value) for key, value in of_reset.items()} == {
+            key: type(value) for key, value in of_steps[0].items()
+        }
+        assert np.isnan([of_reset["reward"], of_reset["env_reward"]]).all()
+        for step, (told, reward) in enumerate(zip(of_steps, episode.rewards, strict=False), 1):
+            known = (0, 0, 2, 3)[step]  # the last is scored, too
+            assert told == {
+                "reward": pytest.approx(reward, abs=1e-6),
+                "env_reward": 1.0,
+                "progress": pytest.approx(PROGRESS[known]),
+                "success": pytest.approx(SUCCESS[known]),
+                "step": known,
+                "lag": step - known,
+                "skipped": 0,
+                "succeeded": known >= 2,
+            }
+
+
+@pytest.mark.parametrize("number", [TERMINATES, TRUNCATES], ids=["terminated", "truncated"])
+@at_each_door
+def test_shaping_of_another_reward_leaves_its_best_policies_as_they_are(
+    judge: Recorder, kind: type[Door], number: int
+) -> None:
+    """Shaping adds a sum that depends on the reset alone; after a time limit, also on the last state."""
+    asked = options(mode="shaping", gamma=GAMMA, add_to_env_reward=True, scale=2.0)
+    with opened(kind, judge, [CodedEnv(number, (length,)) for length in (2, LAST)], asked) as door:
+        ended = [episodes[0] for episodes in played(door, LAST + 1)]
+    sums = [sum(GAMMA**t * (reward - 1) for t, reward in enumerate(episode.rewards)) for episode in ended]
+    assert {episode.truncated for episode in ended} == {number == TRUNCATES}
+    kept = [0.0, 0.0] if number == TERMINATES else [2 * GAMMA**length * PROGRESS[length] for length in (2, LAST)]
+    assert sums == pytest.approx([left - 2 * PROGRESS[0] for left in kept], abs=1e-6)
+
+
+@pytest.mark.parametrize(("bonus", "steps"), [(0.0, [0, LAST]), (1.0, list(range(LAST + 1)))])
+@at_each_door
+def test_final_scores_only_the_ends_unless_a_success_is_looked_for(
+    judge: Recorder, kind: type[Door], bonus: float, steps: list[int]
+) -> None:
+    with opened(kind, judge, [CodedEnv(TERMINATES, (LAST,))], options(mode="final", success_bonus=bonus)) as door:
+        played(door, LAST)
+    asked = [codes[-1] for call in judge.calls for codes, _ in call]
+    assert [step for _, episode, step in asked if episode == 0] == steps
+
+
+@at_each_door
+def test_a_bonus_needs_a_checkpoint_that_predicts_success(judge: Recorder, kind: type[Door]) -> None:
+    judge.server.predicts_success = False  # type: ignore[attr-defined]
+    needs = {"success_bonus: expected 0": {"success_bonus": 1.0}}
+    if kind in ENDED_BY_SUCCESS.values():
+        needs["terminate_on_success: expected None"] = {"terminate_on_success": ENDS}
+    for message, asked in needs.items():
+        with (
+            opened(kind, judge, [CodedEnv()], options(**asked)) as door,
+            pytest.raises(ValueError, match=f"^{message} with a checkpoint that does not predict success"),
+        ):
+            door.reset()
+    with opened(kind, judge, [CodedEnv(TERMINATES, (LAST,))], options(mode="final")) as door:
+        episode = played(door, LAST)[0][0]
+    assert episode.rewards == pytest.approx([0, 0, 0, PROGRESS[LAST]])
+    assert np.isnan([info["reward_model"]["success"] for info in episode.infos]).all()
+
+
+@at_each_door
+def test_late_scores_add_up_at_the_end(judge: Recorder, kind: type[Door]) -> None:
+    with opened(kind, judge, [CodedEnv(TERMINATES, (LAST,))], options(mode="delta", blocking=False)) as door:
+        episodes = [episode for episode in played(door, 3 * LAST)[0] if episode.terminated]
+    for episode in episodes:
+        assert sum(episode.rewards) == pytest.approx(PROGRESS[LAST] - PROGRESS[0], abs=1e-6)
+        assert [episode.infos[at]["reward_model"]["lag"] for at in (0, -1)] == [0, 0]
+
+
+@at_each_door
+def test_after_an_error_delta_pays_what_was_missed(judge: Recorder, kind: type[Door]) -> None:
+    with opened(kind, judge, [CodedEnv(TERMINATES, (LAST,))], options(mode="delta")) as door:
+        door.reset()
+        judge.server.failing = 1
+        with pytest.raises(ServerUnavailableError, match=r"^the server is restarting \(request \w+-\d+\)$"):
+            door.step()
+        assert door.step()[0].reward == pytest.approx(PROGRESS[2] - PROGRESS[0], abs=1e-6)
+
+
+# Which frames are sent. Each encodes environment, episode and step.
+
+CANVAS = CodedEnv().canvas
+
+
+def drawn(observation: Any) -> Any:
+    """Return the frame of an observation; all environments draw into the same array."""
+    CANVAS[:] = observation["pixels"]
+    return CANVAS
+
+
+SOURCES: dict[str, Any] = {"rendered": None, "a key": "pixels", "a function": drawn}
+SENT = [
+    pytest.param(kind, source, reuse, None, id=f"{door}-{name}{'-reused' if reuse else ''}")
+    for door, kind in DOORS.items()
+    for name, source in SOURCES.items()
+    for reuse in (False, True)
+    if kind.resets != SAME_STEP or (not (reuse and source) and (door == "VecEnv" or source))  # refused, see below
+]
+SENT += [
+    pytest.param(kind, "pixels", kind.resets != SAME_STEP, call, id=f"{door}-fails at {call}")
+    for door, kind in DOORS.items()
+    for call in range(CALLS - 1)
+    if not (kind is AutoresetAbove and call in RESETS)  # Gymnasium's wrapper then resets once more
+]
+
+
+def up_to(code: Code, task: str) -> tuple[list[Code], str]:
+    """Return the question about a step: all frames of the episode so far, and the task."""
+    number, episode, step = code
+    return [(number, episode, each) for each in range(step + 1)], task
+
+
+def questions(number: int, lengths: Sequence[int]) -> Iterator[tuple[list[Code], str]]:
+    """Yield the questions about an environment, in order."""
+    for episode, length in enumerate(cycle(lengths)):
+        for step in range(length + 1):
+            yield up_to((number, episode, step), TASKS[number])
+
+
+def check_asked(client: Recorder, num_envs: int, fewest: int) -> None:
+    for number in range(num_envs):
+        asked = [question for call in client.calls for question in call if question[0][0][0] == number]
+        assert len(asked) >= fewest
+        assert asked == list(islice(questions(number, LENGTHS[number]), len(asked)))
+
+
+@pytest.mark.parametrize(("kind", "source", "reuse", "failing"), SENT)
+def test_each_question_has_the_frames_of_its_own_episode(
+    kind: type[Door], source: Any, reuse: bool, failing: int | None
+) -> None:
+    """Also after a failed call, whose frame is part of the episode. A step after an episode's end is refused."""
+    envs = [CodedEnv(number, lengths, reuse=reuse) for number, lengths in enumerate(LENGTHS)]
+    envs = envs if kind.asks_once else envs[:1]
+    with Recorder(failing) as client, opened(kind, client, envs, options(frames_from=source)) as door:
+        for call in range(CALLS):
+            act: Any = partial(go_on, door, envs) if call else door.reset
+            if kind is AutoresetAbove and envs[0].has_ended and call - 1 == failing:  # which was not told of the end
+                with pytest.raises(ResetNeeded):
+                    door.step()
+                act = door.reset
+            with pytest.raises(ServerUnavailableError) if call == failing else nullcontext():
+                act()
+    assert len(client.calls) == CALLS
+    check_asked(client, len(envs), CALLS - 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "source"), [(InProcesses, "pixels"), (Sb3InProcesses, None)])
+def test_environments_in_processes_send_their_own_frames(recorder: Recorder, kind: type[Door], source: Any) -> None:
+    makers = [partial(CodedEnv, number, lengths, reuse=source is None) for number, lengths in enumerate(LENGTHS)]
+    with kind(makers, recorder, options(frames_from=source)) as door:
+        door.reset()
+        for _ in range(CALLS):
+            door.step()
+    check_asked(recorder, 2, CALLS)
+
+
+@pytest.mark.parametrize(("step", "is_last"), [(0, False), (1, False), (3, True)])
+@at_each_door
+def test_after_a_frame_that_could_not_be_kept_an_episode_needs_a_reset(
+    recorder: Recorder, kind: type[Door], step: int, is_last: bool
+) -> None:
+    envs = [CodedEnv(bad=(0, 0, step))]
+    if kind is VECTORS["SAME_STEP"]:
+        pytest.skip("it renders no frames")
+    with opened(kind, recorder, envs, options(frames_from=None)) as door:
+        with pytest.raises(InvalidSampleError, match=r"frame: expected uint8 \[H, W, 3\], got uint8 \[32, 3\]$"):
+            door.reset()
+            for _ in range(step):
+                door.step()
+        resets_itself = is_last and kind in (DOORS["Autoreset below"], VECTORS["NEXT_STEP"])
+        if not resets_itself:
+            reason = "a reset before it|an earlier call failed|ha(s|ve) ended"
+            with pytest.raises(ResetNeeded, match=f"^step: expected a reset of every|^step: expected .*({reason})"):
+                door.step()
+            door.reset()
+        else:
+            door.step()
+        door.step()
+    ((codes, _),) = recorder.calls[-1]
+    assert [code[2] for code in codes] == [0, 1]
+    assert codes[0][1] > 0
+
+
+def test_a_vector_goes_on_after_a_reset_of_the_environment_that_lost_a_frame(recorder: Recorder) -> None:
+    envs = [CodedEnv(0, (3,)), CodedEnv(1, (3,), bad=(1, 0, 1))]
+    with opened(VECTORS["DISABLED"], recorder, envs, options(frames_from=None)) as door:
+        door.reset()
+        with pytest.raises(InvalidSampleError, match=r"^envs\[1\]\.frame: expected uint8"):
+            door.step()
+        expected = r"^step: expected a reset of the environments \[1\], since an earlier call failed"
+        with pytest.raises(ResetNeeded, match=expected):
+            door.step()
+        door.reset([False, True])
+        door.step()
+    assert recorder.calls[-1] == [up_to((0, 0, 2), TASKS[0]), up_to((1, 1, 1), TASKS[1])]
+
+
+@pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if kind.resets == SAME_STEP])
+def test_a_reset_that_draws_over_the_last_frame_is_refused(recorder: Recorder, kind: type[Door]) -> None:
+    expected = r"^(final_obs\[0\]|infos\[0\]\['terminal_observation'\]): expected the last frame .* a copy .*"
+    with opened(kind, recorder, [CodedEnv(reuse=True)], options()) as door:
+        door.reset()
+        for _ in range(2):
+            door.step()
+        with pytest.raises(InvalidSampleError, match=rf"{expected}(NEXT_STEP|RenderedFrame)$"):
+            door.step()
+    assert all(codes == up_to(codes[-1], "")[0] for call in recorder.calls for codes, _ in call)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if kind is not VECTORS["SAME_STEP"]])
+def test_rendered_frames_become_upright_rgb(recorder: Recorder, kind: type[Door]) -> None:
+    asked = options(frames_from=None, orient="rotate180", channels="bgr")
+    with opened(kind, recorder, [CodedEnv(reuse=True)], asked) as door:
+        door.reset()
+        door.step()
+    expected = [frame_of(0, 0, step)[::-1, ::-1, ::-1] for step in range(2)]
+    np.testing.assert_array_equal(recorder.pixels[-1], expected)
+
+
+NO_FRAMES: dict[str, tuple[dict[str, Any], str]] = {
+    "no frame": (
+        {"frames_from": lambda seen: seen["pixels"] / 255},
+        r"frame: expected uint8 \[H, W, 3\], got float64 \[32, 32, 3\]$",
+    ),
+    "a camera is missing": (
+        {"frames_from": lambda seen: {"front": seen["pixels"]}, "cameras": ["front", "top"]},
+        r"frames: expected a frame of each of the cameras \['front', 'top'\], got \['front'\]$",
+    ),
+    "no cameras": ({"frames_from": "pixels", "cameras": ["front"]}, r"the cameras \['front'\], got ndarray$"),
+}
+
+
+@pytest.mark.parametrize(("asked", "message"), NO_FRAMES.values(), ids=NO_FRAMES)
+@at_each_door
+def test_an_observation_without_the_frame_is_refused(
+    recorder: Recorder, kind: type[Door], asked: dict[str, Any], message: str
+) -> None:
+    with (
+        opened(kind, recorder, [CodedEnv()], options(**asked)) as door,
+        pytest.raises(InvalidSampleError, match=message),
+    ):
+        door.reset()
+
+
+# Early resets, after which a reward is never paid.
+
+FINAL: dict[str, Any] = {"mode": "final"}
+WARNED = (
+    "reset: expected the end of the episode before it, got one after 2 steps, whose reward is lost; put the time limit "
+    "inside the wrapper: RewardModelWrapper(TimeLimit(env, steps), ...), or gymnasium.make(..., max_episode_steps=steps)"
+)
+REFUSED = "reset: expected the end of an episode before it, where mode 'final' pays, got one after 2 steps, .*TimeLimit"
+
+
+def cut(door: Door) -> None:
+    """Reset, and step twice."""
+    door.reset()
+    for _ in range(2):
+        door.step()
+
+
+def of_first(door: Door) -> str:
+    return "envs[0]: " if door.asks_once else ""
+
+
+@at_each_door
+def test_final_refuses_the_second_early_reset_in_a_row(
+    recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]
+) -> None:
+    """It says so in the log at the first, which might be deliberate. A caller who means it may go on."""
+    with opened(kind, recorder, [CodedEnv()], options(**FINAL)) as door:
+        cut(door)
+        assert warnings() == []
+        cut(door)
+        assert warnings() == [of_first(door) + WARNED]
+        with pytest.raises(ValueError, match=rf"^(envs\[0\]: )?{REFUSED}"):
+            cut(door)
+        cut(door)
+    assert warnings() == [of_first(door) + WARNED]
+
+
+@at_each_door
+def test_an_end_between_early_resets_allows_them(
+    recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]
+) -> None:
+    """Evaluations reset early; of a vector, one environment may end in time."""
+    envs = [CodedEnv(0, (3,)), CodedEnv(1, (2,))] if kind.asks_once else [CodedEnv(0, (3, 2))]
+    with opened(kind, recorder, envs, options(**FINAL)) as door:
+        for _ in range(4):
+            cut(door)
+    assert warnings() == [of_first(door) + WARNED]
+
+
+CUT: dict[str, tuple[dict[str, Any], bool]] = {  # options, and whether the last step's reward is lost
+    "each step is paid": ({"mode": "delta"}, False),
+    "every fourth step is scored": ({"mode": "delta", "every": 4}, True),
+    "final": (FINAL, True),
+    "final, which scores each step for the bonus": ({"mode": "final", "success_bonus": 1.0}, True),
+}
+
+
+@pytest.mark.parametrize(("asked", "is_lost"), CUT.values(), ids=CUT)
+@at_each_door
+def test_a_reset_that_drops_a_reward_warns_once(
+    recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door], asked: dict[str, Any], is_lost: bool
+) -> None:
+    with opened(kind, recorder, [CodedEnv()], options(**asked)) as door:
+        for _ in range(2):
+            cut(door)
+            played(door, 3)
+    assert warnings() == [of_first(door) + WARNED] * is_lost
+
+
+@at_each_door
+def test_resets_after_an_error_are_silent(
+    recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]
+) -> None:
+    """The error at a last step is an end; after others, the reset is the remedy."""
+    with opened(kind, recorder, [CodedEnv(0, (1,))], options(**FINAL)) as door:
+        recorder.server.failing = 1
+        door.reset()
+        with pytest.raises(ServerUnavailableError):
+            door.step()
+        door.reset()
+    if kind is not VECTORS["SAME_STEP"]:  # which renders no frames
+        with opened(kind, recorder, [CodedEnv(bad=(0, 0, 1))], options(**FINAL, frames_from=None)) as door:
+            door.reset()
+            with pytest.raises(InvalidSampleError):
+                door.step()
+            door.reset()
+    assert warnings() == []
+    with opened(kind, recorder, [CodedEnv()], options(**FINAL, success_bonus=1.0)) as door:
+        for _ in range(3):
+            door.reset()
+            recorder.server.failing = len(recorder.calls)
+            with pytest.raises(ServerUnavailableError):
+                door.step()
+
+
+@at_each_door
+def test_ends_are_no_early_resets(recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]) -> None:
+    with opened(kind, recorder, [CodedEnv(0, (2,))], options(**FINAL)) as door:
+        episodes = played(door, 12)[0]
+    ended = [episode for episode in episodes if episode.terminated]
+    assert len(ended) >= 4
+    assert all(episode.rewards[-1] > 0 for episode in ended)
+    assert warnings() == []
+
+
+REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
+    "mode": ({"mode": "relative"}, "^mode: expected one of absolute, delta, shaping, final, got 'relative'$"),
+    "no gamma": ({"mode": "shaping"}, "^gamma: expected the policy's discount, .* with mode 'shaping', got None$"),
+    "a gamma above 1": (
+        {"mode": "shaping", "gamma": 1.1},
+        "^gamma: expected the policy's discount, above 0 and at most",
+    ),
+    "a gamma of another mode": ({"mode": "delta", "gamma": 0.9}, "^gamma: expected None with mode 'delta', got 0.9$"),
+    "a rule of no bonus": ({"success": SuccessRule()}, "^success: expected None without success_bonus "),
+    "two rules": (
+        {"success": SuccessRule(0.9), "success_bonus": 1.0, "terminate_on_success": SuccessRule(0.8)},
+        "^success: expected None or the rule of terminate_on_success, ",
+    ),
+    "an end that is not awaited": (
+        {"mode": "final", "blocking": False, "await_last": False},
+        "^await_last: expected True with mode 'final'",
+    ),
+    "fuse": ({"fuse": "sum"}, "^fuse: expected one of mean, min, max, got 'sum'$"),
+    "orient": ({"orient": "upside-down"}, "^orient: expected one of none, rotate180, .*, got 'upside-down'$"),
+    "orient of a camera": (
+        {"orient": {"front": "rotate180"}},
+        "^orient: expected one for all frames, .*, got 'front'$",
+    ),
+    "channels of a camera": (
+        {"channels": {"front": "bgr"}},
+        "^channels: expected one for all frames, .*, got 'front'$",
+    ),
+}
+
+
+@pytest.mark.parametrize(("asked", "message"), REFUSED_OPTIONS.values(), ids=REFUSED_OPTIONS)
+def test_options_that_cannot_be_right_are_refused(asked: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RewardOptions(**asked)
+
+
+@at_each_door
+def test_an_environment_that_draws_no_frames_is_refused(recorder: Recorder, kind: type[Door]) -> None:
+    env = CodedEnv()
+    env.render_mode = None  # type: ignore[assignment]
+    with pytest.raises(ValueError, match=r"^render_mode: expected 'rgb_array', .* got None$"):
+        opened(kind, recorder, [env], options(frames_from=None))
+
+
+@pytest.mark.parametrize("kind", VECTORS.values(), ids=VECTORS)
+def test_a_vector_needs_a_task_for_each_environment(recorder: Recorder, kind: type[Door]) -> None:
+    door = kind.__new__(kind)
+    with pytest.raises(ValueError, match=r"^task: expected one for each of the 2 environments, got 1$"):
+        door.wrap(makers_of([CodedEnv(), CodedEnv()]), recorder, ["task 0"], options())
+
+
+INSTEAD = "; wrap each environment in RewardModelWrapper instead$"
+REFUSED_DOORS: dict[str, tuple[Sequence[str], dict[str, Any], str]] = {
+    "an unknown key": (
+        list(DOORS),
+        {"frames_from": "camera"},
+        r"^frames_from: expected a key of the .*\['pixels'\], got",
+    ),
+    "unknown cameras": (
+        list(DOORS),
+        {"frames_from": None, "cameras": ["front"]},
+        r"^cameras: expected keys of the observation \['pixels'\], got \['front'\]$",
+    ),
+    "frames that a vector never renders": (
+        ["SAME_STEP"],
+        {"frames_from": None},
+        rf"^autoreset_mode: expected NEXT_STEP or DISABLED with frames from render\(\), .* got SAME_STEP{INSTEAD}",
+    ),
+    "an end that a vector does not learn of": (
+        ["NEXT_STEP", "SAME_STEP"],
+        {"terminate_on_success": ENDS},
+        f"^autoreset_mode: expected DISABLED with terminate_on_success, got [NS].*{INSTEAD}",
+    ),
+    "an end that a VecEnv does not learn of": (
+        ["VecEnv"],
+        {"terminate_on_success": ENDS},
+        f"^terminate_on_success: expected None, since a VecEnv resets, got .*{INSTEAD}",
+    ),
+}
+REFUSED_AT = [
+    pytest.param(DOORS[door], asked, message, id=f"{door}-{name}")
+    for name, (doors, asked, message) in REFUSED_DOORS.items()
+    for door in doors
+]
+
+
+@pytest.mark.parametrize(("kind", "asked", "message"), REFUSED_AT)
+def test_a_door_refuses_what_it_cannot_pay(
+    recorder: Recorder, kind: type[Door], asked: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        opened(kind, recorder, [CodedEnv()], options(**asked))
+
+
+@pytest.mark.parametrize(
+    "kind", [each for each in DOORS.values() if each.resets == BY_CALLER or each is AutoresetAbove]
+)
+def test_a_success_ends_an_episode_and_a_step_after_it_is_refused(judge: Recorder, kind: type[Door]) -> None:
+    envs = [CodedEnv(TERMINATES, (LAST,)) for _ in range(2)]
+    with opened(kind, judge, envs, options(terminate_on_success=ENDS)) as door:
+        door.reset()
+        first, second = (door.step()[0] for _ in range(2))
+        assert [said.ends for said in (first, second)] == [False, True]
+        assert (second.terminated, second.truncated) == (True, False)
+        assert [said.info["reward_model"]["succeeded"] for said in (first, second)] == [False, True]
+        if door.resets == BY_CALLER:
+            with pytest.raises(ResetNeeded, match=r"^step: expected a reset.*(has|have) ended, got another step; call"):
+                door.step()
+            assert envs[0].code == (TERMINATES, 0, 2)  # it was not stepped
+            assert list(door.reset([True, False])) == [0]
+            with pytest.raises(ResetNeeded, match=r"^step: expected a reset(,| of the environments \[1\],) since"):
+                door.step()
+            door.reset([False, True])
+        else:
+            assert door.step()[0].reward == 0
+        assert judge.calls[-1][0][0] == [(TERMINATES, 1, 0)]
