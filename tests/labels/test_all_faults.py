@@ -232,9 +232,3 @@ def test_all_episodes_that_changed_since_they_were_labelled_are_named_at_once(tm
     lines = refused(root, output, episodes=[0])
     assert lines[0].startswith("episode 2, episode 3, episode 6: expected no change since the labels in ")
     assert "or --episodes with 2:4,6, got other frames or rows" in lines[0]
-
-
-def test_labels_in_place_need_an_hdf5_file(output: Path) -> None:
-    message = "in_place: expected an HDF5 file, got LeRobot v2.1: leave --in-place away"
-    with pytest.raises(DatasetError, match=message):
-        label(open_dataset(LEROBOT / "toy_v21"), BrightnessScorer(), LabelOptions(output=output, in_place=True))

@@ -19,7 +19,7 @@ from pyarrow import parquet
 from labelling import BrightnessScorer, brightness, command
 from pictures import numbered, numbers
 from rfm_client.command_line import ExitCode
-from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset, read_episode_labels
 
 TASK = "stack the cups"
 COUNT = 12  # frames of an episode; more than 10, so 10.png exists
@@ -203,17 +203,14 @@ def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys:
     assert [line for line in said if line in files] == files
     for folder, stem in (("more", "task_1"), ("", "task_2"), ("", "task_10")):
         assert (root / folder / f"{stem}.rfm_summary.png").exists()
-        with h5py.File(root / folder / f"{stem}.rfm_rewards.hdf5") as opened:
-            np.testing.assert_allclose(opened["data/demo_0/rfm_progress"], brightness(numbered(5)), atol=1e-6)
+        labels = read_episode_labels(root / folder / f"{stem}.rfm_progress.parquet", 0)
+        assert labels is not None
+        np.testing.assert_allclose(labels.fused.progress, brightness(numbered(5)), atol=1e-6)
     assert asked(root, LabelOptions())[::2] == (ExitCode.OK, set())  # files of labels are no datasets
     capsys.readouterr()
 
 
 REFUSED_FOLDERS: dict[str, tuple[LabelOptions, str]] = {
-    "another format": (
-        LabelOptions(formats=["progress"]),
-        "format: expected hdf5 for a folder of HDF5 files, each with",
-    ),
     "one name twice": (
         LabelOptions(output=Path("out")),
         r"output: expected .* names differ, got .*a\.h5.*: leave out --o",
@@ -230,4 +227,4 @@ def test_a_folder_of_hdf5_files_is_refused_before_a_score(tmp_path: Path, labels
         opened["data/demo_0/obs/states"] = np.zeros((5, 3))
     with pytest.raises(DatasetError, match=message):
         asked(tmp_path, labels)
-    assert not list(tmp_path.rglob("*rewards*"))
+    assert not list(tmp_path.rglob("*.parquet"))

@@ -17,7 +17,7 @@ from client_commands import invoke
 from hdf5_writers import RGB_MARK, TASK, decoded, jpeg, video
 from labelling import BrightnessScorer
 from rfm_client import RewardClient, Trajectory, UInt8Array
-from rfm_labels import ClientScorer, Dataset, DatasetError, LabelOptions, label, open_dataset
+from rfm_labels import ClientScorer, Dataset, DatasetError, LabelOptions, label, open_dataset, read_episode_labels
 from servers import Endpoints
 from tolerances import TOLERANCE
 
@@ -109,17 +109,17 @@ def test_labels_are_what_the_client_says_about_frames_that_pillow_decodes(
 ) -> None:
     file, expected = write(tmp_path)
     report = label(opened(file), ClientScorer(client), LabelOptions(mode="whole", fuse="mean"))
-    assert report.files == [file.with_name(f"{file.stem}.rfm_rewards.hdf5")]
+    assert report.files[0] == file.with_name(f"{file.stem}.rfm_progress.parquet")
     of_cameras = {
         camera: client.progress(Trajectory(frames=np.ascontiguousarray(frames), task=TASK)).progress
         for camera, frames in expected.items()
     }
-    with h5py.File(report.files[0]) as stored:
-        fused = stored["data/demo_0/rfm_progress"][()]
-        np.testing.assert_allclose(fused, np.mean(list(of_cameras.values()), axis=0), rtol=0, atol=TOLERANCE)
-        for camera, progress in of_cameras.items() if len(expected) > 1 else ():
-            told = stored[f"data/demo_0/rfm_progress.{camera}"][()]
-            np.testing.assert_allclose(told, progress, rtol=0, atol=TOLERANCE)
+    labels = read_episode_labels(report.files[0], 0)
+    assert labels is not None
+    mean = np.mean(list(of_cameras.values()), axis=0)
+    np.testing.assert_allclose(labels.fused.progress, mean, rtol=0, atol=TOLERANCE)
+    for camera, progress in of_cameras.items() if len(expected) > 1 else ():
+        np.testing.assert_allclose(labels.cameras[camera].progress, progress, rtol=0, atol=TOLERANCE)
 
 
 def test_red_and_blue_are_as_the_mark_of_robotwin_says_unless_the_caller_does(tmp_path: Path) -> None:
@@ -250,15 +250,6 @@ def test_a_file_of_maniskill_without_pictures_says_how_to_add_them(tmp_path: Pat
     assert "traj_0/obs/sensor_data: expected a camera" in str(refused.value)
 
 
-def test_labels_are_not_written_into_a_file_of_another_program(tmp_path: Path) -> None:
-    file = writers.write_robomind(tmp_path / "t.hdf5", {"high": FILES["high"]})
-    with pytest.raises(DatasetError) as refused:
-        label(open_dataset(file), BrightnessScorer(), LabelOptions(in_place=True))
-    assert str(refused.value) == (
-        "in_place: expected an HDF5 file of robomimic or LIBERO, got HDF5 (RoboMIND): leave --in-place away"
-    )
-
-
 def test_robomimics_layout_may_hold_files_too(tmp_path: Path) -> None:
     file = tmp_path / "demos.hdf5"
     with h5py.File(file, "w") as stored:
@@ -274,6 +265,6 @@ def test_a_folder_of_episodes_is_labelled_file_by_file(tmp_path: Path, demo_serv
     result = invoke("label", tmp_path, "--no-picture", "--mode", "whole", "--url", demo_server.grpc_url)
     assert result.exit_code == 0, result.output
     assert "layout: ALOHA, cameras high (JPEG or PNG)" in result.output
-    assert {file.name for file in tmp_path.glob("*_rewards.hdf5")} == {
-        f"episode_{n}.rfm_rewards.hdf5" for n in range(2)
+    assert {file.name for file in tmp_path.glob("*_progress.parquet")} == {
+        f"episode_{n}.rfm_progress.parquet" for n in range(2)
     }

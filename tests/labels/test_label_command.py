@@ -211,8 +211,7 @@ def test_pictures_that_are_stored_upside_down_get_the_labels_of_upright_ones(out
         asked = ("--task", task.sentence(), "--override-task", "--no-picture", "--output", output)
         result = own(file, *ENGINE, *asked, *words)
         assert result.exit_code == 0, result.stderr
-        with h5py.File(output / f"{name}.rfm_rewards.hdf5") as opened:
-            return opened["data/demo_0/rfm_progress"][:], result.stderr
+        return parquet.read_table(output / f"{name}.rfm_progress.parquet")["progress_sparse"], result.stderr
 
     expected, told = labels("upright", upright, {})
     assert "rfm: note: orient: agentview_rgb as stored, but LIBERO, which names cameras so, stores them upside" in told
@@ -234,8 +233,7 @@ def test_pictures_that_are_stored_as_bgr_get_the_labels_of_rgb(output: Path) -> 
         result = own(output / f"{name}.hdf5", *ENGINE, *asked)
         assert result.exit_code == 0, result.stderr
         assert ("rfm: note: channels: front bgr (asked for)" in result.stderr) == bool(words)
-        with h5py.File(output / f"{name}.rfm_rewards.hdf5") as opened:
-            return float(opened["data/demo_0/rfm_success"][-1])
+        return float(parquet.read_table(output / f"{name}.rfm_progress.parquet")["success"][-1].as_py())
 
     expected = last_success("rgb", frames)
     assert expected == pytest.approx(0.999, abs=5e-4)  # as the guide says
@@ -259,7 +257,7 @@ def test_what_the_run_did_not_train_is_told(output: Path) -> None:
 
 
 WRONG = {
-    "a format": (["--format", "csv"], "'--format': expected one of progress, signals, hdf5, got 'csv'"),
+    "a format": (["--format", "csv"], "'--format': expected some of progress, signals, got csv"),
     "a rule": (["--sampling", "first"], "Invalid value for '--sampling': 'first' is not one of 'linspace_trunc', "),
     "an option that contradicts": (["--shard", "3/3"], "'--shard': expected i/n with i from 0 to n - 1, got 3/3"),
     "an orientation": (["--orient", "up"], "Invalid value for '--orient': expected one of none, rotate180, "),

@@ -14,10 +14,9 @@ import numpy.typing as npt
 from rfm_client import Float32Array
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
 from rfm_labels.datasets.faults import DatasetError, listed, require
+from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.lerobot_meta import INFO_FILE
-from rfm_labels.hdf5_tables import BLANK, COST, PROVENANCE, find_in_hdf5, of_hdf5, read_attribute, read_hdf5_table
 from rfm_labels.metadata import (
-    BLANK_KEY,
     PROGRESS,
     SUCCESS,
     BlankCameras,
@@ -99,18 +98,31 @@ def find_label_files(root: Path) -> list[Path]:
 
     root: the dataset's folder, or HDF5 file
 
-    For labels in both Parquet formats, return only the progress file. Labels in HDF5 are paths such as
-    ``demos.hdf5/rfm`` (in place) and ``demos.rfm_rewards.hdf5/rfm``. Raises DatasetError for a folder with labels of
-    several HDF5 datasets.
+    For labels in both formats, return only the progress file. Raises DatasetError for a folder with labels of several
+    HDF5 files.
     """
-    in_hdf5 = [] if (root / INFO_FILE).is_file() else find_in_hdf5(root)  # a LeRobot dataset has none
+    folder = root.parent if root.is_file() else root
+    progress = sorted(folder.glob(f"[!.]*{PROGRESS_ENDING}"))
+    named = {reward_name(file) for file in progress}
+    signals = [file for file in sorted((folder / SIGNALS_FOLDER).glob("[!.]*.parquet")) if file.stem not in named]
+    files = sorted((*progress, *signals), key=lambda file: reward_name(file).rpartition(".")[2] != _OWN_NAME)
     if root.is_file():
-        return sorted(in_hdf5, key=lambda file: file.name != _OWN_NAME)
-    progress = sorted(root.glob(f"*{PROGRESS_ENDING}"))
-    named = {file.name.removesuffix(PROGRESS_ENDING) for file in progress}
-    signals = [file for file in sorted((root / SIGNALS_FOLDER).glob("*.parquet")) if file.stem not in named]
-    files = [file for file in (*progress, *signals, *in_hdf5) if not file.name.startswith(".")]
-    return sorted(files, key=lambda file: file.name.removesuffix(PROGRESS_ENDING) != _OWN_NAME)
+        return [file for file in files if _prefix(file) == label_prefix(root)]
+    prefixes = sorted({_prefix(file) for file in files})
+    is_one = len(prefixes) < 2 or (root / INFO_FILE).is_file()
+    got = f"{', '.join(prefix.rstrip('.') or 'others' for prefix in prefixes)}: name one of the HDF5 files"
+    require(folder, is_one, "labels of one dataset", got)
+    return files
+
+
+def reward_name(file: Path) -> str:
+    """Return the name of the reward in a label file, after the dataset's ``label_prefix``."""
+    return file.name.removesuffix(PROGRESS_ENDING).removesuffix(".parquet")
+
+
+def _prefix(file: Path) -> str:
+    before, dot, _ = reward_name(file).rpartition(".")
+    return before + dot
 
 
 def read_label_table(file: Path, *, episode: int | None = None) -> Any:
@@ -118,14 +130,10 @@ def read_label_table(file: Path, *, episode: int | None = None) -> Any:
 
     Score columns: those of ``SCORES``, as far as the file has them.
 
-    file: Parquet, or HDF5 as ``find_label_files`` returns it
-
     episode: only this episode's rows; None: all
     """
     from pyarrow import ArrowException, parquet
 
-    if in_hdf5 := of_hdf5(file):
-        return read_hdf5_table(*in_hdf5, episode=episode)
     try:
         names = parquet.read_schema(file).names
         columns = {**{name: name for name in IDENTITY if name in names}, **_score_columns(file, names)}
@@ -138,27 +146,18 @@ def read_label_table(file: Path, *, episode: int | None = None) -> Any:
 
 def read_cost(file: Path) -> Cost | None:
     """Return the cost of a file's labels; None: the file does not say. Raises DatasetError."""
-    if in_hdf5 := of_hdf5(file):
-        return Cost.parse(read_attribute(*in_hdf5, COST))
     return Cost.parse(_metadata(file).get(COST_KEY))
 
 
 def read_blank(file: Path) -> BlankCameras:
     """Return the cameras that show nothing, as the metadata of a file's labels tell them. Raises DatasetError."""
-    if in_hdf5 := of_hdf5(file):
-        blank = read_attribute(*in_hdf5, BLANK)
-        return blank_from_metadata({BLANK_KEY: blank} if blank else {})
     return blank_from_metadata(_metadata(file))
 
 
 def read_provenance(file: Path) -> dict[str, Any]:
     """Return writer, dataset and recipe of a label file, as far as it tells them. Raises DatasetError."""
-    if in_hdf5 := of_hdf5(file):
-        told = read_attribute(*in_hdf5, PROVENANCE)
-    else:
-        metadata = _metadata(file)
-        told = metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY))
-    return parsed_object(told)
+    metadata = _metadata(file)
+    return parsed_object(metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY)))
 
 
 def _metadata(file: Path) -> Mapping[bytes, bytes]:

@@ -59,7 +59,7 @@ _KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and the name of
     "folders of pictures": (FrameFolders, "folder"),
     "arrays": (ArrayFiles, "file"),
 }
-_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside the episodes, once they have labels
+_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside episodes with labels; of 0.4
 
 
 def open_dataset(
