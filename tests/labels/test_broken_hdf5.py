@@ -205,17 +205,10 @@ def test_what_is_left_out_or_differs_is_told_and_the_rest_is_labelled(
     assert [line for line in notes.lines if not line.startswith(settings)] == lines
 
 
-def test_an_observation_after_the_last_action_gets_a_label(demos: Path) -> None:
-    changed(demos, without_last_action)
-    report = label(open_dataset(demos), BrightnessScorer())
-    assert report.summary is not None
-    assert report.summary.num_frames == 3 * LENGTH
-
-
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_damaged_file_is_read_or_refused(demos: Path, seed: int) -> None:
     whole, draw = demos.read_bytes(), random.Random(seed)
-    for number in range(25):
+    for number in range(15):
         damaged = bytearray(whole)
         for _ in range(draw.choice((1, 4, 16))):
             damaged[draw.randrange(len(whole))] = draw.randrange(256)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -18,7 +18,7 @@ from PIL import Image
 from pyarrow import parquet
 
 from client_commands import invoke
-from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, brightness
+from labelling import BrightnessScorer, Notes, brightness
 from paths import ROOT
 from rfm_client import FrameSize, InvalidSampleError, ProgressResult, ProgressSample, UInt8Array
 from rfm_client.frames import Correction, Orientation, resize_frames
@@ -75,64 +75,6 @@ def pictures(index: int = 0, **more: Any) -> dict[str, Any]:
 def demos(tmp_path: Path) -> Path:
     states = [{"gripper_states": np.zeros((length, 2))} for length in LENGTHS]
     return write(tmp_path / "demos.hdf5", LIBERO, *(pictures(index, **states[index]) for index in range(3)))
-
-
-def test_a_file_gives_its_demonstrations_in_the_order_of_their_numbers(demos: Path) -> None:
-    dataset = open_dataset(demos)
-    assert (dataset.kind, dataset.source, dataset.root) == ("HDF5", "demos.hdf5", demos.parent)
-    assert tuple(dataset.cameras) == CAMERAS
-    told = [(e.index, e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
-    assert told == [(0, "demo_0", TASK, 5, 0), (1, "demo_1", TASK, 7, 5), (2, "demo_2", TASK, 3, 12)]
-    for episode in dataset.episodes:
-        for camera in dataset.cameras:
-            upright = frames_of(episode.index, camera)[:, ::-1]  # as upstream turns LIBERO's
-            np.testing.assert_array_equal(list(dataset.frames(episode, camera)), upright)
-            assert dataset.check(episode, camera) == upright.nbytes
-
-
-def edited(change: Callable[[Any], object]) -> Callable[[Path], None]:
-    def apply(file: Path) -> None:
-        with h5py.File(file, "r+") as opened:
-            change(opened["data"])
-
-    return apply
-
-
-def shorten(data: Any) -> None:
-    del data["demo_1/actions"]
-    data["demo_1/actions"] = np.zeros((5, 7))
-
-
-BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
-    "lengths that differ": (edited(shorten), r"data/demo_1: expected one length, above 0, got .*_rgb 7, .*actions 5"),
-    "a camera that is missing": (
-        edited(lambda data: data["demo_2/obs"].pop(CAMERAS[1])),
-        f"cameras: expected some of {CAMERAS[0]}, got '{CAMERAS[1]}', which is left out: missing in demo_2",
-    ),
-    "no task": (
-        edited(lambda data: data.attrs.pop("problem_info")),
-        r"problem_info or env_args: expected a task as a sentence, got none",
-    ),
-    "no demonstration": (
-        edited(lambda data: [data.pop(name) for name in list(data)]),
-        r"data: expected demo_0, demo_1 and so on, got none",
-    ),
-    "a truncated file": (
-        lambda file: file.write_bytes(file.read_bytes()[:3000]),
-        r"demos\.hdf5: expected an HDF5 file, got ",
-    ),
-}
-
-
-@pytest.mark.parametrize(("break_it", "message"), BROKEN.values(), ids=BROKEN)
-def test_a_file_that_contradicts_itself_is_refused(
-    demos: Path, break_it: Callable[[Path], object], message: str
-) -> None:
-    break_it(demos)
-    scorer = BrightnessScorer()
-    with pytest.raises(DatasetError, match=message):
-        label(open_dataset(demos), scorer, LabelOptions(cameras=CAMERAS))
-    assert scorer.num_samples == 0
 
 
 TURNED_BY_PILLOW: dict[Orientation, Image.Transpose] = {
@@ -196,17 +138,6 @@ def test_pictures_are_turned_as_the_file_says_or_as_the_caller_says(
     for camera, orientation in by_camera.items():
         read = np.stack(list(dataset.frames(episode, camera)))
         np.testing.assert_array_equal(read, turned(pictures()[camera], orientation))
-
-
-def test_videos_are_turned_as_the_caller_says() -> None:
-    root, turn = LEROBOT / "toy_v21", {"wrist": "rotate90"}
-    stored, dataset = open_dataset(root), open_dataset(root, orient=turn)
-    assert (stored.corrections, dataset.corrections) == ({}, {WRIST: Correction("rotate90")})
-    episode = dataset.episodes[0]
-    upright = turned(np.stack(list(stored.frames(episode, WRIST))), "rotate90")
-    np.testing.assert_array_equal(np.stack(list(dataset.frames(episode, WRIST))), upright)
-    with pytest.raises(DatasetError, match=f"orient: expected one of the cameras .*{WRIST}.*, got 'top'"):
-        open_dataset(root, orient={"top": "rotate90"})
 
 
 FRAMES = np.random.default_rng(3).integers(0, 256, (5, 16, 24, 3), np.uint8)
@@ -324,12 +255,6 @@ def test_a_camera_of_some_demonstrations_is_left_out_with_the_reason(
     assert (tuple(dataset.cameras), dataset.left_out, len(dataset.episodes)) == (CAMERAS, {"other": reason}, 2)
 
 
-def test_a_file_without_pictures_says_what_it_holds_and_what_renders_them(tmp_path: Path) -> None:
-    file = write(tmp_path / "demos.hdf5", ROBOMIMIC, {"ee_pos": np.zeros((5, 3))})
-    with pytest.raises(DatasetError, match=r"got ee_pos float64 \[5, 3\]: robomimic's dataset_states_to_obs\.py rend"):
-        open_dataset(file)
-
-
 def test_labels_say_which_cameras_are_turned_and_which_are_left_out(demos: Path) -> None:
     with h5py.File(demos, "r+") as opened:
         for index, length in enumerate(LENGTHS):
@@ -390,13 +315,6 @@ FILTERS: dict[str, tuple[LabelOptions, str]] = {
 def test_a_filter_key_without_episodes_is_refused(masked: Path, options: LabelOptions, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         label(open_dataset(masked), BrightnessScorer(), options)
-
-
-def test_a_filter_key_needs_a_file_that_has_it(demos: Path) -> None:
-    with h5py.File(demos, "r+") as opened:
-        opened["mask/train"] = np.array([3])  # no names of demonstrations
-    with pytest.raises(DatasetError, match="filter_key: expected none, since the dataset has no filter keys, got"):
-        label(open_dataset(demos), BrightnessScorer(), LabelOptions(filter_key="train"))
 
 
 class Comparer(BrightnessScorer):

@@ -1,26 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Label a dataset: plan, score, write the label files.
 
-Labels of the same recipe that are there stay. Others are replaced on request alone.
+Finished episodes stay in the parts. A run replaces label files on request, or if it gives all their labels again.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
 from rfm_labels.datasets.faults import DatasetError
-from rfm_labels.label_files import LabelFile, parquet_labels
-from rfm_labels.metadata import SCORES, Cost, blank_from_metadata, blank_lines, skipping_in
+from rfm_labels.label_files import LabelFile
+from rfm_labels.metadata import SCORES, Cost, blank_from_metadata, blank_lines
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
-from rfm_labels.plan import Item, Plan, all_faults, plan_labels
+from rfm_labels.plan import Plan, all_faults, plan_labels
 from rfm_labels.scorer import Scorer
 from rfm_labels.scoring import FailedEpisode, Run
 from rfm_labels.summary import Summary, summary_of
@@ -71,95 +69,40 @@ def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = DEFAULTS, wa
 def prepared(
     dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
 ) -> tuple[Outputs, Plan, Cost | None]:
-    """Make and check the plan, and restore parts from label files. Return the cost of the labels that exist, too."""
+    """Make and check the plan. Return the cost of these labels in existing files, too; None: unknown."""
     outputs = Outputs.of(dataset, options)
     if options.shard is None:
         outputs.make_folder()
-    checked = check(plan_labels(dataset, scorer, options, watch), dataset, outputs, watch)
-    restore(checked.plan, outputs.parts, checked.before)
-    return outputs, checked.plan, earlier_cost(checked.plan, checked.before)
+    plan = plan_labels(dataset, scorer, options, watch)
+    check(plan, dataset, outputs, watch)
+    digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
+    known = (file.cost for file in outputs.before() if digests & set(file.digests.values()))
+    return outputs, plan, next(filter(None, known), None)
 
 
-@dataclass(frozen=True)
-class CheckedPlan:
-    """A plan after all frames were found.
+def check(plan: Plan, dataset: Dataset, outputs: Outputs, watch: Watch = QUIET) -> int:
+    """Check everything that a run needs before the first score, write nothing, and return the bytes to decode.
 
-    plan: chosen episodes, and others with kept labels
-    before: existing label files
-    num_bytes: stored size by episode number
-    """
-
-    plan: Plan
-    before: Sequence[LabelFile]
-    num_bytes: Mapping[int, int]
-
-
-def check(plan: Plan, dataset: Dataset, outputs: Outputs, watch: Watch = QUIET) -> CheckedPlan:
-    """Check everything that a run needs before the first score, also for labelled episodes. Write nothing.
-
-    Rows and checks may have changed since the labels were made. Raises DatasetError.
+    Raises DatasetError, also for existing label files that this run may not replace.
     """
     options = outputs.options
-    before = outputs.before() if options.shard is None else []
-    plan = joined(plan, dataset, before, options.overwrite, watch)
+    for file in outputs.before() if options.shard is None else ():
+        try:
+            file.check(plan)
+        except DatasetError as error:
+            if not options.overwrite:
+                told = f"{error.problem}: choose another {file.option}, or --overwrite"
+                raise DatasetError(told, error.where) from error
+            watch.note(f"--overwrite: {error}; its labels of {len(file.digests)} episodes are replaced")
     watch.checking(len(plan.items))
-    num_bytes = {}
+    num_bytes = 0
     with all_faults(dataset, options):
         for item in plan.items:
-            num_bytes[item.episode.index] = sum(
-                dataset.check(item.episode, camera) for camera in plan.recipe.decoded_cameras
-            )
+            num_bytes += sum(dataset.check(item.episode, camera) for camera in plan.recipe.decoded_cameras)
             watch.checked(item.episode)
     for line in dataset.frame_notes:
         watch.note(line)
-    return CheckedPlan(plan, before, num_bytes)
-
-
-def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: bool, watch: Watch) -> Plan:
-    """Return the plan with all other episodes whose labels are in the files.
-
-    Raises DatasetError, without ``overwrite``, for a file whose labels would be lost or do not fit the frames.
-    """
-    known: Mapping[int, Item] = {item.episode.index: item for item in plan.items}
-    for file in files:
-        try:
-            known = {**known, **file.check(plan, dataset, known)}
-        except DatasetError as error:
-            if not overwrite:
-                told = f"{error.problem}: choose another {file.option}, or --overwrite"
-                raise DatasetError(told, error.where) from error
-            lost = f"; its labels of {len(file.digests)} episodes are replaced" if file.digests else ""
-            watch.note(f"--overwrite: {error}{lost}")
-    if len(known) > len(plan.items):
-        watch.note(f"labels of {len(known) - len(plan.items)} other episodes are there, and are kept")
-    return replace(plan, items=[known[index] for index in sorted(known)])
-
-
-def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
-    """Write each missing part of the plan whose labels are in a file. Raises OSError."""
-    cameras = ("", *(f".{camera}" for camera in plan.recipe.cameras))
-    order = [name + camera for name in SCORES for camera in cameras]
-    finished = parts.finished(plan.items)
-    for file in files:
-        missing = [item for item in plan.items if item.key not in finished]
-        gone = [item for item in missing if file.digests.get(item.episode.index) == item.digest]
-        for item, columns in file.read(gone) if gone else ():
-            scores = {name: columns[name] for name in order if name in columns}
-            skipping = skipping_in(scores)
-            answered = slice(None) if skipping is None else np.isfinite(scores[skipping])
-            of_all = [
-                len(each) == item.episode.num_frames and np.isfinite(each[answered]).all() for each in scores.values()
-            ]
-            if of_all and all(of_all):
-                index = item.episode.index
-                parts.write(item, scores, {name: of[index] for name, of in file.blank.items() if index in of})
-                finished.add(item.key)
-
-
-def earlier_cost(plan: Plan, files: Sequence[LabelFile]) -> Cost | None:
-    """Return the first cost that a file with labels of this plan tells; None: no such file does."""
-    digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
-    return next((file.cost for file in files if file.cost and digests & set(file.digests.values())), None)
+    return num_bytes
 
 
 def put_together(
@@ -236,8 +179,8 @@ class Outputs:
     def before(self) -> list[LabelFile]:
         """Return the label files that exist already."""
         named = zip(self.progress, ("--name", "--alias"), strict=False)
-        found = [parquet_labels(path, option) for path, option in named if path.exists()]
-        return found + [parquet_labels(path) for path in self.signals if path.exists()]
+        found = [LabelFile.read(path, option) for path, option in named if path.exists()]
+        return found + [LabelFile.read(path) for path in self.signals if path.exists()]
 
     def write(self, plan: Plan, labels: Any, cost: Cost | None) -> list[Path]:
         """Write the labels to all files, and return their paths. Raises OSError.

@@ -246,8 +246,7 @@ class LabelCommand:
         outputs = Outputs.of(dataset, self.labels)
         with self.connect() as scorer, ProgressBar(self.say) as watch:
             plan = plan_labels(dataset, scorer, self.labels, watch)
-            checked = check(plan, dataset, outputs, watch)
-            num_bytes = sum(checked.num_bytes[item.episode.index] for item in plan.items)
+            num_bytes = check(plan, dataset, outputs, watch)
             took_s = _measured_s(plan, dataset, scorer, self.labels.workers, watch)
         _print(_plan_rows(plan, dataset, num_bytes, took_s))
 
@@ -269,13 +268,9 @@ class LabelCommand:
         return ExitCode.OK
 
     def _record(self, folder: Path, report: Report) -> None:
-        """Record the chosen episodes, also those labelled by an earlier run."""
         from rfm_labels.pictures import record_episodes
 
-        dataset = self._dataset()
-        chosen = {episode.index for episode in selected(dataset, self.labels)}
-        plan = replace(report.plan, items=[item for item in report.plan.items if item.episode.index in chosen])
-        for file in record_episodes(folder, dataset, plan, Parts(report.parts)):
+        for file in record_episodes(folder, self._dataset(), report.plan, Parts(report.parts)):
             typer.echo(f"{file}")
 
     def _report(self) -> None:
