@@ -171,7 +171,9 @@ def test_score_reads_videos_behind_urls(served: Served, video: Path) -> None:
 
 
 NO_TASK = 'task: expected a sentence with frames, got none: add --task "SENTENCE"'
-SEVERAL = "video: expected a video of one episode, got a LeRobot v3.0 file that holds 10 episodes: label the dataset "
+SEVERAL = (
+    "video: expected a video of one episode, got a file in the layout of LeRobot v3.0, which holds several: label "
+)
 REFUSED: dict[str, tuple[list[object], str]] = {
     "no frame left out": (
         ["score", "clip.mp4", "--fps", 10, "--no-subsample"],

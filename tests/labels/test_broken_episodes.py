@@ -9,14 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer
-from pictures import numbered, write_video
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 TASK = "stack the cups"
@@ -112,59 +110,3 @@ def test_episodes_that_are_not_chosen_are_not_read(tmp_path: Path, monkeypatch: 
         open_dataset(root), BrightnessScorer(), LabelOptions(output=tmp_path, episodes=[2], cameras=(WRIST,), frames=2)
     )
     assert {file.name for file in read if "data" in file.parts} == {"episode_000002.parquet"}
-
-
-def videos(folder: Path) -> Path:
-    for name, count in (("a.mp4", 3), ("b.mp4", 4), ("c.mp4", 5)):
-        write_video(folder / name, numbered(count))
-    (folder / "b.mp4").write_bytes((folder / "b.mp4").read_bytes()[:300])
-    return folder
-
-
-def demos(folder: Path, break_it: Callable[[Any], object]) -> Path:
-    with h5py.File(folder / "demos.hdf5", "w") as opened:
-        opened.create_group("data").attrs["env_args"] = json.dumps({"env_name": "Lift"})
-        for index in range(3):
-            opened[f"data/demo_{index}/obs/front"] = numbered(3 + index)
-            opened[f"data/demo_{index}/obs/wrist"] = numbered(3 + index)
-            opened[f"data/demo_{index}/actions"] = np.zeros((3 + index, 7))
-        break_it(opened["data"])
-    return folder / "demos.hdf5"
-
-
-def test_a_broken_video_lets_the_others_through(tmp_path: Path, output: Path) -> None:
-    """An unknown length counts as no frames."""
-    root = videos(tmp_path)
-    with pytest.raises(DatasetError, match=r"b\.mp4: expected a whole video file"):
-        label(open_dataset(root, task=TASK), BrightnessScorer(), LabelOptions(output=output))
-    report = label(open_dataset(root, task=TASK), BrightnessScorer(), LabelOptions(output=output, episodes=[0, 2]))
-    table = parquet.read_table(report.files[0])
-    assert table["episode_index"].to_pylist() == [0] * 3 + [2] * 5
-    assert table["index"].to_pylist() == list(range(8))
-
-
-BROKEN_DEMOS: dict[str, tuple[Callable[[Any], object], str]] = {
-    "no observations": (lambda data: data["demo_1"].pop("obs"), "cameras|a camera as uint8"),
-    "no group": (lambda data: [data.pop("demo_1"), data.create_dataset("demo_1", data=1)], "a camera as uint8"),
-    "lengths that differ": (
-        lambda data: [data["demo_1"].pop("actions"), data["demo_1"].create_dataset("actions", data=np.zeros((9, 7)))],
-        "data/demo_1: expected one length, above 0, got obs/front 4, obs/wrist 4, actions 9",
-    ),
-    "a camera that is missing": (lambda data: data["demo_1/obs"].pop("wrist"), "got 'wrist', which is left out: miss"),
-}
-
-
-@pytest.mark.parametrize(("break_it", "message"), BROKEN_DEMOS.values(), ids=BROKEN_DEMOS)
-def test_a_broken_demonstration_lets_the_others_through(
-    tmp_path: Path, break_it: Callable[[Any], object], message: str
-) -> None:
-    file = demos(tmp_path, break_it)
-    asked: dict[str, Any] = {"cameras": ("front", "wrist")}
-    with pytest.raises(DatasetError, match=message):
-        label(open_dataset(file, task=TASK), BrightnessScorer(), LabelOptions(**asked))
-    label(open_dataset(file, task=TASK), BrightnessScorer(), LabelOptions(episodes=[0, 2]))
-    with h5py.File(tmp_path / "demos.rfm_rewards.hdf5") as opened:
-        assert {name: len(opened[f"data/{name}/rfm_progress.wrist"]) for name in opened["data"]} == {
-            "demo_0": 3,
-            "demo_2": 5,
-        }

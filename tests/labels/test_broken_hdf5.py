@@ -205,23 +205,16 @@ def test_what_is_left_out_or_differs_is_told_and_the_rest_is_labelled(
     assert [line for line in notes.lines if not line.startswith(settings)] == lines
 
 
-def test_an_observation_after_the_last_action_gets_a_label(demos: Path) -> None:
-    changed(demos, without_last_action)
-    report = label(open_dataset(demos), BrightnessScorer())
-    with h5py.File(report.files[0]) as opened:
-        assert {demo["rfm_progress"].shape for demo in opened["data"].values()} == {(LENGTH,)}
-
-
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_damaged_file_is_read_or_refused(demos: Path, seed: int) -> None:
     whole, draw = demos.read_bytes(), random.Random(seed)
-    for number in range(25):
+    for number in range(15):
         damaged = bytearray(whole)
         for _ in range(draw.choice((1, 4, 16))):
             damaged[draw.randrange(len(whole))] = draw.randrange(256)
         demos.write_bytes(damaged)
         try:
-            options = LabelOptions(in_place=number % 2 == 0, overwrite=True, parts=str(demos.with_name(f"{number}")))
+            options = LabelOptions(overwrite=True, parts=str(demos.with_name(f"{number}")))
             label(open_dataset(demos, task=TASK), BrightnessScorer(), options)
         except (RewardError, OSError):
             pass

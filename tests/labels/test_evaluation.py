@@ -103,12 +103,6 @@ def test_models_are_compared_on_the_episodes_and_frames_that_both_have(tmp_path:
     assert agreement.distance == pytest.approx(np.mean(distances), abs=1e-6)
 
 
-def test_many_episodes_take_a_moment(tmp_path: Path) -> None:
-    random = np.random.default_rng(0)
-    file = labels(tmp_path / "a.parquet", {each: random.random(20) for each in range(3000)})
-    assert evaluate_labels([file], {each: each % 2 == 0 for each in range(3000)}).evaluations[0].num_frames == 60_000
-
-
 def test_the_cost_is_that_of_the_frames_that_the_run_scored(tmp_path: Path) -> None:
     dataset, output = open_dataset(copied("toy_v30_many", tmp_path)), tmp_path / "labels"
     request_s = 0.05  # and an episode is a request

@@ -11,15 +11,14 @@ from typing import Any
 
 import h5py
 import numpy as np
-import PIL
 import pytest
 from PIL import Image
 from pyarrow import parquet
 
 from labelling import BrightnessScorer, brightness, command
-from pictures import numbered, numbers
+from pictures import numbered
 from rfm_client.command_line import ExitCode
-from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset, read_episode_labels
 
 TASK = "stack the cups"
 COUNT = 12  # frames of an episode; more than 10, so 10.png exists
@@ -39,25 +38,6 @@ def folders(tmp_path: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".JPEG"])
-def test_folders_of_frames_are_read_in_natural_order_by_one_task(tmp_path: Path, suffix: str) -> None:
-    root = tmp_path / "frames"
-    for name in ("10", "2"):
-        write_frames(root / name, numbered(COUNT), suffix)
-        (root / name / "camera.json").write_text("{}")
-        (root / name / f"._frame_0{suffix}").write_bytes(b"of a Mac")
-    dataset = open_dataset(root, task=TASK)
-    assert (dataset.kind, dataset.root, list(dataset.cameras)) == ("folders of frames", root, ["frames"])
-    told = [(e.index, e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
-    assert told == [(0, "2", TASK, COUNT, 0), (1, "10", TASK, COUNT, COUNT)]
-    for episode in dataset.episodes:
-        video = np.stack(list(dataset.frames(episode, "frames")))
-        assert numbers(video, COUNT) == list(range(COUNT))
-        size = sum(file.stat().st_size for file in (root / episode.name).glob(f"frame_*{suffix}"))
-        assert dataset.check(episode, "frames") == size
-    assert dataset.decoder("frames") == f"Pillow {PIL.__version__}"
-
-
 def test_labels_of_folders_of_frames_stay_and_new_folders_are_added(folders: Path) -> None:
     """Also with labels and picture in the dataset's folder."""
     scorer = BrightnessScorer()
@@ -70,8 +50,8 @@ def test_labels_of_folders_of_frames_stay_and_new_folders_are_added(folders: Pat
     assert table["episode_index"].to_pylist() == [0] * COUNT + [1] * COUNT + [2] * COUNT
     np.testing.assert_allclose(table["progress_sparse"].to_numpy()[:COUNT], brightness(numbered(COUNT)), atol=1e-6)
     os.utime(folders / "2" / "frame_3.png", (1, 1))
-    with pytest.raises(DatasetError, match=r"2: expected no change since the labels"):
-        label(open_dataset(folders, task=TASK), scorer, LabelOptions(episodes=[0]))
+    with pytest.raises(DatasetError, match=r"expected labels of the episodes as they are now, got others for 2, whose"):
+        label(open_dataset(folders, task=TASK), scorer, LabelOptions())
 
 
 @pytest.mark.parametrize("column", ["video", "episode"])
@@ -125,26 +105,6 @@ def test_a_folder_without_frames_is_refused_before_a_score(
         label(open_dataset(folders, task=TASK), scorer, LabelOptions())
     assert message in str(refused.value)
     assert scorer.num_samples == 0
-
-
-def test_arrays_are_episodes_with_their_own_tasks_or_the_callers(tmp_path: Path) -> None:
-    frames = numbered(COUNT)
-    np.save(tmp_path / "10.npy", frames[:4])
-    np.savez(tmp_path / "9.npz", frames=frames.astype(np.float32) / 255, task="open the box")
-    dataset = open_dataset(tmp_path, task=TASK, orient="flip-vertical")
-    assert (dataset.kind, dataset.decoder("frames")) == ("arrays", None)
-    told = [(e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
-    assert told == [("9.npz", "open the box", COUNT, 0), ("10.npy", TASK, 4, COUNT)]
-    for episode in dataset.episodes:
-        np.testing.assert_array_equal(list(dataset.frames(episode, "frames")), frames[: episode.num_frames, ::-1])
-        assert dataset.check(episode, "frames") == frames[: episode.num_frames].nbytes
-    with pytest.raises(DatasetError, match=r'10\.npy: expected a task as a sentence, got none: add --task "SENTENCE"'):
-        _ = open_dataset(tmp_path).episodes
-    (tmp_path / "tasks.json").write_text(json.dumps({"10.npy": "open the box", "9.npz": ""}))
-    assert [(e.name, e.task) for e in open_dataset(tmp_path).episodes] == [
-        ("10.npy", "open the box"),
-        ("9.npz", "open the box"),
-    ]
 
 
 UNREADABLE: dict[str, tuple[Any, str]] = {
@@ -203,17 +163,14 @@ def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys:
     assert [line for line in said if line in files] == files
     for folder, stem in (("more", "task_1"), ("", "task_2"), ("", "task_10")):
         assert (root / folder / f"{stem}.rfm_summary.png").exists()
-        with h5py.File(root / folder / f"{stem}.rfm_rewards.hdf5") as opened:
-            np.testing.assert_allclose(opened["data/demo_0/rfm_progress"], brightness(numbered(5)), atol=1e-6)
+        labels = read_episode_labels(root / folder / f"{stem}.rfm_progress.parquet", 0)
+        assert labels is not None
+        np.testing.assert_allclose(labels.fused.progress, brightness(numbered(5)), atol=1e-6)
     assert asked(root, LabelOptions())[::2] == (ExitCode.OK, set())  # files of labels are no datasets
     capsys.readouterr()
 
 
 REFUSED_FOLDERS: dict[str, tuple[LabelOptions, str]] = {
-    "another format": (
-        LabelOptions(formats=["progress"]),
-        "format: expected hdf5 for a folder of HDF5 files, each with",
-    ),
     "one name twice": (
         LabelOptions(output=Path("out")),
         r"output: expected .* names differ, got .*a\.h5.*: leave out --o",
@@ -230,4 +187,4 @@ def test_a_folder_of_hdf5_files_is_refused_before_a_score(tmp_path: Path, labels
         opened["data/demo_0/obs/states"] = np.zeros((5, 3))
     with pytest.raises(DatasetError, match=message):
         asked(tmp_path, labels)
-    assert not list(tmp_path.rglob("*rewards*"))
+    assert not list(tmp_path.rglob("*.parquet"))

@@ -14,7 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from pyarrow import parquet
 
 import labelling
 from labelling import FEW, LEROBOT, BrightnessScorer, Notes, PickyScorer, without_cost
@@ -155,8 +157,37 @@ def test_a_part_that_is_not_whole_is_no_label(
     assert contents(output) == undisturbed
 
 
-@pytest.mark.parametrize("url", ["memory://labels/parts", "file://{}/elsewhere"])
-def test_parts_may_be_behind_a_url(output: Path, undisturbed: list[bytes], url: str) -> None:
-    assert goes_on(output, undisturbed, parts=url.format(output)) == NUM_FRAMES
-    assert goes_on(output, undisturbed, parts=url.format(output)) == 0
+def test_parts_may_be_behind_a_url(output: Path, undisturbed: list[bytes]) -> None:
+    assert goes_on(output, undisturbed, parts="memory://labels/parts") == NUM_FRAMES
+    assert goes_on(output, undisturbed, parts="memory://labels/parts") == 0
     assert not (output / ".rfm_parts").exists()
+
+
+SPOILT: dict[str, Callable[[Any], Any]] = {
+    "a value": lambda table: table.set_column(3, table.schema.field(3), [np.zeros(len(table), np.float32)]),
+    "fewer rows": lambda table: table.slice(1),
+    "no metadata": lambda table: table.replace_schema_metadata({}),
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
+def test_label_files_that_read_back_otherwise_are_not_put_in_place(
+    output: Path, monkeypatch: pytest.MonkeyPatch, spoil: Callable[[Any], Any]
+) -> None:
+    def run() -> None:
+        label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, limit=1, **FEW))
+
+    run()
+    before = [(output / name).read_bytes() for name in FILES]
+    write = parquet.write_table
+
+    def spoilt(table: Any, file: Any, **options: Any) -> None:
+        write(spoil(table) if "reward" not in str(table.column_names) else table, file, **options)
+
+    monkeypatch.setattr(parquet, "write_table", spoilt)
+    with pytest.raises(
+        OSError, match=r"rfm_progress\.parquet: expected the labels that were written, read others: make"
+    ):
+        run()
+    assert [(output / name).read_bytes() for name in FILES] == before
+    assert sorted(file.name for file in output.iterdir()) == [".rfm_parts", "reward_signals", "rfm_progress.parquet"]

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import json
-import resource
+import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -17,10 +17,21 @@ import pytest
 from PIL import Image
 from pyarrow import parquet
 
-from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, brightness
+from client_commands import invoke
+from labelling import BrightnessScorer, Notes, brightness
+from paths import ROOT
 from rfm_client import FrameSize, InvalidSampleError, ProgressResult, ProgressSample, UInt8Array
 from rfm_client.frames import Correction, Orientation, resize_frames
-from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, label, open_dataset
+from rfm_labels import (
+    CheckpointFacts,
+    DatasetError,
+    LabelOptions,
+    find_label_files,
+    label,
+    open_dataset,
+    read_episode_labels,
+    read_provenance,
+)
 
 LENGTHS = (5, 7, 3)
 TASK = "open the drawer"
@@ -64,64 +75,6 @@ def pictures(index: int = 0, **more: Any) -> dict[str, Any]:
 def demos(tmp_path: Path) -> Path:
     states = [{"gripper_states": np.zeros((length, 2))} for length in LENGTHS]
     return write(tmp_path / "demos.hdf5", LIBERO, *(pictures(index, **states[index]) for index in range(3)))
-
-
-def test_a_file_gives_its_demonstrations_in_the_order_of_their_numbers(demos: Path) -> None:
-    dataset = open_dataset(demos)
-    assert (dataset.kind, dataset.source, dataset.root) == ("HDF5", "demos.hdf5", demos.parent)
-    assert tuple(dataset.cameras) == CAMERAS
-    told = [(e.index, e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
-    assert told == [(0, "demo_0", TASK, 5, 0), (1, "demo_1", TASK, 7, 5), (2, "demo_2", TASK, 3, 12)]
-    for episode in dataset.episodes:
-        for camera in dataset.cameras:
-            upright = frames_of(episode.index, camera)[:, ::-1]  # as upstream turns LIBERO's
-            np.testing.assert_array_equal(list(dataset.frames(episode, camera)), upright)
-            assert dataset.check(episode, camera) == upright.nbytes
-
-
-def edited(change: Callable[[Any], object]) -> Callable[[Path], None]:
-    def apply(file: Path) -> None:
-        with h5py.File(file, "r+") as opened:
-            change(opened["data"])
-
-    return apply
-
-
-def shorten(data: Any) -> None:
-    del data["demo_1/actions"]
-    data["demo_1/actions"] = np.zeros((5, 7))
-
-
-BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
-    "lengths that differ": (edited(shorten), r"data/demo_1: expected one length, above 0, got .*_rgb 7, .*actions 5"),
-    "a camera that is missing": (
-        edited(lambda data: data["demo_2/obs"].pop(CAMERAS[1])),
-        f"cameras: expected some of {CAMERAS[0]}, got '{CAMERAS[1]}', which is left out: missing in demo_2",
-    ),
-    "no task": (
-        edited(lambda data: data.attrs.pop("problem_info")),
-        r"problem_info or env_args: expected a task as a sentence, got none",
-    ),
-    "no demonstration": (
-        edited(lambda data: [data.pop(name) for name in list(data)]),
-        r"data: expected demo_0, demo_1 and so on, got none",
-    ),
-    "a truncated file": (
-        lambda file: file.write_bytes(file.read_bytes()[:3000]),
-        r"demos\.hdf5: expected an HDF5 file, got ",
-    ),
-}
-
-
-@pytest.mark.parametrize(("break_it", "message"), BROKEN.values(), ids=BROKEN)
-def test_a_file_that_contradicts_itself_is_refused(
-    demos: Path, break_it: Callable[[Path], object], message: str
-) -> None:
-    break_it(demos)
-    scorer = BrightnessScorer()
-    with pytest.raises(DatasetError, match=message):
-        label(open_dataset(demos), scorer, LabelOptions(cameras=CAMERAS))
-    assert scorer.num_samples == 0
 
 
 TURNED_BY_PILLOW: dict[Orientation, Image.Transpose] = {
@@ -185,17 +138,6 @@ def test_pictures_are_turned_as_the_file_says_or_as_the_caller_says(
     for camera, orientation in by_camera.items():
         read = np.stack(list(dataset.frames(episode, camera)))
         np.testing.assert_array_equal(read, turned(pictures()[camera], orientation))
-
-
-def test_videos_are_turned_as_the_caller_says() -> None:
-    root, turn = LEROBOT / "toy_v21", {"wrist": "rotate90"}
-    stored, dataset = open_dataset(root), open_dataset(root, orient=turn)
-    assert (stored.corrections, dataset.corrections) == ({}, {WRIST: Correction("rotate90")})
-    episode = dataset.episodes[0]
-    upright = turned(np.stack(list(stored.frames(episode, WRIST))), "rotate90")
-    np.testing.assert_array_equal(np.stack(list(dataset.frames(episode, WRIST))), upright)
-    with pytest.raises(DatasetError, match=f"orient: expected one of the cameras .*{WRIST}.*, got 'top'"):
-        open_dataset(root, orient={"top": "rotate90"})
 
 
 FRAMES = np.random.default_rng(3).integers(0, 256, (5, 16, 24, 3), np.uint8)
@@ -313,133 +255,6 @@ def test_a_camera_of_some_demonstrations_is_left_out_with_the_reason(
     assert (tuple(dataset.cameras), dataset.left_out, len(dataset.episodes)) == (CAMERAS, {"other": reason}, 2)
 
 
-def test_a_file_without_pictures_says_what_it_holds_and_what_renders_them(tmp_path: Path) -> None:
-    file = write(tmp_path / "demos.hdf5", ROBOMIMIC, {"ee_pos": np.zeros((5, 3))})
-    with pytest.raises(DatasetError, match=r"got ee_pos float64 \[5, 3\]: robomimic's dataset_states_to_obs\.py rend"):
-        open_dataset(file)
-
-
-def test_labels_go_to_a_file_beside_it(demos: Path) -> None:
-    before = demos.read_bytes()
-    report = label(open_dataset(demos), BrightnessScorer(), LabelOptions())
-    assert report.files == [demos.with_name("demos.rfm_rewards.hdf5")]
-    assert demos.read_bytes() == before
-    with h5py.File(report.files[0]) as opened:
-        assert sorted(opened["data"]) == ["demo_0", "demo_1", "demo_2"]
-        assert json.loads(opened["data"].attrs["rfm_provenance"])["dataset"]["kind"] == "HDF5"
-        for index, length in enumerate(LENGTHS):
-            demo = opened[f"data/demo_{index}"]
-            assert demo["rfm_progress"].dtype == np.float32
-            np.testing.assert_allclose(demo["rfm_progress"], expected(index), atol=1e-6)
-            of_camera = brightness(frames_of(index, CAMERAS[0]))
-            np.testing.assert_allclose(demo[f"rfm_progress.{CAMERAS[0]}"], of_camera, atol=1e-6)
-            assert demo["rfm_success"].shape == (length,)
-    parquet_report = label(open_dataset(demos), BrightnessScorer(), LabelOptions(formats=("progress",)))
-    assert parquet.read_table(parquet_report.files[0])["index"].to_pylist() == list(range(15))
-
-
-class WithoutSuccess(BrightnessScorer):
-    """Another checkpoint, which predicts no success."""
-
-    def __init__(self) -> None:
-        super().__init__(digest="without success")
-
-    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
-        results = super().evaluate(samples)
-        return [
-            ProgressResult(progress=1 - result.progress, success=np.full_like(result.progress, np.nan))
-            for result in results
-        ]
-
-
-def rewards_in(file: Path) -> dict[str, list[str]]:
-    """Return the names of the labels in each demonstration."""
-    with h5py.File(file) as opened:
-        return {name: sorted({*demo} - {"actions", "obs"}) for name, demo in opened["data"].items()}
-
-
-COLUMNS = [f"{score}{camera}" for score in ("progress", "success") for camera in ("", *(f".{c}" for c in CAMERAS))]
-ONE_OF_ANOTHER = LabelOptions(in_place=True, overwrite=True, cameras=CAMERAS[:1], episodes=[1])
-
-
-def test_labels_in_place_are_of_one_provenance_and_leave_all_else_as_it_is(demos: Path, tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    demos.chmod(0o640)
-    real = demos.rename(tmp_path / "elsewhere" / "real.hdf5")
-    demos.symlink_to(real)
-    scorer = BrightnessScorer()
-    for name in ("rfm", "rfm", "rfm_b"):
-        report = label(open_dataset(demos), scorer, LabelOptions(in_place=True, name=name))
-        assert report.files == [demos]
-    assert demos.is_symlink()
-    assert real.stat().st_mode & 0o777 == 0o640
-    assert scorer.num_samples == 2 * 2 * sum(LENGTHS)  # the same labels again cost nothing
-    assert report.summary is not None
-    np.testing.assert_allclose(report.summary.final_progress, [expected(index)[-1] for index in range(3)], atol=1e-6)
-    with h5py.File(demos, "r+") as opened:
-        opened["data/demo_0/rfm_notes"] = "a user's own"
-        others = opened["data"].attrs["rfm_b_provenance"]
-    label(open_dataset(demos), WithoutSuccess(), ONE_OF_ANOTHER)
-    of_others = sorted(f"rfm_b_{column}" for column in COLUMNS)
-    assert rewards_in(demos) == {
-        "demo_0": [*of_others, "rfm_notes"],
-        "demo_1": [*of_others, "rfm_progress"],
-        "demo_2": of_others,
-    }
-    with h5py.File(demos) as opened:
-        attributes = opened["data"].attrs
-        added = {f"{name}_{what}" for name in ("rfm", "rfm_b") for what in ("cost", "episodes", "provenance")}
-        assert set(attributes) == {*LIBERO, *added}
-        assert attributes["rfm_b_provenance"] == others
-        assert json.loads(attributes["rfm_provenance"])["checkpoint"]["weights_digest"] == "without success"
-        dark = 1 - brightness(frames_of(1, CAMERAS[0]))
-        np.testing.assert_allclose(opened["data/demo_1/rfm_progress"], dark, atol=1e-6)
-        assert opened["data/demo_1/actions"].shape == (7, 7)
-
-
-def test_in_place_the_file_is_whole_whoever_is_killed_and_whatever_is_full(
-    demos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    label(open_dataset(demos), WithoutSuccess(), LabelOptions(in_place=True))
-    before, options = demos.read_bytes(), LabelOptions(in_place=True, overwrite=True)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 500, limits[1]))
-    try:
-        with pytest.raises(OSError, match=r"no file has changed: .*make room, or leave --in-place away"):
-            label(open_dataset(demos), BrightnessScorer(), options)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert demos.read_bytes() == before
-    assert [file.name for file in demos.parent.iterdir() if "demos" in file.name] == ["demos.hdf5"]
-
-    replace, left = Path.replace, []  # as a kill just before the new file leaves it
-
-    def seen(self: Path, target: Path) -> Path:
-        left.extend([demos.read_bytes()] if target == demos else [])
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", seen)
-    label(open_dataset(demos), BrightnessScorer(), options)
-    assert left == [before]
-    assert set(map(len, rewards_in(demos).values())) == {len(COLUMNS)}
-
-
-def test_in_place_needs_room_for_a_copy_before_a_frame_is_scored(demos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    free = demos.stat().st_size + 100
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(2 * free, free, free))  # type: ignore[attr-defined]
-    scorer = BrightnessScorer()
-    with pytest.raises(DatasetError, match=rf"demos\.hdf5: expected \d+ bytes of free disk.*, got {free}: make room"):
-        label(open_dataset(demos), scorer, LabelOptions(in_place=True))
-    assert scorer.num_samples == 0
-
-
-def test_what_a_user_wrote_under_the_name_of_a_reward_is_not_replaced(demos: Path) -> None:
-    with h5py.File(demos, "r+") as opened:
-        opened["data/demo_2/rfm_success.front"] = np.zeros(3)
-    with pytest.raises(DatasetError, match=r"expected no labels, or .* got labels of another program: choose another"):
-        label(open_dataset(demos), BrightnessScorer(), LabelOptions(in_place=True))
-
-
 def test_labels_say_which_cameras_are_turned_and_which_are_left_out(demos: Path) -> None:
     with h5py.File(demos, "r+") as opened:
         for index, length in enumerate(LENGTHS):
@@ -450,8 +265,7 @@ def test_labels_say_which_cameras_are_turned_and_which_are_left_out(demos: Path)
     assert f"left out: tactile: {reason}" in notes.lines
     told = [line for line in notes.lines if line.startswith("orient: ")]
     assert told == [*dataset.notes, f"orient: {CAMERAS[1]} rotate180 (asked for)"]
-    with h5py.File(demos.with_name("demos.rfm_rewards.hdf5")) as opened:
-        provenance = json.loads(opened["data"].attrs["rfm_provenance"])
+    provenance = read_provenance(demos.with_name("demos.rfm_progress.parquet"))
     assert provenance["orientations"] == dict(zip(CAMERAS, ("flip-vertical", "rotate180"), strict=True))
     assert provenance["decoders"] == dict.fromkeys(CAMERAS)
     with pytest.raises(DatasetError, match=rf"got orientations\.{CAMERAS[1]}: rotate180 there, flip-vertical now: ch"):
@@ -487,17 +301,6 @@ def masked(demos: Path) -> Path:
     return demos
 
 
-def test_a_filter_key_chooses_demonstrations_and_labels_of_others_stay(masked: Path) -> None:
-    assert open_dataset(masked).filter_keys == {"gone": [7], "train": [0, 2], "valid": [1]}
-    report = label(open_dataset(masked), BrightnessScorer(), LabelOptions(filter_key="train"))
-    assert [item.episode.name for item in report.plan.items] == ["demo_0", "demo_2"]
-    assert set(rewards_in(report.files[0])) == {"demo_0", "demo_2"}
-    scorer = BrightnessScorer()
-    report = label(open_dataset(masked), scorer, LabelOptions(filter_key="valid"))
-    assert scorer.num_samples == LENGTHS[1] * len(CAMERAS)
-    assert set(rewards_in(report.files[0])) == {"demo_0", "demo_1", "demo_2"}
-
-
 FILTERS: dict[str, tuple[LabelOptions, str]] = {
     "another key": (LabelOptions(filter_key="test"), "filter_key: expected one of gone, train, valid, got 'test'"),
     "no episode of both": (
@@ -512,13 +315,6 @@ FILTERS: dict[str, tuple[LabelOptions, str]] = {
 def test_a_filter_key_without_episodes_is_refused(masked: Path, options: LabelOptions, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         label(open_dataset(masked), BrightnessScorer(), options)
-
-
-def test_a_filter_key_needs_a_file_that_has_it(demos: Path) -> None:
-    with h5py.File(demos, "r+") as opened:
-        opened["mask/train"] = np.array([3])  # no names of demonstrations
-    with pytest.raises(DatasetError, match="filter_key: expected none, since the dataset has no filter keys, got"):
-        label(open_dataset(demos), BrightnessScorer(), LabelOptions(filter_key="train"))
 
 
 class Comparer(BrightnessScorer):
@@ -583,3 +379,55 @@ def test_views_stand_beside_a_single_camera_and_a_goal_is_a_picture(demos: Path)
     for goal, told in ((text, "an image"), (demos.with_name("gone.png"), "a picture, or last")):
         with pytest.raises(InvalidSampleError, match=f"^goal: expected {told}, got "):
             label(open_dataset(demos), Comparer(), LabelOptions(cameras=CAMERAS[:1], mode="whole", goal=str(goal)))
+
+
+def test_labels_go_to_files_beside_it_in_both_formats(demos: Path) -> None:
+    before = demos.read_bytes()
+    report = label(open_dataset(demos), BrightnessScorer())
+    folder = demos.parent
+    assert report.files == [folder / "demos.rfm_progress.parquet", folder / "reward_signals" / "demos.rfm.parquet"]
+    assert find_label_files(demos) == find_label_files(folder) == report.files[:1]
+    assert demos.read_bytes() == before
+    assert read_provenance(report.files[0])["dataset"]["kind"] == "HDF5"
+    assert parquet.read_table(report.files[0])["index"].to_pylist() == list(range(15))
+    for index in range(3):
+        labels = read_episode_labels(report.files[0], index)
+        assert labels is not None
+        np.testing.assert_allclose(labels.fused.progress, expected(index), atol=1e-6)
+        of_camera = brightness(frames_of(index, CAMERAS[0]))
+        np.testing.assert_allclose(labels.cameras[CAMERAS[0]].progress, of_camera, atol=1e-6)
+
+
+def test_labels_of_two_files_in_a_folder_are_kept_apart(demos: Path) -> None:
+    more = demos.with_name("demos.v2.hdf5")
+    shutil.copy(demos, more)
+    for file in (demos, more):
+        label(open_dataset(file), BrightnessScorer(), LabelOptions(name="mine"))
+    names = r"demos, demos\.v2: name one of the HDF5 files"
+    with pytest.raises(DatasetError, match=rf"expected labels of one dataset, got {names}"):
+        find_label_files(demos.parent)
+    for file in (demos, more):
+        assert find_label_files(file) == [file.with_name(f"{file.stem}.mine_progress.parquet")]
+        told = invoke("label", file, "--report", "--name", "mine")
+        assert told.exit_code == 0, told.stderr
+        assert str(file.with_name(f"{file.stem}.mine_summary.png")) in told.stdout.replace("\n", "")
+    assert invoke("evaluate", demos).exit_code == 0
+    told = invoke("label", demos, "--report", "--name", "gone")
+    assert "demos.gone_progress.parquet: expected a file of labels, got none: label the dataset first" in told.stderr
+
+
+def test_a_filter_key_chooses_demonstrations(masked: Path) -> None:
+    assert open_dataset(masked).filter_keys == {"gone": [7], "train": [0, 2], "valid": [1]}
+    report = label(open_dataset(masked), BrightnessScorer(), LabelOptions(filter_key="train"))
+    assert [item.episode.name for item in report.plan.items] == ["demo_0", "demo_2"]
+
+
+def test_the_guide_s_lines_copy_a_column_back(demos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    label(open_dataset(demos), BrightnessScorer())
+    guide = (ROOT / "docs" / "guides" / "label_a_dataset.md").read_text()
+    (code,) = (block for block in re.findall(r"```python\n(.*?)```", guide, re.DOTALL) if "import h5py" in block)
+    monkeypatch.chdir(demos.parent)
+    exec(compile(code, "guide", "exec"), {})
+    with h5py.File(demos) as opened:
+        for index in range(3):
+            np.testing.assert_allclose(opened[f"data/demo_{index}/rfm_progress"], expected(index), atol=1e-6)

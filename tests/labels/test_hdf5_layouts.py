@@ -13,13 +13,10 @@ import numpy as np
 import pytest
 
 import hdf5_writers as writers
-from client_commands import invoke
 from hdf5_writers import RGB_MARK, TASK, decoded, jpeg, video
 from labelling import BrightnessScorer
-from rfm_client import RewardClient, Trajectory, UInt8Array
-from rfm_labels import ClientScorer, Dataset, DatasetError, LabelOptions, label, open_dataset
-from servers import Endpoints
-from tolerances import TOLERANCE
+from rfm_client import UInt8Array
+from rfm_labels import Dataset, DatasetError, LabelOptions, label, open_dataset
 
 LENGTH = 6
 FILES = {name: [jpeg(frame) for frame in video(LENGTH, seed)] for seed, name in enumerate(("high", "left", "right"))}
@@ -102,26 +99,6 @@ def test_a_file_gives_its_cameras_task_and_frames(tmp_path: Path, write: Writer)
         np.testing.assert_array_equal(frames_of(dataset, camera), frames)
 
 
-@pytest.mark.triton
-@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_labels_are_what_the_client_says_about_frames_that_pillow_decodes(
-    tmp_path: Path, client: RewardClient, write: Writer
-) -> None:
-    file, expected = write(tmp_path)
-    report = label(opened(file), ClientScorer(client), LabelOptions(mode="whole", fuse="mean"))
-    assert report.files == [file.with_name(f"{file.stem}.rfm_rewards.hdf5")]
-    of_cameras = {
-        camera: client.progress(Trajectory(frames=np.ascontiguousarray(frames), task=TASK)).progress
-        for camera, frames in expected.items()
-    }
-    with h5py.File(report.files[0]) as stored:
-        fused = stored["data/demo_0/rfm_progress"][()]
-        np.testing.assert_allclose(fused, np.mean(list(of_cameras.values()), axis=0), rtol=0, atol=TOLERANCE)
-        for camera, progress in of_cameras.items() if len(expected) > 1 else ():
-            told = stored[f"data/demo_0/rfm_progress.{camera}"][()]
-            np.testing.assert_allclose(told, progress, rtol=0, atol=TOLERANCE)
-
-
 def test_red_and_blue_are_as_the_mark_of_robotwin_says_unless_the_caller_does(tmp_path: Path) -> None:
     file = writers.write_robotwin(tmp_path, SWAPPED)
     stored = pixels(SWAPPED["head_camera"])
@@ -142,18 +119,6 @@ def test_files_of_a_camera_with_and_without_the_mark_are_refused(tmp_path: Path)
     dataset = open_dataset(file)
     with pytest.raises(DatasetError, match="observation/head_camera/rgb: expected JPEG files all with RoboTwin's mark"):
         dataset.check(dataset.episodes[0], "head_camera")
-
-
-@pytest.mark.parametrize("layout", ["ALOHA", "RoboMIND"])
-def test_a_command_swaps_red_and_blue_of_one_camera(tmp_path: Path, layout: str) -> None:
-    is_aloha = layout == "ALOHA"
-    write = writers.write_aloha if is_aloha else writers.write_robomind
-    file = write(tmp_path / "episode_0.hdf5", {"high": FILES["high"], "left": FILES["left"]})
-    dataset = open_dataset(file, task=TASK if is_aloha else None, channels={"left": "bgr"})
-    np.testing.assert_array_equal(frames_of(dataset, "left"), pixels(FILES["left"])[..., ::-1])
-    np.testing.assert_array_equal(frames_of(dataset, "high"), pixels(FILES["high"]))
-    (line,) = (note for note in dataset.notes if note.startswith("channels: "))
-    assert line.startswith("channels: high read as JPEG files say; some recorders store blue in the place of red")
 
 
 BROKEN: dict[str, tuple[bytes, str]] = {
@@ -237,43 +202,9 @@ def test_the_task_of_robotwin_is_the_first_sentence_of_its_side_file(
         open_dataset(file)
 
 
-def test_trajectories_of_maniskill_keep_their_numbers(tmp_path: Path) -> None:
-    frames = {3: {"base_camera": video(LENGTH, 3)}, 12: {"base_camera": video(LENGTH - 2, 4)}}
-    dataset = open_dataset(writers.write_maniskill(tmp_path / "trajectory.h5", frames), task=TASK)
-    assert [(e.index, e.name, e.num_frames) for e in dataset.episodes] == [(3, "demo_3", 6), (12, "demo_12", 4)]
-    assert "lengths: demo_3, demo_12: one observation more than actions: each observation gets a label" in dataset.notes
-
-
-def test_a_file_of_maniskill_without_pictures_says_how_to_add_them(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError) as refused:
-        open_dataset(writers.write_maniskill(tmp_path / "trajectory.h5", {0: {"c": video(2)[:, :4, :4, 0]}}), task=TASK)
-    assert "traj_0/obs/sensor_data: expected a camera" in str(refused.value)
-
-
-def test_labels_are_not_written_into_a_file_of_another_program(tmp_path: Path) -> None:
-    file = writers.write_robomind(tmp_path / "t.hdf5", {"high": FILES["high"]})
-    with pytest.raises(DatasetError) as refused:
-        label(open_dataset(file), BrightnessScorer(), LabelOptions(in_place=True))
-    assert str(refused.value) == (
-        "in_place: expected an HDF5 file of robomimic or LIBERO, got HDF5 (RoboMIND): leave --in-place away"
-    )
-
-
 def test_robomimics_layout_may_hold_files_too(tmp_path: Path) -> None:
     file = tmp_path / "demos.hdf5"
     with h5py.File(file, "w") as stored:
         frames = stored.create_dataset("data/demo_0/obs/front", (LENGTH,), dtype=h5py.vlen_dtype(np.uint8))
         frames[:] = [np.frombuffer(each, np.uint8) for each in FILES["high"]]
     np.testing.assert_array_equal(frames_of(open_dataset(file, task=TASK), "front"), pixels(FILES["high"]))
-
-
-@pytest.mark.triton
-def test_a_folder_of_episodes_is_labelled_file_by_file(tmp_path: Path, demo_server: Endpoints) -> None:
-    for number in range(2):
-        writers.write_aloha(tmp_path / f"episode_{number}.hdf5", {"high": FILES["high"]}, task=TASK)
-    result = invoke("label", tmp_path, "--no-picture", "--mode", "whole", "--url", demo_server.grpc_url)
-    assert result.exit_code == 0, result.output
-    assert "layout: ALOHA, cameras high (JPEG or PNG)" in result.output
-    assert {file.name for file in tmp_path.glob("*_rewards.hdf5")} == {
-        f"episode_{n}.rfm_rewards.hdf5" for n in range(2)
-    }

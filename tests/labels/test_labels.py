@@ -35,7 +35,7 @@ from tolerances import TOLERANCE
 MODELS = ROOT / "model_repository"
 ELSEWHERE = goldens.ROOT.parent / "lerobot"
 DATASETS = [
-    *(pytest.param(LEROBOT / name, id=name) for name in ("toy_v21", "toy_v30_many")),
+    *(pytest.param(LEROBOT / name, id=name) for name in ("toy_v30_many",)),
     pytest.param(
         ELSEWHERE / "toy_v30",
         id="elsewhere toy_v30",

@@ -11,14 +11,14 @@ from rfm_labels import DatasetError, open_dataset
 
 UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the end of the message
     "TFRecord files alone": (["1.0.0/a.tfrecord-00000-of-00001"], "1.0.0", "got TFRecord files without features.json"),
-    "Zarr": ([".zgroup", "data/.zgroup"], "", "got Zarr arrays: convert them to LeRobot with "),
-    "Zarr in an archive": (["buffer.zarr.zip"], "buffer.zarr.zip", "got Zarr arrays: convert them to LeRobot with "),
+    "Zarr": ([".zgroup", "data/.zgroup"], "", "got Zarr arrays: convert them to LeRobot, or"),
+    "Zarr in an archive": (["buffer.zarr.zip"], "buffer.zarr.zip", "got Zarr arrays: convert them to LeRobot, or"),
     "a rosbag of ROS 2": (["metadata.yaml", "a_0.db3"], "", "got a rosbag: convert it to LeRobot with "),
     "a rosbag of ROS 1": (["a.bag"], "a.bag", "got a rosbag: convert it to LeRobot with "),
     "MCAP files": (["a.mcap", "b.mcap"], "", "got a rosbag: convert it to LeRobot with "),
-    "LeRobot v1": (["meta_data/info.json"], "", "got a LeRobot dataset of v1: convert it to v2.0 with "),
+    "LeRobot v1": (["meta_data/info.json"], "", "got a LeRobot dataset of v1: convert it to v2.0 with LeRobot 0.3"),
     "HDF5 files in folders": (["a/x.hdf5"], "", "each a dataset of its own: rfm-client label takes the folder, open_"),
-    "pictures": (["1.png", "2.png"], "", "the folder of an episode: mkdir ROOT/0 && mv ROOT/*.png ROOT/0"),
+    "pictures": (["1.png", "2.png"], "", "got pictures outside of the folder of an episode (1.png)"),
     "pictures of cameras": (["a/front/1.jpg"], "", "list the folders of one camera (a/front) in tasks.csv"),
     "pictures and a video": (
         ["0/1.png", "a.mp4"],

@@ -18,10 +18,7 @@ from pyarrow import parquet
 
 from labelling import BrightnessScorer, Notes, brightness
 from paths import ROOT
-from rfm_client import ProgressSample, RewardClient, Trajectory
-from rfm_client.frames import Sampling
-from rfm_labels import ClientScorer, DatasetError, LabelOptions, label, open_dataset
-from tolerances import TOLERANCE
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 RLDS = ROOT / "tests" / "rlds"
 CAMERAS = ("image", "wrist_image")
@@ -66,23 +63,6 @@ def test_a_missing_package_is_named_with_the_extra_to_install(monkeypatch: pytes
     monkeypatch.setitem(sys.modules, "google_crc32c", None)
     with pytest.raises(ImportError, match=r'pip install \./client "\./apps/labels\[rlds\]"'):
         label(open_dataset(RLDS / "toy_steps_texts"), BrightnessScorer(), LabelOptions())
-
-
-@pytest.mark.triton
-def test_labels_are_what_the_client_says_of_independently_decoded_frames(client: RewardClient, output: Path) -> None:
-    options = LabelOptions(output=output, cameras=("image",), filter_key="val")
-    report = label(open_dataset(RLDS / "toy_steps_texts"), ClientScorer(client), options)
-    table = parquet.read_table(report.files[0]).to_pydict()
-    assert table["episode_index"] == [3] * 4 + [4] * 2
-    assert table["index"] == list(range(14, 20))
-    frames, sampling = decoded(), Sampling("rint", client.model_info(frames=True).max_frames)
-    expected = []
-    for place in PLACES[3:]:
-        video, task = frames[f"{place}/image"], str(frames[f"{place}/task"][0])
-        shown = [sampling.prefix(t) for t in range(len(video))]
-        results = client.evaluate([ProgressSample(Trajectory(frames=video[p.indices], task=task)) for p in shown])
-        expected += [result.progress[p.read] for result, p in zip(results, shown, strict=True)]
-    np.testing.assert_allclose(table["progress_sparse"], expected, rtol=0, atol=TOLERANCE)
 
 
 def test_black_and_depth_pictures_are_left_out_with_a_line(output: Path) -> None:
@@ -131,13 +111,6 @@ def test_a_dataset_without_instructions_needs_a_task(copied: Path) -> None:
     ):
         _ = open_dataset(copied).episodes
     assert {episode.task for episode in open_dataset(copied, task="wave").episodes} == {"wave"}
-
-
-def test_a_task_of_the_caller_replaces_the_instructions() -> None:
-    dataset = open_dataset(RLDS / "toy_steps_texts", task="wave", override_task=True)
-    assert {task for episode in dataset.episodes for task in tasks_of(episode)} == {"wave"}
-    first = open_dataset(RLDS / "toy_steps_texts", several_tasks="first").episode(2)
-    assert (first.task, first.tasks) == ("pick up the cube", ())
 
 
 def spoilt(change: Callable[[bytearray], object]) -> Callable[[Path], None]:

@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from pyarrow import parquet
@@ -188,28 +187,10 @@ def lerobot(folder: Path, task: str) -> Path:
     return root
 
 
-def hdf5(folder: Path, task: str) -> Path:
-    with h5py.File(folder / "demos.hdf5", "w") as opened:
-        opened.create_group("data").attrs["env_args"] = json.dumps({"env_name": "Lift", "lang": task})
-        opened["data/demo_0/obs/front"] = np.zeros((3, 8, 8, 3), np.uint8)
-    return folder / "demos.hdf5"
-
-
 def table(folder: Path, task: str) -> Path:
     write_video(folder / "a.mp4", numbered(3))
     (folder / "tasks.csv").write_text(f"video,task\na.mp4,{task}\n")
     return folder
-
-
-KINDS: dict[str, Callable[[Path, str], Path]] = {"LeRobot": lerobot, "HDF5": hdf5, "videos": table}
-
-
-@pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
-def test_a_task_fills_in_where_episodes_have_none(tmp_path: Path, make: Callable[[Path, str], Path]) -> None:
-    source = make(tmp_path, "")
-    with pytest.raises(DatasetError, match="--task"):
-        _ = open_dataset(source).episodes
-    assert {episode.task for episode in open_dataset(source, task="open the box").episodes} == {"open the box"}
 
 
 @pytest.mark.parametrize(
@@ -225,7 +206,7 @@ def test_a_task_fills_in_where_a_table_has_none(videos: Path, text: str, expecte
     assert [episode.task for episode in open_dataset(videos, task="open the box").episodes] == expected
 
 
-@pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
+@pytest.mark.parametrize("make", [lerobot, table])
 def test_a_task_replaces_those_of_episodes_only_on_request(tmp_path: Path, make: Callable[[Path, str], Path]) -> None:
     source = make(tmp_path, "stack the cups")
     with pytest.raises(DatasetError) as refused:

@@ -633,7 +633,7 @@ def test_broken_episodes_are_marked_and_an_hdf5_dataset_is_watched(
             opened[f"data/demo_{episode.index}/obs/wrist"] = frames
             opened[f"data/demo_{episode.index}"].attrs["language"] = episode.task
     label(open_dataset(root), BrightnessScorer(), LabelOptions(formats=("progress",)))
-    label(open_dataset(demos), BrightnessScorer(), LabelOptions(in_place=True))
+    label(open_dataset(demos), BrightnessScorer(), LabelOptions(formats=("progress",)))
     next(root.rglob("*front/episode_000002.mp4")).write_text("no video")
     words = ("--dataset", str(root), "--dataset", str(demos))
     with running(demo_server, tmp_path, "rfm", *words) as gateway:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 datasets on the page: labels beside and in place, pictures as videos, refusals."""
+"""HDF5 datasets on the page: labels, pictures as videos, refusals."""
 
 from __future__ import annotations
 
@@ -42,10 +42,9 @@ def demos(tmp_path: Path) -> Path:
     return file
 
 
-@pytest.mark.parametrize("in_place", [False, True], ids=["beside", "in place"])
-def test_the_page_shows_an_hdf5_dataset_with_its_labels(demos: Path, in_place: bool) -> None:
-    label(open_dataset(demos), BrightnessScorer(), LabelOptions(in_place=in_place))
-    name = "demos.hdf5/rfm" if in_place else "demos.rfm_rewards.hdf5/rfm"
+def test_the_page_shows_an_hdf5_dataset_with_its_labels(demos: Path) -> None:
+    label(open_dataset(demos), BrightnessScorer(), LabelOptions())
+    name = "demos.rfm_progress.parquet"
     labels = read_episode_labels(demos.parent / name, NUMBERS[1])
     assert labels is not None
     with inside(dataset=(str(demos),)) as gateway:
@@ -127,8 +126,8 @@ def test_a_file_that_changes_to_show_another_file_is_not_read(demos: Path, tmp_p
 def test_labels_in_another_folder_are_not_read(demos: Path, tmp_path: Path) -> None:
     with inside(dataset=(str(demos),)) as gateway:
         label(open_dataset(demos), BrightnessScorer(), LabelOptions())
-        assert gateway.get("/viewer/datasets/0").json()["labels"] == "demos.rfm_rewards.hdf5/rfm"
-        labels = demos.with_name("demos.rfm_rewards.hdf5")
+        assert gateway.get("/viewer/datasets/0").json()["labels"] == "demos.rfm_progress.parquet"
+        labels = demos.with_name("demos.rfm_progress.parquet")
         labels.symlink_to(labels.rename(tmp_path / labels.name))
         assert "got a link that leaves it" in failure(gateway.get("/viewer/datasets/0"), 500)
 
@@ -176,7 +175,7 @@ def test_the_page_shows_an_episode_of_jpeg_files_with_its_labels(tmp_path: Path)
         table = gateway.get("/viewer/datasets/0").json()
         shown = gateway.get("/viewer/datasets/0/episodes/0/videos/0")
     assert about["kind"] == "HDF5 (RoboMIND)"
-    assert about["labels"] == ["trajectory.rfm_rewards.hdf5/rfm"]
+    assert about["labels"] == ["trajectory.rfm_progress.parquet"]
     assert (table["cameras"], table["fps"]) == (["camera_top"], 30)
     with av.open(io.BytesIO(shown.content)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]

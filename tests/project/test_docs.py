@@ -94,6 +94,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     )
     (tmp_path / "outcomes.csv").write_text(f"episode,success\n{outcomes}")
     toy_dataset.write(tmp_path / "demo_output" / "toy", clips=2)
+    hdf5_writers.write_robomimic(tmp_path / "demos.hdf5", [{"front": hdf5_writers.video(4)}])
     hdf5_writers.write_aloha(tmp_path / "aloha_folder" / "episode_0.hdf5", {"top": hdf5_writers.video(4)})
     maniskill = tmp_path / "trajectory.rgb.pd_ee_delta_pose.physx_cpu.h5"
     hdf5_writers.write_maniskill(maniskill, {0: {"base_camera": hdf5_writers.video(4)}})
@@ -136,9 +137,10 @@ def names() -> dict[str, Any]:
 @pytest.mark.parametrize("code", found(BLOCK))
 def test_every_example_runs(demo_server: Endpoints, folder: Path, code: str) -> None:
     code = code.replace("grpc://localhost:8001", demo_server.grpc_url)
-    for name in re.findall(r"my_dataset/(\w+)_progress\.parquet", code):
+    for source, name in re.findall(r"(my_dataset/|demos\.)(\w+)_progress\.parquet", code):
+        dataset = open_dataset("demos.hdf5" if source == "demos." else "my_dataset")
         with RewardClient(demo_server.grpc_url) as client:
-            label(open_dataset("my_dataset"), ClientScorer(client), LabelOptions(name=name, frames=4))
+            label(dataset, ClientScorer(client), LabelOptions(name=name, frames=4))
     shown: dict[str, Any] = names()
     exec(compile(code, "README", "exec"), shown)
     if "envs" in shown:

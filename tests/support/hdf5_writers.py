@@ -40,6 +40,25 @@ def decoded(file: bytes) -> UInt8Array:
     return np.asarray(Image.open(io.BytesIO(file)).convert("RGB"))
 
 
+def write_robomimic(
+    file: Path, demos: Sequence[Mapping[str, Any]] | Mapping[int, Mapping[str, Any]], task: str | None = TASK
+) -> Path:
+    """robomimic: a group for each demonstration, with pixels and actions. demos: observations, by number"""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    by_number = demos if isinstance(demos, Mapping) else dict(enumerate(demos))
+    with h5py.File(file, "w") as opened:
+        told = {"env_name": "Lift", **({} if task is None else {"lang": task})}
+        opened.create_group("data").attrs["env_args"] = json.dumps(told)
+        for number, observations in by_number.items():
+            demo = opened.create_group(f"data/demo_{number}")
+            for name, stored in observations.items():
+                demo[f"obs/{name}"] = stored
+            length = len(next(iter(observations.values())))
+            demo["actions"] = np.zeros((length, 7))
+            demo.attrs["num_samples"] = length
+    return file
+
+
 def write_aloha(file: Path, cameras: Mapping[str, Any], **attributes: Any) -> Path:
     """ALOHA: arrays of pixels, or files in rows of bytes that zeros make equally long, with ``compress_len``."""
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,6 @@ from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, iter_episodes
 from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.datasets.opening import open_dataset
 from rfm_labels.evaluation import Evaluation, LabelComparison, evaluate_labels, read_outcomes
-from rfm_labels.hdf5_tables import stored_in
 from rfm_labels.label_files import Curve, EpisodeLabels, find_label_files, read_episode_labels, read_provenance
 from rfm_labels.labelling import Report, label
 from rfm_labels.options import LabelOptions, RayOptions, Watch, parse_episodes
@@ -46,6 +45,5 @@ __all__ = [
     "read_episode_labels",
     "read_outcomes",
     "read_provenance",
-    "stored_in",
     "summarise",
 ]

@@ -19,11 +19,9 @@ import numpy.typing as npt
 
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
-from rfm_labels.hdf5_tables import full_path
-from rfm_labels.label_files import read_cost, read_label_table
+from rfm_labels.label_files import read_cost, read_label_table, reward_name
 from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.summary import BACKWARDS_BY
-from rfm_labels.writing import PROGRESS_ENDING
 
 Floats = npt.NDArray[np.floating[Any]]
 
@@ -121,13 +119,11 @@ class _Scores:
 def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool] | None = None) -> LabelComparison:
     """Return the evaluations of label files of one dataset.
 
-    files: Parquet, or HDF5 as ``find_label_files`` returns them
     outcomes: True for each successful episode, by its number; None: unknown
 
     Raises DatasetError for an unreadable file, files without a common episode, or an episode without an outcome.
     """
     require("labels", len(files) > 0, "at least one file", "none")
-    files = [full_path(file) for file in files]
     names = _names(files)
     read = {name: _episodes(file) for name, file in zip(names, files, strict=True)}
     common = sorted(set.intersection(*(set(episodes) for episodes in read.values())))
@@ -204,7 +200,7 @@ def _outcome(where: str, value: Any) -> bool:
 
 def _names(files: Sequence[Path]) -> list[str]:
     """Return a name for each file: that of the reward, with its folder if two are alike."""
-    short = [file.name.removesuffix(PROGRESS_ENDING).removesuffix(".parquet") for file in files]
+    short = [reward_name(file) for file in files]
     names = [name if short.count(name) == 1 else str(file) for name, file in zip(short, files, strict=True)]
     require("labels", len(set(names)) == len(names), "each file once", ", ".join(names))
     return names

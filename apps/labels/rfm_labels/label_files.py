@@ -1,33 +1,31 @@
 # SPDX-License-Identifier: MIT
-"""Read label files of all formats: whole tables, single episodes, and how they were made. Needs pyarrow."""
+"""Read label files: whole tables, single episodes, and how they were made. Needs pyarrow."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client import Float32Array
-from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
+from rfm_labels.datasets.dataset import SIGNALS_FOLDER
 from rfm_labels.datasets.faults import DatasetError, listed, require
+from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.lerobot_meta import INFO_FILE
-from rfm_labels.hdf5_tables import BLANK, COST, PROVENANCE, find_in_hdf5, of_hdf5, read_attribute, read_hdf5_table
 from rfm_labels.metadata import (
-    BLANK_KEY,
     PROGRESS,
     SUCCESS,
     BlankCameras,
-    Columns,
     Cost,
     blank_from_metadata,
     parsed_object,
     skipping_in,
 )
-from rfm_labels.plan import Item, Plan, make_plan
+from rfm_labels.plan import Plan
 from rfm_labels.writing import (
     COST_KEY,
     EPISODES_KEY,
@@ -38,36 +36,8 @@ from rfm_labels.writing import (
     SIGNALS_PROVENANCE_KEY,
 )
 
-Reader: TypeAlias = Callable[[Sequence[Item]], Iterator[tuple[Item, Columns]]]
-
 _OWN_NAME = "rfm"  # default of ``LabelOptions.name``
 _PROGRESS_NAMES = ("progress", "progress_sparse", "progress_dense")
-_OTHERS = "those of others, or of videos that have changed or were copied (--verify knows copies by their content)"
-
-
-def parquet_labels(path: Path, option: str = "--name") -> LabelFile:
-    """Return the labels in a file. ``option``: the command-line option that chooses another path."""
-    from pyarrow import ArrowException, parquet
-
-    try:
-        metadata = parquet.read_schema(path).metadata or {}
-    except (OSError, ArrowException):
-        metadata = {}
-    provenance = metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY))
-    cost = Cost.parse(metadata.get(COST_KEY))
-    blank = blank_from_metadata(metadata)
-    digests = metadata.get(EPISODES_KEY)
-    return LabelFile.of(path, provenance, digests, lambda items: _read(path, items), option, cost, blank)
-
-
-def _read(path: Path, items: Sequence[Item]) -> Iterator[tuple[Item, Columns]]:
-    table = read_label_table(path)
-    episodes = table["episode_index"].to_numpy()
-    names = [name for name in table.column_names if name not in IDENTITY]
-    for item in items:
-        start, end = np.searchsorted(episodes, [item.episode.index, item.episode.index + 1]).tolist()
-        rows = table.slice(start, end - start)
-        yield item, {name: rows[name].to_numpy() for name in names}
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,18 +69,31 @@ def find_label_files(root: Path) -> list[Path]:
 
     root: the dataset's folder, or HDF5 file
 
-    For labels in both Parquet formats, return only the progress file. Labels in HDF5 are paths such as
-    ``demos.hdf5/rfm`` (in place) and ``demos.rfm_rewards.hdf5/rfm``. Raises DatasetError for a folder with labels of
-    several HDF5 datasets.
+    For labels in both formats, return only the progress file. Raises DatasetError for a folder with labels of several
+    HDF5 files.
     """
-    in_hdf5 = [] if (root / INFO_FILE).is_file() else find_in_hdf5(root)  # a LeRobot dataset has none
+    folder = root.parent if root.is_file() else root
+    progress = sorted(folder.glob(f"[!.]*{PROGRESS_ENDING}"))
+    named = {reward_name(file) for file in progress}
+    signals = [file for file in sorted((folder / SIGNALS_FOLDER).glob("[!.]*.parquet")) if file.stem not in named]
+    files = sorted((*progress, *signals), key=lambda file: reward_name(file).rpartition(".")[2] != _OWN_NAME)
     if root.is_file():
-        return sorted(in_hdf5, key=lambda file: file.name != _OWN_NAME)
-    progress = sorted(root.glob(f"*{PROGRESS_ENDING}"))
-    named = {file.name.removesuffix(PROGRESS_ENDING) for file in progress}
-    signals = [file for file in sorted((root / SIGNALS_FOLDER).glob("*.parquet")) if file.stem not in named]
-    files = [file for file in (*progress, *signals, *in_hdf5) if not file.name.startswith(".")]
-    return sorted(files, key=lambda file: file.name.removesuffix(PROGRESS_ENDING) != _OWN_NAME)
+        return [file for file in files if _prefix(file) == label_prefix(root)]
+    prefixes = sorted({_prefix(file) for file in files})
+    is_one = len(prefixes) < 2 or (root / INFO_FILE).is_file()
+    got = f"{', '.join(prefix.rstrip('.') or 'others' for prefix in prefixes)}: name one of the HDF5 files"
+    require(folder, is_one, "labels of one dataset", got)
+    return files
+
+
+def reward_name(file: Path) -> str:
+    """Return the name of the reward in a label file, after the dataset's ``label_prefix``."""
+    return file.name.removesuffix(PROGRESS_ENDING).removesuffix(".parquet")
+
+
+def _prefix(file: Path) -> str:
+    before, dot, _ = reward_name(file).rpartition(".")
+    return before + dot
 
 
 def read_label_table(file: Path, *, episode: int | None = None) -> Any:
@@ -118,14 +101,10 @@ def read_label_table(file: Path, *, episode: int | None = None) -> Any:
 
     Score columns: those of ``SCORES``, as far as the file has them.
 
-    file: Parquet, or HDF5 as ``find_label_files`` returns it
-
     episode: only this episode's rows; None: all
     """
     from pyarrow import ArrowException, parquet
 
-    if in_hdf5 := of_hdf5(file):
-        return read_hdf5_table(*in_hdf5, episode=episode)
     try:
         names = parquet.read_schema(file).names
         columns = {**{name: name for name in IDENTITY if name in names}, **_score_columns(file, names)}
@@ -138,27 +117,18 @@ def read_label_table(file: Path, *, episode: int | None = None) -> Any:
 
 def read_cost(file: Path) -> Cost | None:
     """Return the cost of a file's labels; None: the file does not say. Raises DatasetError."""
-    if in_hdf5 := of_hdf5(file):
-        return Cost.parse(read_attribute(*in_hdf5, COST))
     return Cost.parse(_metadata(file).get(COST_KEY))
 
 
 def read_blank(file: Path) -> BlankCameras:
     """Return the cameras that show nothing, as the metadata of a file's labels tell them. Raises DatasetError."""
-    if in_hdf5 := of_hdf5(file):
-        blank = read_attribute(*in_hdf5, BLANK)
-        return blank_from_metadata({BLANK_KEY: blank} if blank else {})
     return blank_from_metadata(_metadata(file))
 
 
 def read_provenance(file: Path) -> dict[str, Any]:
     """Return writer, dataset and recipe of a label file, as far as it tells them. Raises DatasetError."""
-    if in_hdf5 := of_hdf5(file):
-        told = read_attribute(*in_hdf5, PROVENANCE)
-    else:
-        metadata = _metadata(file)
-        told = metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY))
-    return parsed_object(told)
+    metadata = _metadata(file)
+    return parsed_object(metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY)))
 
 
 def _metadata(file: Path) -> Mapping[bytes, bytes]:
@@ -215,69 +185,50 @@ def _score_columns(file: Path, names: Sequence[str]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class LabelFile:
-    """An existing label file.
+    """An existing label file, which a run may replace.
 
-    flaw: why no run can keep its labels; None: its metadata tells how they were made
-    digests: digest of each labelled item, by episode number
-    read: yields the scores of items, as far as the file has them
-    option: command-line option that chooses another name
+    provenance: writer, dataset and recipe; empty: labels of another program
+    digests: digest of each labelled episode, by its number
     cost: of the last run that scored; None: unknown
-    blank: cameras that show nothing
+    option: command-line option that chooses another path
     """
 
     path: Path
-    flaw: str | None
     provenance: Mapping[str, Any]
     digests: Mapping[int, str]
-    read: Reader
+    cost: Cost | None
     option: str
-    cost: Cost | None = None
-    blank: BlankCameras = field(default_factory=dict)
 
     @classmethod
-    def of(
-        cls,
-        path: Path,
-        provenance: Any,
-        digests: Any,
-        read: Reader,
-        option: str = "--name",
-        cost: Cost | None = None,
-        blank: BlankCameras | None = None,
-    ) -> LabelFile:
-        """Return the label file. provenance, digests: JSON texts of its metadata, None if absent"""
-        told, by_episode = parsed_object(provenance), parsed_object(digests)
-        if not str(told.get("writer")).startswith("rfm-client") or not isinstance(told.get("dataset"), dict):
-            return cls(path, "labels of another program", {}, {}, read, option)
-        known = {int(index): str(digest) for index, digest in by_episode.items() if index.isdecimal()}
-        flaw = None if known else "no digests of its episodes"
-        return cls(path, flaw, told, known, read, option, cost, blank or {})
+    def read(cls, path: Path, option: str = "--name") -> LabelFile:
+        """Return what a file tells in its metadata."""
+        from pyarrow import ArrowException, parquet
 
-    def check(self, plan: Plan, dataset: Dataset, known: Mapping[int, Item]) -> Mapping[int, Item]:
-        """Return the file's items by episode number. Raises DatasetError if labels would be lost, or do not fit.
+        try:
+            metadata = parquet.read_schema(path).metadata or {}
+        except (OSError, ArrowException):
+            metadata = {}
+        told = parsed_object(metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY)))
+        is_own = str(told.get("writer")).startswith("rfm-client") and isinstance(told.get("dataset"), dict)
+        by_number = parsed_object(metadata.get(EPISODES_KEY)) if is_own else {}
+        digests = {int(number): str(digest) for number, digest in by_number.items() if number.isdecimal()}
+        return cls(path, told if is_own else {}, digests, Cost.parse(metadata.get(COST_KEY)), option)
 
-        known: items of the plan, and of label files checked before
-        """
+    def check(self, plan: Plan) -> None:
+        """Raise DatasetError unless the plan gives all labels of the file again, by the same recipe."""
         there, now = _settings(_recipe(self.provenance)), _settings(_recipe(plan.provenance()))
         names = [name for name in dict.fromkeys([*now, *there]) if there.get(name) != now.get(name)]
         differ = "; ".join(f"{name}: {there.get(name, 'none')} there, {now.get(name, 'none')} now" for name in names)
-        got = (self.provenance and differ) or self.flaw or ""
-        require(self.path, self.flaw is None and not differ, "no labels, or those of the same recipe", got)
-
-        lost = set(self.digests) - set(dataset.numbers)
-        expected = f"labels of the dataset's {len(dataset.numbers)} episodes"
-        require(self.path, not lost, expected, f"some of episode {min(lost, default=None)}")
-        others = [dataset.episode(index) for index in sorted(self.digests) if index not in known]
-        items = {item.episode.index: item for item in make_plan(dataset, plan.recipe, others).items}
-        found = {index: {**known, **items}[index] for index in self.digests}
-        changed = [index for index, digest in self.digests.items() if found[index].digest != digest]
-        require(self.path, len(changed) < len(self.digests), "labels of this dataset's episodes", _OTHERS)
-        chosen = {item.episode.index for item in plan.items}
-        left = sorted(set(changed) - chosen)
-        episodes = ", ".join(found[index].episode.name for index in left)
-        expected = f"no change since the labels in {self.path}, or --episodes with {listed(left)}"
-        require(episodes, not left, expected, "other frames or rows")
-        return found
+        got = differ if self.provenance else "labels of another program"
+        is_same = not differ and bool(self.digests)
+        require(self.path, is_same, "no labels, or those of the same recipe", got or "others")
+        planned = {item.episode.index: item.digest for item in plan.items}
+        lost = sorted(self.digests.keys() - planned.keys())
+        got = f"those of {listed(lost)}, too"
+        require(self.path, not lost, "labels of the chosen episodes alone", got)
+        changed = sorted(number for number, digest in self.digests.items() if planned[number] != digest)
+        got = f"others for {listed(changed)}, whose frames or rows have changed (copied videos: --verify)"
+        require(self.path, not changed, "labels of the episodes as they are now", got)
 
 
 def _recipe(provenance: Mapping[str, Any]) -> dict[str, Any]:

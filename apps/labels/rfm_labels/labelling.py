@@ -1,29 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Label a dataset: plan, score, write the label files.
 
-Labels of the same recipe that are there stay. Others are replaced on request alone.
+Finished episodes stay in the parts. A run replaces label files on request, or if it gives all their labels again.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
-from rfm_labels.datasets.faults import DatasetError, require
-from rfm_labels.datasets.hdf5 import Hdf5Dataset
-from rfm_labels.hdf5_labels import Hdf5Labels, check_room, hdf5_labels
-from rfm_labels.hdf5_tables import own_file
-from rfm_labels.label_files import LabelFile, parquet_labels
-from rfm_labels.metadata import SCORES, Cost, blank_from_metadata, blank_lines, skipping_in
-from rfm_labels.options import DEFAULTS, QUIET, Format, LabelOptions, Watch
-from rfm_labels.plan import Item, Plan, all_faults, plan_labels
+from rfm_labels.datasets.faults import DatasetError
+from rfm_labels.label_files import LabelFile
+from rfm_labels.metadata import SCORES, Cost, blank_from_metadata, blank_lines
+from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
+from rfm_labels.plan import Plan, all_faults, plan_labels
 from rfm_labels.scorer import Scorer
 from rfm_labels.scoring import FailedEpisode, Run
 from rfm_labels.summary import Summary, summary_of
@@ -68,109 +63,55 @@ def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = DEFAULTS, wa
     outputs, plan, earlier = prepared(dataset, scorer, options, watch)
     run = Run(plan, dataset, scorer, outputs.parts, watch)
     failures = run.finish_all(options.workers)
-    return put_together(plan, outputs, failures, run.cost or earlier, watch)
+    return put_together(plan, dataset, outputs, failures, run.cost or earlier, watch)
 
 
 def prepared(
     dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
 ) -> tuple[Outputs, Plan, Cost | None]:
-    """Make and check the plan, and restore parts from label files. Return the cost of the labels that exist, too."""
-    outputs = Outputs(options.output or dataset.root, options, dataset)
+    """Make and check the plan. Return the cost of these labels in existing files, too; None: unknown."""
+    outputs = Outputs.of(dataset, options)
     if options.shard is None:
         outputs.make_folder()
-    checked = check(plan_labels(dataset, scorer, options, watch), outputs, watch)
-    restore(checked.plan, outputs.parts, checked.before)
-    return outputs, checked.plan, earlier_cost(checked.plan, checked.before)
+    plan = plan_labels(dataset, scorer, options, watch)
+    check(plan, dataset, outputs, watch)
+    digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
+    known = (file.cost for file in outputs.before() if digests & set(file.digests.values()))
+    return outputs, plan, next(filter(None, known), None)
 
 
-@dataclass(frozen=True)
-class CheckedPlan:
-    """A plan after all frames were found.
+def check(plan: Plan, dataset: Dataset, outputs: Outputs, watch: Watch = QUIET) -> int:
+    """Check everything that a run needs before the first score, write nothing, and return the bytes to decode.
 
-    plan: chosen episodes, and others with kept labels
-    before: existing label files
-    num_bytes: stored size by episode number
+    Raises DatasetError, also for existing label files that this run may not replace.
     """
-
-    plan: Plan
-    before: Sequence[LabelFile]
-    num_bytes: Mapping[int, int]
-
-
-def check(plan: Plan, outputs: Outputs, watch: Watch = QUIET) -> CheckedPlan:
-    """Check everything that a run needs before the first score, also for labelled episodes. Write nothing.
-
-    Rows and checks may have changed since the labels were made. Raises DatasetError.
-    """
-    options, dataset = outputs.options, outputs.dataset
-    assert dataset is not None  # a run has one
-    before = outputs.before() if options.shard is None else []
-    plan = joined(plan, dataset, before, options.overwrite, watch)
-    if options.in_place:
-        for file in outputs.hdf5:
-            check_room(file, plan)
+    options = outputs.options
+    for file in outputs.before() if options.shard is None else ():
+        try:
+            file.check(plan)
+        except DatasetError as error:
+            if not options.overwrite:
+                told = f"{error.problem}: choose another {file.option}, or --overwrite"
+                raise DatasetError(told, error.where) from error
+            watch.note(f"--overwrite: {error}; its labels of {len(file.digests)} episodes are replaced")
     watch.checking(len(plan.items))
-    num_bytes = {}
+    num_bytes = 0
     with all_faults(dataset, options):
         for item in plan.items:
-            num_bytes[item.episode.index] = sum(
-                dataset.check(item.episode, camera) for camera in plan.recipe.decoded_cameras
-            )
+            num_bytes += sum(dataset.check(item.episode, camera) for camera in plan.recipe.decoded_cameras)
             watch.checked(item.episode)
     for line in dataset.frame_notes:
         watch.note(line)
-    return CheckedPlan(plan, before, num_bytes)
-
-
-def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: bool, watch: Watch) -> Plan:
-    """Return the plan with all other episodes whose labels are in the files.
-
-    Raises DatasetError, without ``overwrite``, for a file whose labels would be lost or do not fit the frames.
-    """
-    known: Mapping[int, Item] = {item.episode.index: item for item in plan.items}
-    for file in files:
-        try:
-            known = {**known, **file.check(plan, dataset, known)}
-        except DatasetError as error:
-            if not overwrite:
-                told = f"{error.problem}: choose another {file.option}, or --overwrite"
-                raise DatasetError(told, error.where) from error
-            lost = f"; its labels of {len(file.digests)} episodes are replaced" if file.digests else ""
-            watch.note(f"--overwrite: {error}{lost}")
-    if len(known) > len(plan.items):
-        watch.note(f"labels of {len(known) - len(plan.items)} other episodes are there, and are kept")
-    return replace(plan, items=[known[index] for index in sorted(known)])
-
-
-def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
-    """Write each missing part of the plan whose labels are in a file. Raises OSError."""
-    cameras = ("", *(f".{camera}" for camera in plan.recipe.cameras))
-    order = [name + camera for name in SCORES for camera in cameras]
-    finished = parts.finished(plan.items)
-    for file in files:
-        missing = [item for item in plan.items if item.key not in finished]
-        gone = [item for item in missing if file.digests.get(item.episode.index) == item.digest]
-        for item, columns in file.read(gone) if gone else ():
-            scores = {name: columns[name] for name in order if name in columns}
-            skipping = skipping_in(scores)
-            answered = slice(None) if skipping is None else np.isfinite(scores[skipping])
-            of_all = [
-                len(each) == item.episode.num_frames and np.isfinite(each[answered]).all() for each in scores.values()
-            ]
-            if of_all and all(of_all):
-                index = item.episode.index
-                parts.write(item, scores, {name: of[index] for name, of in file.blank.items() if index in of})
-                finished.add(item.key)
-
-
-def earlier_cost(plan: Plan, files: Sequence[LabelFile]) -> Cost | None:
-    """Return the first cost that a file with labels of this plan tells; None: no such file does."""
-    digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
-    return next((file.cost for file in files if file.cost and digests & set(file.digests.values())), None)
+    return num_bytes
 
 
 def put_together(
-    plan: Plan, outputs: Outputs, failures: Sequence[FailedEpisode], cost: Cost | None, watch: Watch
+    plan: Plan,
+    dataset: Dataset,
+    outputs: Outputs,
+    failures: Sequence[FailedEpisode],
+    cost: Cost | None,
+    watch: Watch,
 ) -> Report:
     """Write the label files, unless an episode failed or the run labelled only a shard."""
     report = Report([], failures, outputs.parts.url, None, plan)
@@ -180,12 +121,11 @@ def put_together(
     blank = blank_from_metadata(labels.schema.metadata)
     for line in blank_lines(blank, len(plan.items)):
         watch.note(line)
-    files = outputs.write(plan, labels, cost, watch)
+    files = outputs.write(plan, labels, cost)
     for name, score in SCORES.items():
         if name in labels.column_names and (told := score.told(labels[name].to_numpy())):
             watch.note(f"{told}; the column {name} marks them")
-    assert outputs.dataset is not None  # ``prepared`` sets it
-    num_episodes = len(outputs.dataset.numbers)
+    num_episodes = len(dataset.numbers)
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
         watch.note(f"{len(plan.items)} of the dataset's {num_episodes} episodes have labels{others}")
@@ -196,49 +136,30 @@ def put_together(
 class Outputs:
     """Paths of the parts, and of the label files in the formats to write.
 
-    dataset: None: only the paths of Parquet files are needed
-
-    Raises DatasetError for HDF5 labels of a dataset that is no HDF5 file.
+    prefix: of the names of the label files, as ``Dataset.label_prefix``
     """
 
     folder: Path
     options: LabelOptions
-    dataset: Dataset | None = None
+    prefix: str
 
-    def __post_init__(self) -> None:
-        is_written = self.dataset is None or isinstance(self.dataset, Hdf5Dataset)
-        expected = "progress or signals for a dataset that is no HDF5 file"
-        require("format", is_written or "hdf5" not in self.options.formats, expected, "hdf5")
-        got = f"{self.dataset.kind if self.dataset else 'none'}: leave --in-place away"
-        takes = isinstance(self.dataset, Hdf5Dataset) and self.dataset.takes_labels
-        expected = f"an HDF5 file{' of robomimic or LIBERO' * isinstance(self.dataset, Hdf5Dataset)}"
-        require("in_place", self.dataset is None or takes or not self.options.in_place, expected, got)
-
-    @property
-    def formats(self) -> Sequence[Format]:
-        """The formats to write; by default those of the dataset's kind."""
-        by_kind: Sequence[Format] = ("hdf5",) if isinstance(self.dataset, Hdf5Dataset) else ("progress", "signals")
-        return self.options.formats or by_kind
+    @classmethod
+    def of(cls, dataset: Dataset, options: LabelOptions) -> Outputs:
+        """Return the paths for a dataset."""
+        return cls(options.output or dataset.root, options, dataset.label_prefix)
 
     @property
     def progress(self) -> list[Path]:
         """The progress file, then its alias."""
-        named = self.folder / f"{self.options.name}{PROGRESS_ENDING}"
-        alias = [self.folder / f"{self.options.alias}.parquet"] if self.options.alias else []
-        return [named, *alias] if "progress" in self.formats else []
+        named = self.folder / f"{self.prefix}{self.options.name}{PROGRESS_ENDING}"
+        alias = [self.folder / f"{self.prefix}{self.options.alias}.parquet"] if self.options.alias else []
+        return [named, *alias] if "progress" in self.options.formats else []
 
     @property
     def signals(self) -> list[Path]:
         """The file of frame signals."""
-        return [self.folder / SIGNALS_FOLDER / f"{self.options.name}.parquet"] if "signals" in self.formats else []
-
-    @property
-    def hdf5(self) -> list[Path]:
-        """The labels' own HDF5 file, or the dataset's."""
-        if "hdf5" not in self.formats or not isinstance(self.dataset, Hdf5Dataset):
-            return []
-        own = own_file(self.folder, self.dataset.file.stem, self.options.name)
-        return [self.dataset.file if self.options.in_place else own]
+        named = self.folder / SIGNALS_FOLDER / f"{self.prefix}{self.options.name}.parquet"
+        return [named] if "signals" in self.options.formats else []
 
     @cached_property
     def parts(self) -> Parts:
@@ -256,14 +177,12 @@ class Outputs:
             raise DatasetError.at(self.folder, "a folder for the labels", got) from error
 
     def before(self) -> list[LabelFile]:
-        """Return the label files that exist already. Raises DatasetError for an unreadable HDF5 file."""
+        """Return the label files that exist already."""
         named = zip(self.progress, ("--name", "--alias"), strict=False)
-        found = [parquet_labels(path, option) for path, option in named if path.exists()]
-        found += [parquet_labels(path) for path in self.signals if path.exists()]
-        in_hdf5 = [hdf5_labels(path, self.options.name) for path in self.hdf5 if path.exists()]
-        return found + [each for each in in_hdf5 if each is not None]
+        found = [LabelFile.read(path, option) for path, option in named if path.exists()]
+        return found + [LabelFile.read(path) for path in self.signals if path.exists()]
 
-    def write(self, plan: Plan, labels: Any, cost: Cost | None, watch: Watch) -> list[Path]:
+    def write(self, plan: Plan, labels: Any, cost: Cost | None) -> list[Path]:
         """Write the labels to all files, and return their paths. Raises OSError.
 
         labels: table of ``Parts.read_all``
@@ -277,10 +196,4 @@ class Outputs:
         except OSError as error:
             remedy = f"make room, or name another folder with --output and this one's --parts {self.parts.url}"
             raise OSError(f"{self.folder}: expected to write the labels, got {error}: {remedy}") from error
-        in_hdf5 = Hdf5Labels(plan, labels, self.options.name, cost)
-        for file in self.hdf5:
-            if self.options.in_place:
-                in_hdf5.write_in_place(file, watch.note)
-            else:
-                in_hdf5.write(file)
-        return [*(sidecar.path for sidecar in sidecars), *self.hdf5]
+        return [sidecar.path for sidecar in sidecars]

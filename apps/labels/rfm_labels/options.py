@@ -19,7 +19,7 @@ from rfm_labels.datasets.faults import listed, require
 
 Mode: TypeAlias = Literal["prefix", "whole"]
 ProgressRule: TypeAlias = Literal["remaining_over_first"]
-Format: TypeAlias = Literal["progress", "signals", "hdf5"]
+Format: TypeAlias = Literal["progress", "signals"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_WORKERS = 4
 LAST = "last"  # in place of a picture of the goal
@@ -79,7 +79,6 @@ def _names(text: str) -> tuple[str, ...]:
 class LabelOptions(Settings):
     """Options of a labelling run. Raises ConfigError, a ValueError.
 
-    formats: empty: ``progress`` and ``signals``, for an HDF5 dataset ``hdf5``
     cameras: empty: all but depth cameras
     sampling, frames: None: those of the checkpoint's training (``Sampling.of``)
     episodes: numbers; None: all
@@ -96,8 +95,8 @@ class LabelOptions(Settings):
         None, "Write the progress file under this name, too: sarm_progress is what LeRobot reads."
     )
     formats: Sequence[Format] = setting(
-        (),
-        "Output formats. Default: progress,signals (HDF5 datasets: hdf5).",
+        FORMATS,
+        "Output formats.",
         flag="--format",
         metavar=",".join(FORMATS),
         parse=_names,
@@ -151,7 +150,6 @@ class LabelOptions(Settings):
     workers: int = setting(DEFAULT_WORKERS, "Episodes to score at a time.", least=1)
     overwrite: bool = setting(False, "Replace labels made by another recipe.")
     verify: bool = setting(False, "Detect changed videos by SHA-256 instead of size and mtime.")
-    in_place: bool = setting(False, "Write the labels into the HDF5 file itself.")
 
     def __post_init__(self) -> None:
         for name in ("episodes", "shard"):
@@ -163,9 +161,8 @@ class LabelOptions(Settings):
             value = getattr(self, name)
             if value is not None and not _NAME.fullmatch(value):
                 raise ConfigError.at(name, "1 to 64 letters, digits, _ or -", repr(value))
-        for each in self.formats:
-            if each not in FORMATS:
-                raise ConfigError.at("formats", f"one of {', '.join(FORMATS)}", repr(each))
+        if not self.formats or set(self.formats) - set(FORMATS):
+            raise ConfigError.at("formats", f"some of {', '.join(FORMATS)}", ", ".join(self.formats) or "none")
         if len(set(self.cameras)) != len(self.cameras):
             raise ConfigError.at("cameras", "each once", ", ".join(self.cameras))
         if self.mode == "whole" and self.sampling not in (None, "all"):

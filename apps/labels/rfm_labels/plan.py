@@ -329,7 +329,7 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     if several:
         how = "each stretch of frames with one task is scored by itself (--several-tasks first: all by the first task)"
         watch.note(f"tasks: {several} episodes have several: {how}")
-        if "progress" in (options.formats or ("progress",)):
+        if "progress" in options.formats:
             own = "the scores are in the column progress"
             watch.note(f"progress_sparse: the sum of the gains in an episode's tasks, as LeRobot's RA-BC needs; {own}")
     told = " ".join(dataset.notes)

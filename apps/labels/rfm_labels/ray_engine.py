@@ -136,4 +136,4 @@ def label_with_ray(
         outputs, plan, earlier = prepared(dataset, scorer, options, watch)
     job = RayJob(source, opening, connect, plan, outputs.parts.url, options.workers)
     failures = finish_all_with_ray(job, ray, watch)
-    return put_together(plan, outputs, failures, earlier, watch)
+    return put_together(plan, dataset, outputs, failures, earlier, watch)

@@ -64,7 +64,7 @@ class Summary:
 
 
 def summarise(file: Path) -> Summary:
-    """Return the summary of a label file, Parquet or HDF5. Raises DatasetError for another file."""
+    """Return the summary of a label file. Raises DatasetError for another file."""
     table = read_label_table(file)
     require(file, len(table) > 0, "labels", "none")
     return summary_of(table)

@@ -287,9 +287,11 @@ def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
 
 
 def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
-    """Write new files with the labels, then put all in place. Raises OSError; a failed write changes no file.
+    """Write new files with the labels, read them back, then put one after the other in place.
 
     labels: table of ``Parts.read_all``
+
+    Raises OSError for a failed write, and for a file that reads back otherwise; no file has changed then.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -302,4 +304,21 @@ def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
             schema = pa.schema(fields, metadata={**sidecar.metadata, **(labels.schema.metadata or {})})
             sidecar.path.parent.mkdir(parents=True, exist_ok=True)
             file = whole.enter_context(whole_file(sidecar.path))
-            parquet.write_table(own.cast(schema), file, row_group_size=_ROWS_AT_A_TIME)
+            table = own.cast(schema)
+            parquet.write_table(table, file, row_group_size=_ROWS_AT_A_TIME)
+            if not _holds(file, table):
+                raise OSError(f"{sidecar.path}: expected the labels that were written, read others")
+
+
+def _holds(file: Path, table: Any) -> bool:
+    """True if a file has the rows, values and metadata of a table."""
+    from pyarrow import ArrowException, parquet
+
+    try:
+        read = parquet.ParquetFile(file).read()
+    except ArrowException:
+        return False
+    pairs = zip(read.columns, table.columns, strict=False)
+    return read.schema.equals(table.schema, check_metadata=True) and all(
+        np.array_equal(one.to_numpy(), other.to_numpy(), equal_nan=True) for one, other in pairs
+    )

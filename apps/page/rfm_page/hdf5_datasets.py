@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_labels import DatasetEpisode, DatasetError, find_label_files, stored_in
+from rfm_labels import DatasetEpisode, DatasetError, find_label_files
 from rfm_labels.datasets import Hdf5Dataset, opened_hdf5
 from rfm_page.encoded import encoded
 from rfm_page.links import check_links
@@ -39,10 +39,8 @@ class ShownHdf5(ShownDataset):
 
     def check(self) -> None:
         """Raise DatasetError for data in other files, in the dataset or its labels."""
-        files = dict.fromkeys([self.path, *map(stored_in, find_label_files(self.path))])
-        check_links(self.root, files)
-        for file in files:
-            _check_inside(file, _changed_ns(file))
+        check_links(self.root, [self.path, *find_label_files(self.path)])
+        _check_inside(self.path, _changed_ns(self.path))
 
     @property
     def cameras(self) -> Sequence[str]:

@@ -32,7 +32,6 @@ from rfm_labels import (
     find_label_files,
     read_episode_labels,
     read_provenance,
-    stored_in,
     summarise,
 )
 
@@ -110,7 +109,7 @@ class ShownDataset(ABC):
         ``unused`` has what each camera shows instead of colours (``Dataset.unused_cameras``); null: colours.
         """
         file = self._labels(labels)
-        status = None if file is None else stored_in(file).stat()
+        status = None if file is None else file.stat()
         summary = None if file is None or status is None else _summary(file, status.st_mtime_ns)
         unused = self.dataset.unused_cameras(self.dataset.cameras)
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))

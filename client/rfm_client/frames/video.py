@@ -22,7 +22,6 @@ from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
 from rfm_client.contract.numbers import checked_finite, checked_positive
 from rfm_client.contract.proxies import open_url
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.lerobot_videos import check_local_video, check_video_behind
 from rfm_client.frames.pictures import FrameFileError, decoded_picture, opened_picture
 from rfm_client.frames.video_decoding import (
     DAMAGED,
@@ -30,6 +29,7 @@ from rfm_client.frames.video_decoding import (
     UNDAMAGED,
     Packets,
     Upright,
+    check_is_one_episode,
     import_av,
     judged,
     read_packets,
@@ -90,16 +90,16 @@ def read_video(
     container: FFmpeg's name for the file format; None: FFmpeg guesses. Name it for untrusted files, because some
         formats make FFmpeg open other files or addresses
 
-    Raises InvalidSampleError for a missing or truncated file, a file of no video, several videos or depth maps, fewer
-    frames than packets, and a frame that the decoder marks as damaged among those returned. Also for a file of several
-    LeRobot episodes (``lerobot_videos``) without both ``start_s`` and ``end_s``.
+    Raises InvalidSampleError for a missing file, a file of no video, several videos or depth maps, fewer frames than
+    packets, and a frame that the decoder marks as damaged among those returned. Also for a file of several LeRobot
+    episodes (v3.0) without both ``start_s`` and ``end_s``.
     """
     import_av()
     _check_numbers(fps, start_s, end_s, timeout_s)
     take = take or (lambda num_bytes: None)
     with _errors_of(source):
         if start_s is None or end_s is None:
-            check_video_behind(str(source)) if is_url(source) else check_local_video(source)
+            check_is_one_episode(source)
         with _opened(source, timeout_s) as file:
             is_part = (start_s, end_s) != (None, None)
             picture = None if is_part or container is not None else _still(file)

@@ -7,26 +7,38 @@ Containers, streams, packets and frames are PyAV's.
 from __future__ import annotations
 
 import math
+import os
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, BinaryIO
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.broken_off import broken_off
 from rfm_client.frames.pictures import FrameFileError
 
 UNDAMAGED = "an undamaged frame"
 DAMAGED = "one that the decoder marks, or is made from such a one"
-REENCODE = "download it again, or keep what can be decoded: ffmpeg -i IN OUT"
+REENCODE = "download it again"
 _HEADLESS = ("an HEVC video that begins with a key frame (cut it there: ffmpeg -ss SECONDS -i IN OUT)", "another frame")
 
 _NO_MATRIX, _BT601, _BT2020 = 0, 5, 9  # from YUV to RGB, as ITU-T H.273 numbers them
 _MATRICES = (1, 4, _BT601, 7, _BT2020)  # that libswscale knows; it takes BT.601 in place of others
 _SAME_MATRIX = {6: _BT601, 10: _BT2020}  # other numbers for the same matrix
 _BITS = 8  # most bits of a grey video's only channel; depth maps have more
+_TS_SYNC, _TS_PACKETS = 0x47, ((188, 0), (192, 4))  # first byte, lengths and its offset (ISO 13818-1, Blu-ray)
+_HEAD_BYTES = 1024  # enough to recognise MPEG-TS packets, or the padding of a GIF
+_SEVERAL_EPISODES = (
+    "a file in the layout of LeRobot v3.0, which holds several: label the dataset with rfm-client label, or name a "
+    "part: start_s and end_s of load_trajectory, in seconds since the file's first frame (from_timestamp in "
+    "meta/episodes, and length / fps later)"
+)
+_SHARED_FILE = re.compile(r"/videos/[^/]+/chunk-\d+/file-\d+\.\w+$")  # of several episodes, in LeRobot v3.0
 _NEARLY = math.tan(math.radians(1))  # FFmpeg's tolerance for quarter turns of a display matrix
 
 
@@ -96,12 +108,10 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
 
     container: FFmpeg's name of the file's format; None: FFmpeg guesses it
 
-    Raises FrameFileError, also for a truncated file and broken packets, and the errors of PyAV.
+    Raises FrameFileError, also for broken packets, and the errors of PyAV. A Matroska or Ogg file that ends too early
+    is read as far as it goes.
     """
-    missing = broken_off(file)
-    if missing is not None:
-        raise FrameFileError.of("a whole video file", missing)
-    file.seek(0)
+    _check_last_picture(file)
     timed: list[tuple[float, int]] = []
     count = num_hidden = 0
     with import_av().open(file, format=container) as opened:
@@ -126,6 +136,32 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     timed.sort()
     times_s = np.array([time_s for time_s, _ in timed])
     return Packets(count, times_s, tuple(size for _, size in timed), num_hidden, tick_s, fps)
+
+
+def _check_last_picture(file: BinaryIO) -> None:
+    """Raise FrameFileError for a truncated GIF or MPEG-TS file, whose decoders may give part of a picture."""
+    num_bytes = file.seek(0, os.SEEK_END)
+    file.seek(max(num_bytes - _HEAD_BYTES, 0))
+    tail = file.read()
+    file.seek(0)
+    head = file.read(_HEAD_BYTES)
+    file.seek(0)
+    is_cut = head.startswith(b"GIF8") and not tail.rstrip(b"\0").endswith(b";")
+    for length, offset in _TS_PACKETS:
+        syncs = head[offset::length]
+        is_cut |= len(syncs) > 3 and set(syncs) == {_TS_SYNC} and num_bytes % length != 0
+    if is_cut:
+        raise FrameFileError.of("a whole video file", f"one that ends inside a picture, after {num_bytes} bytes")
+
+
+def check_is_one_episode(source: str | Path) -> None:
+    """Raise InvalidSampleError for a path or URL in the layout of LeRobot v3.0, whose files hold several episodes."""
+    if isinstance(source, Path) or "://" not in source:
+        paths = [Path(source).absolute().as_posix(), Path(source).resolve().as_posix()]  # a download may be a link
+    else:
+        paths = [unquote(urlsplit(source).path)]
+    if any(map(_SHARED_FILE.search, paths)):
+        raise InvalidSampleError.at("video", "a video of one episode", _SEVERAL_EPISODES)
 
 
 class Upright:

@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.lerobot_videos import check_local_video
 from rfm_client.frames.pictures import FrameFileError
 from rfm_client.frames.video_decoding import (
     DAMAGED,
     UNDAMAGED,
     Packets,
     Upright,
+    check_is_one_episode,
     decoder,
     import_av,
     judged,
@@ -48,8 +48,8 @@ class Video:
         return decoder()
 
     def check_is_one_episode(self) -> None:
-        """Raise InvalidSampleError if a LeRobot dataset keeps several episodes, or one and other frames, in it."""
-        check_local_video(self.file)
+        """Raise InvalidSampleError for a file in which LeRobot v3.0 keeps several episodes."""
+        check_is_one_episode(self.file)
 
     @cached_property
     def packets(self) -> Packets:

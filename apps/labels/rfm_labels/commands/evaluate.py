@@ -38,7 +38,7 @@ def evaluate(
     labels: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Label file: Parquet, or HDF5 (demos.hdf5/NAME in place). Repeat for more. Default: all in DATASET.",
+            help="Label file. Repeat for more. Default: all of DATASET.",
             show_default=False,
         ),
     ] = None,
@@ -64,7 +64,7 @@ def evaluate(
         raise DatasetError.at(dataset, "a labelled dataset", "no file or folder of this name")
     files = labels or find_label_files(dataset)
     if not files:
-        expected = "label files, NAME_progress.parquet or in HDF5 (rfm-client label), or --labels"
+        expected = "label files, NAME_progress.parquet (rfm-client label), or --labels"
         raise DatasetError.at(dataset, expected, "none")
     comparison = evaluate_labels(files, None if outcome is None else read_outcomes(outcome, dataset))
     if output.prints_tables:

@@ -20,12 +20,11 @@ from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, setting
 from rfm_labels.commands.progress_bar import ProgressBar, Say
 from rfm_labels.datasets.cameras import parsed_by_camera
-from rfm_labels.datasets.dataset import Dataset, SeveralTasks
+from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset, SeveralTasks
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
-from rfm_labels.datasets.hdf5 import SUFFIXES
+from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.opening import hdf5_files, open_dataset
-from rfm_labels.hdf5_tables import dataset_stem, labels_in, own_file, stored_in
 from rfm_labels.label_files import read_blank
 from rfm_labels.labelling import Outputs, Report, check
 from rfm_labels.labelling import label as label_dataset
@@ -187,10 +186,6 @@ class LabelCommand:
 
     def _run_each(self, files: Sequence[Path]) -> ExitCode:
         """Run for each HDF5 file of a folder, once all can be opened. Raises DatasetError for a file that cannot."""
-        formats = ", ".join(self.labels.formats)
-        require(
-            "format", formats in ("", "hdf5"), "hdf5 for a folder of HDF5 files, each with labels of its own", formats
-        )
         stems = [file.stem for file in files]
         twice = [str(file) for file in files if stems.count(file.stem) > 1]
         got = f"{', '.join(twice)}: leave out --output, and labels lie beside their files"
@@ -248,11 +243,10 @@ class LabelCommand:
     def _try(self) -> None:
         """Check everything, measure a few episodes, write nothing."""
         dataset = self._dataset()
-        outputs = Outputs(self.labels.output or dataset.root, self.labels, dataset)
+        outputs = Outputs.of(dataset, self.labels)
         with self.connect() as scorer, ProgressBar(self.say) as watch:
             plan = plan_labels(dataset, scorer, self.labels, watch)
-            checked = check(plan, outputs, watch)
-            num_bytes = sum(checked.num_bytes[item.episode.index] for item in plan.items)
+            num_bytes = check(plan, dataset, outputs, watch)
             took_s = _measured_s(plan, dataset, scorer, self.labels.workers, watch)
         _print(_plan_rows(plan, dataset, num_bytes, took_s))
 
@@ -274,22 +268,17 @@ class LabelCommand:
         return ExitCode.OK
 
     def _record(self, folder: Path, report: Report) -> None:
-        """Record the chosen episodes, also those labelled by an earlier run."""
         from rfm_labels.pictures import record_episodes
 
-        dataset = self._dataset()
-        chosen = {episode.index for episode in selected(dataset, self.labels)}
-        plan = replace(report.plan, items=[item for item in report.plan.items if item.episode.index in chosen])
-        for file in record_episodes(folder, dataset, plan, Parts(report.parts)):
+        for file in record_episodes(folder, self._dataset(), report.plan, Parts(report.parts)):
             typer.echo(f"{file}")
 
     def _report(self) -> None:
         """Show the summary of existing labels; the source is a dataset or a label file."""
         path = Path(self.source)
-        if path.suffix.lower() in SUFFIXES:
-            path = self._in_hdf5(path)
-        elif path.is_dir() or self.labels.output is not None:
-            outputs = Outputs(self.labels.output or path, self.labels)
+        if label_prefix(path) or path.is_dir() or self.labels.output is not None:
+            folder = self.labels.output or (path if path.is_dir() else path.parent)
+            outputs = Outputs(folder, self.labels, label_prefix(path))
             files = [*outputs.progress, *outputs.signals]
             path = next((file for file in files if file.exists()), files[0])
         summary = summarise(path)
@@ -297,26 +286,14 @@ class LabelCommand:
             self.say(f"note: {line}")
         self._show(summary, path)
 
-    def _in_hdf5(self, path: Path) -> Path:
-        """Existing labels of an HDF5 dataset: beside, or in place. Raises DatasetError."""
-        own = own_file(self.labels.output or path.parent, path.stem, self.labels.name)
-        files = [path] if self.labels.in_place or not own.exists() else [own]
-        found = [each for file in files for each in labels_in(file)]
-        named = [each for each in found if each.name == self.labels.name]
-        got = f"{', '.join(each.name for each in found) or 'none'}: choose with --name"
-        require(path, bool(named), f"labels with the name {self.labels.name}, in {own.name} or in place", got)
-        return named[0]
-
     def _show(self, summary: Summary, file: Path) -> None:
         _print(summary.rows())
         if self.options.picture:
             from rfm_labels.pictures import draw_summary
 
-            stored = stored_in(file)
-            beside = stored.parent.parent if stored.parent.name == "reward_signals" else stored.parent
-            source = Path(self.source)
-            of_file = f"{dataset_stem(source)}." if source.suffix.lower() in SUFFIXES else ""
-            picture = (self.labels.output or beside) / f"{of_file}{self.labels.name}_summary.png"
+            beside = file.parent.parent if file.parent.name == SIGNALS_FOLDER else file.parent
+            named = f"{label_prefix(Path(self.source))}{self.labels.name}_summary.png"
+            picture = (self.labels.output or beside) / named
             draw_summary(picture, summary, file)
             typer.echo(f"{picture}")
 

@@ -104,6 +104,7 @@ class Dataset(ABC):
 
     kind: layout, for example ``LeRobot v3.0``
     root: default folder for labels
+    label_prefix: beginning of the names of its label files, if its folder may hold other datasets
     source: id on the Hub, or name of the folder or file
     revision: commit on the Hub; None: local
     cameras: names, in the dataset's order
@@ -118,6 +119,7 @@ class Dataset(ABC):
 
     kind: str
     root: Path
+    label_prefix: str = ""
     source: str
     revision: str | None = None
     cameras: Sequence[str] = ()

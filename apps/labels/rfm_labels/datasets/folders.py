@@ -123,7 +123,7 @@ class VideoFolder(EpisodeFiles):
         video.check_is_one_episode()
         with faults_at(file):
             packets = video.packets
-        expected = f"{packets.count} frames with time stamps (ffmpeg -framerate FPS -i IN OUT.mp4 gives them)"
+        expected = f"{packets.count} frames with time stamps"
         require(file, len(packets.times_s) == packets.count, expected, len(packets.times_s))
         return packets.count
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -40,10 +39,10 @@ class _Name:
         return cls(file, tuple(parts[::2]), digits, tuple(map(Decimal, digits)))
 
     def kind(self, place: int | None) -> str:
-        """The name as a shell pattern, with ``*`` for all numbers but the one at ``place``."""
+        """The name with ``*`` for all numbers but the one at ``place``."""
         shown = ["*" if number != place else digits for number, digits in enumerate(self.digits)]
         parts = [self.words[0], *(part for pair in zip(shown, self.words[1:], strict=True) for part in pair)]
-        return "".join(part if part == "*" else shlex.quote(part) for part in parts if part) + Path(self.file).suffix
+        return "".join(parts) + Path(self.file).suffix
 
 
 def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
@@ -80,14 +79,11 @@ def _num_cameras(names: Sequence[_Name], place: int) -> int:
 
 
 def _several_kinds(folder: Path, names: Sequence[_Name], place: int | None) -> DatasetError:
-    """The error for several kinds of names, with a shell command that moves one of them."""
+    """The error for several kinds of names."""
     kinds: Mapping[str, int] = Counter(name.kind(place) for name in names)
     shortest = sorted(kinds, key=lambda kind: (len(kind), kind))
     told = " and ".join(f"{kind} ({kinds[kind]})" for kind in shortest[:_EXAMPLES])
     if max(kinds.values()) == 1:
         return DatasetError.at(folder, "names that differ in a number", f"{told}: rename them, as in 0.png and 1.png")
-    moved = shortest[1]
-    target = re.sub(r"\W+|_", "", Path(moved).stem) or "others"
-    each = f'for d in {shlex.quote(str(folder.parent))}/*/; do mkdir "$d"{target} && mv "$d"{moved} "$d"{target}; done'
-    got = f"{told}: move all but one kind into folders of their own, such as: {each}"
+    got = f"{told}: give each kind a folder of its own, and list those of one camera in tasks.csv"
     return DatasetError.at(folder, "pictures of one camera, whose names differ in a number", got)

@@ -59,6 +59,11 @@ def is_hdf5(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
+def label_prefix(path: Path) -> str:
+    """Return the beginning of the names of a dataset's label files: ``demos.`` for ``demos.hdf5``, else nothing."""
+    return f"{path.stem}." if path.suffix.lower() in SUFFIXES else ""
+
+
 class Hdf5Dataset(Dataset):
     """The demonstrations of one file.
 
@@ -73,6 +78,7 @@ class Hdf5Dataset(Dataset):
     ) -> None:
         self.file = file
         self.root = file.parent
+        self.label_prefix = label_prefix(file)
         self.source = file.name
         self.given_task = task
         with opened_hdf5(file) as opened:
@@ -81,7 +87,7 @@ class Hdf5Dataset(Dataset):
             self._demos = {index: name for index, (name, _) in demos.items()}
             self._pictures = pictures_in(demos, self._layout.are_pictures)
             self._forms = forms_in(demos)
-            attributes = (opened["data"] if self.takes_labels else opened).attrs
+            attributes = (opened["data"] if self._is_robomimic else opened).attrs
             self._tasks = {index: self._task_in(opened, demo, attributes) for index, (_, demo) in demos.items()}
             self.filter_keys, notes = filter_keys(opened, self._demos)
             self.cameras, self.left_out = self._shared(list(demos))
@@ -89,16 +95,16 @@ class Hdf5Dataset(Dataset):
                 index: _lengths_of(demo, self.cameras or self._cameras_of(index)) for index, (_, demo) in demos.items()
             }
             self._broken = unread_documents(attributes)
-            others = unread(opened, self._demos.values()) if self.takes_labels else []
+            others = unread(opened, self._demos.values()) if self._is_robomimic else []
             notes = [*others, *notes, *_notes_on_lengths(demos, self._lengths)]
             notes += [
                 f"data: {name} is not a JSON object, so it states neither a task nor LIBERO" for name in self._broken
             ]
-            is_libero = self.takes_labels and is_of_libero(attributes)
+            is_libero = self._is_robomimic and is_of_libero(attributes)
             self.fps = self._layout.fps or fps_of(attributes)
             self._firsts = first_files(demos, self._pictures, self._layout.are_pictures)
             is_upright = "opencv" in str(attribute(attributes, "macros_image_convention"))  # robosuite then does
-        self.kind = "HDF5" if self.takes_labels else f"HDF5 ({self._layout.name})"
+        self.kind = "HDF5" if self._is_robomimic else f"HDF5 ({self._layout.name})"
         self.numbers = list(demos)
         known = [camera for camera in self._pictures if any(camera in self._cameras_of(each) for each in self.numbers)]
         if not known:
@@ -112,15 +118,15 @@ class Hdf5Dataset(Dataset):
         self.notes += self._notes_on_colours(corrections, unmarked) + self._notes_on_layout()
 
     @property
-    def takes_labels(self) -> bool:
-        """True if labels can be written into the file: it is robomimic's or LIBERO's."""
+    def _is_robomimic(self) -> bool:
+        """True for robomimic's layout, which LIBERO's files have, too."""
         return self._layout is ROBOMIMIC
 
     def _task_in(self, opened: Any, demo: Any, attributes: Mapping[str, Any]) -> Any:
-        return own_task_of(demo) or task_of(attributes) if self.takes_labels else task_in(self.file, opened, demo)
+        return own_task_of(demo) or task_of(attributes) if self._is_robomimic else task_in(self.file, opened, demo)
 
     def _notes_on_layout(self) -> list[str]:
-        if self.takes_labels:
+        if self._is_robomimic:
             return []
         forms = [f"{camera}{' (JPEG or PNG)' * (camera in self._firsts)}" for camera in self.cameras]
         notes = [f"layout: {self._layout.name}, cameras {', '.join(forms)}"]
@@ -142,7 +148,7 @@ class Hdf5Dataset(Dataset):
     def read_episode(self, number: int) -> DatasetEpisode:
         where = f"{self.file}: {self._layout.group_of(self._demos[number])}".removesuffix(": ")
         told = " or ".join(name + " (no JSON object)" * (name in self._broken) for name in DOCUMENTS)
-        places = f"ep_meta, or data: {told}" if self.takes_labels else task_places(self.file)
+        places = f"ep_meta, or data: {told}" if self._is_robomimic else task_places(self.file)
         task = self.given_task.of(f"{where}: {places}", self._tasks[number])
         lengths = self._lengths[number]
         got = ", ".join(f"{key} {length}" for key, length in lengths.items()) or self._forms[number]

@@ -38,19 +38,15 @@ _LAYOUTS = (
     f"folder of videos, of folders of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {' or '.join(TABLES)}, "
     "or a Hub id org/name[@revision]"
 )
-_TABLE = "list the videos in tasks.csv (columns video, task)"
+_CONVERT = "convert them to LeRobot, or write each episode's pictures to a video and list the videos in tasks.csv"
 _GIVE_TASK = '--task "SENTENCE"'
 _FILL = "put a video, an array or a folder of pictures for each episode in it"
 _UNREAD = {  # remedies for layouts without a reader, by pattern of file names
-    r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with convert_dataset_v1_to_v2.py of lerobot/datasets/v2 "
-    "(LeRobot 0.3), and label that",
+    r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with LeRobot 0.3",
     r".*\.tfrecord.*": f"TFRecord files without {FEATURES_FILE}, which TensorFlow Datasets 4.6 or later writes beside "
     "them: copy the whole folder of the version",
-    r".*\.zarr(\.zip)?|\.z(group|array|attrs|metadata)|zarr\.json": "Zarr arrays: convert them to LeRobot with "
-    "https://github.com/arpitg1304/forge, or write each episode's pictures to a video "
-    f"(imageio.mimwrite('0.mp4', frames, fps=10)) and {_TABLE}",
-    r".*\.(bag|mcap|db3)": "a rosbag: convert it to LeRobot with https://github.com/arpitg1304/forge, or write each "
-    f"camera's topic to a video (the package rosbags reads it without ROS) and {_TABLE}",
+    r".*\.zarr(\.zip)?|\.z(group|array|attrs|metadata)|zarr\.json": f"Zarr arrays: {_CONVERT}",
+    r".*\.(bag|mcap|db3)": f"a rosbag: {_CONVERT}",
 }
 _VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")
 _SUFFIXES = {"videos": _VIDEO_SUFFIXES, "arrays": ARRAY_SUFFIXES}  # of episodes that are files
@@ -59,7 +55,7 @@ _KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and the name of
     "folders of pictures": (FrameFolders, "folder"),
     "arrays": (ArrayFiles, "file"),
 }
-_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside the episodes, once they have labels
+_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside episodes with labels; of 0.4
 
 
 def open_dataset(
@@ -239,8 +235,7 @@ def _unread(path: Path) -> str | None:
         remedy = "rfm-client label takes the folder, open_dataset each file"
         return f"a folder of HDF5 files, each a dataset of its own: {remedy}"
     if pictures := [file for file in path.iterdir() if _is_frame(file)]:
-        moved = f"mkdir {path}/0 && mv {path}/*{pictures[0].suffix} {path}/0"
-        return f"pictures outside of the folder of an episode: {moved}"
+        return f"pictures outside of the folder of an episode ({pictures[0].name})"
     deeper = next((file for file in path.glob("*/*/*") if is_picture(file)), None)
     listed = deeper and deeper.parent.relative_to(path)
     return f"pictures two levels down: list the folders of one camera ({listed}) in tasks.csv" if deeper else None

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: MIT
+"""Every format of datasets alike: episodes, tasks, frames, labels, resumed runs, corrections, a broken episode."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+import hdf5_writers
+from hdf5_writers import TASK, decoded, jpeg, video
+from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, brightness
+from paths import ROOT
+from pictures import numbered, numbers, write_video
+from rfm_client import RewardError, UInt8Array
+from rfm_labels import Dataset, DatasetError, LabelOptions, iter_episodes, label, open_dataset, read_episode_labels
+
+RLDS = ROOT / "tests" / "rlds"
+LENGTHS = (4, 6, 3)
+CLIPS = [video(length, seed) for seed, length in enumerate(LENGTHS)]
+
+Frames = Mapping[str, UInt8Array]
+
+
+@dataclass(frozen=True)
+class Written:
+    """A dataset on disk.
+
+    episodes: number, task, and the frames of each camera; None: other tests compare the frames
+    spoil: breaks the second episode; None: the dataset has one episode, or other tests break it
+    """
+
+    source: Path
+    episodes: list[tuple[int, str, Frames | None]]
+    spoil: Callable[[], object] | None = None
+    task: str | None = None
+
+
+def lerobot(name: str) -> Callable[[Path], Written]:
+    def write(folder: Path) -> Written:
+        root = Path(shutil.copytree(LEROBOT / name, folder / name))
+        tasks = [episode.task for episode in open_dataset(root).episodes]
+        film = root / "videos" / "chunk-000" / WRIST / "episode_000001.mp4"
+        spoil = (lambda: film.write_bytes(film.read_bytes()[:2000])) if film.exists() else None
+        return Written(root, [(number, task, None) for number, task in enumerate(tasks)], spoil)
+
+    return write
+
+
+def robomimic(folder: Path) -> Written:
+    file = folder / "demos.hdf5"
+    frames = {
+        number: {"front": clip, "wrist": clip[:, :32, ::-1]} for number, clip in zip((1, 4, 10), CLIPS, strict=True)
+    }
+    hdf5_writers.write_robomimic(file, frames)
+
+    def spoil() -> None:
+        with h5py.File(file, "r+") as opened:
+            del opened["data/demo_4/actions"]
+            opened["data/demo_4/actions"] = np.zeros((2, 7))
+
+    return Written(file, [(number, TASK, cameras) for number, cameras in frames.items()], spoil)
+
+
+def of_files(write: Callable[..., Path], mark: bytes = b"", **more: Any) -> Callable[[Path], Written]:
+    """A file of one episode, whose frames are JPEG files."""
+
+    def written(folder: Path) -> Written:
+        files = {name: [jpeg(frame, mark) for frame in video(4, seed)] for seed, name in enumerate(("high", "left"))}
+        pixels = {name: np.stack([decoded(each) for each in stored]) for name, stored in files.items()}
+        return Written(write(folder / "data" / "episode_0.hdf5", files, **more), [(0, TASK, pixels)])
+
+    return written
+
+
+def robotwin(file: Path, files: Any) -> Path:
+    return hdf5_writers.write_robotwin(file.parent, files)
+
+
+def maniskill(folder: Path) -> Written:
+    frames = {3: {"base_camera": CLIPS[0]}, 12: {"base_camera": CLIPS[1]}}
+    file = hdf5_writers.write_maniskill(folder / "trajectory.h5", frames)
+    return Written(file, [(number, TASK, cameras) for number, cameras in frames.items()], task=TASK)
+
+
+def rlds(folder: Path) -> Written:
+    stored = dict(np.load(RLDS / "toy_episode_texts.npz"))
+    places = ("train/0", "train/1", "train/2", "val/0", "val/1")
+    tasks = [str(stored[f"{place}/task"][0]) for place in places]
+    return Written(
+        Path(shutil.copytree(RLDS / "toy_episode_texts", folder / "rlds")),
+        [(number, task, None) for number, task in enumerate(tasks)],
+    )
+
+
+def with_table(folder: Path, names: list[str]) -> None:
+    (folder / "tasks.csv").write_text("episode,task\n" + "".join(f"{name},task of {name}\n" for name in names))
+
+
+def videos(folder: Path) -> Written:
+    names = ["b.mp4", "a.mp4", "c.mp4"]
+    for name, length in zip(names, LENGTHS, strict=True):
+        write_video(folder / name, numbered(length))
+    with_table(folder, names)
+    spoil = lambda: (folder / "a.mp4").write_bytes((folder / "a.mp4").read_bytes()[:300])  # noqa: E731
+    return Written(folder, [(number, f"task of {name}", None) for number, name in enumerate(names)], spoil)
+
+
+def pictures(folder: Path) -> Written:
+    for number, clip in enumerate(CLIPS):
+        (folder / f"{number}").mkdir()
+        for t, frame in enumerate(clip):
+            Image.fromarray(frame).save(folder / f"{number}" / f"frame_{t + 8}.png")  # 8, 9, 10, ...
+    episodes: list[Any] = [(number, TASK, {"frames": clip}) for number, clip in enumerate(CLIPS)]
+    return Written(folder, episodes, lambda: (folder / "1" / "frame_9.png").write_bytes(b"no picture"), task=TASK)
+
+
+def arrays(folder: Path) -> Written:
+    for number, clip in enumerate(CLIPS):
+        np.savez(folder / f"{number}.npz", frames=clip, task=f"task {number}")
+    episodes: list[Any] = [(number, f"task {number}", {"frames": clip}) for number, clip in enumerate(CLIPS)]
+    return Written(folder, episodes, lambda: (folder / "1.npz").write_bytes(b"no arrays"))
+
+
+FORMATS: dict[str, Callable[[Path], Written]] = {
+    "LeRobot v2.1": lerobot("toy_v21"),
+    "LeRobot v3.0": lerobot("toy_v30_many"),
+    "robomimic": robomimic,
+    "ALOHA": of_files(hdf5_writers.write_aloha, task=TASK),
+    "RoboTwin": of_files(robotwin, hdf5_writers.RGB_MARK),
+    "RoboMIND": of_files(hdf5_writers.write_robomind),
+    "ManiSkill": maniskill,
+    "RLDS": rlds,
+    "videos": videos,
+    "pictures": pictures,
+    "arrays": arrays,
+}
+every_format = pytest.mark.parametrize("write", FORMATS.values(), ids=FORMATS)
+
+
+def written(write: Callable[[Path], Written], folder: Path) -> tuple[Written, Dataset]:
+    (folder / "data").mkdir()
+    there = write(folder / "data")
+    return there, open_dataset(there.source, task=there.task)
+
+
+@every_format
+def test_episodes_have_their_numbers_tasks_and_frames(tmp_path: Path, write: Callable[[Path], Written]) -> None:
+    there, dataset = written(write, tmp_path)
+    assert [(each.index, each.task) for each in dataset.episodes] == [(n, task) for n, task, _ in there.episodes]
+    first = 0
+    for episode, (_, _, expected) in zip(dataset.episodes, there.episodes, strict=True):
+        assert episode.first_index == first
+        first += episode.num_frames
+        for camera in dataset.chosen_cameras() if expected is not None else ():
+            assert dataset.check(episode, camera) > 0
+            np.testing.assert_array_equal(np.stack(list(dataset.frames(episode, camera))), expected[camera])
+            assert episode.num_frames == len(expected[camera])
+    if there.source.name == "data":  # the folders of videos
+        read = [
+            numbers(shown[camera].positions, n)
+            for (_, shown), n in zip(iter_episodes(dataset), LENGTHS, strict=True)
+            for camera in shown
+            if camera == "video"
+        ]
+        assert read in ([], [list(range(length)) for length in LENGTHS])
+    overridden = open_dataset(there.source, task="wave", override_task=True)
+    assert {episode.task for episode in overridden.episodes} == {"wave"}
+
+
+@every_format
+def test_each_frame_gets_its_label_and_a_second_run_scores_what_is_missing(
+    tmp_path: Path, output: Path, write: Callable[[Path], Written]
+) -> None:
+    _, dataset = written(write, tmp_path)
+    cameras = dataset.chosen_cameras()[:2]
+    scorer, chosen = BrightnessScorer(), dataset.numbers[:2]
+    options = LabelOptions(output=output, frames=2, cameras=cameras, episodes=chosen, workers=1)
+    report = label(dataset, scorer, options)
+    for number in chosen:
+        labels = read_episode_labels(report.files[0], number)
+        assert labels is not None
+        expected = [brightness(np.stack(list(dataset.frames(dataset.episode(number), each)))) for each in cameras]
+        np.testing.assert_allclose(labels.fused.progress, np.mean(expected, axis=0), atol=1e-6)
+        assert labels.frames.tolist() == list(range(len(expected[0])))
+    num_scored = sum(dataset.episode(number).num_frames for number in chosen) * len(cameras)
+    assert scorer.num_samples == num_scored
+    files = [file.read_bytes() for file in report.files]
+    (output / ".rfm_parts" / f"{report.plan.items[0].key}.parquet").unlink()
+    again = BrightnessScorer()
+    report = label(dataset, again, options)
+    assert again.num_samples == dataset.episode(chosen[0]).num_frames * len(cameras)
+    assert len(report.files) == len(files)
+
+
+@every_format
+def test_a_camera_is_turned_and_its_colours_swapped_on_request_and_the_recipe_says_so(
+    tmp_path: Path, output: Path, write: Callable[[Path], Written]
+) -> None:
+    there, stored = written(write, tmp_path)
+    camera, *others = stored.chosen_cameras()
+    swapped = "rgb" if stored.corrections.get(camera) else "bgr"
+    dataset = open_dataset(there.source, task=there.task, orient={camera: "rotate90"}, channels={camera: swapped})
+    episode = stored.episodes[0]
+    pixels = np.stack(list(stored.stored_frames(episode, camera)))
+    expected = np.rot90(pixels, -1, axes=(1, 2))[..., :: -1 if swapped == "bgr" else 1]
+    np.testing.assert_array_equal(np.stack(list(dataset.frames(episode, camera))), expected)
+    for other in others:
+        np.testing.assert_array_equal(list(dataset.frames(episode, other)), list(stored.frames(episode, other)))
+    options = LabelOptions(output=output, frames=2, cameras=(camera,), episodes=[episode.index])
+    label(stored, BrightnessScorer(), options)
+    with pytest.raises(DatasetError, match=rf"orientations\.{camera}: \w.* there, rotate90 now"):
+        label(dataset, BrightnessScorer(), options)
+    with pytest.raises(DatasetError, match=rf"orient: expected one of the cameras .*{camera}.*, got 'top'"):
+        open_dataset(there.source, task=there.task, orient={"top": "rotate90"})
+
+
+@pytest.mark.parametrize(
+    "write", [FORMATS[name] for name in ("LeRobot v2.1", "robomimic", "videos", "pictures", "arrays")]
+)
+def test_a_broken_episode_is_named_before_a_score_and_lets_the_others_through(
+    tmp_path: Path, output: Path, write: Callable[[Path], Written]
+) -> None:
+    there, dataset = written(write, tmp_path)
+    assert there.spoil is not None
+    there.spoil()
+    dataset, scorer = open_dataset(there.source, task=there.task), BrightnessScorer()
+    numbers_ = [number for number, _, _ in there.episodes]
+    options: dict[str, Any] = {"output": output, "frames": 2, "cameras": dataset.chosen_cameras()[-1:]}
+    with pytest.raises(RewardError, match=r"--episodes \d"):
+        label(dataset, scorer, LabelOptions(**options))
+    assert scorer.num_samples == 0
+    rest = [number for number in numbers_ if number != numbers_[1]]
+    report = label(dataset, scorer, LabelOptions(**options, episodes=rest))
+    assert report.summary is not None
+    assert report.summary.episodes.tolist() == rest
+
+
+def test_lerobot_s_cameras_are_those_of_the_toy_world() -> None:
+    assert open_dataset(LEROBOT / "toy_v21").chosen_cameras() == (FRONT, WRIST)
