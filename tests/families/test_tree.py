@@ -17,7 +17,7 @@ from rfm import families
 from rfm.engine import Engine, Execution
 from rfm.vlm import leaves, tree
 from rfm.vlm.row import VlmRow
-from rfm.vlm.tree import trees
+from rfm.vlm.tree import Conversation, trees
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
 from rfm_client.contract import wire
 from tolerances import TOLERANCE
@@ -78,6 +78,15 @@ def test_a_tree_has_few_tokens(name: str, num_frames: int, size_px: tuple[int, i
     rows = collator.rows(sample(num_frames, *size_px))
     assert sum(row.num_tokens for row in rows) == separate
     assert sum(row.cost for row in planned(rows, collator)) <= most
+
+
+def test_conversations_share_the_tokens_before_the_first_that_is_read_or_stands_elsewhere() -> None:
+    collator: Any = families.load(CHECKPOINT, reward_model="topreward").collator  # type: ignore[attr-defined]
+    whole = Conversation.of(collator.rows(sample(4))[-1], collator.visual_pad, are_images=False)
+    assert whole.shared(whole) == whole.reads[0] < whole.row.num_tokens
+    position_ids = whole.row.position_ids.copy()
+    position_ids[0, 5] += 1
+    assert whole.shared(replace(whole, row=replace(whole.row, position_ids=position_ids))) == 5
 
 
 def test_budget_and_metrics_count_the_tokens_of_a_tree() -> None:

@@ -23,6 +23,7 @@ from repositories import description_of
 from rfm import families
 from rfm.engine import Engine
 from rfm.families import CheckpointError
+from rfm.vlm.lora import Scaling, split
 from rfm_client import ProgressSample, Result, RewardError
 from spoilt import Spoil, in_json, settings, text, text_settings, weights
 from vlm import PLAIN, assert_close, load, video
@@ -96,6 +97,13 @@ def test_updates_too_small_for_bfloat16_are_not_lost(copied: Callable[[str], Pat
         assert ((base + update).bfloat16() == base).double().mean() > 0.9  # a sum in bfloat16 is the base alone
         torch.testing.assert_close(built[f"{module}.weight"].double() - base, update, rtol=1e-2, atol=1e-7)
     assert len(modules) == 14
+
+
+def test_factors_in_bfloat16_are_scaled_in_float32() -> None:
+    factors = {"A": torch.ones(3, 4).bfloat16(), "B": torch.randn(5, 3, generator=torch.manual_seed(0)).bfloat16()}
+    tensors = {f"layer.lora_{side}.weight": factor for side, factor in factors.items()}
+    _, scaled = split({"layer.weight": torch.zeros(5, 4), **tensors}, Scaling(Path("adapter_config.json"), 3, 1.0))
+    torch.testing.assert_close(scaled["layer.lora_B.weight"], factors["B"].float() / 3, rtol=1e-6, atol=0)
 
 
 def test_lora_of_weights_that_make_text_is_not_needed(copied: Callable[[str], Path]) -> None:
