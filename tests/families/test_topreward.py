@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
-from paths import GOLDEN
 from reward_models import ROOT, Reference, references
 from rfm import families
 from rfm.engine import Engine, Execution
@@ -208,28 +206,6 @@ def test_a_sample_without_a_meaning_is_refused(
     assert message in str(outcome)
 
 
-WRONG: dict[str, tuple[str, str]] = {
-    "an unknown name": ("gvl", "--as: expected one of topreward, topreward-robometer, roboreward, roboreward-expected"),
-    "an unknown setting": (
-        "topreward,frames=3",
-        "--as: expected settings among num_prefixes, fps, chat_template, max_frames",
-    ),
-    "no value": ("topreward,fps", "--as: expected setting=value, got 'fps'"),
-    "no number": ("topreward,fps=fast", "--as: fps: expected a value of type float, got 'fast'"),
-    "no frames a second": ("topreward,fps=0", "fps: expected a finite number above 0, got 0.0"),
-    "an ignored setting": ("topreward-robometer,fps=2", "--as: fps: expected none for topreward-robometer"),
-    "a setting of RoboReward": ("roboreward,fps=2", "--as: expected no settings of this reward model, got 'fps'"),
-    "one prefix": ("topreward,num_prefixes=1", "num_prefixes: expected at least 2, the first and the last, got 1"),
-}
-
-
-@pytest.mark.parametrize("said, message", WRONG.values(), ids=WRONG)
-def test_a_wrong_setting_is_refused(said: str, message: str) -> None:
-    with pytest.raises(CheckpointError) as refusal:
-        families.load(CHECKPOINT, reward_model=said)
-    assert message in str(refusal.value)
-
-
 def test_an_export_keeps_its_reward_model(tmp_path: Path) -> None:
     families.load(CHECKPOINT, reward_model="topreward").save(tmp_path / "saved")
     for said in ("topreward-robometer", "topreward,fps=4", "roboreward"):
@@ -237,42 +213,6 @@ def test_an_export_keeps_its_reward_model(tmp_path: Path) -> None:
             CheckpointError, match=r"--as: expected none for an export|expected an export of roboreward"
         ):
             families.load(tmp_path / "saved", reward_model=said)
-
-
-def test_a_template_without_the_video_is_refused(tmp_path: Path) -> None:
-    changed = shutil.copytree(CHECKPOINT, tmp_path / "changed")
-    file = changed / "chat_template.json"
-    template = json.loads(file.read_text())["chat_template"]
-    file.write_text(json.dumps({"chat_template": "<|im_start|>system\nHelp.<|im_end|>\n" + template}))
-    with pytest.raises(CheckpointError, match="chat template: expected one video in a prompt, got 0"):
-        Engine.of(families.load(str(changed), reward_model="topreward"))
-
-
-def test_a_robometer_needs_no_as() -> None:
-    with pytest.raises(CheckpointError, match="expected an ordinary Qwen3-VL, got reward heads: leave out --as"):
-        families.load(GOLDEN / "vlm" / "q3_tok_disc10" / "checkpoint", reward_model="topreward")
-
-
-def test_an_ordinary_model_is_no_reward_model_by_itself() -> None:
-    with pytest.raises(CheckpointError, match=r"with an ordinary vision-language model, say --as which reward model"):
-        families.load(CHECKPOINT)
-
-
-def test_an_unknown_key_of_lerobot_is_refused(tmp_path: Path) -> None:
-    changed = shutil.copytree(OF_LEROBOT, tmp_path / "changed")
-    content = json.loads((changed / "config.json").read_text()) | {"frame_stride": 2}
-    (changed / "config.json").write_text(json.dumps(content))
-    with pytest.raises(CheckpointError, match=r"expected the keys of LeRobot's TOPReward, got 'frame_stride'"):
-        families.load(changed, base_model=str(CHECKPOINT))
-
-
-def test_a_missing_language_head_is_refused(tmp_path: Path) -> None:
-    changed = shutil.copytree(CHECKPOINT, tmp_path / "changed")
-    weights = load_file(changed / "model.safetensors")
-    del weights["lm_head.weight"]
-    save_file(weights, changed / "model.safetensors", {"format": "pt"})
-    with pytest.raises(CheckpointError, match=r"expected lm_head.weight, since tie_word_embeddings is false, got none"):
-        families.load(changed, reward_model="topreward")
 
 
 @pytest.mark.gpu
