@@ -18,7 +18,6 @@ from rfm.engine import Execution
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
 from rfm_client import (
     InferenceFailedError,
-    InvalidSampleError,
     PreferenceSample,
     ProgressResult,
     ProgressSample,
@@ -93,15 +92,6 @@ def test_a_trajectory_is_encoded_as_alone(encoders: Encoders) -> None:
     videos = [footage(index, *shape, f"lift {'the cup ' * index}") for index, shape in enumerate(shapes)]
     for alone, together in zip(videos, encoders.encode(videos), strict=True):
         assert_encoded(together, encoded(encoders.encode([alone])[0]))
-
-
-def test_a_task_that_is_too_long_fails_alone(encoders: Encoders) -> None:
-    videos = [footage(0, 2, task=task) for task in ("lift", "lift " * 100, "drop")]
-    first, failed, last = encoders.encode(videos)
-    assert isinstance(failed, InvalidSampleError)
-    assert str(failed).startswith("task: expected at most 32 tokens (limit of the text encoder), got ")
-    for outcome, alone in ((first, videos[0]), (last, videos[2])):
-        assert_encoded(outcome, encoded(encoders.encode([alone])[0]))
 
 
 @pytest.mark.parametrize("kind", [PreferenceSample, SimilaritySample])
@@ -198,17 +188,6 @@ def test_a_checkpoints_own_encoder_weights_win_and_must_fit(encoders: Encoders) 
     few = {"embeddings.cls_token": torch.zeros(1, 1, 48)}
     with pytest.raises(ValueError, match=r"the encoder's weights do not fit: \{'missing_keys': .*'layernorm.weight'"):
         Encoders.from_pretrained(*sources, image_weights=few)
-
-
-@pytest.mark.gpu
-def test_the_gpu_gives_the_embeddings_of_the_cpu(encoders: Encoders) -> None:
-    frames = [video(0, 5, 50, 70).positions]
-    on_cpu = encoders.encode_frames(frames)[0]
-    try:
-        on_gpu = encoders.to(torch.device("cuda")).encode_frames(frames)[0]
-    finally:
-        encoders.to(torch.device("cpu"))
-    np.testing.assert_allclose(on_gpu, on_cpu, rtol=0, atol=1e-4)
 
 
 def saved(encoders: Encoders, folder: Path, file: str, change: Callable[[dict[str, Any]], object]) -> Path:

@@ -27,7 +27,6 @@ from rfm.vlm.written import WrittenAnswer
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
-    PreferenceSample,
     ProgressResult,
     ProgressSample,
     Trajectory,
@@ -334,13 +333,6 @@ def test_logits_that_are_not_finite_are_a_failure_and_no_answer() -> None:
     assert isinstance(outcome, InferenceFailedError)
 
 
-def test_a_preference_is_refused(engine: Engine) -> None:
-    trajectory = CASES[0].samples()[0].trajectory
-    (outcome,) = engine.evaluate([PreferenceSample(trajectory, trajectory)])
-    assert isinstance(outcome, InvalidSampleError)
-    assert "expected progress (this checkpoint has no preference head), got preference" in str(outcome)
-
-
 def test_a_folder_of_its_name_needs_no_option(tmp_path: Path) -> None:
     folder = shutil.copytree(CHECKPOINT, tmp_path / "RoboReward-4B")
     checkpoint = families.load(folder)
@@ -352,17 +344,3 @@ def test_a_folder_of_its_name_needs_no_option(tmp_path: Path) -> None:
         assert isinstance(result, ProgressResult)
         assert isinstance(expected, ProgressResult)
         np.testing.assert_array_equal(result.progress_logits, expected.progress_logits)
-
-
-@pytest.mark.gpu
-def test_a_gpu_writes_the_answers_of_the_original_in_bfloat16() -> None:
-    engine = Engine.of(families.load(str(CHECKPOINT), reward_model="roboreward"), device="cuda")
-    cases = [case for case in CASES if case.config == CONFIGS[0]]
-    told = [each for case in cases for each in case.content["generations"]]
-    results = engine.evaluate([sample for case in cases for sample in samples_of(case)])
-    for result, expected in zip(results, told, strict=True):
-        if expected["parsed_score"] is None:
-            assert isinstance(result, InvalidSampleError)
-            continue
-        assert isinstance(result, ProgressResult)
-        assert result.last_progress == expected["parsed_score"] / 4 - 0.25

@@ -17,11 +17,8 @@ from rfm import families
 from rfm.engine import Engine, Execution
 from rfm.families import CheckpointError
 from rfm_client import (
-    InvalidSampleError,
-    PreferenceSample,
     ProgressResult,
     ProgressSample,
-    SimilaritySample,
     Trajectory,
     UInt8Array,
 )
@@ -173,39 +170,6 @@ def test_a_saved_model_scores_the_same(tmp_path: Path, robometer: Engine) -> Non
     assert not [decision.name for decision in checkpoint.decisions() if decision.is_assumed]
 
 
-REFUSED: dict[str, tuple[str, Any, str]] = {
-    "dense mode": (
-        "lerobot",
-        ProgressSample(Trajectory(frames=noise(3), task=TASK), frame_steps=2),
-        "frame_steps: expected 0 (TOPReward's progress is relative to the whole episode",
-    ),
-    "preference": (
-        "lerobot",
-        PreferenceSample(progress(noise(2)).trajectory, progress(noise(2)).trajectory),
-        "sample_type: expected progress (this checkpoint has no preference head), got preference",
-    ),
-    "similarity": (
-        "lerobot",
-        SimilaritySample(progress(noise(2)).trajectory, progress(noise(2)).trajectory),
-        "sample_type: expected progress (this checkpoint has no similarity head), got similarity",
-    ),
-    "small frames": ("lerobot", progress(noise(2, 8, 8)), "frames of at least 32 x 32 pixels, got 8 x 8"),
-    "narrow frames": ("lerobot", progress(noise(1, 32, 6432)), "at most 200 times as long as wide"),
-    "many frames": ("robometer", progress(noise(65, 8, 8)), "num_frames: expected at most 64"),
-    "a special token": ("robometer", progress(noise(2), "a <|video_pad|>"), "text without the model's special tokens"),
-    "the end of a message": ("lerobot", progress(noise(2), "a <|im_end|>"), "text without the model's special tokens"),
-}
-
-
-@pytest.mark.parametrize("variant, sample, message", REFUSED.values(), ids=REFUSED)
-def test_a_sample_without_a_meaning_is_refused(
-    request: pytest.FixtureRequest, variant: str, sample: Any, message: str
-) -> None:
-    (outcome,) = request.getfixturevalue(variant).evaluate([sample])
-    assert isinstance(outcome, InvalidSampleError)
-    assert message in str(outcome)
-
-
 def test_an_export_keeps_its_reward_model(tmp_path: Path) -> None:
     families.load(CHECKPOINT, reward_model="topreward").save(tmp_path / "saved")
     for said in ("topreward-robometer", "topreward,fps=4", "roboreward"):
@@ -213,18 +177,3 @@ def test_an_export_keeps_its_reward_model(tmp_path: Path) -> None:
             CheckpointError, match=r"--as: expected none for an export|expected an export of roboreward"
         ):
             families.load(tmp_path / "saved", reward_model=said)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("reward_model", ["topreward", "topreward-robometer"])
-def test_a_gpu_gives_the_cpu_s_numbers(reward_model: str) -> None:
-    samples = [progress(noise(n, h, w, n)) for n, h, w in ((1, 64, 96), (5, 48, 80), (8, 100, 200))]
-    engines = (
-        Engine.of(families.load(str(CHECKPOINT), reward_model=reward_model), device=device, dtype=torch.float32)
-        for device in ("cpu", "cuda")
-    )
-    for expected, result in zip(*(engine.evaluate(samples) for engine in engines), strict=True):
-        assert isinstance(expected, ProgressResult)
-        assert isinstance(result, ProgressResult)
-        assert result.log_prob is not None
-        np.testing.assert_allclose(result.log_prob, expected.log_prob, rtol=0, atol=RAW)

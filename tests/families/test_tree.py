@@ -209,18 +209,6 @@ def test_a_device_gives_the_scores_of_a_tree_and_rarely_makes_the_host_wait(seen
         np.testing.assert_allclose(each, wanted, rtol=0, atol=TOLERANCE)
 
 
-@pytest.mark.gpu
-@pytest.mark.parametrize("frame_steps", [0, 4], ids=["TOPReward", "dense mode"])
-def test_a_gpu_gives_the_cpu_s_scores_of_a_tree(frame_steps: int) -> None:
-    engine_of = robometer if frame_steps else topreward
-    samples = [replace(each, frame_steps=frame_steps) for each in MIXED]
-    expected, found = (
-        values(engine_of(device=device, dtype=torch.float32).evaluate(samples)) for device in ("cpu", "cuda")
-    )
-    for each, wanted in zip(found, expected, strict=True):
-        np.testing.assert_allclose(each, wanted, rtol=0, atol=1e-4)
-
-
 @pytest.mark.parametrize("engine, frame_steps", [(topreward, 0), (robometer, 4)], ids=["TOPReward", "dense Robometer"])
 def test_a_tree_that_does_not_fit_in_memory_is_scored_prefix_by_prefix(
     engine: Any, frame_steps: int, monkeypatch: pytest.MonkeyPatch
