@@ -56,7 +56,7 @@ class CheckpointConfig(Settings):
     reward_model: str | None = setting(
         None,
         "How to ask a model that has no config.yaml: topreward, topreward-robometer, roboreward, roboreward-expected, "
-        "rynnvalue, robodopamine or procvlm; settings follow: topreward,num_prefixes=15.",
+        "rynnvalue or robodopamine; settings follow: topreward,num_prefixes=15.",
         flag="--as",
         metavar="NAME",
     )

@@ -32,7 +32,6 @@ FAMILIES = (
     "rfm.topreward",
     "rfm.roboreward",
     "rfm.robodopamine",
-    "rfm.procvlm",
     "rfm.rynnvalue",
     "rfm.vlm",
     "rfm.rewind",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reward models that write an answer about separate images: Robo-Dopamine and ProcVLM.
+"""Reward models that write an answer about separate images, such as Robo-Dopamine.
 
 L tokens. A model gives its settings, the images of each question, the text around them, and the reading of an answer.
 """

@@ -13,13 +13,11 @@ from torch import Tensor
 
 import goldens
 from engines import load_engine
-from rfm import families
-from rfm.checkpoint.content import PREPROCESSOR_CONFIG, CheckpointError
+from rfm.checkpoint.content import PREPROCESSOR_CONFIG
 from rfm.engine import Execution
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
 from rfm_client import (
     InferenceFailedError,
-    InvalidSampleError,
     PreferenceSample,
     ProgressResult,
     ProgressSample,
@@ -94,15 +92,6 @@ def test_a_trajectory_is_encoded_as_alone(encoders: Encoders) -> None:
     videos = [footage(index, *shape, f"lift {'the cup ' * index}") for index, shape in enumerate(shapes)]
     for alone, together in zip(videos, encoders.encode(videos), strict=True):
         assert_encoded(together, encoded(encoders.encode([alone])[0]))
-
-
-def test_a_task_that_is_too_long_fails_alone(encoders: Encoders) -> None:
-    videos = [footage(0, 2, task=task) for task in ("lift", "lift " * 100, "drop")]
-    first, failed, last = encoders.encode(videos)
-    assert isinstance(failed, InvalidSampleError)
-    assert str(failed).startswith("task: expected at most 32 tokens (limit of the text encoder), got ")
-    for outcome, alone in ((first, videos[0]), (last, videos[2])):
-        assert_encoded(outcome, encoded(encoders.encode([alone])[0]))
 
 
 @pytest.mark.parametrize("kind", [PreferenceSample, SimilaritySample])
@@ -201,17 +190,6 @@ def test_a_checkpoints_own_encoder_weights_win_and_must_fit(encoders: Encoders) 
         Encoders.from_pretrained(*sources, image_weights=few)
 
 
-@pytest.mark.gpu
-def test_the_gpu_gives_the_embeddings_of_the_cpu(encoders: Encoders) -> None:
-    frames = [video(0, 5, 50, 70).positions]
-    on_cpu = encoders.encode_frames(frames)[0]
-    try:
-        on_gpu = encoders.to(torch.device("cuda")).encode_frames(frames)[0]
-    finally:
-        encoders.to(torch.device("cpu"))
-    np.testing.assert_allclose(on_gpu, on_cpu, rtol=0, atol=1e-4)
-
-
 def saved(encoders: Encoders, folder: Path, file: str, change: Callable[[dict[str, Any]], object]) -> Path:
     """The encoders in a folder, in which a JSON file is changed."""
     encoders.save(folder)
@@ -220,39 +198,6 @@ def saved(encoders: Encoders, folder: Path, file: str, change: Callable[[dict[st
 
 
 IMAGES = f"image_encoder/{PREPROCESSOR_CONFIG}"
-IMAGE_MODEL = r"image_encoder: model_type: expected one of dinov2, dinov2_with_registers, got "
-UNSUPPORTED: dict[str, tuple[str, dict[str, object], str]] = {
-    "no resize": (IMAGES, {"do_resize": False}, "do_resize: expected True, got False"),
-    "bilinear": (IMAGES, {"resample": 2}, "resample: expected 3, got 2"),
-    "another scale": (IMAGES, {"rescale_factor": 1.0}, "rescale_factor: expected 1/255, got 1.0"),
-    "fixed size": (IMAGES, {"size": {"height": 3, "width": 3}}, "expected size {shortest_edge}"),
-    "a number of a processor of squares": (
-        IMAGES,
-        {"size": 64, "image_processor_type": "ViTImageProcessor"},
-        "expected size {shortest_edge} and crop_size {height, width}, got 64 and",
-    ),
-    "a size of half a pixel": (IMAGES, {"size": {"shortest_edge": 0.5}}, "expected size {shortest_edge}"),
-    "ViT": ("image_encoder/config.json", {"model_type": "vit"}, IMAGE_MODEL + "vit"),
-    "T5": (
-        "text_encoder/config.json",
-        {"model_type": "t5"},
-        r"text_encoder: model_type: expected one of bert, .*, got t5",
-    ),
-    "a tokenizer of more words": (
-        "text_encoder/tokenizer.json",
-        {"model": {"type": "WordLevel", "unk_token": "w", "vocab": {"w": 0} | {f"w{i}": i for i in range(1, 200)}}},
-        r"text_encoder: expected a tokenizer of at most 180 tokens, got ",
-    ),
-}
-
-
-@pytest.mark.parametrize(("file", "change", "message"), UNSUPPORTED.values(), ids=UNSUPPORTED)
-def test_encoders_that_work_otherwise_are_refused(
-    encoders: Encoders, tmp_path: Path, file: str, change: dict[str, object], message: str
-) -> None:
-    folder = saved(encoders, tmp_path, file, lambda content: content.update(change))
-    with pytest.raises((ValueError, CheckpointError), match=message):
-        Encoders.load(folder)
 
 
 def test_what_is_saved_is_the_same_also_with_sizes_as_transformers_once_wrote_them(
@@ -264,29 +209,6 @@ def test_what_is_saved_is_the_same_also_with_sizes_as_transformers_once_wrote_th
     frames = [video(0, 2, 50, 70).positions]
     np.testing.assert_array_equal(copy.encode_frames(frames)[0], encoders.encode_frames(frames)[0])
     np.testing.assert_array_equal(copy.encode_tasks(["lift the cup"]), encoders.encode_tasks(["lift the cup"]))
-
-
-def test_an_encoder_without_its_files_or_with_weights_twice_is_refused(encoders: Encoders, tmp_path: Path) -> None:
-    encoders.save(tmp_path)
-    (tmp_path / "image_encoder" / "model.safetensors.index.json").write_text('{"weight_map": {}}')
-    with pytest.raises(CheckpointError, match=r"image_encoder: expected model\.safetensors or shards, got"):
-        Encoders.load(tmp_path)
-    (tmp_path / "image_encoder" / "model.safetensors.index.json").unlink()
-    for file in (tmp_path / "text_encoder").iterdir():
-        if file.name not in ("config.json", "model.safetensors"):
-            file.unlink()
-    with pytest.raises(ValueError, match=r"text_encoder: expected files of a tokenizer \(tokenizer\.json, or vocab"):
-        Encoders.load(tmp_path)
-
-
-def test_what_an_encoder_s_source_lacks_is_told_with_its_option(encoders: Encoders, tmp_path: Path) -> None:
-    saved(encoders, tmp_path, "image_encoder/config.json", lambda content: content.update(hidden_size="x"))
-    sources = {which: str(tmp_path / which) for which in ("image_encoder", "text_encoder")}
-    checkpoint = families.load(goldens.config(NAME).checkpoint, **sources)
-    with pytest.raises(
-        CheckpointError, match=r"^encoders .* \(name local folders with --image-encoder and --text-encoder\)$"
-    ):
-        checkpoint.encoders()
 
 
 # For a 4 x 4 picture: the crop, and the offset of the picture in it, or of a smaller crop in the picture.

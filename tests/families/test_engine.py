@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -79,6 +80,15 @@ def test_the_next_batch_is_collated_while_the_current_one_runs() -> None:
     assert passes == [1, 2, 3, 4]
     results = [outcome for outcome in outcomes if isinstance(outcome, ProgressResult)]
     assert [result.progress[0] for result in results] == [0, 1, 2, 3]
+
+
+def test_collating_inside_a_forward_pass_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    times_s, execution = iter([0, 1, 4, 10]), Execution()
+    with monkeypatch.context() as clock:
+        clock.setattr(time, "perf_counter", lambda: next(times_s))
+        with execution.forwarding(), execution.collating():
+            pass
+    assert (execution.collate_s, execution.forward_s) == (3, 7)
 
 
 class Fixed:

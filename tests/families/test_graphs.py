@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 import random
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,9 +20,9 @@ from reward_models import references
 from rfm import families
 from rfm.engine import Engine, Execution
 from rfm.engine.feature_cache import FeatureCache
-from rfm.engine.graphs import IDLE_CALLS, MAX_GRAPHS, STEP_TOKENS, Captured, Function, Graphs
+from rfm.engine.graphs import IDLE_CALLS, STEP_TOKENS, Captured, Function, Graphs
 from rfm_client import PreferenceSample, ProgressSample, Sample
-from vlm import BFLOAT16, PLAIN, assert_close, video
+from vlm import PLAIN, assert_close, video
 
 ROBOREWARD = references("roboreward")[0].config / "checkpoint"
 CPU = torch.device("cpu")
@@ -225,30 +224,3 @@ def test_an_engine_has_graphs_where_they_can_be_used(monkeypatch: pytest.MonkeyP
         assert Engine.of(checkpoint, device=CUDA, cuda_graphs=True).graphs is not None
         embedded = families.load(goldens.REWIND[0].checkpoint)
         assert Engine.of(embedded, device=CUDA, cuda_graphs=True).graphs is None
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_graphs_on_a_gpu_give_the_scores_of_plain_passes(dtype: torch.dtype) -> None:
-    """Prints how much faster a lone sample is."""
-    config = goldens.config(BFLOAT16)
-    checkpoint = families.load(config.checkpoint, **config.sources)
-    plain = Engine.of(checkpoint, device="cuda", dtype=dtype)
-    engine = Engine.of(checkpoint, device="cuda", dtype=dtype, cuda_graphs=True)
-    graphs = engine.graphs
-    assert graphs is not None
-    samples: list[Sample] = [ProgressSample(video(seed, 5, 84, 112)) for seed in range(3)]
-    samples += [PreferenceSample(video(seed, 2, 64, 96), video(seed + 1, 3, 64, 64)) for seed in (3, 5)]
-    tolerance = 1e-5 if dtype is torch.float32 else 0.02  # lengths are padded, so kernels differ
-    for _ in range(4):
-        for sample in samples:
-            assert_close(engine.evaluate([sample])[0], plain.evaluate([sample])[0], tolerance)
-    assert not graphs.has_failed
-    assert graphs.num_replayed > MAX_GRAPHS
-    durations_ms = {}
-    for name, each in {"plain": plain, "graphs": engine}.items():
-        started_s = time.perf_counter()
-        for _ in range(50):
-            each.evaluate(samples[:1])
-        durations_ms[name] = (time.perf_counter() - started_s) * 1e3 / 50
-    print(f"\n{dtype}: a lone sample takes {durations_ms['plain']:.2f} ms, {durations_ms['graphs']:.2f} ms with graphs")

@@ -195,41 +195,6 @@ def test_a_row_over_the_token_budget_runs_alone() -> None:
     assert rows == [2, 1, 1, 1]
 
 
-def test_a_sample_over_the_servers_limit_is_refused_alone() -> None:
-    engine = Engine(engine_of(build(SMALL)).predictor, max_sample_tokens=16)
-    refused, scored = engine.evaluate([ProgressSample(trajectory(0, 8)), ProgressSample(trajectory(0, 7))])
-    assert isinstance(refused, InvalidSampleError)
-    assert str(refused) == "num_frames: expected at most 16 tokens (max_sample_tokens of this server), got 17 tokens"
-    assert isinstance(scored, ProgressResult)
-
-
-TOO_LONG = "num_frames: expected at most 8 (max_len of this checkpoint, which has per-frame progress tokens), got 9"
-BAD_FOR_CHECKPOINT: dict[str, tuple[Sample, str]] = {
-    "T over max_len": (ProgressSample(trajectory(0, 9)), TOO_LONG),
-    "second T over max_len": (PreferenceSample(trajectory(0, 1), trajectory(0, 9)), TOO_LONG),
-    "wrong D": (
-        ProgressSample(random_trajectory(0, 2, 13, 6)),
-        "video_embeddings: expected float32 [T, 12], got [2, 13]",
-    ),
-    "wrong Dt": (ProgressSample(random_trajectory(0, 2, 12, 7)), "text_embedding: expected float32 [6], got [7]"),
-    "frames without encoders": (
-        ProgressSample(Trajectory(frames=np.zeros((1, 4, 4, 3), np.uint8), task="lift")),
-        "frames: expected video_embeddings (no encoders are loaded), got frames",
-    ),
-}
-
-
-@pytest.mark.parametrize(("sample", "message"), BAD_FOR_CHECKPOINT.values(), ids=BAD_FOR_CHECKPOINT)
-def test_what_the_checkpoint_cannot_take_fails_alone(sample: Sample, message: str) -> None:
-    good = ProgressSample(trajectory(1, 3))
-    engine = engine_of(build(SMALL))
-    first, failed, last = engine.evaluate([good, sample, good])
-    assert isinstance(failed, InvalidSampleError)
-    assert str(failed) == message
-    np.testing.assert_allclose(numbers(first), numbers(engine.evaluate([good])[0]), atol=TOLERANCE)
-    np.testing.assert_allclose(numbers(first), numbers(last), atol=TOLERANCE)
-
-
 def test_a_score_that_is_no_number_is_an_error() -> None:
     huge = Trajectory(
         video_embeddings=np.full((2, 12), MAX_EMBEDDING, np.float32), text_embedding=np.ones(6, np.float32)
@@ -290,15 +255,6 @@ def test_the_engine_gives_every_reference_answer(case: goldens.Case, engine: Cal
     for result, expected in zip(results, case.expected(), strict=True):
         goldens.check(result, expected, case.tolerances)
     case.check_response(results)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
-def test_the_gpu_gives_the_numbers_of_the_cpu(config: RewindConfig) -> None:
-    samples = samples_for(config)
-    on_cpu, on_gpu = (engine_of(build(config), device=device).evaluate(samples) for device in ("cpu", "cuda"))
-    for left, right in zip(on_cpu, on_gpu, strict=True):
-        np.testing.assert_allclose(numbers(left), numbers(right), rtol=0, atol=1e-4)
 
 
 def test_half_precision_scores_are_near_those_of_float32() -> None:

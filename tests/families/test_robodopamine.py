@@ -13,10 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from reward_models import ROOT
 from rfm import families
 from rfm.engine import Engine, Execution
-from rfm.families import CheckpointError
 from rfm.robodopamine.answers import fused, hops, parsed, sampled_frames
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
 from robodopamine import ANSWERED, CHECKPOINT, FOLDER, READABLE, Case, case_named
@@ -186,43 +184,6 @@ def test_a_missing_wrist_is_replaced_by_the_front_camera() -> None:
 
 
 FRONT = np.zeros((3, 32, 32, 3), np.uint8)
-REFUSED = {
-    "one frame": (Trajectory(frames=FRONT[:1], task="t"), 0, "num_frames: expected at least 2"),
-    "one wrist": (Trajectory(frames=FRONT, task="t", views=(FRONT,)), 0, "views: expected none, or those of"),
-    "a placeholder": (Trajectory(frames=FRONT, task="a <image>"), 0, "task: expected text without <image>"),
-    "a special token": (Trajectory(frames=FRONT, task="<|image_pad|>"), 0, "task: expected text without the model's"),
-    "dense mode": (Trajectory(frames=FRONT, task="t"), 2, "frame_steps: expected 0"),
-}
-
-
-@pytest.mark.parametrize(("trajectory", "frame_steps", "told"), REFUSED.values(), ids=REFUSED)
-def test_a_sample_that_cannot_be_compared_is_refused(trajectory: Trajectory, frame_steps: int, told: str) -> None:
-    (result,) = case_named("forward_T5").engine().evaluate([ProgressSample(trajectory, frame_steps)])
-    assert isinstance(result, InvalidSampleError)
-    assert str(result).startswith(told)
-
-
-def test_other_checkpoints_refuse_views_and_a_goal() -> None:
-    engine = Engine.of(families.load(ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint", reward_model="roboreward"))
-    for more in ({"views": (FRONT, FRONT)}, {"goal": FRONT[0]}):
-        (result,) = engine.evaluate([ProgressSample(Trajectory(frames=FRONT, task="t", **more))])
-        assert isinstance(result, InvalidSampleError)
-        assert str(result).startswith("views, goal: expected none")
-
-
-WRONG = {
-    "another mode": (
-        "robodopamine,mode=fused",
-        r"--as: mode: expected one of incremental, benchmark, forward, backward, mean",
-    ),
-    "no interval": ("robodopamine,interval=0", "--as: interval: expected at least 1 frame, got 0"),
-}
-
-
-@pytest.mark.parametrize(("said", "told"), WRONG.values(), ids=WRONG)
-def test_settings_that_make_no_sense_are_refused(said: str, told: str) -> None:
-    with pytest.raises(CheckpointError, match=told):
-        families.load(CHECKPOINT, reward_model=said)
 
 
 @pytest.mark.parametrize("name", ["Robo-Dopamine-GRM-3B", "models--tanhuajie2001--Robo-Dopamine-GRM-2.0-4B-Preview"])
@@ -260,16 +221,3 @@ def test_the_work_grows_with_the_number_of_questions() -> None:
     checkpoint = families.load(CHECKPOINT, reward_model="robodopamine,mode=mean")
     short, long = (checkpoint.flop(ProgressSample(Trajectory(frames=FRONT[[0] * count], task="t"))) for count in (2, 3))
     assert 1.9 < long / short < 2.1  # twice as many questions
-
-
-@pytest.mark.gpu
-def test_a_gpu_writes_the_original_s_answers() -> None:
-    cases = [each for each in READABLE if each.config == CHECKPOINT.parent]
-    for case in cases:
-        loaded = families.load(CHECKPOINT, reward_model=case.said)
-        on_cpu, on_gpu = (Engine.of(loaded, device=each, dtype=torch.float32) for each in ("cpu", "cuda"))
-        (expected,), (result,) = (each.evaluate([case.sample]) for each in (on_cpu, on_gpu))
-        assert isinstance(expected, ProgressResult)
-        assert isinstance(result, ProgressResult)
-        np.testing.assert_array_equal(result.progress, expected.progress)
-    assert cases

@@ -19,7 +19,6 @@ from PIL import Image
 from reward_models import Reference, references
 from rfm import families
 from rfm.engine import Engine, Execution
-from rfm.families import CheckpointError
 from rfm.roboreward.predictor import RoboRewardPredictor
 from rfm.roboreward.prompts import as_jpeg, is_unclear, parsed
 from rfm.vlm.qwen import ROOM
@@ -28,7 +27,6 @@ from rfm.vlm.written import WrittenAnswer
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
-    PreferenceSample,
     ProgressResult,
     ProgressSample,
     Trajectory,
@@ -335,13 +333,6 @@ def test_logits_that_are_not_finite_are_a_failure_and_no_answer() -> None:
     assert isinstance(outcome, InferenceFailedError)
 
 
-def test_a_preference_is_refused(engine: Engine) -> None:
-    trajectory = CASES[0].samples()[0].trajectory
-    (outcome,) = engine.evaluate([PreferenceSample(trajectory, trajectory)])
-    assert isinstance(outcome, InvalidSampleError)
-    assert "expected progress (this checkpoint has no preference head), got preference" in str(outcome)
-
-
 def test_a_folder_of_its_name_needs_no_option(tmp_path: Path) -> None:
     folder = shutil.copytree(CHECKPOINT, tmp_path / "RoboReward-4B")
     checkpoint = families.load(folder)
@@ -353,43 +344,3 @@ def test_a_folder_of_its_name_needs_no_option(tmp_path: Path) -> None:
         assert isinstance(result, ProgressResult)
         assert isinstance(expected, ProgressResult)
         np.testing.assert_array_equal(result.progress_logits, expected.progress_logits)
-
-
-Change = Callable[[dict[str, Any]], Any]
-REFUSED: dict[str, tuple[Change, str]] = {
-    "a penalty": (lambda c: c.update(repetition_penalty=1.1), "repetition_penalty: expected 1.0, got 1.1; remove it"),
-    "an unknown key": (lambda c: c.update(suppress_tokens=[1]), "suppress_tokens: expected no such key, got [1]"),
-    "no end": (lambda c: c.pop("eos_token_id"), "eos_token_id: expected ids of tokens, got None"),
-}
-
-
-@pytest.mark.parametrize("change, message", REFUSED.values(), ids=REFUSED)
-def test_settings_that_change_the_text_are_refused(tmp_path: Path, change: Change, message: str) -> None:
-    folder = shutil.copytree(CHECKPOINT, tmp_path / "checkpoint")
-    content = json.loads((folder / "generation_config.json").read_text())
-    change(content)
-    (folder / "generation_config.json").write_text(json.dumps(content))
-    with pytest.raises(CheckpointError) as refusal:
-        families.load(folder, reward_model="roboreward")
-    assert message in str(refusal.value)
-
-
-def test_without_settings_of_generation_it_is_refused(tmp_path: Path) -> None:
-    folder = shutil.copytree(CHECKPOINT, tmp_path / "checkpoint")
-    (folder / "generation_config.json").unlink()
-    with pytest.raises(CheckpointError, match=r"generation_config.json: expected the file, got none"):
-        families.load(folder, reward_model="roboreward")
-
-
-@pytest.mark.gpu
-def test_a_gpu_writes_the_answers_of_the_original_in_bfloat16() -> None:
-    engine = Engine.of(families.load(str(CHECKPOINT), reward_model="roboreward"), device="cuda")
-    cases = [case for case in CASES if case.config == CONFIGS[0]]
-    told = [each for case in cases for each in case.content["generations"]]
-    results = engine.evaluate([sample for case in cases for sample in samples_of(case)])
-    for result, expected in zip(results, told, strict=True):
-        if expected["parsed_score"] is None:
-            assert isinstance(result, InvalidSampleError)
-            continue
-        assert isinstance(result, ProgressResult)
-        assert result.last_progress == expected["parsed_score"] / 4 - 0.25

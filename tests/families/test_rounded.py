@@ -313,17 +313,3 @@ def test_a_gpu_needs_room_for_the_rounded_bytes(monkeypatch: pytest.MonkeyPatch)
         rooms.append(high)
     assert rooms == sorted(rooms, reverse=True)
     assert len(set(rooms)) == 3
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_gpu_decodes_as_the_cpu(kind: str) -> None:
-    engines = [
-        Engine.of(families.load(**sources(PLAIN), weights=kind), device=on, dtype=torch.float32)
-        for on in ("cpu", "cuda")
-    ]
-    layers = [layers_of(engine) for engine in engines]
-    for name, layer in layers[0].items():
-        assert torch.equal(layer.values(torch.bfloat16), layers[1][name].values(torch.bfloat16).cpu())
-    for result, expected in zip(*(engine.evaluate(SAMPLES) for engine in engines), strict=True):
-        assert_close(result, expected, 1e-4)

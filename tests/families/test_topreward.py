@@ -11,19 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
-from paths import GOLDEN
 from reward_models import ROOT, Reference, references
 from rfm import families
 from rfm.engine import Engine, Execution
 from rfm.families import CheckpointError
 from rfm_client import (
-    InvalidSampleError,
-    PreferenceSample,
     ProgressResult,
     ProgressSample,
-    SimilaritySample,
     Trajectory,
     UInt8Array,
 )
@@ -175,61 +170,6 @@ def test_a_saved_model_scores_the_same(tmp_path: Path, robometer: Engine) -> Non
     assert not [decision.name for decision in checkpoint.decisions() if decision.is_assumed]
 
 
-REFUSED: dict[str, tuple[str, Any, str]] = {
-    "dense mode": (
-        "lerobot",
-        ProgressSample(Trajectory(frames=noise(3), task=TASK), frame_steps=2),
-        "frame_steps: expected 0 (TOPReward's progress is relative to the whole episode",
-    ),
-    "preference": (
-        "lerobot",
-        PreferenceSample(progress(noise(2)).trajectory, progress(noise(2)).trajectory),
-        "sample_type: expected progress (this checkpoint has no preference head), got preference",
-    ),
-    "similarity": (
-        "lerobot",
-        SimilaritySample(progress(noise(2)).trajectory, progress(noise(2)).trajectory),
-        "sample_type: expected progress (this checkpoint has no similarity head), got similarity",
-    ),
-    "small frames": ("lerobot", progress(noise(2, 8, 8)), "frames of at least 32 x 32 pixels, got 8 x 8"),
-    "narrow frames": ("lerobot", progress(noise(1, 32, 6432)), "at most 200 times as long as wide"),
-    "many frames": ("robometer", progress(noise(65, 8, 8)), "num_frames: expected at most 64"),
-    "a special token": ("robometer", progress(noise(2), "a <|video_pad|>"), "text without the model's special tokens"),
-    "the end of a message": ("lerobot", progress(noise(2), "a <|im_end|>"), "text without the model's special tokens"),
-}
-
-
-@pytest.mark.parametrize("variant, sample, message", REFUSED.values(), ids=REFUSED)
-def test_a_sample_without_a_meaning_is_refused(
-    request: pytest.FixtureRequest, variant: str, sample: Any, message: str
-) -> None:
-    (outcome,) = request.getfixturevalue(variant).evaluate([sample])
-    assert isinstance(outcome, InvalidSampleError)
-    assert message in str(outcome)
-
-
-WRONG: dict[str, tuple[str, str]] = {
-    "an unknown name": ("gvl", "--as: expected one of topreward, topreward-robometer, roboreward, roboreward-expected"),
-    "an unknown setting": (
-        "topreward,frames=3",
-        "--as: expected settings among num_prefixes, fps, chat_template, max_frames",
-    ),
-    "no value": ("topreward,fps", "--as: expected setting=value, got 'fps'"),
-    "no number": ("topreward,fps=fast", "--as: fps: expected a value of type float, got 'fast'"),
-    "no frames a second": ("topreward,fps=0", "fps: expected a finite number above 0, got 0.0"),
-    "an ignored setting": ("topreward-robometer,fps=2", "--as: fps: expected none for topreward-robometer"),
-    "a setting of RoboReward": ("roboreward,fps=2", "--as: expected no settings of this reward model, got 'fps'"),
-    "one prefix": ("topreward,num_prefixes=1", "num_prefixes: expected at least 2, the first and the last, got 1"),
-}
-
-
-@pytest.mark.parametrize("said, message", WRONG.values(), ids=WRONG)
-def test_a_wrong_setting_is_refused(said: str, message: str) -> None:
-    with pytest.raises(CheckpointError) as refusal:
-        families.load(CHECKPOINT, reward_model=said)
-    assert message in str(refusal.value)
-
-
 def test_an_export_keeps_its_reward_model(tmp_path: Path) -> None:
     families.load(CHECKPOINT, reward_model="topreward").save(tmp_path / "saved")
     for said in ("topreward-robometer", "topreward,fps=4", "roboreward"):
@@ -237,54 +177,3 @@ def test_an_export_keeps_its_reward_model(tmp_path: Path) -> None:
             CheckpointError, match=r"--as: expected none for an export|expected an export of roboreward"
         ):
             families.load(tmp_path / "saved", reward_model=said)
-
-
-def test_a_template_without_the_video_is_refused(tmp_path: Path) -> None:
-    changed = shutil.copytree(CHECKPOINT, tmp_path / "changed")
-    file = changed / "chat_template.json"
-    template = json.loads(file.read_text())["chat_template"]
-    file.write_text(json.dumps({"chat_template": "<|im_start|>system\nHelp.<|im_end|>\n" + template}))
-    with pytest.raises(CheckpointError, match="chat template: expected one video in a prompt, got 0"):
-        Engine.of(families.load(str(changed), reward_model="topreward"))
-
-
-def test_a_robometer_needs_no_as() -> None:
-    with pytest.raises(CheckpointError, match="expected an ordinary Qwen3-VL, got reward heads: leave out --as"):
-        families.load(GOLDEN / "vlm" / "q3_tok_disc10" / "checkpoint", reward_model="topreward")
-
-
-def test_an_ordinary_model_is_no_reward_model_by_itself() -> None:
-    with pytest.raises(CheckpointError, match=r"with an ordinary vision-language model, say --as which reward model"):
-        families.load(CHECKPOINT)
-
-
-def test_an_unknown_key_of_lerobot_is_refused(tmp_path: Path) -> None:
-    changed = shutil.copytree(OF_LEROBOT, tmp_path / "changed")
-    content = json.loads((changed / "config.json").read_text()) | {"frame_stride": 2}
-    (changed / "config.json").write_text(json.dumps(content))
-    with pytest.raises(CheckpointError, match=r"expected the keys of LeRobot's TOPReward, got 'frame_stride'"):
-        families.load(changed, base_model=str(CHECKPOINT))
-
-
-def test_a_missing_language_head_is_refused(tmp_path: Path) -> None:
-    changed = shutil.copytree(CHECKPOINT, tmp_path / "changed")
-    weights = load_file(changed / "model.safetensors")
-    del weights["lm_head.weight"]
-    save_file(weights, changed / "model.safetensors", {"format": "pt"})
-    with pytest.raises(CheckpointError, match=r"expected lm_head.weight, since tie_word_embeddings is false, got none"):
-        families.load(changed, reward_model="topreward")
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("reward_model", ["topreward", "topreward-robometer"])
-def test_a_gpu_gives_the_cpu_s_numbers(reward_model: str) -> None:
-    samples = [progress(noise(n, h, w, n)) for n, h, w in ((1, 64, 96), (5, 48, 80), (8, 100, 200))]
-    engines = (
-        Engine.of(families.load(str(CHECKPOINT), reward_model=reward_model), device=device, dtype=torch.float32)
-        for device in ("cpu", "cuda")
-    )
-    for expected, result in zip(*(engine.evaluate(samples) for engine in engines), strict=True):
-        assert isinstance(expected, ProgressResult)
-        assert isinstance(result, ProgressResult)
-        assert result.log_prob is not None
-        np.testing.assert_allclose(result.log_prob, expected.log_prob, rtol=0, atol=RAW)

@@ -17,7 +17,7 @@ from rfm import families
 from rfm.engine import Engine, Execution
 from rfm.vlm import leaves, tree
 from rfm.vlm.row import VlmRow
-from rfm.vlm.tree import trees
+from rfm.vlm.tree import Conversation, trees
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
 from rfm_client.contract import wire
 from tolerances import TOLERANCE
@@ -78,6 +78,15 @@ def test_a_tree_has_few_tokens(name: str, num_frames: int, size_px: tuple[int, i
     rows = collator.rows(sample(num_frames, *size_px))
     assert sum(row.num_tokens for row in rows) == separate
     assert sum(row.cost for row in planned(rows, collator)) <= most
+
+
+def test_conversations_share_the_tokens_before_the_first_that_is_read_or_stands_elsewhere() -> None:
+    collator: Any = families.load(CHECKPOINT, reward_model="topreward").collator  # type: ignore[attr-defined]
+    whole = Conversation.of(collator.rows(sample(4))[-1], collator.visual_pad, are_images=False)
+    assert whole.shared(whole) == whole.reads[0] < whole.row.num_tokens
+    position_ids = whole.row.position_ids.copy()
+    position_ids[0, 5] += 1
+    assert whole.shared(replace(whole, row=replace(whole.row, position_ids=position_ids))) == 5
 
 
 def test_budget_and_metrics_count_the_tokens_of_a_tree() -> None:
@@ -198,18 +207,6 @@ def test_a_device_gives_the_scores_of_a_tree_and_rarely_makes_the_host_wait(seen
     assert (seen.asked.total() - asked, seen.awaited - awaited) == (1, 1)  # the scores are read, the answers sent
     for each, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(each, wanted, rtol=0, atol=TOLERANCE)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("frame_steps", [0, 4], ids=["TOPReward", "dense mode"])
-def test_a_gpu_gives_the_cpu_s_scores_of_a_tree(frame_steps: int) -> None:
-    engine_of = robometer if frame_steps else topreward
-    samples = [replace(each, frame_steps=frame_steps) for each in MIXED]
-    expected, found = (
-        values(engine_of(device=device, dtype=torch.float32).evaluate(samples)) for device in ("cpu", "cuda")
-    )
-    for each, wanted in zip(found, expected, strict=True):
-        np.testing.assert_allclose(each, wanted, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("engine, frame_steps", [(topreward, 0), (robometer, 4)], ids=["TOPReward", "dense Robometer"])

@@ -23,7 +23,6 @@ from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.qwen import embedded
 from rfm_client import (
     InferenceFailedError,
-    InvalidSampleError,
     PreferenceResult,
     PreferenceSample,
     ProgressResult,
@@ -32,7 +31,6 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from servers import Served
 from vlm import BFLOAT16, PLAIN, assert_close, load, predictor_of, upstream_inputs, video
 
 PIXEL_TOLERANCE = 1e-6  # relative, of a sum over all pixels
@@ -164,13 +162,6 @@ def test_an_ordinary_video_over_the_token_budget_is_scored() -> None:
         assert_close(outcome, other, MIXED_TOLERANCE)
 
 
-def test_a_mixture_over_the_wire_equals_its_samples_alone(served: Served) -> None:
-    samples, model = mixture(step=4), "q25_video_avg_disc10"
-    with served.client("grpc", model) as client:
-        for result, sample in zip(client.evaluate(samples), samples, strict=True):
-            assert_close(result, load_engine(model).evaluate([sample])[0], MIXED_TOLERANCE)
-
-
 def changed(name: str, **settings: Any) -> VlmPredictor:
     """A checkpoint as if it had been trained with other settings."""
     checkpoint = load(name)
@@ -225,39 +216,6 @@ def test_a_pair_of_two_frame_sizes_is_scored_as_transformers_reads_it(
             np.testing.assert_allclose(scores.progress, progress, rtol=0, atol=1e-6)
             success = network.success_head(states).squeeze(-1).sigmoid()[places]
             np.testing.assert_allclose(scores.success, success, rtol=0, atol=1e-6)
-
-
-BAD: dict[str, tuple[Callable[[], Sample], str]] = {
-    "a special token in the task": (
-        lambda: ProgressSample(video(0, 1, 56, 56, "lift <|prog_token|> it")),
-        "task: expected text without the model's special tokens, got '<|prog_token|>'",
-    ),
-    "an image token in the task": (
-        lambda: PreferenceSample(video(0, 1, 56, 56, "<|image_pad|>"), video(0, 1, 56, 56)),
-        "task: expected text without the model's special tokens, got '<|image_pad|>'",
-    ),
-    "an image that is a line": (
-        lambda: ProgressSample(video(0, 1, 1, 300)),
-        "frames: expected an image at most 200 times as long as wide, got 1 x 300",
-    ),
-    "a 20-megapixel frame": (
-        lambda: ProgressSample(Trajectory(frames=np.zeros((1, 4000, 5000, 3), np.uint8), task="lift")),
-        "num_frames: expected at most 8192 tokens (max_position_embeddings of this checkpoint), got",
-    ),
-    "similarity without a head": (
-        lambda: SimilaritySample(video(0, 1, 56, 56), video(1, 1, 56, 56)),
-        "sample_type: expected progress or preference (this checkpoint has no similarity head), got similarity",
-    ),
-}
-
-
-@pytest.mark.parametrize(("make", "message"), BAD.values(), ids=BAD)
-def test_what_cannot_be_scored_fails_alone(make: Callable[[], Sample], message: str) -> None:
-    good = ProgressSample(video(1, 2, 56, 56))
-    first, failed, last = load_engine(PLAIN).evaluate([good, make(), good])
-    assert isinstance(failed, InvalidSampleError)
-    assert str(failed).startswith(message)
-    assert_close(first, last, MIXED_TOLERANCE)
 
 
 def test_the_task_is_not_a_template() -> None:

@@ -32,7 +32,6 @@ FAMILIES = {
     "vlm": set(),
     "topreward": {"rfm.vlm"},
     "roboreward": {"rfm.vlm"},
-    "procvlm": {"rfm.vlm"},
     "robodopamine": {"rfm.vlm"},
     "rynnvalue": {"rfm.vlm"},
 }  # and the families that each extends

@@ -8,6 +8,8 @@ import importlib.metadata
 from pathlib import Path
 from typing import Any
 
+import torch
+
 import goldens
 from rfm import families
 from rfm.checkpoint.content import read_run_config
@@ -35,6 +37,12 @@ def load_engine(name: str) -> Engine:
     config = goldens.config(name)
     checkpoint = families.load(config.checkpoint, **config.sources)
     return Engine.of(checkpoint, encoders=checkpoint.encoders())
+
+
+@functools.cache
+def asked_engine(folder: Path, reward_model: str, dtype: torch.dtype | None = None) -> Engine:
+    """Return the engine of a model that is asked in words. reward_model: as ``--as`` takes it"""
+    return Engine.of(families.load(folder, reward_model=reward_model), dtype=dtype)
 
 
 def training_run(file: Path) -> dict[str, Any]:

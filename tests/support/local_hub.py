@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
+from unittest import mock
 from urllib.parse import unquote
 
 from servers import web_server
@@ -89,6 +90,32 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
 
     with web_server(Handler) as url:
         yield url
+
+
+@contextmanager
+def asked(endpoint: str, cache: Path, timeout_s: int = 10) -> Iterator[None]:
+    """Let this process ask the Hub at ``endpoint``, with an empty cache or one that another call filled.
+
+    ``huggingface_hub`` reads the environment once, into these constants.
+    """
+    from huggingface_hub import constants, file_download
+    from huggingface_hub.utils import _http
+
+    template = endpoint + "/{repo_id}/resolve/{revision}/{filename}"
+    changed = {
+        "ENDPOINT": endpoint,
+        "HF_HUB_CACHE": str(cache),
+        "HF_HUB_OFFLINE": False,
+        "HF_HUB_ETAG_TIMEOUT": timeout_s,
+    }
+    forget = getattr(_http, "reset_sessions", lambda: None)  # sessions of huggingface_hub 0.x are offline for good
+    forget()
+    with (
+        mock.patch.multiple(constants, **changed),
+        mock.patch.object(file_download, "HUGGINGFACE_CO_URL_TEMPLATE", template),
+    ):
+        yield
+    forget()
 
 
 def _told(file: Path, folder: Path) -> dict[str, object]:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from engines import asked_engine
 from reward_models import ROOT, Reference
-from rfm import families
 from rfm.engine import Engine
 from rfm.robodopamine.answers import parsed
 from rfm_client import ProgressSample, Trajectory
@@ -50,7 +50,7 @@ class Case(Reference):
         return f"robodopamine,mode={self.request['eval_mode']},interval={self.request['frame_interval']}"
 
     def engine(self, dtype: torch.dtype | None = None) -> Engine:
-        return Engine.of(families.load(self.config / "checkpoint", reward_model=self.said), dtype=dtype)
+        return asked_engine(self.config / "checkpoint", self.said, dtype)
 
 
 CASES = [Case(file) for file in sorted(FOLDER.glob("*/cases/*.json"))]
