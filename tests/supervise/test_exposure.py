@@ -6,12 +6,9 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import httpx
 import pytest
 
 from commands import REPOSITORY, nothing_left_behind
@@ -22,7 +19,6 @@ from rfm.launch.endpoints import PORTS, Endpoints, GrpcTls, check_version, free_
 from rfm.launch.installation import ServerStartError
 from rfm.launch.model_processes import children_of, has_ended
 from rfm.launch.triton_server import TritonServer
-from rfm.supervise.status import NO_REASON, Status, StatusServer
 from rfm_client.options import ConfigError
 from secured import Papers, other_program
 from servers import wait_for
@@ -146,51 +142,3 @@ def test_children_are_found_dead_or_alive(monkeypatch: pytest.MonkeyPatch, has_l
             child.kill()
             child.wait()
     assert not {child.pid for child in children} & set(children_of(os.getpid()))
-
-
-@pytest.mark.slow
-def test_a_silent_connection_to_the_status_port_is_cut() -> None:
-    port = Endpoints.free().http_port
-    with closing(StatusServer("127.0.0.1", port, Status())), socket.create_connection(("127.0.0.1", port)) as silent:
-        silent.send(b"G")
-        assert silent.recv(1) == b""
-        assert httpx.get(f"http://127.0.0.1:{port}/live").status_code == 200
-
-
-def told(about: Status) -> dict[str, Any]:
-    """Return the metrics of models by name and labels."""
-    lines = [line for line in about.metrics().decode().splitlines() if line.startswith("rfm_serve_")]
-    return {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines) if "ready" in name}
-
-
-def test_the_status_tells_nothing_of_what_there_was() -> None:
-    about = Status()
-    about.record({"a": NO_REASON, "b": NO_REASON, "a_frames": NO_REASON})
-    about.record({"a": NO_REASON, "a_frames": NO_REASON})
-    assert told(about) == {'rfm_serve_ready{model="a"}': 1, 'rfm_serve_ready{model="a_frames"}': 1}
-    about.record_down("restarted")
-    about.record({"a": "it is loading", "a_frames": NO_REASON})
-    assert told(about) == {
-        'rfm_serve_ready{model="a"}': 0,
-        'rfm_serve_ready{model="a_frames"}': 1,
-        'rfm_serve_not_ready{model="a",reason="it is loading"}': 1,
-    }
-    about.record_down("restarted")
-    assert about.ready[1]["models"]["a_frames"] == {"ready": False, "reason": "restarted"}
-
-
-def test_a_server_without_a_model_that_is_left_out_is_ready_and_names_it() -> None:
-    about = Status()
-    about.record({"a": NO_REASON, "b": "it is left out"}, left_out=["b"])
-    is_ready, body = about.ready
-    assert is_ready
-    assert body["models"]["b"] == {"ready": False, "reason": "it is left out"}
-    assert told(about)['rfm_serve_ready{model="b"}'] == 0
-    port = Endpoints.free().http_port
-    with closing(StatusServer("127.0.0.1", port, about)):
-        codes = [httpx.get(f"http://127.0.0.1:{port}/ready{query}").status_code for query in ("", "?strict")]
-    assert codes == [200, 503]
-    about.record({"a": "it is loading", "b": "it is left out"}, left_out=["b"])
-    assert not about.ready[0]
-    about.record({"b": "it is left out"}, left_out=["b"])
-    assert not about.ready[0]
