@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import socket
-import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,7 +22,6 @@ import pytest
 import stand_in_triton
 from commands import running
 from rfm.launch import model_processes, triton_server
-from rfm.launch.installation import Installation
 from rfm.launch.model_processes import LOADING_DEAD_S, UNKNOWN, ModelProcesses
 from rfm.launch.triton_server import TritonServer
 from rfm.supervise import probe, status, supervisor, watch
@@ -32,11 +30,6 @@ from rfm.supervise.supervisor import MOST, STEADY_S, BackOff, CrashLoopError, Su
 from servers import Endpoints, Serving, wait_for
 
 SILENT_S, HANG_S = 1.5, 1.5
-MODEL = """
-import pathlib, sys, time
-while not pathlib.Path({deadly!r}).exists():
-    time.sleep(0.02)
-"""
 
 
 @pytest.fixture(autouse=True)
@@ -75,15 +68,8 @@ class Supervised:
 
 @contextmanager
 def supervised(folder: Path, *models: str) -> Iterator[Supervised]:
-    repository, program = folder / "models", folder / "tritonserver"
-    for model in models:
-        (repository / model / "1").mkdir(parents=True)
-        (repository / model / "config.pbtxt").write_text(f'name: "{model}"\nbackend: "python"\n')
-        code = MODEL.format(deadly=str(folder / f"deadly-{model}"))
-        (repository / model / "1" / "model.py").write_text(code)
-    program.write_text(f"#!{sys.executable}\n{Path(stand_in_triton.__file__).read_text()}")
-    program.chmod(0o755)
-    server, status_port = TritonServer(repository, Endpoints.free(), Installation(program)), Endpoints.free().http_port
+    repository, program = stand_in_triton.repository(folder, *models), stand_in_triton.installation(folder)
+    server, status_port = TritonServer(repository, Endpoints.free(), program), Endpoints.free().http_port
     watched = Supervisor(server, status_port=status_port, probe_s=0.05, hang_s=HANG_S, triton_silent_s=SILENT_S)  # type: ignore[arg-type]
     handlers: list[Callable[..., None]] = []
 

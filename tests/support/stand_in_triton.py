@@ -74,6 +74,27 @@ class Answer(BaseHTTPRequestHandler):
         pass
 
 
+def repository(folder: Path, *models: str) -> Path:
+    """A repository of these models. A model with the file ``deadly-MODEL`` ends."""
+    for model in models:
+        version = folder / "models" / model / "1"
+        version.mkdir(parents=True)
+        (version.parent / "config.pbtxt").write_text(f'name: "{model}"\nbackend: "python"\n')
+        deadly = f"pathlib.Path({str(folder / f'deadly-{model}')!r})"
+        (version / "model.py").write_text(f"import pathlib, time\nwhile not {deadly}.exists():\n    time.sleep(0.02)\n")
+    return folder / "models"
+
+
+def installation(folder: Path) -> Any:
+    """The program that stands in for Triton."""
+    from rfm.launch.installation import Installation
+
+    program = folder / "tritonserver"
+    program.write_text(f"#!{sys.executable}\n{Path(__file__).read_text()}")
+    program.chmod(0o755)
+    return Installation(program)
+
+
 def main(*words: str) -> None:
     options = [word.removeprefix("--").partition("=") for word in words]
     given = {name: value for name, _, value in options}
