@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -21,7 +22,8 @@ class ModelProcesses:
     """The model processes of a Triton, one for each instance, from /proc.
 
     Triton notices the death of a served model's process only at the next request, and keeps a zombie until then. If a
-    loading model's process dies before its handshake, Triton never notices.
+    loading model's process dies before its handshake, Triton never notices. A process that is replaced may be a zombie
+    for seconds.
     """
 
     def __init__(self, triton_pid: int) -> None:
@@ -29,16 +31,19 @@ class ModelProcesses:
         self._models: dict[int, str] = {}  # by process; a zombie's command line is empty
         self._since_s: dict[int, float] = {}  # of dead and stopped processes
 
-    def fault(self, settled: Collection[str] = ()) -> tuple[str, str] | None:
+    def fault(self, wanted: Mapping[str, int] | None = None, *, is_settled: bool = False) -> tuple[str, str] | None:
         """Return a model and the fault of its process: dead or stopped.
 
-        settled: models that neither load nor unload; their fault counts at the second look, others after LOADING_DEAD_S
+        wanted: number of processes by model; while so many live, a dead one was replaced
+        is_settled: no model loads or unloads: a fault counts at the second look, otherwise after LOADING_DEAD_S
         """
         states, now_s = self._states(), time.monotonic()
-        ill = [pid for pid, state in states.items() if state in _STATES]
+        living = Counter(self._models[pid] for pid, state in states.items() if state not in _STATES)
+        enough = {model for model, number in (wanted or {}).items() if living[model] >= number}
+        ill = [pid for pid, state in states.items() if state in _STATES and self._models[pid] not in enough]
         before, self._since_s = self._since_s, {pid: self._since_s.get(pid, now_s) for pid in ill}
         for pid in sorted(before.keys() & self._since_s.keys()):
-            if self._models[pid] in settled or now_s - before[pid] >= LOADING_DEAD_S:
+            if is_settled or now_s - before[pid] >= LOADING_DEAD_S:
                 return self._models[pid], _STATES[states[pid]]
         return None
 

@@ -23,7 +23,7 @@ from urllib.parse import quote
 
 from rfm.launch.admin_key import http_headers
 from rfm.launch.http import NO_ANSWER, Http
-from rfm.launch.model_processes import UNKNOWN, ModelProcesses
+from rfm.launch.model_processes import ModelProcesses
 from rfm.launch.repository_api import INDEX_PATH, LOADING, READY, UNLOADING, ModelVersion, versions_of
 from rfm.launch.triton_server import Config, TritonServer
 from rfm.supervise.probe import Probe, can_be_probed
@@ -75,6 +75,7 @@ class TritonWatch:
         self._progress_s: dict[str, float] = {}  # time of a model's last progress
         self._ready: dict[str, list[int]] = {}  # ready versions by model
         self._going: set[str] = set()  # models that are loading or unloading
+        self._wanted: dict[str, int] = {}  # processes by model; without the models that are loading
         self._leaving: set[str] = set()
         self.served = dict(served)
         self.reasons: dict[str, str] = dict.fromkeys(served, "it is loading")
@@ -123,8 +124,7 @@ class TritonWatch:
                 self._counts[model], self._progress_s[model] = count, time.monotonic()
 
     def _dead(self) -> tuple[str, str] | None:
-        settled = self._ready.keys() - self._going
-        found = self._processes.fault(settled if self._going else {*settled, UNKNOWN})
+        found = self._processes.fault(self._wanted, is_settled=not self._going)
         if found is None:
             return None
         loading = next(iter(self._going)) if len(self._going) == 1 else TRITON
@@ -159,6 +159,9 @@ class TritonWatch:
                 known = before is not None and before.has_answered
                 self._probes[model].has_answered = known  # a reloaded model stays ready
         (self._going.add if is_going else self._going.discard)(model)
+        self._wanted.pop(model, None)
+        if model in self.served and not any(entry.state == LOADING for entry in versions):
+            self._wanted[model] = len(ready) * num_instances(self.served[model])
         if is_settled:
             self._ready[model] = ready
         elif not ready:
@@ -189,6 +192,11 @@ class TritonWatch:
 def parts_of(config: Config) -> list[str]:
     """Return the models of an ensemble; empty for other models."""
     return [step["model_name"] for step in config.get("ensemble_scheduling", {}).get("step", [])]
+
+
+def num_instances(config: Config) -> int:
+    """Return the number of instances, and so of processes, of each version of a model."""
+    return sum(group["count"] * max(1, len(group.get("gpus", ()))) for group in config.get("instance_group", ()))
 
 
 def serving_just(config: Config, versions: Sequence[int]) -> Config:

@@ -7,6 +7,7 @@ the sums every FLUSH_INTERVAL_S.
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import threading
 from collections import Counter
@@ -71,7 +72,6 @@ class InstanceMetrics:
         self._totals: Counter[str] = Counter()
         self._observed: list[tuple[str, float]] = []
         self._kept_bytes = 0
-        self._families: list[Any] = []  # keeps their metrics alive
         self._has_failed = False
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -118,7 +118,11 @@ class InstanceMetrics:
             self._flush(is_served=False)
 
     def _make_all(self, labels: dict[str, str], checkpoint: Mapping[str, str], sample_types: Collection[str]) -> None:
-        """Create the metrics in Triton's process, where they outlive this process and continue after a reload."""
+        """Create the metrics in Triton's process, where they outlive this process and continue after a reload.
+
+        No family is ever destroyed, nor the metrics that it holds: after ``finalize`` that would crash this process,
+        and earlier it would remove the series under an instance that was loaded in this one's place.
+        """
         samples = self._family("samples_total", "COUNTER", "Samples, by the outcome of their request.")
         self._sample_metrics = {  # all at once, so that the first failure is an increase
             (sample_type, outcome): samples.Metric(labels={**labels, "sample_type": sample_type, "outcome": outcome})
@@ -143,8 +147,9 @@ class InstanceMetrics:
         import triton_python_backend_utils as pb_utils
 
         kind = getattr(pb_utils.MetricFamily, kind)
-        self._families.append(pb_utils.MetricFamily(name=f"rfm_{name}", description=description, kind=kind))
-        return self._families[-1]
+        family = pb_utils.MetricFamily(name=f"rfm_{name}", description=description, kind=kind)
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(family))
+        return family
 
     def _flush_for_ever(self) -> None:
         while not self._closing.wait(FLUSH_INTERVAL_S):

@@ -15,6 +15,7 @@ from typer.testing import CliRunner, Result
 from labelling import LEROBOT
 from paths import ROOT
 from rfm.config import ExportConfig, ServeConfig
+from rfm.launch.endpoints import PORT_STEP, free_ports
 from rfm.supervise.supervisor import GatewayProcess, Supervisor
 from rfm_client.options import ConfigError
 from rfm_commands import cli
@@ -194,6 +195,11 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Any:
     return run
 
 
+@pytest.fixture
+def port() -> int:
+    return free_ports(1)[0]
+
+
 def invoke(*words: str) -> Result:
     return CliRunner().invoke(cli.app, words)
 
@@ -207,10 +213,10 @@ def test_every_setting_is_an_option_of_its_command() -> None:
             assert not setting.has_option or options[setting.option].help.startswith(setting.help), name
 
 
-def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path: Path) -> None:
+def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path: Path, port: int) -> None:
     (tmp_path / "key.txt").write_text("open sesame")
     given = {
-        "port": "8100",
+        "port": str(port),
         "host": "127.0.0.2",
         "triton": "grpc://127.0.0.1:9001",
         "metrics_url": "http://127.0.0.1:9002/metrics",
@@ -238,10 +244,10 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path
 @pytest.mark.parametrize(
     "name", ["certificate", "triton-ca-file", "triton-certificate", "api-key-file", "allow-folder", "dataset"]
 )
-def test_a_gateway_that_would_not_start_is_refused_before_triton_starts(name: str) -> None:
+def test_a_gateway_that_would_not_start_is_refused_before_triton_starts(name: str, port: int) -> None:
     other = {"certificate": "key", "triton-certificate": "triton-key"}.get(name)
     words = [f"--gateway-{each}=nowhere" for each in (name, other) if each]
-    result = invoke("serve", str(REPOSITORY), "--gateway-port=8100", *words)
+    result = invoke("serve", str(REPOSITORY), f"--gateway-port={port}", *words)
     assert result.exit_code == 1
     assert result.stderr.startswith(f"rfm: --gateway-{name}: expected ")
     assert "nowhere" in result.stderr
@@ -253,50 +259,59 @@ def test_an_option_of_the_gateway_needs_its_port() -> None:
     assert "--gateway-dataset needs --gateway-port" in result.stderr
 
 
-def test_a_gateway_before_a_model_that_is_not_there_is_refused_with_those_that_are() -> None:
-    result = invoke("serve", str(REPOSITORY), "--gateway-port=8100", "--gateway-model=nope")
+def test_a_gateway_before_a_model_that_is_not_there_is_refused_with_those_that_are(port: int) -> None:
+    result = invoke("serve", str(REPOSITORY), f"--gateway-port={port}", "--gateway-model=nope")
     told = "rfm: gateway: model: expected one of rfm, got nope; --gateway-model names another\n"
     assert (result.exit_code, result.stderr) == (1, told)
 
 
 @pytest.mark.parametrize(("host", "reached"), [("0.0.0.0", "127.0.0.1"), ("::", "[::1]"), ("::1", "[::1]")], ids=str)
-def test_a_gateway_asks_a_server_that_listens_everywhere_at_this_machine(started: Any, host: str, reached: str) -> None:
-    options = started("--host", host, "--gateway-port=8100", "--accept-known-vulnerabilities")
+def test_a_gateway_asks_a_server_that_listens_everywhere_at_this_machine(
+    started: Any, host: str, reached: str, port: int
+) -> None:
+    options = started("--host", host, f"--gateway-port={port}", "--accept-known-vulnerabilities")
     assert options["--host"] == [host]
     assert options["--triton"] == [f"grpc://{reached}:8001"]
     assert options["--metrics-url"] == [f"http://{reached}:8002/metrics"]
 
 
-def test_a_gateway_takes_from_the_server_what_its_section_leaves_open(started: Any, tmp_path: Path) -> None:
+def test_a_gateway_takes_from_the_server_what_its_section_leaves_open(started: Any, tmp_path: Path, port: int) -> None:
     ends = Endpoints.free()
     (tmp_path / "serve.yaml").write_text(
         f"export: {{name: rfm}}\nserve: {{http_port: {ends.http_port}, grpc_port: {ends.grpc_port}, "
-        f"metrics_port: {ends.metrics_port}}}\ngateway: {{port: 8100, cors_origin: [http://a, http://b]}}\n"
+        f"metrics_port: {ends.metrics_port}}}\ngateway: {{port: {port}, cors_origin: [http://a, http://b]}}\n"
     )
     options = started("--config", str(tmp_path / "serve.yaml"))
     assert options["--triton"] == [ends.grpc_url]
     assert options["--metrics-url"] == [ends.metrics_url]
-    assert (options["--host"], options["--port"], options["--model"]) == (["127.0.0.1"], ["8100"], ["rfm"])
+    assert (options["--host"], options["--port"], options["--model"]) == (["127.0.0.1"], [str(port)], ["rfm"])
     assert options["--cors-origin"] == ["http://a", "http://b"]
     assert options["--timeout"] == ["120.0"]
     (tmp_path / "serve.yaml").write_text("use_frame_steps: true\n")
-    assert "--use-frame-steps" in started("--config", str(tmp_path / "serve.yaml"), "--gateway-port=8100")
+    assert "--use-frame-steps" in started("--config", str(tmp_path / "serve.yaml"), f"--gateway-port={port}")
 
 
-def test_a_gateway_on_a_port_of_triton_asks_triton_where_it_moved(started: Any) -> None:
-    assert started("--gateway-port=8001")["--triton"] == ["grpc://127.0.0.1:8021"]
-    result = invoke("serve", str(REPOSITORY), "--gateway-port=8001", "--grpc-port=8001")
+@pytest.fixture
+def grpc_port(port: int, monkeypatch: pytest.MonkeyPatch) -> int:
+    """A free port in the place of Triton's default for gRPC."""
+    monkeypatch.setattr(Endpoints, "grpc_port", port)
+    return port
+
+
+def test_a_gateway_on_a_port_of_triton_asks_triton_where_it_moved(started: Any, grpc_port: int) -> None:
+    moved = f"grpc://127.0.0.1:{grpc_port + PORT_STEP}"
+    assert started(f"--gateway-port={grpc_port}")["--triton"] == [moved]
+    result = invoke("serve", str(REPOSITORY), f"--gateway-port={grpc_port}", f"--grpc-port={grpc_port}")
     assert result.exit_code == 1
-    assert (
-        "(--grpc-port) and gateway.port (--gateway-port): expected different ports, got 8001 for both" in result.stderr
-    )
+    told = f"(--grpc-port) and gateway.port (--gateway-port): expected different ports, got {grpc_port} for both"
+    assert told in result.stderr
 
 
-def test_the_fastapi_servers_file_starts_a_gateway_on_its_port(started: Any, tmp_path: Path) -> None:
-    (tmp_path / "server.yaml").write_text("server_url: 0.0.0.0\nserver_port: 8001\n")
+def test_the_fastapi_servers_file_starts_a_gateway_on_its_port(started: Any, tmp_path: Path, grpc_port: int) -> None:
+    (tmp_path / "server.yaml").write_text(f"server_url: 0.0.0.0\nserver_port: {grpc_port}\n")
     options = started("--config", str(tmp_path / "server.yaml"))
-    assert (options["--host"], options["--port"]) == (["0.0.0.0"], ["8001"])
-    assert options["--triton"] == ["grpc://127.0.0.1:8021"]
+    assert (options["--host"], options["--port"]) == (["0.0.0.0"], [str(grpc_port)])
+    assert options["--triton"] == [f"grpc://127.0.0.1:{grpc_port + PORT_STEP}"]
 
 
 WORDS: dict[str, tuple[list[str], str]] = {

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -13,11 +12,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from commands import RFM, is_alive
-from patients import make_repository
+from commands import is_alive
 from rfm.launch import cleanup
 from rfm.launch.ending import ProcessGroup, how_it_ended
-from servers import PATIENCE_S, START_S, Endpoints, Serving, children, wait_for
+from servers import PATIENCE_S, children, wait_for
 
 AT_ONCE_S = 10.0  # a model process used to stay for two minutes
 GROUP = """
@@ -84,45 +82,3 @@ def test_notes_of_requests_in_dead_processes_come_first_and_empty_notes_hide_non
         assert claim.requests.parent.stat().st_mode & 0o077 == 0  # only the owner can write notes
     finally:
         claim.release()
-
-
-@pytest.mark.triton
-@pytest.mark.slow
-@pytest.mark.parametrize("log", ["full disk", pytest.param("closed pipe", marks=pytest.mark.nightly)])
-def test_rfm_serve_heals_without_a_log_and_if_it_is_killed_no_process_stays(tmp_path: Path, log: str) -> None:
-    ends, more = Endpoints.free(), Endpoints.free()
-    ports = {"http": ends.http_port, "grpc": ends.grpc_port, "metrics": ends.metrics_port}
-    ports |= {"status": more.http_port, "gateway": more.grpc_port}
-    words = [RFM, "serve", make_repository(tmp_path), *(f"--{name}-port={port}" for name, port in ports.items())]
-    reading, writing = os.pipe()
-    os.close(reading)
-    with Path("/dev/full").open("wb") as full, os.fdopen(writing, "wb") as closed:
-        broken = full if log == "full disk" else closed
-        process = subprocess.Popen(words, stdout=broken, stderr=broken)
-    served = Serving(process, ends, f"http://127.0.0.1:{more.http_port}", tmp_path / "log")
-    try:
-        served.wait_ready(within_s=START_S)
-        os.kill(served.model_processes()[0], signal.SIGKILL)
-        wait_for(lambda: served.restarts("rfm", "triton") == 1)
-        served.wait_ready()
-        wait_for(lambda: len(children(process.pid, "python")) == 1)  # the gateway
-        os.kill(children(process.pid, "python")[0], signal.SIGKILL)
-        wait_for(lambda: served.restarts("gateway") == 1)
-        assert process.poll() is None
-        started = [*children(process.pid), *served.model_processes()]
-    finally:
-        process.kill()
-        process.wait(PATIENCE_S)
-    try:
-        assert len(started) == 5  # Triton and the gateway, a sentinel of each, a model process
-        wait_for(lambda: not [pid for pid in started if is_alive(pid)], AT_ONCE_S)
-    finally:
-        for pid in started:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-
-        def nothing_left() -> bool:
-            cleanup.clear()
-            return not list(cleanup.SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
-
-        wait_for(nothing_left)

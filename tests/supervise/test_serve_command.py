@@ -134,11 +134,13 @@ def test_a_terminal_shows_one_screen_and_a_file_the_lines_of_triton(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("arguments", "number"),
-    [([], signal.SIGHUP), ([], signal.SIGKILL), (TRY, signal.SIGTERM)],
-    ids=["hang up", "kill", "try"],
+    ("arguments", "number", "status"),
+    [([], signal.SIGTERM, 0), ([], signal.SIGHUP, 0), ([], signal.SIGKILL, -9), (TRY, signal.SIGTERM, 143)],
+    ids=["end", "hang up", "kill", "try"],
 )
-def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], number: signal.Signals) -> None:
+def test_a_signal_while_models_load_leaves_nothing_running(
+    tmp_path: Path, arguments: list[str], number: signal.Signals, status: int
+) -> None:
     """A stand-in never gets ready, so the moment of the signal is certain."""
     started = tmp_path / "started"
     program = executable(
@@ -152,28 +154,17 @@ def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], n
         cwd=tmp_path,
         env={**os.environ, "TMPDIR": str(temporary)},
         stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     wait_for(lambda: started.exists() or process.poll() is not None)
     process.send_signal(number)
-    process.wait(EXIT_S)
+    _, log = process.communicate(timeout=EXIT_S)
+    assert process.returncode == status
+    assert not re.search(r"^rfm: | ERROR ", log, re.MULTILINE)
     wait_for(lambda: not is_alive(int(started.read_text())))
     if number != signal.SIGKILL:  # which leaves folders to the next start
         assert list(temporary.glob("rfm-*")) == []
-
-
-@pytest.mark.triton
-@pytest.mark.slow
-def test_a_signal_while_it_still_loads_ends_it() -> None:
-    with nothing_left_behind():
-        words = [*command(REPOSITORY, Endpoints.free()), "--", "--log-info=true"]
-        process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
-        assert process.stderr is not None
-        next(line for line in process.stderr if "server.cc" in line or "model_lifecycle" in line)
-        process.terminate()
-        _, rest = process.communicate(timeout=EXIT_S)
-        assert process.returncode == 0
-        assert not re.search(r"^rfm: | ERROR ", rest, re.MULTILINE)
 
 
 @pytest.mark.triton

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import re
 import threading
-import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -136,18 +136,25 @@ def test_a_log_that_cannot_be_written_costs_no_answer(tmp_path: Path, monkeypatc
 
 
 class Slow(Model):
-    """Takes ``seconds`` for a batch of several questions."""
+    """Takes ``seconds`` of a stopped clock for a batch of several questions."""
 
-    seconds = 0.0
+    seconds = now_s = 0.0
 
     def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
-        time.sleep(self.seconds if len(questions) > 1 else 0.0)
+        self.now_s += self.seconds if len(questions) > 1 else 0.0
         return super().answer(questions, execution)
 
 
-def test_a_cancelled_request_is_not_scored(tmp_path: Path) -> None:
-    """Also after a split batch whose last request took no time."""
+@pytest.fixture
+def slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Slow:
     model = Slow(tmp_path)
+    monkeypatch.setattr(batch_model, "time", SimpleNamespace(monotonic=lambda: model.now_s))
+    return model
+
+
+def test_a_cancelled_request_is_not_scored(slow: Slow) -> None:
+    """Also after a split batch whose last request took no time."""
+    model = slow
     model.seconds = 1.5 * ASKING_S
     model.respond(request(1), request(BREAKS))
     cancelled, scored = model.respond(request(5, is_given_up=True), request(6))
@@ -158,9 +165,9 @@ def test_a_cancelled_request_is_not_scored(tmp_path: Path) -> None:
     assert model.samples[("progress", "cancelled")] == 1
 
 
-def test_all_cancelled_requests_ahead_of_the_others_are_dropped_behind_a_short_batch(tmp_path: Path) -> None:
+def test_all_cancelled_requests_ahead_of_the_others_are_dropped_behind_a_short_batch(slow: Slow) -> None:
     """Asking behind a living request is worth it only behind a long batch."""
-    model = Slow(tmp_path)
+    model = slow
     model.seconds = 1.5 * ASKING_S
     model.respond(request(1, 1))
     asked = [request(5, is_given_up=True), request(6, is_given_up=True), request(7), request(8, is_given_up=True)]

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import httpx
 import numpy as np
@@ -18,7 +19,9 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from mixtures import TOLD_S, mixed_samples
+from patients import make_repository
 from rfm.engine import Execution
+from rfm.launch.installation import Installation, find_installation
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
 from rfm_client import (
@@ -32,7 +35,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.serving import ServerStatus
-from servers import RepositoryApi, Served, wait_for
+from servers import RepositoryApi, Served, start_triton, wait_for
 from tensors import infer
 from trajectories import random_trajectory
 
@@ -271,3 +274,33 @@ def test_a_model_that_is_loaded_again_counts_on(served_too: Served) -> None:
         asked.evaluate([sample])
         wait_for(shows(1))
         assert counted(scrape(served_too), before, TWICE) == {"progress scored": 3, "frames": 9}
+
+
+class Recorded(Installation):
+    """The wheel's Triton, which writes the exit status of each model process to ``file``."""
+
+    file: Path
+
+    def lay_out_backends(self, folder: Path) -> list[str]:
+        arguments = super().lay_out_backends(folder)
+        stub = folder / "python" / "triton_python_backend_stub"
+        program = stub.readlink()
+        stub.unlink()
+        tell = f"status=$?; test $# = 0 || echo $status >> {self.file}"  # Triton first tries it without arguments
+        stub.write_text(f'#!/bin/sh\n{program} "$@"\n{tell}\n')
+        stub.chmod(0o755)
+        return arguments
+
+
+@pytest.mark.slow
+def test_the_process_of_an_unloaded_model_does_not_crash(tmp_path: Path) -> None:
+    """The Python backend's metrics do not bear to be destroyed at the end."""
+    wheel, Recorded.file = find_installation(), tmp_path / "statuses"
+    program = Recorded(wheel.executable, wheel.environment, wheel.wheel)
+    with (
+        start_triton(make_repository(tmp_path), program) as server,
+        RepositoryApi(server.endpoints.grpc_url, server.admin_key) as api,
+    ):
+        api.unload("rfm")
+        wait_for(Recorded.file.exists)
+        assert Recorded.file.read_text() == "0\n"

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: MIT
+"""What the supervisor does about each fault, with a stand-in for Triton and real model processes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import httpx
+import pytest
+
+import stand_in_triton
+from commands import running
+from rfm.launch import model_processes, triton_server
+from rfm.launch.model_processes import LOADING_DEAD_S, UNKNOWN, ModelProcesses
+from rfm.launch.triton_server import TritonServer
+from rfm.supervise import probe, status, supervisor, watch
+from rfm.supervise.status import NO_REASON, Status, StatusServer
+from rfm.supervise.supervisor import MOST, STEADY_S, BackOff, CrashLoopError, Supervisor
+from servers import Endpoints, Serving, wait_for
+
+SILENT_S, HANG_S = 1.5, 1.5
+
+
+@pytest.fixture(autouse=True)
+def _in_a_hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, name, seconds in (
+        (supervisor, "POLL_S", 0.01),
+        (supervisor, "FIRST_PAUSE_S", 0.0),
+        (watch, "LOOK_S", 0.02),
+        (probe, "BROKEN_S", 0.1),
+        (triton_server, "POLL_S", 0.02),
+    ):
+        monkeypatch.setattr(module, name, seconds)
+
+
+@dataclass(frozen=True)
+class Supervised:
+    """A stand-in below a supervisor, which runs in a thread."""
+
+    server: TritonServer
+    serving: Serving
+    ended: Future[None]
+
+    @property
+    def repository(self) -> Path:
+        return self.server.repository
+
+    def file(self, name: str) -> Path:
+        """A file that changes what the stand-in does."""
+        return self.repository.parent / name
+
+    def signal(self, number: signal.Signals, model: str = "") -> None:
+        """Send a signal to Triton, or to a model's process."""
+        for pid in running(f"{self.repository}/{model}/", 2) if model else [self.server.pid]:
+            os.kill(pid, number)
+
+
+@contextmanager
+def supervised(folder: Path, *models: str) -> Iterator[Supervised]:
+    repository, program = stand_in_triton.repository(folder, *models), stand_in_triton.installation(folder)
+    server, status_port = TritonServer(repository, Endpoints.free(), program), Endpoints.free().http_port
+    watched = Supervisor(server, status_port=status_port, probe_s=0.05, hang_s=HANG_S, triton_silent_s=SILENT_S)  # type: ignore[arg-type]
+    handlers: list[Callable[..., None]] = []
+
+    def take(handler: Callable[..., None]) -> Any:
+        handlers.append(handler)
+        return nullcontext()
+
+    with pytest.MonkeyPatch.context() as patched, ThreadPoolExecutor(1) as thread:
+        patched.setattr(supervisor, "stop_signals_to", take)  # which only a main thread can take
+        ended = thread.submit(watched.run)
+        process: Any = SimpleNamespace(poll=lambda: ended.done() or None)
+        serving = Serving(process, server.endpoints, f"http://127.0.0.1:{status_port}", folder / "log")
+        try:
+            serving.wait_ready()
+            yield Supervised(server, serving, ended)
+        finally:
+            for handler in handlers:
+                handler(signal.SIGTERM, None)
+    if not isinstance(ended.exception(), CrashLoopError):
+        ended.result()
+
+
+Act = Callable[[Supervised], None]
+FAULTS: dict[str, tuple[Act, str, str]] = {
+    "a process dies": (lambda s: s.signal(signal.SIGKILL, "a"), "a", "a: a process of it is dead"),
+    "a process stops": (lambda s: s.signal(signal.SIGSTOP, "a"), "a", "a: a process of it is stopped"),
+    "triton dies": (lambda s: s.signal(signal.SIGKILL), "triton", "killed by SIGKILL"),
+    "requests fail": (lambda s: s.file("fails").touch(), "a", "a: it has failed at 3 probes in a row"),
+    "triton is silent": (lambda s: s.signal(signal.SIGSTOP), "triton", f"no answer for {SILENT_S:g} s"),
+    "requests hang": (lambda s: s.file("hangs").touch(), "a", f"a: it has answered nothing for {HANG_S:g} s"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_triton_is_started_again_after_each_fault(tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str) -> None:
+    act, what, why = FAULTS[name]
+    caplog.set_level("INFO")
+    with supervised(tmp_path, "a") as stage:
+        before = stage.server.pid
+        assert stage.serving.restarts(what) == 0
+        act(stage)
+        stage.serving.wait_ready(False)
+        for file in ("fails", "hangs"):
+            stage.file(file).unlink(missing_ok=True)
+        wait_for(lambda: stage.serving.restarts(what) == 1)
+        stage.serving.wait_ready()
+        assert stage.serving.reasons() == {"a": NO_REASON}
+        assert stage.server.pid != before
+    assert f"triton is started again: {why}" in caplog.messages
+    assert [message.startswith("ready again after ") for message in caplog.messages].count(True) == 1
+
+
+def test_a_model_that_works_on_long_requests_is_not_started_again(tmp_path: Path) -> None:
+    with supervised(tmp_path, "a") as stage:
+        stage.file("busy").touch()
+        stage.file("hangs").touch()
+        ends_s = time.monotonic() + 1.5 * HANG_S
+        wait_for(lambda: time.monotonic() > ends_s)
+        stage.file("hangs").unlink()
+        assert stage.serving.restarts("a", "triton") == 0
+
+
+def test_faults_in_a_row_end_the_supervisor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "MOST", 1)
+    with supervised(tmp_path, "a") as stage:
+        stage.signal(signal.SIGKILL)
+        wait_for(lambda: stage.serving.restarts("triton") == 1)
+        stage.serving.wait_ready()
+        stage.signal(signal.SIGKILL)
+        wanted = r"^triton: expected to run, got 2 faults in a row; the last: killed by SIGKILL$"
+        with pytest.raises(CrashLoopError, match=wanted):
+            stage.ended.result()
+
+
+def test_a_model_that_keeps_ending_is_left_out_until_it_is_loaded_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "MOST_OF_A_MODEL", 1)
+    with supervised(tmp_path, "a", "b") as stage:
+        serving = stage.serving
+        assert httpx.get(f"{serving.status_url}/live").status_code == 200
+        assert httpx.get(f"{serving.status_url}/other").status_code == 404
+        stage.file("deadly-b").touch()
+        wait_for(lambda: serving.reasons().get("b", "").startswith("it is left out"))
+        wait_for(serving.is_ready)
+        assert serving.reasons()["a"] == NO_REASON
+        assert httpx.get(f"{serving.status_url}/ready?strict").status_code == 503
+        assert serving.metric("rfm_serve_ready", model="b") == 0
+        stage.file("deadly-b").unlink()
+        away = (stage.repository / "b").rename(tmp_path / "b")
+        wait_for(lambda: serving.reasons() == {"a": NO_REASON})  # without the folder it is forgotten
+        shutil.copytree(away, stage.repository / "b")
+        httpx.post(f"{serving.endpoints.http_url}/v2/repository/models/b/load")
+        wait_for(lambda: serving.reasons() == {"a": NO_REASON, "b": NO_REASON})
+    told = "b is left out, since it had 2 of 2 faults in a row; the last: a process of it is dead"
+    assert told in caplog.messages
+
+
+class Stubs(ModelProcesses):
+    """Model processes in these states."""
+
+    def __init__(self) -> None:
+        super().__init__(0)
+        self.states: dict[int, tuple[str, str]] = {}  # model and state by process
+
+    def _states(self) -> dict[int, str]:
+        self._models = {pid: model for pid, (model, _) in self.states.items()}
+        return {pid: state for pid, (_, state) in self.states.items()}
+
+
+ALIVE, DEAD, STOPPED = ("a", "sleeping"), ("a", "zombie"), ("a", "stopped")
+NEVER = None
+PROCESSES: dict[str, tuple[list[tuple[str, str]], dict[str, int] | None, bool, float | None]] = {
+    # processes, wanted ones, does no model load, seconds until the fault counts
+    "dead": ([DEAD], {"a": 1}, True, 0),
+    "stopped": ([STOPPED], {"a": 1}, True, 0),
+    "one of two is dead": ([ALIVE, DEAD], {"a": 2}, True, 0),
+    "one of two is stopped": ([ALIVE, STOPPED], {"a": 2}, True, 0),
+    "replaced": ([DEAD, ALIVE], {"a": 1}, True, NEVER),
+    "replaced while another model loads": ([DEAD, ALIVE], {"a": 1}, False, NEVER),
+    "dead while another model loads": ([DEAD], {"a": 1}, False, LOADING_DEAD_S),
+    "dead while its model loads": ([ALIVE, DEAD], {}, False, LOADING_DEAD_S),
+    "dead in a start": ([DEAD], None, False, LOADING_DEAD_S),
+    "dead before it was seen": ([ALIVE, (UNKNOWN, "zombie")], {"a": 1}, True, 0),
+}
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_a_dead_process_counts_unless_it_was_replaced(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    processes, wanted, is_settled, counts_s = PROCESSES[name]
+    now_s = 0.0
+    monkeypatch.setattr(model_processes, "time", SimpleNamespace(monotonic=lambda: now_s))
+    stubs = Stubs()
+    stubs.states = dict(enumerate(processes))
+    for now_s in (0.0, 0.1, LOADING_DEAD_S - 0.1, LOADING_DEAD_S, 100.0):
+        found = stubs.fault(wanted, is_settled=is_settled)
+        assert (found is not None) == (counts_s is not None and now_s > 0 and now_s >= counts_s)
+    stubs.states = {9: ALIVE}
+    assert stubs.fault(wanted, is_settled=is_settled) is None
+
+
+def test_a_fault_of_a_load_counts_for_the_model_that_loads_and_is_part_of_no_crash_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "MOST", 1)
+    monkeypatch.setattr(model_processes, "LOADING_DEAD_S", 0.2)
+    with supervised(tmp_path, "a", "b") as stage:
+        for number in (1, 2):
+            stage.file("loading-b").touch()
+            wait_for(lambda: "b" in stage.serving.reasons())
+            stage.signal(signal.SIGKILL, "b")
+            wait_for(lambda number=number: stage.serving.restarts("b") == number)
+            stage.file("loading-b").unlink()
+            stage.serving.wait_ready()
+        assert stage.serving.restarts("a", "triton") == 0
+
+
+def test_a_crash_loop_is_many_faults_each_soon_after_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long run resets the count; failed starts do not, however long they take."""
+    now_s = 0.0
+    monkeypatch.undo()
+    monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic=lambda: now_s))
+
+    def run_for(duration_s: float) -> float:
+        nonlocal now_s
+        ends.started()
+        now_s += duration_s
+        ends.failed("triton")
+        return ends.pause_s("why")
+
+    ends = BackOff()
+    assert [ends.failed(cause) for cause in ("rfm", "triton", "rfm")] == [1, 1, 2]
+    assert ends.row == ["rfm", "triton", "rfm"]
+    ends = BackOff()
+    assert [run_for(1.0) for _ in range(MOST)] == [0, 0.5, 1, 2, 4]
+    assert run_for(STEADY_S) == 0
+    assert [run_for(1.0) for _ in range(MOST - 1)] == [0.5, 1, 2, 4]
+    wanted = r"^triton: expected to run, got 6 faults in a row; the last: why$"
+    with pytest.raises(CrashLoopError, match=wanted):
+        run_for(1.0)
+    ends = BackOff()
+    run_for(5 * STEADY_S)
+    for _ in range(MOST - 1):
+        now_s += 2 * STEADY_S
+        ends.failed("triton")
+        ends.pause_s("it does not start")
+    ends.failed("triton")
+    with pytest.raises(CrashLoopError, match="the last: it does not start"):
+        ends.pause_s("it does not start")
+
+
+def test_a_silent_connection_to_the_status_port_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(status._Handler, "timeout", 0.1)
+    port = Endpoints.free().http_port
+    with closing(StatusServer("127.0.0.1", port, Status())), socket.create_connection(("127.0.0.1", port)) as silent:
+        silent.send(b"G")
+        assert silent.recv(1) == b""
+        assert httpx.get(f"http://127.0.0.1:{port}/live").status_code == 200
+
+
+def told(about: Status) -> dict[str, Any]:
+    """Return the metrics of models by name and labels."""
+    lines = [line for line in about.metrics().decode().splitlines() if line.startswith("rfm_serve_")]
+    return {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines) if "ready" in name}
+
+
+def test_the_status_tells_nothing_of_what_there_was() -> None:
+    about = Status()
+    about.record({"a": NO_REASON, "b": NO_REASON, "a_frames": NO_REASON})
+    about.record({"a": NO_REASON, "a_frames": NO_REASON})
+    assert told(about) == {'rfm_serve_ready{model="a"}': 1, 'rfm_serve_ready{model="a_frames"}': 1}
+    about.record_down("restarted")
+    about.record({"a": "it is loading", "a_frames": NO_REASON})
+    assert told(about) == {
+        'rfm_serve_ready{model="a"}': 0,
+        'rfm_serve_ready{model="a_frames"}': 1,
+        'rfm_serve_not_ready{model="a",reason="it is loading"}': 1,
+    }
+    about.record_down("restarted")
+    assert about.ready[1]["models"]["a_frames"] == {"ready": False, "reason": "restarted"}
+
+
+def test_a_server_without_a_model_that_is_left_out_is_ready_and_names_it() -> None:
+    about = Status()
+    about.record({"a": NO_REASON, "b": "it is left out"}, left_out=["b"])
+    is_ready, body = about.ready
+    assert is_ready
+    assert body["models"]["b"] == {"ready": False, "reason": "it is left out"}
+    assert told(about)['rfm_serve_ready{model="b"}'] == 0
+    port = Endpoints.free().http_port
+    with closing(StatusServer("127.0.0.1", port, about)):
+        codes = [httpx.get(f"http://127.0.0.1:{port}/ready{query}").status_code for query in ("", "?strict")]
+    assert codes == [200, 503]
+    about.record({"a": "it is loading", "b": "it is left out"}, left_out=["b"])
+    assert not about.ready[0]
+    about.record({"b": "it is left out"}, left_out=["b"])
+    assert not about.ready[0]
