@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import re
 from collections.abc import Iterator
 
@@ -30,12 +29,12 @@ from gateway_requests import (
 )
 from gateways import Gateway, running
 from paths import ROOT
-from rfm_gateway.limited_log import PERIOD_S, LimitedLog
 from servers import Served
 from tolerances import TOLERANCE
 
 pytestmark = pytest.mark.triton
 
+QWEN3 = {"name": "model", "type": "Qwen3VLModel"}  # as a client of the original server looks for it
 PROBABILITY = goldens.config(CHECKPOINT).tolerances[1]
 
 
@@ -76,18 +75,11 @@ def test_a_recorded_request_gets_the_original_servers_numbers_and_those_of_the_p
 def test_the_reports_that_clients_read_have_their_keys(gateway: Gateway, request_: FieldRequest) -> None:
     status, _, body = request_.sent(gateway.url)
     assert status == 200, body
-    assert set(request_.expected["keys"]) <= json.loads(body).keys()
-
-
-def test_model_info_shows_a_client_that_it_asks_a_qwen3(gateway: Gateway) -> None:
-    (asking,) = (report for report in REPORTS if str(report) == "get.model_info")
-    status, _, body = asking.sent(gateway.url)
-    assert status == 200
-    architecture = json.loads(body)["model_architecture"]
-    assert architecture["model_module"] == "rfm.vlm.network"
-    assert {"name": "model", "type": "Qwen3VLModel"}.items() <= architecture["architecture_summary"][1].items(), (
-        architecture
-    )
+    answer = json.loads(body)
+    assert set(request_.expected["keys"]) <= answer.keys()
+    if "model_architecture" in answer:
+        assert answer["model_architecture"]["model_module"] == "rfm.vlm.network"
+        assert answer["model_architecture"]["architecture_summary"][1].items() >= QWEN3.items()
 
 
 NAMED = {str(request): request for request in EVALUATIONS}
@@ -140,20 +132,6 @@ def test_zeros_that_pad_a_clip_are_scored_with_a_warning_or_refused(gateway: Gat
     assert response.headers["X-RFM-Warning"] == warning
     refusal = re.escape(f"expected pictures that show something, got {told}")
     check_refused(ask_json(changed, [progress(padded)]), (["samples", 0, "trajectory", "frames"], refusal))
-
-
-def test_warnings_of_many_requests_are_one_line_in_ten_seconds(caplog: pytest.LogCaptureFixture) -> None:
-    now_s = 0.0
-    log = LimitedLog(logging.getLogger("rfm_gateway"), 1, "more requests had such samples", lambda: now_s)
-    with caplog.at_level(logging.WARNING, "rfm_gateway"):
-        for number in range(4):
-            log.write(f"black {number}".__str__)
-        now_s = PERIOD_S
-        log.write(lambda: "black 4")
-        now_s = 2 * PERIOD_S
-        log.write(lambda: "black 5")
-    lines = ["black 0", "3 more requests had such samples", "black 4", "black 5"]
-    assert [record.getMessage() for record in caplog.records] == lines
 
 
 def test_the_guide_names_each_project_whose_requests_are_sent_and_the_longest_that_it_waits() -> None:

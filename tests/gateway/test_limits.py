@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Limits of the gateway: bodies, waiting requests, callers."""
+"""Limits of bodies, connections, and evaluations at a time. A stand-in for Triton answers when a test lets it."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +19,22 @@ from gateway_requests import (
     FIRST,
     MULTIPART,
     NAMED,
+    NO_KEY,
     SECOND,
     TINY,
     TINY_CONFIG,
-    Triton,
     answered,
     ask_json,
     begun,
+    dumped,
     expected,
     failure,
     numbers,
-    paused,
     post_body,
     preference,
     progress,
 )
-from gateways import Gateway, metric_at, poll, running
+from gateways import Address, StandIn, inside, listening, metric_at, poll, running
 from rfm.config import ExportConfig
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
@@ -40,7 +43,25 @@ from rfm_gateway import GatewayConfig
 from rfm_gateway.state import STALL_S, TritonState
 from servers import start_triton
 
-pytestmark = pytest.mark.triton
+KEY = "open sesame"
+SCORED = {"outputs_progress": {"progress_pred": [[pytest.approx(0.1)] * 3]}}  # of FIRST, by the stand-in
+
+
+@pytest.fixture(scope="module")
+def triton() -> StandIn:
+    return StandIn(served=["rfm"])
+
+
+@pytest.fixture(scope="module")
+def strict(triton: StandIn) -> Iterator[Address]:
+    """Two evaluations at a time, none waits."""
+    with listening(triton, timeout_s=0.5, max_in_flight=2, max_waiting=0) as started:
+        yield started
+
+
+@pytest.fixture(autouse=True)
+def _open(triton: StandIn) -> None:
+    triton.is_open.set()
 
 
 HALVES = {
@@ -50,60 +71,102 @@ HALVES = {
 
 
 @pytest.mark.parametrize(("path", "half"), HALVES.items(), ids=HALVES)
-def test_a_body_that_does_not_come_is_a_408_and_lets_others_pass(strict: Gateway, path: str, half: Any) -> None:
+def test_a_body_that_does_not_come_is_a_408(strict: Address, path: str, half: Any) -> None:
     connection = begun(strict, *half, path=path)
-    assert answered(ask_json(strict, [progress(FIRST)]))
+    poll(lambda: strict.metric("requests_in_flight") == 1)
+    assert answered(ask_json(strict, [progress(FIRST)])).items() >= SCORED.items()
     response = connection.getresponse()
     assert (response.status, response.getheader("Connection")) == (408, "close")
     assert json.loads(response.read())["detail"] == "body: expected all of it in time, got a part"
     connection.close()
 
 
-def test_more_requests_than_allowed_are_a_503_and_health_is_not_one(triton: Triton, strict: Gateway) -> None:
-    with paused(triton):
-        connection = post_body(strict, progress(FIRST))
-        poll(lambda: strict.metric("requests_in_flight") == 1)
-        response = ask_json(strict, [progress(FIRST)])
-        assert failure(response, 503) == "expected at most 1 evaluations at a time, got more"
-        assert response.headers["Retry-After"] == "1"
-        assert "evaluations" not in failure(strict.get("/health"), 503)
-    assert connection.getresponse().status == 504
-    connection.close()
+def test_a_caller_who_leaves_in_the_middle_of_a_body_is_a_400(strict: Address) -> None:
+    for path, half in HALVES.items():
+        begun(strict, *half, path=path).close()
+        poll(lambda path=path: strict.metric("requests_total", endpoint=path, code="400") >= 1)  # type: ignore[misc]
+
+
+def test_more_evaluations_than_allowed_are_a_503_and_no_score_in_time_is_a_504(
+    triton: StandIn, strict: Address
+) -> None:
+    triton.is_open.clear()
+    callers = [post_body(strict, progress(FIRST)) for _ in range(2)]
+    poll(lambda: strict.metric("requests_in_flight") == 2)
+    response = ask_json(strict, [progress(FIRST)])
+    assert failure(response, 503) == "expected at most 2 evaluations at a time, got more"
+    assert response.headers["Retry-After"] == "1"
+    for caller in callers:
+        answer = caller.getresponse()
+        assert (answer.status, json.loads(answer.read())["detail"]) == (504, "Triton: no answer within 0.5 s")
+        caller.close()
     poll(lambda: strict.metric("requests_in_flight") == 0)
+    triton.is_open.set()
     assert answered(ask_json(strict, [progress(FIRST)]))
 
 
-def test_a_caller_who_leaves_is_no_failure_of_the_gateway(tiny: Gateway) -> None:
-    for path, half in HALVES.items():
-        begun(tiny, *half, path=path).close()
-        poll(lambda path=path: tiny.metric("requests_total", endpoint=path, code="400") >= 1)  # type: ignore[misc]
+def test_callers_who_wait_too_long_are_a_503_and_those_without_the_key_do_not_wait() -> None:
+    triton, sent = StandIn(served=["rfm"]), {"content": dumped(progress(FIRST)), "headers": {"X-API-Key": KEY}}
+    with inside(KEY, triton, timeout_s=1, max_in_flight=1) as client, ThreadPoolExecutor() as pool:
+        asked = [pool.submit(client.post, "/evaluate_batch", **sent) for _ in range(2)]
+        poll(lambda: "requests_waiting 1.0" in client.get("/metrics", headers=sent["headers"]).text)
+        assert failure(client.post("/evaluate_batch", content=b"[]"), 401) == NO_KEY
+        assert {each.result().status_code for each in asked} <= {503, 504}
 
 
-def test_three_hundred_callers_at_once_are_all_answered(triton: Triton, tiny: Gateway) -> None:
-    """Upstream's clients do not ask again: more than are scored at a time wait."""
-    answer = expected(tiny, [progress(FIRST)])
-    with paused(triton):
-        callers = [post_body(tiny, progress(FIRST)) for _ in range(300)]
-        poll(lambda: tiny.metric("requests_in_flight") + tiny.metric("requests_waiting") == 300)
-        assert tiny.metric("requests_waiting") == 300 - 256
-    for caller in callers:
-        response = caller.getresponse()
-        assert (response.status, json.loads(response.read())) == (200, numbers(answer))
-        caller.close()
+def test_more_callers_than_are_scored_at_a_time_are_all_answered() -> None:
+    """Upstream's clients do not ask again."""
+    triton = StandIn(served=["rfm"])
+    with listening(triton, max_in_flight=40) as gateway:
+        callers = [post_body(gateway, progress(FIRST)) for _ in range(60)]
+        poll(lambda: gateway.metric("requests_waiting") == 60 - 40)
+        assert gateway.metric("requests_in_flight") == 40
+        triton.is_open.set()
+        for caller in callers:
+            response = caller.getresponse()
+            assert response.status == 200
+            assert json.loads(response.read()).items() >= SCORED.items()
+            caller.close()
 
 
-def test_a_caller_who_waits_too_long_is_a_503(triton: Triton, tmp_path: Path) -> None:
-    with running(triton.endpoints, tmp_path, TINY, "--timeout", "1", "--max-in-flight", "1") as gateway:
-        answered(ask_json(gateway, [progress(FIRST)]))
-        with paused(triton):
-            first = post_body(gateway, progress(FIRST))
-            poll(lambda: gateway.metric("requests_in_flight") == 1)
-            second, third = (post_body(gateway, progress(FIRST)) for _ in range(2))
-            codes = []
-            for caller in (first, second, third):
-                codes.append(caller.getresponse().status)
-                caller.close()
-        assert set(codes) == {503, 504}
+POST = b"POST /evaluate_batch HTTP/1.1\r\nHost: localhost\r\n"
+CHUNKED = POST + b"Transfer-Encoding: chunked\r\n\r\n2\r\n[]\r\n"
+ENDLESS = {
+    "trailers": CHUNKED + b"0\r\n" + b"a: b\r\n" * 2**19,
+    "an extension of a chunk": CHUNKED + b"1;" + b"a" * 2**21,
+    "a header": POST + b"x: " + b"a" * 2**21,
+    "headers": POST + b"a: b\r\n" * 2**19,
+}
+
+
+@pytest.mark.parametrize("sent", ENDLESS.values(), ids=ENDLESS)
+def test_what_has_no_end_is_cut_off(strict: Address, sent: bytes) -> None:
+    with strict.dial() as peer, suppress(ConnectionError):
+        peer.sendall(sent)
+        while peer.recv(65536):
+            pass
+
+
+UPGRADES = {
+    "a JDK's or curl's HTTP/2": b"Connection: Upgrade, HTTP2-Settings\r\nUpgrade: h2c\r\nHTTP2-Settings: AAEAAEAA\r\n",
+    "a websocket": b"Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n",
+}
+
+
+@pytest.mark.parametrize("headers", UPGRADES.values(), ids=UPGRADES)
+def test_a_request_for_another_protocol_is_an_ordinary_request_with_its_body(strict: Address, headers: bytes) -> None:
+    body = dumped(progress(FIRST)).encode()
+    with strict.dial() as peer:
+        peer.sendall(POST + headers + b"Content-Length: %d\r\n\r\n" % len(body) + body)
+        head, _, answer = peer.recv(65536).partition(b"\r\n\r\n")
+        assert head.startswith(b"HTTP/1.1 200 ")
+        assert json.loads(answer or peer.recv(65536)).items() >= SCORED.items()
+
+
+def test_a_program_that_names_no_host_is_answered(strict: Address) -> None:
+    with strict.dial() as caller:
+        caller.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
+        assert caller.makefile("rb").readline().split()[1] == b"200"
 
 
 CLOSED_GATE = """
@@ -131,6 +194,7 @@ TritonPythonModel.load = load
 
 
 @pytest.mark.slow
+@pytest.mark.triton
 def test_while_a_model_works_health_is_told_and_callers_who_hang_up_cost_no_forward(
     tiny_network: RewindTransformer, tmp_path: Path
 ) -> None:
@@ -183,10 +247,3 @@ def test_while_a_model_works_health_is_told_and_callers_who_hang_up_cost_no_forw
         poll(lambda: scored("preference") == 2)
         assert scored("progress") == progress_before + 1
         assert gateway.metric("requests_in_flight") == 0
-
-
-def test_no_score_in_time_is_a_504(triton: Triton, strict: Gateway) -> None:
-    assert answered(ask_json(strict, [progress(FIRST)]))
-    with paused(triton):
-        assert failure(ask_json(strict, [progress(FIRST)]), 504) == "Triton: no answer within 1 s"
-    assert answered(ask_json(strict, [progress(FIRST)]))

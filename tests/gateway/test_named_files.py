@@ -28,15 +28,15 @@ from gateway_requests import (
     preference,
     progress,
 )
-from gateways import Gateway, running
+from gateways import Gateway, StandIn, TestClient, inside
 
-pytestmark = pytest.mark.triton
+WIDE = np.zeros((256, 1000), np.float32)
 FRAMES_AT, PATH_AT = ["samples", 0, "trajectory", "frames"], ["samples", 0, "trajectory", "embeddings_path"]
 
 
 @pytest.fixture(scope="module")
-def shelf(triton: Triton, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gateway, Path]]:
-    """A gateway that may read a folder."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that a gateway may read, with links to files outside."""
     outside = tmp_path_factory.mktemp("shelf")
     folder = outside / "allowed"
     (folder / "episode").mkdir(parents=True)
@@ -62,24 +62,38 @@ def shelf(triton: Triton, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         (folder / f"link_to_{name}").symlink_to(outside / name)
     (folder / "folder_outside").symlink_to(outside)
     (folder / "circle").symlink_to("circle")
-    with running(triton.endpoints, outside, ENCODERS, "--allow-folder", str(folder)) as started:
-        yield started, folder
+    Image.fromarray(np.zeros((512, 682, 3), np.uint8)).save(folder / "black.png")  # with the next two: a mebibyte each
+    np.save(folder / "plain.npy", WIDE)
+    np.savez_compressed(folder / "packed.npz", video_embeddings=WIDE, text_embedding=WIDE[0])
+    return folder
 
 
-def test_images_and_arrays_in_the_allowed_folder_are_read(shelf: tuple[Gateway, Path]) -> None:
-    gateway, folder = shelf
-    frames = filmed(1, 3)["frames"]
+@pytest.fixture(scope="module")
+def gateway(folder: Path) -> Iterator[TestClient]:
+    triton = StandIn(dims=ENCODER_DIMS)
+    triton.is_open.set()
+    with inside(triton=triton, allow_folder=folder, max_body_mib=1) as client:
+        yield client
+
+
+@pytest.mark.triton
+def test_images_and_arrays_in_the_allowed_folder_are_read(triton: Triton, encoders: Gateway, folder: Path) -> None:
+    frames, given = filmed(1, 3)["frames"], embedded(1, 3, ENCODER_DIMS)
     names = ["link.png", "episode/1.png", str(folder / "episode" / "2.png")]
-    assert answered(ask_json(gateway, [of_frames(names)])) == expected(gateway, [of_frames(frames)])
-    # as EXIF data turn them
-    assert answered(ask_json(gateway, [of_frames(["turned.png"] * 2)])) == expected(
-        gateway, [of_frames(np.rot90(frames[[0, 0]], -1, axes=(1, 2)))]
-    )
-    given = embedded(1, 3, ENCODER_DIMS)
+    turned = np.rot90(frames[[0, 0]], -1, axes=(1, 2))  # as EXIF data say
     whole = progress({"embeddings_path": "episode.npz"})
     parts = progress({"embeddings_path": "episode.npy", "text_embedding": given["text_embedding"]})
-    answer = answered(ask_json(gateway, [whole, preference(parts["trajectory"], whole["trajectory"])]))
-    assert answer == expected(gateway, [progress(given), preference(given, given)])
+    asked = {
+        "images": ([of_frames(names)], [of_frames(frames)]),
+        "turned": ([of_frames(["turned.png"] * 2)], [of_frames(turned)]),
+        "embeddings": (
+            [whole, preference(parts["trajectory"], whole["trajectory"])],
+            [progress(given), preference(given, given)],
+        ),
+    }
+    with inside(triton=triton.endpoints.grpc_url, model=ENCODERS, allow_folder=folder) as client:
+        for samples, same in asked.values():
+            assert answered(ask_json(client, samples)) == expected(encoders, same)
 
 
 OUTSIDE = ["../outside.png", "episode/../../outside.png", "/etc/passwd", "link_to_outside.png"]
@@ -96,43 +110,31 @@ BAD_FILES = [
 
 
 @pytest.mark.parametrize(("name", "wanted"), BAD_IMAGES, ids=[repr(name)[:30] for name, _ in BAD_IMAGES])
-def test_no_other_image_is_opened(shelf: tuple[Gateway, Path], name: str, wanted: str) -> None:
-    response = ask_json(shelf[0], [of_frames(["episode/0.png", name])])
+def test_no_other_image_is_opened(gateway: TestClient, name: str, wanted: str) -> None:
+    response = ask_json(gateway, [of_frames(["episode/0.png", name])])
     check_refused(response, ([*FRAMES_AT, 1], re.escape(f"expected {wanted}, got {name}")))
 
 
 @pytest.mark.parametrize(("name", "wanted"), BAD_FILES, ids=[name for name, _ in BAD_FILES])
-def test_no_other_array_is_opened(shelf: tuple[Gateway, Path], name: str, wanted: str) -> None:
-    response = ask_json(shelf[0], [progress({"embeddings_path": name, "task": "lift"})])
+def test_no_other_array_is_opened(gateway: TestClient, name: str, wanted: str) -> None:
+    response = ask_json(gateway, [progress({"embeddings_path": name, "task": "lift"})])
     check_refused(response, (PATH_AT, re.escape(f"expected {wanted}, got {name}")))
 
 
-def test_files_that_do_not_fit_are_refused(shelf: tuple[Gateway, Path]) -> None:
-    response = ask_json(shelf[0], [of_frames(["episode/0.png", "larger.png"])])
+def test_files_that_do_not_fit_are_refused(gateway: TestClient) -> None:
+    response = ask_json(gateway, [of_frames(["episode/0.png", "larger.png"])])
     check_refused(response, (FRAMES_AT, "expected images of one size, got different ones"))
-    response = ask_json(shelf[0], [progress({"embeddings_path": "frames.npy", "task": "lift"})])
+    response = ask_json(gateway, [progress({"embeddings_path": "frames.npy", "task": "lift"})])
     check_refused(response, (PATH_AT, "expected a file of embeddings, got frames"))
 
 
-def test_files_are_refused_before_they_fill_the_memory(triton: Triton, tmp_path: Path) -> None:
-    """Images and embeddings of a mebibyte, some with small views. The cache has room for two."""
-    folder = tmp_path / "shelf"
-    folder.mkdir()
-    Image.fromarray(np.zeros((512, 682, 3), np.uint8)).save(folder / "black.png")
-    embeddings = np.zeros((256, 1000), np.float32)
-    np.save(folder / "plain.npy", embeddings)
-    np.savez_compressed(folder / "packed.npz", video_embeddings=embeddings, text_embedding=embeddings[0])
+def test_files_are_refused_before_they_fill_the_memory(gateway: TestClient) -> None:
+    """There is room for two mebibytes."""
     message = "body: expected files of at most 2097152 bytes in one request, when they are decoded, got more; "
     image = of_frames(["black.png"])
     plain, packed = (progress({"embeddings_path": name, "task": "lift"}) for name in ("plain.npy", "packed.npz"))
-    with running(triton.endpoints, tmp_path, ENCODERS, "--allow-folder", str(folder), "--max-body-mib", "1") as gateway:
-        answered(ask_json(gateway, [image, image]))
-        assert ask_json(gateway, [plain, packed]).status_code == 422  # the widths are others
-        for too_many in (
-            [of_frames(["black.png"] * 3)],
-            [image] * 3,
-            [plain] * 3,
-            [packed] * 3,
-            [image, plain, packed],
-        ):
-            assert failure(ask_json(gateway, too_many), 413).startswith(message)
+    answered(ask_json(gateway, [image, image]))
+    assert ask_json(gateway, [plain, packed]).status_code == 422  # the widths are others
+    too_many = [of_frames(["black.png"] * 3)], [image] * 3, [plain] * 3, [packed] * 3, [image, plain, packed]
+    for samples in too_many:
+        assert failure(ask_json(gateway, samples), 413).startswith(message)

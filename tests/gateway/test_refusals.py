@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Refusals of the gateway name the field."""
+"""Requests that are refused, with the field at fault. A stand-in for Triton describes the models."""
 
 from __future__ import annotations
 
+import gzip
+import json
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,8 @@ from gateway_requests import (
     BLACK,
     ENCODER_DIMS,
     FIRST,
+    MULTIPART,
+    NAMED,
     SECOND,
     Ask,
     Json,
@@ -19,16 +24,165 @@ from gateway_requests import (
     ask_json,
     ask_npy,
     check_refused,
+    dumped,
     embedded,
     failure,
     filmed,
+    npy,
+    npy_of,
     of_frames,
     preference,
     progress,
 )
-from gateways import Gateway
+from gateways import StandIn, TestClient, inside
 
-pytestmark = pytest.mark.triton
+NPY = "/evaluate_batch_npy"
+SAMPLE = dumped(progress(FIRST))
+
+
+@pytest.fixture(scope="module")
+def gateway() -> Iterator[TestClient]:
+    """A gateway before models of the widths ENCODER_DIMS."""
+    with inside(triton=StandIn(dims=ENCODER_DIMS), max_body_mib=1, timeout_s=10) as client:
+        yield client
+
+
+NO_SAMPLE, NO_STEPS = "expected at least one sample, got none", "expected true or false, got "
+BODIES: dict[str, tuple[bytes, list[Any], str]] = {
+    "half an object": (b'{"samples": [', [], "expected JSON, got: .*"),
+    "no UTF-8": (b'["\xff"]', [], "expected JSON, got: .*"),
+    "ten thousand brackets": (b"[" * 10_000, [], "expected JSON, got: recursion limit .*"),
+    "an empty list": (b"[]", ["samples"], NO_SAMPLE),
+    "an empty object": (b"{}", ["samples"], NO_SAMPLE),
+    "a number": (b"5", [], "expected a list of samples, got int"),
+    "samples as an object": (b'{"samples": {}}', ["samples"], "expected a list of samples, got dict"),
+    "too many": (b"[%b5]" % (b"5," * 10_000), ["samples"], "expected at most 10000 samples, got 10001"),
+    "very many errors": (b"[%b5]" % (b"5," * 2000), [], "expected no faulty fields, got 2001"),
+    "a list of numbers": (b"[5]", [0], "expected an object, got 5"),
+    "a sample without a type": (b'{"sample_type": null}', ["sample_type"], "expected progress, .*, got None"),
+    "a list by another name": (b'{"batch": [5]}', ["batch", 0], "expected an object, got 5"),
+    "an object of samples": (b'{"a": %b, "b": 6}' % SAMPLE.encode(), ["b"], "expected an object, got 6"),
+    "no steps": (b'{"samples": [5], "use_frame_steps": 2}', ["use_frame_steps"], f"{NO_STEPS}2"),
+}
+
+
+@pytest.mark.parametrize(("body", "path", "message"), BODIES.values(), ids=BODIES)
+def test_a_body_without_samples(gateway: TestClient, body: bytes, path: list[Any], message: str) -> None:
+    check_refused(gateway.post("/evaluate_batch", content=body), (path, message))
+
+
+VIDEO_AT = ["sample_0", "trajectory", "video_embeddings"]
+HUGE = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000, 2)}"
+NO_NPY = r"expected a \.npy file, got: .*"
+FILES = {
+    "truncated": (npy(np.ones((3, 2)))[:-4], NO_NPY),
+    "too long": (npy(np.ones((3, 2))) + b"1", r"expected a \.npy file of 48 bytes behind its header, got more"),
+    "a shape of petabytes": (npy_of(HUGE), NO_NPY),
+    "pickled": (npy(np.array([[1, {}]], object), pickled=True), NO_NPY),
+    "text": (npy(np.array([["a", "b"]])), r"expected a \.npy file of numbers, got <U1"),
+    "complex": (npy(np.ones((3, 2), complex)), r"expected a \.npy file of numbers, got complex128"),
+    "no .npy file": (b"hello world", NO_NPY),
+    "an unbalanced header": (npy_of("{'descr': '<f4', ("), NO_NPY),
+    "a type of nothing": (npy_of(HUGE.replace("'<f4'", "()")), NO_NPY),
+    "an endless header": (npy_of("-" * 20_000), NO_NPY),
+}
+
+
+@pytest.mark.parametrize(("file", "message"), FILES.values(), ids=FILES)
+def test_a_bad_npy_file(gateway: TestClient, file: bytes, message: str) -> None:
+    form = {"sample_0": json.dumps(progress({"video_embeddings": {"__numpy_file__": "video"}}))}
+    check_refused(gateway.post(NPY, data=form, files={"video": ("video.npy", file)}), (VIDEO_AT, message))
+
+
+ZERO = ("sample_0", (None, SAMPLE))
+MISSING = dumped(progress({**FIRST, "video_embeddings": {"__numpy_file__": "other"}}))
+TWICE, NO_FILE = "expected one part of this name, got several", "expected a form field, got a file"
+FORMS: dict[str, tuple[list[tuple[str, Any]], list[Any], str]] = {
+    "no sample": ([("use_frame_steps", (None, "true"))], ["samples"], NO_SAMPLE),
+    "a gap": ([ZERO, ("sample_2", ZERO[1])], ["sample_1"], "expected a sample, got none, but sample_2"),
+    "another spelling": ([("sample_01", ZERO[1])], ["sample_01"], "expected sample_0, sample_1 and so on, got .*"),
+    "other steps": ([ZERO, ("use_frame_steps", (None, "yes"))], ["use_frame_steps"], f"{NO_STEPS}'yes'"),
+    "no JSON": ([("sample_0", (None, "{"))], ["sample_0"], "expected JSON, got: .*"),
+    "JSON in JSON": ([("sample_0", (None, '"{}"'))], ["sample_0"], "expected an object, got '{}'"),
+    "no part": ([("sample_0", (None, MISSING))], VIDEO_AT, r"expected a \.npy part named 'other', got none"),
+    "one field twice": ([ZERO] * 2, ["sample_0"], TWICE),
+    "one file twice": ([ZERO, *[("a", ("a.npy", b""))] * 2], ["a"], TWICE),
+    "a sample as a file": ([("sample_0", ("sample_0", b"{}"))], ["sample_0"], NO_FILE),
+    "steps as a file": ([ZERO, ("use_frame_steps", ("steps", b"true"))], ["use_frame_steps"], NO_FILE),
+}
+
+
+@pytest.mark.parametrize(("parts", "path", "message"), FORMS.values(), ids=FORMS)
+def test_a_form_whose_parts_are_not_all_read(
+    gateway: TestClient, parts: list[tuple[str, Any]], path: list[Any], message: str
+) -> None:
+    check_refused(gateway.post(NPY, files=parts), (path, message))
+
+
+NAMELESS = b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n"
+NO_FORM = "content-type: expected multipart/form-data with a boundary, got"
+NO_PARTS, NO_END = "body: expected multipart/form-data, got: ", "body: expected its last boundary"
+NO_CHARSET = "content-type: expected the charset utf-8, got "
+WHOLE = NAMED + SAMPLE.encode() + b"\r\n"
+UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
+    "JSON": (415, f"{NO_FORM} application/json", "application/json", b"[]"),
+    "no content type": (415, f"{NO_FORM} none", "", b"[]"),
+    "no boundary": (415, f"{NO_FORM} multipart/form-data", "multipart/form-data", NAMED),
+    "no multipart": (400, NO_PARTS, MULTIPART, b"hello"),
+    "no name": (400, NO_PARTS, MULTIPART, NAMELESS),
+    **{
+        f"charset {name}": (415, f"{NO_CHARSET}'{name}'", f"{MULTIPART}; charset={name}", WHOLE + b"--b--\r\n")
+        for name in ("undefined", "unicode_escape", "idna", "rot13", "latin-1")
+    },
+    "nothing": (400, NO_END, MULTIPART, b""),
+    "cut off": (400, NO_END, MULTIPART, WHOLE + NAMED + b"{"),
+    "cut off in a boundary": (400, NO_END, MULTIPART, WHOLE + b"--"),
+}
+
+
+@pytest.mark.parametrize(("code", "message", "content_type", "body"), UNREADABLE.values(), ids=UNREADABLE)
+def test_a_body_that_is_no_multipart(
+    gateway: TestClient, code: int, message: str, content_type: str, body: bytes
+) -> None:
+    assert failure(gateway.post(NPY, content=body, headers={"Content-Type": content_type}), code).startswith(message)
+
+
+@pytest.mark.parametrize("path", ["/evaluate_batch", NPY, "/viewer/score"])
+@pytest.mark.parametrize("content", [b" " * (2**20 + 1), [b" " * 2**19] * 3], ids=["announced", "in chunks"])
+def test_too_large_a_body_is_a_413(gateway: TestClient, path: str, content: Any) -> None:
+    body = content if isinstance(content, bytes) else iter(content if path == "/evaluate_batch" else [NAMED, *content])
+    response = gateway.post(path, content=body, headers={"Content-Type": MULTIPART})
+    remedy = "send less in one request, or start the gateway with --max-body-mib (rfm serve: --gateway-max-body-mib)"
+    assert failure(response, 413) == f"body: expected at most 1048576 bytes, got more; {remedy}"
+
+
+def test_too_many_parts_are_a_413(gateway: TestClient) -> None:
+    files = [("sample_0", (None, "{")), *((f"array_{number}", (f"{number}.npy", b"")) for number in range(2000))]
+    expected = "body: expected at most 2000 parts, fields and files together, got more"
+    assert failure(gateway.post(NPY, files=files), 413) == f"{expected}; send the samples in several requests"
+    assert gateway.post(NPY, files=files[:-1]).status_code == 422
+
+
+def test_json_is_smaller_than_other_bodies() -> None:
+    with inside() as client:
+        response = client.post("/evaluate_batch", content=b" " * (32 * 2**20 + 1))
+        remedy = "send arrays as .npy files, to /evaluate_batch_npy"
+        assert failure(response, 413) == f"body: expected at most 33554432 bytes, got more; {remedy}"
+
+
+@pytest.mark.parametrize("path", ["/evaluate_batch", NPY])
+def test_a_compressed_body_is_a_415(gateway: TestClient, path: str) -> None:
+    headers = {"Content-Type": MULTIPART, "Content-Encoding": "gzip"}
+    response = gateway.post(path, content=gzip.compress(SAMPLE.encode()), headers=headers)
+    expected = "content-encoding: expected none, since the gateway unpacks no body, got 'gzip'; send the body as it is"
+    assert failure(response, 415) == expected
+
+
+def test_unknown_paths_and_methods_are_answered_in_json(gateway: TestClient) -> None:
+    assert failure(gateway.post("/evaluate"), 404) == "Not Found"
+    assert failure(gateway.get("/evaluate_batch"), 405) == "Method Not Allowed"
+
+
 ROW = [1.0] * ENCODER_DIMS[0]
 GOOD = progress(embedded(1, 2, ENCODER_DIMS))
 
@@ -86,6 +240,7 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
     },
 }
 TWO_WIDE = preference(embedded(1, 2, ENCODER_DIMS), embedded(1, 2, (7, 32)))
+SLIVER, TOO_LONG = np.ones((1, 2, 200, 3), int), "expected frames at most 50 times as long .*"
 BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
     f"{field}, {name}": (
         of_frames(value) if field == "frames" else but(**{field: value}),
@@ -98,21 +253,6 @@ BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
     "no text, blank task": (but(text_embedding=None, task=" "), "trajectory text_embedding", NO_TEXT),
     "a task that is a number": (but(task=5), "trajectory task", "expected text, got 5"),
     "no task": (of_frames(BLACK, task=None), "trajectory task", "expected a task sentence with frames, got ''"),
-    "too many frames": (
-        but(video_embeddings=np.ones((17, 48))),
-        "trajectory video_embeddings",
-        "expected at most 16 .*, got 17; send fewer frames, such as some at equal distances, or use_frame_steps",
-    ),
-    "a sliver": (
-        of_frames(np.ones((1, 2, 200, 3), int)),
-        "trajectory frames",
-        "expected frames at most 50 times as long .*",
-    ),
-    "a sliver in a pair": (
-        preference(filmed(1, 2), {**filmed(1, 2), "frames": np.ones((1, 2, 200, 3), int)}),
-        "",
-        "expected frames at most 50 times as long .*",
-    ),
     "names of images": (of_frames(["0.png", "1.png"]), "trajectory frames 0", NO_FILES),
     "the name of a file": (progress({"embeddings_path": "a.npz"}), "trajectory embeddings_path", NO_FILES),
     "no trajectory": ({"sample_type": "progress"}, "trajectory", "expected a value, got none"),
@@ -131,42 +271,61 @@ BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
 
 
 @pytest.mark.parametrize(("sample", "path", "message"), BAD_SAMPLES.values(), ids=BAD_SAMPLES)
-def test_a_bad_sample_is_refused_at_its_field(encoders: Gateway, sample: Any, path: str, message: str) -> None:
+def test_a_bad_sample(gateway: TestClient, sample: Any, path: str, message: str) -> None:
     at = [int(part) if part.isdecimal() else part for part in path.split()]
-    check_refused(ask_json(encoders, [GOOD, sample, GOOD]), (["samples", 1, *at], message))
+    check_refused(ask_json(gateway, [GOOD, sample, GOOD]), (["samples", 1, *at], message))
 
 
-def test_all_bad_samples_are_told_at_once(encoders: Gateway, ask: Ask) -> None:
+def test_all_bad_samples_are_named_at_once(gateway: TestClient, ask: Ask) -> None:
     sent = as_parts if ask is ask_npy else list
-    response = ask(encoders, [but(video_embeddings=np.ones((3, 7))), GOOD, TWO_WIDE])
+    response = ask(gateway, [but(video_embeddings=np.ones((3, 7))), GOOD, TWO_WIDE])
     first = sent(["samples", 0, "trajectory", "video_embeddings"])
     second = sent(["samples", 2, "rejected_trajectory", "video_embeddings"])
     check_refused(response, (first, r".*\[3, 7\]"), (second, r".*\[2, 7\]"))
-    task = but(text_embedding=None, task="lift " * 200)
-    response = ask(encoders, [task, but(text_embedding=None), task])
-    at = [sent(["samples", index, "trajectory", "task"]) for index in (0, 2)]
-    check_refused(response, *((path, r"expected at most \d+ tokens.*, got .*") for path in at))
 
 
 NO_FRAMES = "expected embeddings, since no model for raw frames is served, got frames"
 NO_EMBEDDINGS = "expected frames, since no model for embeddings is served, got embeddings"
 NO_ENCODER = "expected an embedding, or a task to encode, got a task, and no encoder is served"
-NO_TOKEN = r"expected text without the model's special tokens, got '<\|prog_token\|>'"
 OF_MODEL: dict[str, tuple[str, Json, str, str]] = {
-    "no frames": ("tiny", progress(filmed(1, 2)), "trajectory frames", NO_FRAMES),
-    "no task": ("tiny", progress({**FIRST, "text_embedding": None}), "trajectory text_embedding", NO_ENCODER),
-    "no embeddings": ("video", progress(FIRST), "trajectory video_embeddings", NO_EMBEDDINGS),
-    "no special token": ("video", progress(filmed(1, 2, task="lift <|prog_token|>")), "trajectory task", NO_TOKEN),
+    "no frames": ("rfm", progress(filmed(1, 2)), "frames", NO_FRAMES),
+    "no task": ("rfm", progress({**FIRST, "text_embedding": None}), "text_embedding", NO_ENCODER),
+    "no embeddings": ("rfm_frames", progress(FIRST), "video_embeddings", NO_EMBEDDINGS),
 }
 
 
-@pytest.mark.parametrize(("model", "sample", "path", "message"), OF_MODEL.values(), ids=OF_MODEL)
-def test_what_the_served_model_does_not_read_is_said(
-    request: pytest.FixtureRequest, model: str, sample: Json, path: str, message: str
+@pytest.mark.parametrize(("only", "sample", "field", "message"), OF_MODEL.values(), ids=OF_MODEL)
+def test_a_sample_that_the_served_model_does_not_read(only: str, sample: Json, field: str, message: str) -> None:
+    with inside(triton=StandIn(served=[only])) as client:
+        check_refused(ask_json(client, [sample]), (["samples", 0, "trajectory", field], message))
+
+
+NO_TOKEN = r"expected text without the model's special tokens, got '<\|prog_token\|>'"
+LONG = but(text_embedding=None, task="lift " * 200)
+LARGE = progress({**FIRST, "video_embeddings": np.full((3, 2), 3e38, np.float32)})
+MORE_FRAMES = "expected at most 16 .*, got 17; send fewer frames, such as some at equal distances, or use_frame_steps"
+SLIVER, TOO_LONG = np.ones((1, 2, 200, 3), int), "expected frames at most 50 times as long .*"
+BY_TRITON: dict[str, tuple[str, Json, str, str]] = {
+    "too many frames": (
+        "encoders",
+        but(video_embeddings=np.ones((17, 48))),
+        "trajectory video_embeddings",
+        MORE_FRAMES,
+    ),
+    "too many tokens": ("encoders", LONG, "trajectory task", r"expected at most \d+ tokens.*, got .*"),
+    "a sliver": ("encoders", of_frames(SLIVER), "trajectory frames", TOO_LONG),
+    "a sliver in a pair": ("encoders", preference(filmed(1, 2), filmed(1, 2, frames=SLIVER)), "", TOO_LONG),
+    "a special token": ("video", progress(filmed(1, 2, task="lift <|prog_token|>")), "trajectory task", NO_TOKEN),
+    "an overflow": ("tiny", LARGE, "trajectory video_embeddings", r"expected values from -1e\+06 to 1e\+06, got .*"),
+}
+
+
+@pytest.mark.triton
+@pytest.mark.parametrize(("model", "sample", "path", "message"), BY_TRITON.values(), ids=BY_TRITON)
+def test_a_sample_that_triton_refuses(
+    request: pytest.FixtureRequest, ask: Ask, model: str, sample: Json, path: str, message: str
 ) -> None:
-    check_refused(ask_json(request.getfixturevalue(model), [sample]), (["samples", 0, *path.split()], message))
-
-
-def test_embeddings_with_which_the_network_would_overflow_are_refused(tiny: Gateway) -> None:
-    too_large = progress({**FIRST, "video_embeddings": np.full((3, 2), 3e38, np.float32)})
-    assert "expected values from -1e+06 to 1e+06" in failure(ask_json(tiny, [progress(FIRST), too_large]), 422)
+    at: list[Any] = ["samples", 0, *path.split()]
+    again = ["samples", 1, *path.split()]
+    expected = [(as_parts(each) if ask is ask_npy else each, message) for each in (at, again)]
+    check_refused(ask(request.getfixturevalue(model), [sample, sample]), *expected)

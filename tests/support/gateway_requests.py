@@ -22,7 +22,7 @@ import requests
 from gateway_fixtures import ENCODERS as ENCODERS
 from gateway_fixtures import TINY as TINY
 from gateway_fixtures import VLM as VLM
-from gateways import Gateway
+from gateways import Address, Gateway, TestClient
 from proxies import Proxy
 from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from servers import Endpoints
@@ -86,17 +86,21 @@ def npy(array: Array, *, pickled: bool = False) -> bytes:
     return file.getvalue()
 
 
-def ask_json(gateway: Gateway, samples: Any, **fields: Any) -> requests.Response:
+def ask_json(gateway: Address | TestClient, samples: Any, **fields: Any) -> requests.Response:
     return post_json(gateway, {"samples": samples, **fields})
 
 
-def post_json(gateway: Gateway, document: Any) -> requests.Response:
+def post_json(gateway: Address | TestClient, document: Any) -> Any:
+    if isinstance(gateway, TestClient):
+        return gateway.post("/evaluate_batch", content=dumped(document))
     return requests.post(f"{gateway.url}/evaluate_batch", dumped(document))
 
 
-def ask_npy(gateway: Gateway, samples: Sequence[Json], **fields: Any) -> requests.Response:
+def ask_npy(gateway: Address | TestClient, samples: Sequence[Json], **fields: Any) -> Any:
     """Send every array as a part, as the evaluation server's documentation says."""
     files, form = multipart(samples, **fields)
+    if isinstance(gateway, TestClient):
+        return gateway.post("/evaluate_batch_npy", files=files, data=form)
     return requests.post(f"{gateway.url}/evaluate_batch_npy", files=files, data=form)
 
 
@@ -230,7 +234,7 @@ MULTIPART = "multipart/form-data; boundary=b"
 NAMED = b'--b\r\nContent-Disposition: form-data; name="sample_0"\r\n\r\n'
 
 
-def begun(gateway: Gateway, headers: Mapping[str, str], *parts: bytes, path: str = "/evaluate_batch") -> Any:
+def begun(gateway: Address, headers: Mapping[str, str], *parts: bytes, path: str = "/evaluate_batch") -> Any:
     """Open a connection and send the beginning of a request."""
     connection = gateway.connect()
     connection.putrequest("POST", path)
@@ -243,7 +247,7 @@ def begun(gateway: Gateway, headers: Mapping[str, str], *parts: bytes, path: str
 
 
 def post_body(
-    gateway: Gateway, sample: Json, headers: Mapping[str, str] = MappingProxyType({})
+    gateway: Address, sample: Json, headers: Mapping[str, str] = MappingProxyType({})
 ) -> http.client.HTTPConnection:
     """A connection on which a whole request has been sent."""
     body = dumped([sample]).encode()

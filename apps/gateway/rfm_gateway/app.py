@@ -9,14 +9,18 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from fastapi import APIRouter, Depends, FastAPI, Request, Response
+from fastapi.encoders import jsonable_encoder
+from fastapi.exceptions import RequestValidationError
 from fastapi.middleware.cors import CORSMiddleware
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import JSONResponse
 from pydantic.json_schema import models_json_schema
+from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from rfm_client import (
     AccessDeniedError,
+    AsyncRewardClient,
     DeadlineExceededError,
     InferenceFailedError,
     ModelNotFoundError,
@@ -24,7 +28,7 @@ from rfm_client import (
     ServerUnavailableError,
 )
 from rfm_gateway import pages, schema
-from rfm_gateway.admission import RETRY_AFTER
+from rfm_gateway.admission import RETRY_AFTER, Places
 from rfm_gateway.blank_frames import WARNING_HEADER
 from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
 from rfm_gateway.config import MIB, GatewayConfig
@@ -39,7 +43,7 @@ from rfm_gateway.observe import (
     RequestMiddleware,
     while_connected,
 )
-from rfm_gateway.refusals import RefusalLog, asked
+from rfm_gateway.refusals import Refusals, asked
 from rfm_gateway.scoring import Evaluator
 from rfm_gateway.state import TritonState, told
 
@@ -56,18 +60,25 @@ _STATUS_OF = {  # HTTP status, by the client's error
 logger = logging.getLogger("rfm_gateway")
 
 
-def create_app(config: GatewayConfig, api_key: str | None = None, started_by: str = "rfm-client gateway") -> FastAPI:
+def create_app(
+    config: GatewayConfig,
+    api_key: str | None = None,
+    started_by: str = "rfm-client gateway",
+    *,
+    client: AsyncRewardClient | None = None,
+) -> FastAPI:
     """Return the application.
 
     api_key: key that requests must show, except for health and documentation; None: no key
     started_by: the command that a person repeats to start this gateway again
+    client: of Triton; None: as ``config`` says
 
     Raises OSError for a missing folder, ValueError for a malformed URL or an unusable file.
     """
     folder = config.resolved_folder
-    client, metrics = config.client(), GatewayMetrics()
+    client, metrics = client or config.client(), GatewayMetrics()
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
-    state = TritonState(client, config)
+    state, refusals = TritonState(client, config), Refusals()
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -76,11 +87,16 @@ def create_app(config: GatewayConfig, api_key: str | None = None, started_by: st
 
     title, summary = "RFM evaluation gateway", "Rewards for robot trajectories."
     app = FastAPI(
-        title=title, summary=summary, lifespan=lifespan, docs_url=None, redoc_url=None, exception_handlers=_handlers()
+        title=title,
+        summary=summary,
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        exception_handlers=_handlers(refusals),
     )
-    app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # the innermost
-    app.add_middleware(RefusalLog)
-    app.add_middleware(RequestMiddleware, metrics=metrics, config=config)
+    has_key = api_key is not None
+    app.add_middleware(ForeignPageMiddleware, config=config, refusals=refusals, has_key=has_key)  # the innermost
+    app.add_middleware(RequestMiddleware, metrics=metrics)
     if config.cors_origin:
         app.add_middleware(
             CORSMiddleware,
@@ -94,7 +110,8 @@ def create_app(config: GatewayConfig, api_key: str | None = None, started_by: st
     evaluator = Evaluator(
         client, limits, folder, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
     )
-    _add_evaluations(guarded, limits, evaluator, metrics)
+    place = Depends(Places(config, metrics).taken)
+    _add_evaluations(guarded, limits, evaluator, metrics, place)
     _add_reports(guarded, state, metrics)
     app.include_router(guarded)
 
@@ -106,12 +123,14 @@ def create_app(config: GatewayConfig, api_key: str | None = None, started_by: st
     pages.add_docs(app)
     add_page = page_of(config)
     if add_page is not None:
-        add_page(PageHost(app, guards, config, limits, metrics, started_by))
+        add_page(PageHost(app, guards, place, config, limits, metrics, started_by))
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
     return app
 
 
-def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator, metrics: GatewayMetrics) -> None:
+def _add_evaluations(
+    router: APIRouter, limits: BodyLimits, evaluator: Evaluator, metrics: GatewayMetrics, place: Any
+) -> None:
     async def answer(request: Request, reading: Awaitable[Batch]) -> Response:
         batch = await reading
         found, warning = await while_connected(request, evaluator.evaluate(batch, request.state.request_id))
@@ -123,6 +142,7 @@ def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator
 
     @router.post(
         "/evaluate_batch",
+        dependencies=[place],
         response_model=schema.EvaluateBatchAnswer,
         responses={422: {"model": schema.InvalidRequest}, **_failures(408, 413, 415, 502, 503, 504)},
         openapi_extra=_body("application/json", {"$ref": _REFERENCE.format(model="EvaluateBatchRequest")}),
@@ -133,6 +153,7 @@ def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator
 
     @router.post(
         "/evaluate_batch_npy",
+        dependencies=[place],
         response_model=schema.EvaluateBatchAnswer,
         responses={422: {"model": schema.InvalidRequest}, **_failures(400, 408, 413, 415, 502, 503, 504)},
         openapi_extra=_body("multipart/form-data", _MULTIPART),
@@ -182,24 +203,32 @@ def _failures(*codes: int) -> dict[int | str, dict[str, Any]]:
     return {code: {"model": schema.Failure} for code in codes}
 
 
-def _handlers() -> dict[Any, Any]:
+def _handlers(refusals: Refusals) -> dict[Any, Any]:
     """Return handlers that answer every error as JSON, and never answer bad input with 500."""
 
     def fixed(code: int, detail: str, **headers: str) -> Callable[..., Awaitable[JSONResponse]]:
-        async def handler(_request: Request, _error: Exception) -> JSONResponse:
-            return JSONResponse({"detail": detail}, code, headers)
+        async def handler(request: Request, _error: Exception) -> JSONResponse:
+            return refusals.answer(request.scope, code, detail, headers)
 
         return handler
 
-    async def failed(_request: Request, error: RewardError) -> JSONResponse:
+    async def refused(request: Request, error: HTTPException) -> JSONResponse:
+        return refusals.answer(request.scope, error.status_code, error.detail, error.headers)
+
+    async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+        return refusals.answer(request.scope, 422, jsonable_encoder(error.errors()))
+
+    async def failed(request: Request, error: RewardError) -> JSONResponse:
         code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
-        return JSONResponse({"detail": told(error)}, code, RETRY_AFTER if code == 503 else None)
+        return refusals.answer(request.scope, code, told(error), RETRY_AFTER if code == 503 else None)
 
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
         logger.error("500 %s: unexpected", asked(request.scope), exc_info=error)
         return JSONResponse({"detail": "the gateway failed; its log has the reason"}, 500)
 
     return {
+        HTTPException: refused,
+        RequestValidationError: invalid,
         TimeoutError: fixed(408, "body: expected all of it in time, got a part", Connection="close"),
         ClientDisconnect: fixed(400, "body: expected all of it, got a part"),  # the caller is gone
         CallerLeftError: fixed(CALLER_LEFT, "the caller has hung up"),  # for the log and the metrics

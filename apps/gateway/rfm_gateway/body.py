@@ -13,6 +13,7 @@ from functools import cache, partial
 from tokenize import TokenError
 from typing import Any, TypeAlias
 
+import anyio
 import numpy as np
 from fastapi import HTTPException, Request
 from fastapi.exceptions import RequestValidationError
@@ -24,7 +25,6 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
-from rfm_gateway.admission import Turn, arriving
 from rfm_gateway.field_errors import STEPS_FIELD, Path, field_errors, invalid
 
 DECODED_PER_BODY = 2  # limit of decoded files, as a multiple of the body's limit
@@ -66,7 +66,7 @@ class Batch:
 class BodyLimits:
     """Limits of a request's body: its size, of JSON at most MAX_JSON_BYTES, and its time of arrival.
 
-    Reading raises HTTPException 413 and 503, and TimeoutError, as ``arriving`` and ``Turn`` do.
+    Reading raises HTTPException 413 as soon as the announced or received size is too large, and TimeoutError.
     """
 
     max_bytes: int
@@ -76,7 +76,8 @@ class BodyLimits:
         """Return the whole body."""
         remedy = AS_FILES if max_bytes == MAX_JSON_BYTES else LESS
         limit = (self.max_bytes, LARGER) if self.max_bytes <= max_bytes else (max_bytes, remedy)
-        return b"".join([chunk async for chunk in self._chunks(request, *limit)])
+        with anyio.fail_after(self.timeout_s):
+            return b"".join([chunk async for chunk in self._chunks(request, *limit)])
 
     @contextmanager
     def decoding(self) -> Iterator[Take]:
@@ -116,7 +117,8 @@ class BodyLimits:
         most: Any = {"max_files": MAX_PARTS, "max_fields": MAX_PARTS, "max_part_size": MAX_JSON_BYTES}
         parser = _Form(request.headers, self._chunks(request, self.max_bytes, LARGER), **most)
         try:
-            form = await parser.parse()
+            with anyio.fail_after(self.timeout_s):
+                form = await parser.parse()
         except (MultiPartException, ValueError) as error:  # ValueError: of python_multipart
             raise HTTPException(400, f"body: expected multipart/form-data, got: {error}") from None
         try:
@@ -130,14 +132,20 @@ class BodyLimits:
         finally:
             await form.close()
 
-    def _chunks(self, request: Request, max_bytes: int, remedy: str) -> AsyncGenerator[bytes, None]:
+    async def _chunks(self, request: Request, max_bytes: int, remedy: str) -> AsyncGenerator[bytes, None]:
         coding = request.headers.get("content-encoding", "identity")
         if coding.lower() != "identity":
             expected = "content-encoding: expected none, since the gateway unpacks no body"
             raise HTTPException(415, f"{expected}, got {reprlib.repr(coding)}; send the body as it is")
-        chunks = arriving(request, max_bytes, self.timeout_s, remedy=remedy)
-        turn: Turn | None = request.state.turn
-        return chunks if turn is None else turn.admitted(chunks)
+        too_large = HTTPException(413, f"body: expected at most {max_bytes} bytes, got more; {remedy}")
+        announced, num_bytes = request.headers.get("content-length", ""), 0
+        if announced.isdecimal() and int(announced) > max_bytes:
+            raise too_large
+        async for chunk in request.stream():
+            num_bytes += len(chunk)
+            if num_bytes > max_bytes:
+                raise too_large
+            yield chunk
 
 
 class _Form(MultiPartParser):

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -18,6 +19,7 @@ from rfm_client.serving import DEFAULT_MODEL, raise_limit, write_log
 from rfm_gateway.config import DEFAULT_HOST, DEFAULT_PORT, MAX_PORT, GatewayConfig
 
 KEEP_ALIVE_S = 30
+MAX_HEAD_BYTES = 64 * 2**10  # of a request; also of its trailers
 STOP_WITHIN_S = 30
 logger = logging.getLogger("rfm_gateway")
 
@@ -46,14 +48,13 @@ def gateway(config: GatewayOptions) -> None:
         import uvicorn
 
         from rfm_gateway.app import create_app
-        from rfm_gateway.connections import Connection, most_connections
         from rfm_gateway.mounting import INSTALL, page_of
     except ModuleNotFoundError as error:
         raise typer.BadParameter(f"the gateway needs {error.name}: pip install ./client ./apps/gateway") from None
     write_log("rfm-gateway", os.environ)
     address = config.address
     try:
-        api_key, tls = config.api_key(os.environ), config.tls
+        api_key, options = config.api_key(os.environ), server_options(config)
         app = create_app(config, api_key, _started_by(sys.argv[0]))
         address.check_free("gateway", port_option="--port")
     except ConfigError:  # with_options names its option
@@ -68,19 +69,25 @@ def gateway(config: GatewayOptions) -> None:
         logger.info("look at rewards in the browser: %s", page_link(config))
     elif config.viewer:
         logger.info("no page in the browser, since the package rfm-page is not installed: %s", INSTALL)
-    uvicorn.run(
-        app,
-        host=address.host,
-        port=address.port,
-        access_log=False,
-        log_config=None,
-        log_level="warning",
-        http=Connection,
-        limit_concurrency=most_connections(raise_limit()),
-        timeout_keep_alive=KEEP_ALIVE_S,
-        timeout_graceful_shutdown=STOP_WITHIN_S,
-        **tls,
-    )
+    uvicorn.run(app, **options)
+
+
+def server_options(config: GatewayConfig) -> dict[str, Any]:
+    """Return uvicorn's options, and let this process open as many files as it may. Raises ConfigError."""
+    return {
+        "host": config.address.host,
+        "port": config.address.port,
+        "access_log": False,
+        "log_config": None,
+        "log_level": "error",  # malformed requests are warnings, with which callers could fill the log
+        "http": "h11",  # httptools loses the body behind `Upgrade: h2c`, which JDK clients and `curl --http2` send
+        "ws": "none",
+        "h11_max_incomplete_event_size": MAX_HEAD_BYTES,
+        "limit_concurrency": raise_limit() * 7 // 8,  # the other descriptors are for files and for Triton
+        "timeout_keep_alive": KEEP_ALIVE_S,
+        "timeout_graceful_shutdown": STOP_WITHIN_S,
+        **config.tls,
+    }
 
 
 def check_gateway(config: GatewayConfig, environment: Mapping[str, str]) -> None:

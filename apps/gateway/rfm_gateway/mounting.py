@@ -32,11 +32,13 @@ class PageHost:
     """The gateway that serves a page.
 
     guards: refuse requests without the gateway's key
+    place: of endpoints that score: waits for a place among the evaluations at a time
     started_by: the command that a person repeats to start the gateway again: ``rfm serve`` or one of its own
     """
 
     app: FastAPI
     guards: Sequence[Depends]
+    place: Depends
     config: GatewayConfig
     limits: BodyLimits
     metrics: GatewayMetrics

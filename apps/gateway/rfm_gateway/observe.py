@@ -15,8 +15,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rfm_client import DeadlineExceededError
 from rfm_client.serving import begin_request
-from rfm_gateway.admission import Room, Turn
-from rfm_gateway.config import GatewayConfig
 
 Returned = TypeVar("Returned")
 
@@ -79,12 +77,11 @@ class GatewayMetrics:
 
 
 class RequestMiddleware:
-    """ASGI middleware that gives requests ids, times and counts them, and ends the turns of evaluations."""
+    """ASGI middleware that gives requests ids, and counts and times them."""
 
-    def __init__(self, app: ASGIApp, metrics: GatewayMetrics, config: GatewayConfig) -> None:
+    def __init__(self, app: ASGIApp, metrics: GatewayMetrics) -> None:
         self._app = app
         self._metrics = metrics
-        self._room = Room(config, metrics.in_flight, metrics.waiting)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a request, and count it with its answer."""
@@ -103,13 +100,9 @@ class RequestMiddleware:
                 MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
             await send(message)
 
-        turn = Turn(self._room) if scope["path"] in EVALUATIONS else None
-        scope["state"]["turn"] = turn  # `BodyLimits` takes it
         try:
             await self._app(scope, receive, send_counted)
         finally:
-            if turn is not None:
-                turn.end()
             self._metrics.count(scope["path"], code, time.perf_counter() - started_s)
 
 

@@ -1,24 +1,62 @@
 # SPDX-License-Identifier: MIT
-"""Log requests that were refused or failed, since many callers never show the text of an answer."""
+"""Answer requests that are refused or fail, and log why, since many callers never show the text of an answer."""
 
 from __future__ import annotations
 
-import json
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.responses import JSONResponse
+from starlette.types import Scope
 
-from rfm_gateway.limited_log import LimitedLog
-
-MOST_LINES = 20  # in a period of the log
+PERIOD_S = 10.0
+MOST_LINES = 20  # in PERIOD_S
 _MOST_LETTERS = 500  # of a reason
 _MOST_NAME_LETTERS = 100  # of a path or a program
 
 logger = logging.getLogger("rfm_gateway.refusals")
+
+
+class LimitedLog:
+    """Writes at most ``most_lines`` warnings in PERIOD_S. The first line after that tells the number of the others.
+
+    others: follows that number, such as ``more requests were refused``
+    """
+
+    def __init__(
+        self, logger: logging.Logger, most_lines: int, others: str, clock_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._logger, self._most_lines, self._others, self._clock_s = logger, most_lines, others, clock_s
+        self._began_s = float("-inf")  # the period
+        self._num_lines = self._num_left_out = 0
+
+    def write(self, line: str) -> None:
+        """Write a line, or count it."""
+        now_s = self._clock_s()
+        if now_s - self._began_s >= PERIOD_S:
+            if self._num_left_out:
+                self._logger.warning("%d %s", self._num_left_out, self._others)
+            self._began_s, self._num_lines, self._num_left_out = now_s, 0, 0
+        if self._num_lines == self._most_lines:
+            self._num_left_out += 1
+            return
+        self._num_lines += 1
+        self._logger.warning("%s", line)
+
+
+class Refusals:
+    """Answers of status 400 and above. Each is a line in the log, within the limits of LimitedLog."""
+
+    def __init__(self) -> None:
+        self._log = LimitedLog(logger, MOST_LINES, "more requests were refused or failed")
+
+    def answer(self, scope: Scope, code: int, detail: Any, headers: Mapping[str, str] | None = None) -> JSONResponse:
+        """Return the answer. detail: text, or errors at fields as ``field_errors.invalid`` makes them"""
+        self._log.write(f"{code} {asked(scope)}: {_reason(detail)}")
+        return JSONResponse({"detail": detail}, code, headers)
 
 
 def asked(scope: Scope) -> str:
@@ -28,38 +66,10 @@ def asked(scope: Scope) -> str:
     return f"{scope['method']} {scope['path'][:_MOST_NAME_LETTERS]} for {caller} ({program[:_MOST_NAME_LETTERS]})"
 
 
-class RefusalLog:
-    """ASGI middleware that logs a line for each answer of status 400 and above, within the limits of LimitedLog.
-
-    The line has the status, ``asked`` and the first reason.
-    """
-
-    def __init__(self, app: ASGIApp, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._app = app
-        self._log = LimitedLog(logger, MOST_LINES, "more requests were refused or failed", clock_s)
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request, and log its refusal."""
-        code = 200
-
-        async def send_logged(message: Message) -> None:
-            nonlocal code
-            await send(message)
-            if message["type"] == "http.response.start":
-                code = message["status"]
-            elif code >= 400 and not message.get("more_body"):
-                self._log.write(lambda: f"{code} {asked(scope)}: {_reason(message.get('body', b''))}")
-
-        await self._app(scope, receive, send_logged if scope["type"] == "http" else send)
-
-
-def _reason(body: bytes) -> str:
-    """Return the first reason in an answer, and how many more it has."""
-    try:
-        detail: Any = json.loads(body)["detail"]
-        if not isinstance(detail, str):
-            first, *others = (f"{'.'.join(map(str, each['loc'][1:]))}: {each['msg']}" for each in detail)
-            detail = first[:_MOST_LETTERS] + (f" (and {len(others)} more)" if others else "")
-    except (ValueError, LookupError, TypeError):
-        return "no reason"
-    return str(detail)[: 2 * _MOST_LETTERS]
+def _reason(detail: Any) -> str:
+    """Return the first reason, and how many more there are."""
+    if isinstance(detail, str):
+        return detail[: 2 * _MOST_LETTERS]
+    first, *others = detail
+    reason = f"{'.'.join(map(str, first['loc'][1:]))}: {first['msg']}"[:_MOST_LETTERS]
+    return reason + (f" (and {len(others)} more)" if others else "")

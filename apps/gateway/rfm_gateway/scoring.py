@@ -39,8 +39,8 @@ from rfm_gateway.blank_frames import refuse_blank_frames, warning_of
 from rfm_gateway.body import Batch, BodyLimits
 from rfm_gateway.field_errors import refused
 from rfm_gateway.folder import RequestFiles
-from rfm_gateway.limited_log import LimitedLog
 from rfm_gateway.observe import within
+from rfm_gateway.refusals import LimitedLog
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 FRAME_STEPS_OF_SECONDS = 8  # the same, for a model of remaining seconds
@@ -105,7 +105,7 @@ class Evaluator:
         num_bytes = batch.num_bytes if self._folder is None else None  # files may be large
         samples, warning = await off_loop(num_bytes, conversion.samples, batch)
         if warning:
-            self._warnings.write(lambda: warning)
+            self._warnings.write(warning)
         asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
         flat = chain.from_iterable(asked)
         outcomes = iter(await self._client.evaluate(flat, return_errors=True, request_id=request_id))

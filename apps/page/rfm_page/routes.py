@@ -78,12 +78,12 @@ def viewer_routes(host: PageHost) -> APIRouter:
         models = [_told_of(name, info) for name, info in await _infos(config)]
         return JSONResponse({"models": models, "model": config.checkpoint})
 
-    @router.post("/viewer/score")
+    @router.post("/viewer/score", dependencies=[host.place])
     async def score(request: Request) -> Response:
         asked = await read(request, "video")
         return StreamingResponse(events(asked), media_type="text/event-stream", headers=_AS_THEY_COME)
 
-    @router.post("/viewer/compare")
+    @router.post("/viewer/compare", dependencies=[host.place])
     async def compare(request: Request) -> Response:
         asked = await read(request, "first", "second")
         async with config.client(asked.question.model) as client:
