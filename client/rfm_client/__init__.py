@@ -8,8 +8,9 @@ with RewardClient("grpc://localhost:8001") as client:
     result.progress, result.success  # float32 [T] each
 """
 
-from rfm_client.async_client import AsyncRewardClient
-from rfm_client.client import RewardClient
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from rfm_client.contract import (
     FRAME_SCORES,
     AccessDeniedError,
@@ -37,7 +38,11 @@ from rfm_client.contract import (
     float_frames_to_uint8,
 )
 from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
-from rfm_client.frames.inputs import as_trajectory, load_trajectory
+
+if TYPE_CHECKING:
+    from rfm_client.async_client import AsyncRewardClient
+    from rfm_client.client import RewardClient
+    from rfm_client.frames.inputs import as_trajectory, load_trajectory
 
 __all__ = [
     "FRAME_SCORES",
@@ -72,3 +77,16 @@ __all__ = [
     "float_frames_to_uint8",
     "load_trajectory",
 ]
+
+_LATER = {  # imported at first use, since servers need the contract alone
+    "AsyncRewardClient": "async_client",
+    "RewardClient": "client",
+    "as_trajectory": "frames.inputs",
+    "load_trajectory": "frames.inputs",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module 'rfm_client' has no attribute {name!r}")
+    return getattr(import_module(f"rfm_client.{_LATER[name]}"), name)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -28,6 +29,7 @@ from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes
 from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
 from rfm_client.episodes.scorer import Asked, StepScorer
 from rfm_client.episodes.steps import Steps
+from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.call import Call, CallOptions
 from rfm_client.scoring.samples import SampleScorer, results_of
 from rfm_client.transport.calls import connect
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 READY_POLL_S = 0.2
+PREFIXES_AT_A_TIME = 64  # of a trajectory, in memory
 
 
 class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
@@ -93,6 +96,24 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     ) -> SimilarityResult:
         """Return the raw similarity score of ``other`` to ``reference``. Raises RewardError."""
         return cast(SimilarityResult, await self.score(SimilaritySample(reference, other), **options))
+
+    async def curve(
+        self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
+    ) -> ProgressResult:
+        """Return the scores of each frame, as at the moment when it was the newest: on the frames up to it.
+
+        sampling: the frames that the model sees of each prefix; None: as in the checkpoint's training
+        options: of each of several calls, since the prefixes of a long trajectory do not fit in memory together
+
+        Raises RewardError; ValueError if neither ``sampling`` nor the checkpoint says how many frames to show.
+        """
+        info = await self.model_info(frames=trajectory.frames is not None, timeout_s=options.get("timeout_s"))
+        info.check_scores_prefixes()
+        rule = sampling or Sampling.of(None, None, info.max_frames, trained_padding=info.trained_padding)
+        samples, results = rule.samples(trajectory), list[Result]()
+        while part := list(itertools.islice(samples, PREFIXES_AT_A_TIME)):
+            results += await self.evaluate(part, **options)
+        return rule.joined(cast("list[ProgressResult]", results))
 
     async def score(self, sample: Sample, **options: Unpack[CallOptions]) -> Result:
         """Return the result of one sample of any type. Raises RewardError."""

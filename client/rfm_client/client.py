@@ -19,6 +19,7 @@ from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample
 from rfm_client.episodes.episodes import Episode, Episodes
 from rfm_client.episodes.options import StepKeywords, StepScore
 from rfm_client.frames.fit_to_checkpoint import snapshot
+from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.call import CallOptions
 from rfm_client.transport.lifetime import Closing, OneProcess
 from rfm_client.transport.loop_thread import LoopThread
@@ -56,6 +57,12 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         both_orders: as in AsyncRewardClient
         """
         return self._loop.wait(self._client.preference(first, second, both_orders=both_orders, **options))
+
+    def curve(
+        self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
+    ) -> ProgressResult:
+        """Return the scores of each frame on the frames up to it, as AsyncRewardClient.curve. Raises RewardError."""
+        return self._loop.wait(self._client.curve(trajectory, sampling, **options))
 
     def similarity(self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]) -> SimilarityResult:
         """Return the raw similarity score of ``other`` to ``reference``. Raises RewardError."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import clip
+from engine_server import engines  # noqa: F401  a fixture
 from paths import ROOT
 
 

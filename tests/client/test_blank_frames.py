@@ -4,19 +4,21 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 from PIL import Image
 
 from encoding import encode
-from rfm_client import UInt8Array
+from rfm_client import ProgressSample, RewardClient, Trajectory, UInt8Array
 from rfm_client.frames import BlankFrames, read_video
 from rfm_client.frames.blank_frames import is_blank
+from shelves import Shelf
 
 VIDEOS = Path(__file__).parents[1] / "videos"
+TASK = "stack the cups"
 SIZE = (48, 64, 3)
 BLACK = np.zeros(SIZE, np.uint8)
 NOISE = np.random.default_rng(0).integers(0, 256, SIZE, np.uint8)
@@ -57,17 +59,15 @@ def test_a_frame_is_blank_if_it_is_black_or_of_one_colour(frame: UInt8Array, exp
     assert is_blank(frame) is expected
 
 
-@pytest.mark.parametrize("colour", [(0, 0, 0), (128, 128, 128), (0, 135, 0), (37, 201, 90)])
 @pytest.mark.parametrize("codec", ["libx264", "libsvtav1"])
-def test_a_film_of_one_colour_stays_blank(tmp_path: Path, codec: str, colour: tuple[int, int, int]) -> None:
-    encode(tmp_path / "flat.mp4", [BLACK + np.array(colour, np.uint8)] * 12, codec, {})
+def test_a_film_of_one_colour_stays_blank(tmp_path: Path, codec: str) -> None:
+    encode(tmp_path / "flat.mp4", [BLACK + np.array((37, 201, 90), np.uint8)] * 12, codec, {})
     assert BlankFrames(read_video(tmp_path / "flat.mp4")).told
 
 
 @pytest.mark.parametrize("file", sorted(VIDEOS.glob("*.mp4")), ids=lambda file: file.stem)
 def test_a_real_scene_in_a_twentieth_of_its_light_is_no_blank_one(file: Path) -> None:
-    with av.open(str(file)) as container:
-        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    frames = read_video(file)
     assert not any(is_blank((frame * 0.05).astype(np.uint8)) for frame in frames)
     assert all(is_blank((frame * 0.03).astype(np.uint8)) for frame in frames)
 
@@ -87,3 +87,45 @@ def test_a_camera_shows_nothing_in_ten_frames_in_a_row_or_in_all_of_fewer(shown:
     frames = BlankFrames(BLACK if each == "." else NOISE for each in shown)
     assert (frames.highest == 0) is expected
     assert frames.told == ("black pictures" if expected else "")
+
+
+FLOATS = np.stack([(NOISE / 255).astype(np.uint8)] * 3)
+VIDEO = np.stack([NOISE] * 3)
+CALLS: dict[str, tuple[Callable[[RewardClient, UInt8Array], object], UInt8Array, str]] = {
+    "a sample": (lambda client, frames: client.progress(Trajectory(frames=frames, task=TASK)), FLOATS, "3 frames"),
+    "samples": (
+        lambda client, frames: client.evaluate([ProgressSample(Trajectory(frames=frames, task=TASK))] * 3),
+        FLOATS,
+        "3 frames",
+    ),
+    "the second of a pair": (
+        lambda client, frames: client.preference(
+            Trajectory(frames=VIDEO, task=TASK), Trajectory(frames=frames, task=TASK)
+        ),
+        FLOATS,
+        "3 frames",
+    ),
+    "an episode": (lambda client, frames: [*map(client.episode(TASK, sampling="all").add, frames)], FLOATS, "2 frames"),
+    "one of two pictures": (
+        lambda client, frames: client.progress(Trajectory(frames=frames, task=TASK)),
+        np.stack([BLACK, NOISE]),
+        "",
+    ),
+    "a picture, as of a probe": (
+        lambda client, frames: client.progress(Trajectory(frames=frames, task=TASK)),
+        BLACK[np.newaxis],
+        "",
+    ),
+}
+
+
+@pytest.mark.parametrize(("ask", "frames", "count"), CALLS.values(), ids=CALLS)
+def test_a_client_tells_once_of_a_video_that_shows_nothing(
+    caplog: pytest.LogCaptureFixture, ask: Callable[[RewardClient, UInt8Array], object], frames: UInt8Array, count: str
+) -> None:
+    with RewardClient("", transports=[Shelf(has_encoder=False)]) as client:
+        for _ in range(2):
+            ask(client, frames)
+    told = "black pictures, no value above 1 (multiply floats in 0..1 by 255 before they become uint8)"
+    expected = f"frames: expected pictures that show something, got {count}: {told} (logged once)"
+    assert caplog.messages == ([expected] if count else [])

@@ -10,12 +10,7 @@ import numpy as np
 import pytest
 
 from client_commands import TASK, WIDTHS
-from rfm_client import (
-    FrameScores,
-    InferenceFailedError,
-    PreferenceResult,
-    RewardClient,
-)
+from rfm_client import FrameScores, InferenceFailedError, PreferenceResult, RewardClient
 from rfm_client.cli.comparing import LEGEND, Comparison, compare
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel, plot
@@ -48,12 +43,7 @@ def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_p
 
 ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int] | None, list[str]]] = {
     "agree": ({(0, 1): 0.4, (1, 0): 0.9}, [2, 1], [1, 0], ["agree"]),
-    "disagree by a hair": (
-        {(0, 1): 0.5001, (1, 0): 0.5001},
-        [None, None],
-        None,
-        ["no answer"],
-    ),
+    "disagree by a hair": ({(0, 1): 0.5001, (1, 0): 0.5001}, [None, None], None, ["no answer"]),
     "both are even": ({(0, 1): 0.5, (1, 0): 0.5}, [None, None], None, ["no answer"]),
     "the third loses to either": (
         {(0, 1): 0.9, (1, 0): 0.9, (0, 2): 0.9, (2, 0): 0.1, (1, 2): 0.8, (2, 1): 0.2},
@@ -72,10 +62,7 @@ ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int
 
 @pytest.mark.parametrize(("preferences", "ranks", "ranking", "answers"), ORDERS.values(), ids=ORDERS)
 def test_a_comparison_names_no_winner_where_the_orders_disagree(
-    preferences: dict[tuple[int, int], float],
-    ranks: list[int | None],
-    ranking: list[int] | None,
-    answers: list[str],
+    preferences: dict[tuple[int, int], float], ranks: list[int | None], ranking: list[int] | None, answers: list[str]
 ) -> None:
     scores = FrameScores(progress=np.zeros(2, np.float32), success=np.zeros(2, np.float32))
     seen = random_trajectory(0, 2, *WIDTHS)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -14,22 +13,15 @@ import numpy as np
 import pytest
 
 from client_commands import RFM_CLIENT, invoke, rows
-from gateways import Gateway, running
+from engine_server import EngineServer
+from gateways import running
 from proxies import Proxy
 from rfm_client import RewardClient, ServerUnavailableError
 from rfm_client.command_line import ExitCode
 from servers import Endpoints, folder_server, wait_for
 
-pytestmark = pytest.mark.triton
-
-NUM_SOURCES = 2000  # more than are scored before the server is gone
+NUM_SOURCES = 1000  # more than are scored before the server is gone
 NOT_ASKED = "not asked, since no server answers any more"
-
-
-@pytest.fixture(scope="module")
-def gateway(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
-    with running(demo_server, tmp_path_factory.mktemp("gateway")) as gateway:
-        yield gateway
 
 
 PORTS = {
@@ -59,21 +51,21 @@ def test_a_wrong_port_is_told_with_the_right_one(demo_server: Endpoints, scheme:
     assert str(caught.value) == expected
 
 
-@pytest.mark.parametrize("scheme", ["grpc", "http"])
-def test_tls_where_there_is_none_is_told(demo_server: Endpoints, scheme: str) -> None:
-    url = demo_server.grpc_url if scheme == "grpc" else demo_server.http_url
-    secure = url.replace(scheme, f"{scheme}s")
-    with RewardClient(secure, retry=False) as client, pytest.raises(ServerUnavailableError) as caught:
-        client.model_info()
-    assert " with TLS, got its " in str(caught.value)
-    assert str(caught.value).endswith(f" without: use {url}")
+def test_tls_where_there_is_none_is_told(demo_server: Endpoints) -> None:
+    for url in (demo_server.grpc_url, demo_server.http_url):
+        secure = url.replace("://", "s://")
+        with RewardClient(secure, retry=False) as client, pytest.raises(ServerUnavailableError) as caught:
+            client.model_info()
+        assert " with TLS, got its " in str(caught.value)
+        assert str(caught.value).endswith(f" without: use {url}")
 
 
-@pytest.mark.parametrize("scheme", ["grpc", "http"])
-def test_a_gateway_is_no_triton(gateway: Gateway, scheme: str) -> None:
-    result = invoke("sample", "--url", gateway.url.replace("http", scheme))
-    assert result.exit_code == ExitCode.UNAVAILABLE
-    assert "got a gateway's: use that of the Triton behind it, by default 800" in result.stderr
+def test_a_gateway_is_no_triton(demo_server: Endpoints, tmp_path: Path) -> None:
+    with running(demo_server, tmp_path) as gateway:
+        for url in (gateway.url, gateway.url.replace("http", "grpc")):
+            result = invoke("sample", "--url", url)
+            assert result.exit_code == ExitCode.UNAVAILABLE
+            assert "got a gateway's: use that of the Triton behind it, by default 800" in result.stderr
 
 
 def test_the_port_of_something_else_is_not_told_wrong(tmp_path: Path) -> None:
@@ -88,16 +80,16 @@ ENDS = {"has gone": ExitCode.UNAVAILABLE, "hangs": ExitCode.DEADLINE}
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ENDS)
-def test_a_server_that_goes_away_is_not_asked_any_more(demo_server: Endpoints, tmp_path: Path, how: str) -> None:
+def test_a_server_that_goes_away_is_not_asked_any_more(engines: EngineServer, tmp_path: Path, how: str) -> None:
     random = np.random.default_rng(0)
     source, target = tmp_path / "episode.npz", tmp_path / "scores.json"
     shown, told = tmp_path / "stdout", tmp_path / "stderr"
     embeddings = {"video_embeddings": random.random((8, 64)), "text_embedding": random.random(32)}
     np.savez(source, **{name: array.astype(np.float32) for name, array in embeddings.items()})
     with ExitStack() as proxies:
-        proxy = proxies.enter_context(Proxy(demo_server.grpc_port))
+        proxy = proxies.enter_context(Proxy(int(engines.url.rpartition(":")[2])))
         url = f"grpc://127.0.0.1:{proxy.port}"
-        words = ("score", *[source] * NUM_SOURCES, "--timeout", 3, "--json", target, "--url", url)
+        words = ("score", *[source] * NUM_SOURCES, "--timeout", 1, "--json", target, "--url", url)
         with shown.open("w") as out, told.open("w") as err:
             process = subprocess.Popen([str(RFM_CLIENT), *map(str, words)], stdout=out, stderr=err)
             wait_for(lambda: len(rows(shown.read_text(), str(source))) >= 5)  # they come while others are asked

@@ -11,34 +11,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_commands import (
-    MODEL,
-    ask,
-    assert_scores,
-)
-from rfm_client import (
-    FrameScores,
-    ProgressResult,
-)
+from client_commands import MODEL, ask, assert_scores
+from engine_server import EngineServer
+from rfm_client import FrameScores, ProgressResult
 from rfm_client.cli.documents import frame_document
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.synthetic import SyntheticSamples, parse_lengths
 from rfm_client.command_line import ExitCode, number
 from rfm_client.contract.wire import encode_samples
-from servers import Served
 
 SAMPLES = {"embeddings": ("progress", False), "pairs": ("similarity", False), "frames": ("preference", True)}
 
 
 @pytest.mark.parametrize(("kind", "use_frames"), SAMPLES.values(), ids=SAMPLES)
 def test_sample_and_bench_input_ask_for_the_same_samples(
-    served: Served, tmp_path: Path, kind: Any, use_frames: bool
+    engines: EngineServer, tmp_path: Path, kind: Any, use_frames: bool
 ) -> None:
     words = ["--sample-type", kind, "--num-samples", 3, "--num-frames", "2,5", "--seed", 5]
     words += ["--use-frames"] if use_frames else []
-    result = ask(served, "sample", *words, "--json", "-")
+    result = ask(engines, "sample", *words, "--json", "-")
     assert (result.exit_code, result.stderr) == (0, "")
-    with served.client("grpc", MODEL) as client:
+    with engines.client(MODEL) as client:
         samples = SyntheticSamples(kind, 3, parse_lengths("2,5"), use_frames, seed=5).samples(client)
         expected = client.evaluate(samples)
     for answer, scores in zip(json.loads(result.stdout)["samples"], expected, strict=True):
@@ -50,9 +43,9 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
                 assert_scores(answer[name], getattr(scores, name))
 
     target = tmp_path / "input.json"
-    result = ask(served, "bench-input", *words, "--output", target)
+    result = ask(engines, "bench-input", *words, "--output", target)
     name = f"{MODEL}_frames" if use_frames else MODEL
-    command = f"perf_analyzer -m {name} -i grpc -u {served.url('grpc').removeprefix('grpc://')} --input-data {target}"
+    command = f"perf_analyzer -m {name} -i grpc -u {engines.url.removeprefix('grpc://')} --input-data {target}"
     assert result.stdout == f"{command} --async --concurrency-range 1:16:5\n"
     for request, sample in zip(json.loads(target.read_text())["data"], samples, strict=True):
         tensors = encode_samples([sample])
@@ -66,13 +59,13 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
             np.testing.assert_array_equal(flat.reshape(1, *request[tensor]["shape"]), array)
 
 
-def test_sample_shows_a_table_and_tells_of_each_that_fails(served: Served) -> None:
-    result = ask(served, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", "3,17")
+def test_sample_shows_a_table_and_tells_of_each_that_fails(engines: EngineServer) -> None:
+    result = ask(engines, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", "3,17")
     assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
     for index, line in enumerate(result.stderr.splitlines()):
         assert line.startswith(f"rfm-client: samples[{index}]: num_frames: expected at most 16")
-    good = ask(served, "sample", "--sample-type", "preference", "--num-samples", 1)
-    with served.client("grpc", MODEL) as client:
+    good = ask(engines, "sample", "--sample-type", "preference", "--num-samples", 1)
+    with engines.client(MODEL) as client:
         (expected,) = client.evaluate(SyntheticSamples("preference", 1).samples(client))
     assert f"P(first) = {expected.preference:.4f}" in good.stdout  # type: ignore[union-attr]
 

@@ -7,7 +7,6 @@ import asyncio
 import inspect
 import re
 from collections.abc import Callable, Mapping
-from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -15,19 +14,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from engine_server import EngineServer
 from engines import load_engine
-from mixtures import FRAMES_MODEL, MODEL, assert_same, mixed_samples, plug
+from mixtures import FRAMES_MODEL, assert_same, mixed_samples
 from rfm_client import (
     FRAME_SCORES,
     AsyncRewardClient,
-    DeadlineExceededError,
     InvalidSampleError,
     ModelInfo,
     ModelNotFoundError,
     PreferenceSample,
     ProgressResult,
     ProgressSample,
-    Result,
     RewardClient,
     Sample,
     ServerUnavailableError,
@@ -35,18 +33,12 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.frames import resize_frames
-from servers import Served
 from shelves import Shelf
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
-from transports import Answer, Connection
+from transports import Answer
 
 NOBODY = "grpc://127.0.0.1:1"  # a port where nothing listens
-KINDS: dict[type, str] = {
-    ProgressSample: "progress",
-    PreferenceSample: "preference",
-    SimilaritySample: "similarity",
-}
 WIDTHS = (48, 32)  # of the embeddings of FRAMES_MODEL
 
 
@@ -59,133 +51,52 @@ def test_help_of_a_client_tells_of_each_option(kind: type[Any]) -> None:
         assert re.search(rf"^    [\w, ]*\b{name}\b[\w, ]*: ", kind.__init__.__doc__ or "", re.MULTILINE), name
 
 
-def test_every_style_of_call_gives_the_engine_s_answers(served: Served, protocol: str) -> None:
-    samples = mixed_samples(12)
-
-    async def awaited() -> list[Result]:
-        async with AsyncRewardClient(served.url(protocol), model=MODEL) as client:
-            alone = [getattr(client, KINDS[type(sample)])(*sample.trajectories) for sample in samples]
-            return [*await client.evaluate(iter(samples)), *await asyncio.gather(*alone)]
-
-    with served.client(protocol) as client:
-        answers = client.evaluate(samples)
-        answers += [getattr(client, KINDS[type(sample)])(*sample.trajectories) for sample in samples]
-        answers += [future.result() for future in [client.submit(sample) for sample in samples]]
-    answers += asyncio.run(awaited())
-    for answer, expected in zip(answers, 5 * load_engine(MODEL).evaluate(samples), strict=True):
-        assert_same(answer, expected)
-        assert answer.model_version == "1"
-
-
-def test_hundreds_of_samples_of_frames_and_embeddings_come_back_in_order(served: Served) -> None:
-    embedded = [random_trajectory(seed, 1 + seed % 16, *WIDTHS) for seed in range(300)]
+def test_samples_of_frames_of_several_sizes_and_embeddings_come_back_in_order(engines: EngineServer) -> None:
+    embedded = [random_trajectory(seed, 1 + seed % 16, *WIDTHS) for seed in range(100)]
     samples: list[Sample] = [ProgressSample(trajectory) for trajectory in embedded]
     frames = np.random.default_rng(0).integers(0, 256, (3, 24, 32, 3), np.uint8)
     videos = [Trajectory(frames=frames[:length], task="stack the cups") for length in (1, 3)]
-    samples[150:150] = [ProgressSample(videos[0]), PreferenceSample(*videos), SimilaritySample(*embedded[:2])]
-    with served.client("grpc", FRAMES_MODEL) as client:
+    taller = Trajectory(
+        frames=np.random.default_rng(1).integers(0, 256, (2, 90, 61, 3), np.uint8), task="stack the cups"
+    )
+    samples[50:50] = [ProgressSample(videos[0]), PreferenceSample(*videos), SimilaritySample(*embedded[:2])]
+    samples[60:60] = [PreferenceSample(videos[1], taller), SimilaritySample(taller, videos[0])]
+    with engines.client(FRAMES_MODEL) as client:
         answers = client.evaluate(samples)
     for answer, alone in zip(answers, load_engine(FRAMES_MODEL).evaluate(samples), strict=True):
         assert_same(answer, alone)
 
 
-def test_a_bad_sample_fails_alone_or_is_raised_with_its_place(served: Served, protocol: str) -> None:
-    samples = mixed_samples(5)
-    too_long = ProgressSample(random_trajectory(0, 20))
-    with served.client(protocol) as client:
-        outcomes = client.evaluate([*samples, too_long, "a string"], return_errors=True)  # type: ignore[list-item]
-        good = client.evaluate(samples)
-        with pytest.raises(
-            InvalidSampleError,
-            match=r"^samples\[5\]\.num_frames: expected at most 16 .*, got 20; .*subsample=True.* \(request \S+\)$",
-        ):
-            client.evaluate([*samples, too_long])
-    for outcome, expected in zip(outcomes[:5], good, strict=True):
-        assert_same(outcome, expected)
-    assert isinstance(outcomes[5], InvalidSampleError)
-    assert str(outcomes[6]) == "sample: expected ProgressSample, PreferenceSample or SimilaritySample, got str"
-
-
-def test_embeddings_of_another_width_are_told_in_our_words(served: Served, protocol: str) -> None:
-    with served.client(protocol) as client:
-        with pytest.raises(InvalidSampleError, match=r"^video_embeddings: expected \[-1,768\], got \[2,5\] \(request "):
-            client.progress(random_trajectory(0, 2, 5, 384))
-        with pytest.raises(InvalidSampleError, match=r"^text_embedding: expected \[384\], got \[7\] \(request \S+\)$"):
-            client.progress(random_trajectory(0, 2, 768, 7))
-
-
-def test_a_deadline_ends_a_call_and_no_other(served: Served, protocol: str) -> None:
-    full = [ProgressSample(random_trajectory(0, 40), frame_steps=16) for _ in range(64)]
-    with served.client(protocol) as client, ThreadPoolExecutor(3) as pool:
-        plugs = [pool.submit(client.evaluate, full) for _ in range(3)]
-        next(as_completed(plugs))  # two more come before the next call
-        with pytest.raises(DeadlineExceededError, match=r"no answer within 0\.05 s"):
-            client.progress(random_trajectory(0, 4), timeout_s=0.05)
-        for each in plugs:
-            each.result()
-        assert client.progress(random_trajectory(0, 4), timeout_s=1e9).last_progress > 0
-
-
-def test_a_cancelled_future_disturbs_no_other(served: Served) -> None:
-    with served.client("grpc") as client:
-        plugged = [client.submit(sample) for sample in plug()]
-        waiting = client.submit(ProgressSample(random_trajectory(0, 4)))
-        assert waiting.cancel()
-        with pytest.raises(CancelledError):
-            waiting.result()
-        for future in plugged:
-            future.result()
-
-
-def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(served: Served) -> None:
+def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(engines: EngineServer) -> None:
     video = ProgressSample(Trajectory(frames=np.zeros((1, 8, 8, 3), np.uint8), task="none"))
-    with served.client("grpc") as client:  # MODEL has no encoders
+    with engines.client() as client:  # MODEL has no encoders
         outcomes = client.evaluate([video, ProgressSample(random_trajectory(0, 2)), video], return_errors=True)
     assert [type(outcome) for outcome in outcomes] == [ModelNotFoundError, ProgressResult, ModelNotFoundError]
 
 
-def test_requests_in_flight_are_bounded(served: Served) -> None:
-    class Counting(Connection):
+def test_requests_in_flight_are_bounded() -> None:
+    class Counting(Shelf):
         now = most = 0
 
-        async def infer(self, *arguments: object, **options: object) -> Answer:
+        async def infer(self, *asked: Any, **more: Any) -> Answer:
             self.now += 1
             self.most = max(self.most, self.now)
-            try:
-                return await super().infer(*arguments, **options)  # type: ignore[arg-type]
-            finally:
-                self.now -= 1
+            await asyncio.sleep(0.001)
+            self.now -= 1
+            return await super().infer(*asked, **more)
 
-    transport = Counting(served.url("grpc"))
-    with RewardClient("", transports=[transport], model=MODEL, max_in_flight=3) as client:
+    shelf = Counting()
+    with RewardClient("", transports=[shelf], max_in_flight=3) as client:
         for future in [client.submit(sample) for sample in mixed_samples(30)]:
             future.result()
-    assert transport.most == 3
+    assert shelf.most == 3
 
 
-def test_model_info_tells_what_the_checkpoint_takes(served: Served, protocol: str) -> None:
-    with served.client(protocol, FRAMES_MODEL) as client:
-        info, frames = client.model_info(), client.model_info(frames=True)
-    assert (info.name, info.versions, info.max_batch_size) == (FRAMES_MODEL, ("1",), 64)
-    assert (info.max_frames, info.frame_size, info.progress_bins) == (16, None, 10)
-    assert (info.video_dim, info.text_dim) == WIDTHS
-    assert (frames.max_frames, str(frames.frame_size), frames.progress_bins) == (16, "shortest 64", 10)
-    assert (frames.video_dim, frames.text_dim) == (None, None)
-
-
-def test_what_is_not_served_is_told(served: Served, protocol: str) -> None:
-    with served.client(protocol, "not_served") as client:
-        with pytest.raises(ModelNotFoundError, match=f"not_served.*served: .*{MODEL}"):
-            client.model_info()
-        with pytest.raises(DeadlineExceededError, match=r"not_served and not_served_frames: not ready within 0\.3 s"):
-            client.wait_ready(0.3)
-
-
-def test_a_long_trajectory_is_subsampled_when_asked(served: Served) -> None:
+def test_a_long_trajectory_is_subsampled_when_asked(engines: EngineServer) -> None:
     long, short = random_trajectory(1, 40), random_trajectory(2, 5)
     kept = np.rint(np.linspace(0, 39, 16)).astype(int)
     cut = replace(long, video_embeddings=long.positions[kept])
-    with served.client("grpc") as client:
+    with engines.client() as client:
         result = client.progress(long, subsample=True)
         pair = client.preference(long, short, subsample=True)
         assert_same(result, client.progress(cut))
@@ -198,10 +109,10 @@ def test_a_long_trajectory_is_subsampled_when_asked(served: Served) -> None:
     assert len(dense.progress) == 40
 
 
-def test_both_orders_are_asked_under_the_task_of_the_first(served: Served) -> None:
+def test_both_orders_are_asked_under_the_task_of_the_first(engines: EngineServer) -> None:
     first, second = random_trajectory(1, 40), random_trajectory(2, 5)
     back = replace(second, text_embedding=first.text_embedding)
-    with served.client("grpc") as client:
+    with engines.client() as client:
         once = client.preference(first, second, subsample=True)
         swapped = client.preference(back, first, subsample=True).preference
         other_text = client.preference(second, first, subsample=True).preference
@@ -218,13 +129,13 @@ def test_both_orders_are_asked_under_the_task_of_the_first(served: Served) -> No
     assert asked_both.value.message == asked_once.value.message
 
 
-def test_each_trajectory_is_resized_by_its_own_size_when_asked(served: Served) -> None:
+def test_each_trajectory_is_resized_by_its_own_size_when_asked(engines: EngineServer) -> None:
     random = np.random.default_rng(4)
     wide, tall = (
         Trajectory(frames=random.integers(0, 256, (num_frames, *size, 3), np.uint8), task="open the drawer")
         for num_frames, size in ((4, (120, 160)), (3, (200, 90)))
     )
-    with served.client("grpc", FRAMES_MODEL) as client:
+    with engines.client(FRAMES_MODEL) as client:
         size = client.model_info(frames=True).frame_size
         assert size is not None
         smaller = [replace(t, frames=resize_frames(t.positions, size)) for t in (wide, tall)]
@@ -232,19 +143,6 @@ def test_each_trajectory_is_resized_by_its_own_size_when_asked(served: Served) -
         assert_same(client.preference(wide, tall, resize=True), client.preference(*smaller))
         resized = client.progress(wide, resize=True)
         np.testing.assert_allclose(resized.progress, client.progress(wide).progress, rtol=0, atol=5e-4)
-
-
-def test_pairs_of_two_frame_sizes_are_scored(served: Served) -> None:
-    random = np.random.default_rng(5)
-    videos = [
-        Trajectory(frames=random.integers(0, 256, (num_frames, *size, 3), np.uint8), task="open the drawer")
-        for num_frames, size in ((4, (48, 60)), (3, (90, 61)), (2, (48, 60)))
-    ]
-    samples = [PreferenceSample(a, b) if a is videos[0] else SimilaritySample(a, b) for a in videos for b in videos]
-    with served.client("grpc", FRAMES_MODEL) as client:
-        answers = client.evaluate(samples)
-    for result, expected in zip(answers, load_engine(FRAMES_MODEL).evaluate(samples), strict=True):
-        assert_same(result, expected)
 
 
 @pytest.mark.parametrize("retry", [False, True])
@@ -259,8 +157,8 @@ def test_nobody_there_is_an_error_of_its_own_for_each_sample(caplog: pytest.LogC
     assert [record.message.partition(": trying again")[0] for record in caplog.records] == [NOBODY] * retry
 
 
-def test_timing_and_logits_come_when_asked(served: Served) -> None:
-    with served.client("grpc") as client:
+def test_timing_and_logits_come_when_asked(engines: EngineServer) -> None:
+    with engines.client() as client:
         plain = client.progress(random_trajectory(0, 3))
         full = client.progress(random_trajectory(0, 3), logits=True, timing=True)
     assert (plain.timing, plain.progress_logits) == (None, None)
@@ -269,58 +167,9 @@ def test_timing_and_logits_come_when_asked(served: Served) -> None:
     assert full.timing.forward_ms > 0
 
 
-TOKENS = "q3_tok_disc10"  # trained on at most 8 frames, takes more
-MORE = "trajectory: expected at most 8 frames, as in the training of "
-
-
 def filmed(num_frames: int) -> Trajectory:
     frames = np.random.default_rng(num_frames).integers(0, 256, (num_frames, 32, 32, 3), np.uint8)
     return Trajectory(frames=frames, task="stack the cups")
-
-
-def test_a_client_tells_once_of_more_frames_than_in_training(
-    served: Served, caplog: pytest.LogCaptureFixture, protocol: str
-) -> None:
-    with served.client(protocol, TOKENS) as client:
-        client.progress(filmed(8))
-        client.progress(filmed(9), subsample=True)
-        client.progress(filmed(9), frame_steps=4)
-        assert caplog.messages == []
-        for num_frames in (10, 12):
-            client.progress(filmed(num_frames))
-    (told,) = caplog.messages
-    assert told.startswith(MORE)
-    assert "got 10: score 8 of them (subsample=True), or each frame on its prefix" in told
-
-
-CALLS: dict[str, Callable[[RewardClient], object]] = {
-    "evaluate": lambda client: client.evaluate([ProgressSample(filmed(3)), ProgressSample(filmed(9))]),
-    "submit": lambda client: client.submit(ProgressSample(filmed(9))).result(),
-    "preference": lambda client: client.preference(filmed(3), filmed(9)),
-    "a step of an episode": lambda client: [
-        client.episode("stack", sampling="linspace_round", frames=9).add(frame) for frame in filmed(1).positions
-    ],
-}
-
-
-@pytest.mark.parametrize("ask", CALLS.values(), ids=CALLS)
-def test_every_call_tells_of_more_frames_than_in_training(
-    served: Served, caplog: pytest.LogCaptureFixture, ask: Callable[[RewardClient], object]
-) -> None:
-    with served.client("grpc", TOKENS) as client:
-        ask(client)
-    assert [message.startswith(MORE) for message in caplog.messages] == [True]
-
-
-def test_an_async_client_tells_once_of_more_frames_than_in_training(
-    served: Served, caplog: pytest.LogCaptureFixture
-) -> None:
-    async def asked() -> None:
-        async with AsyncRewardClient(served.url("grpc"), model=TOKENS) as client:
-            await asyncio.gather(*(client.progress(filmed(9)) for _ in range(3)))
-
-    asyncio.run(asked())
-    assert [message.startswith(MORE) for message in caplog.messages] == [True]
 
 
 class Described(Shelf):
@@ -369,6 +218,31 @@ def test_a_step_has_each_score_that_the_checkpoint_gives_unasked(monkeypatch: py
     assert names == [*step.more_scores]
     np.testing.assert_allclose(steps.more_scores["log_prob"], [np.nan, 0.1])
     assert steps.unclear.tolist() == [False, True]
+
+
+MORE = "trajectory: expected at most 16 frames, as in the training of "
+CALLS: dict[str, tuple[Callable[[RewardClient], object], int]] = {  # and the lines that follow
+    "as many as in training": (lambda client: client.progress(filmed(16)), 0),
+    "subsampled": (lambda client: client.progress(filmed(17), subsample=True), 0),
+    "dense": (lambda client: client.progress(filmed(17), frame_steps=4), 0),
+    "twice": (lambda client: [client.progress(filmed(17)) for _ in range(2)], 1),
+    "evaluate": (lambda client: client.evaluate([ProgressSample(filmed(3)), ProgressSample(filmed(17))]), 1),
+    "submit": (lambda client: [each.result() for each in [client.submit(ProgressSample(filmed(17))) for _ in "ab"]], 1),
+    "preference": (lambda client: client.preference(filmed(3), filmed(17)), 1),
+    "a step of an episode": (
+        lambda client: client.episode("stack", sampling="linspace_round", frames=17).add(filmed(1).positions[0]),
+        1,
+    ),
+}
+
+
+@pytest.mark.parametrize(("ask", "num_lines"), CALLS.values(), ids=CALLS)
+def test_a_client_tells_once_of_more_frames_than_in_training(
+    caplog: pytest.LogCaptureFixture, ask: Callable[[RewardClient], object], num_lines: int
+) -> None:
+    with RewardClient("", transports=[Shelf(has_encoder=False)]) as client:
+        ask(client)
+    assert [message.startswith(MORE) for message in caplog.messages] == [True] * num_lines
 
 
 @pytest.mark.parametrize(

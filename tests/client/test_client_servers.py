@@ -75,7 +75,7 @@ class Stand:
         return ModelInfo(name=model, versions=(str(self.version),), max_batch_size=self.max_batch_size)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
-        return self.error is None and not self.is_down
+        return self.error is None and not (self.is_down or self.is_silent)
 
     async def close(self) -> None:
         pass
@@ -172,6 +172,18 @@ def test_a_server_that_lacks_the_model_is_left_out() -> None:
     asyncio.run(asyncio.wait_for(rounds(), WITHIN_S))
     assert good.asked["infer"] == 80
     assert lacking.asked["infer"] <= 4  # of the first round
+
+
+def test_a_server_that_hangs_costs_one_call_and_is_left_out() -> None:
+    hung, good = Stand("grpc://hung:1"), Stand("grpc://good:1")
+    hung.is_silent = True
+
+    async def rounds() -> list[object]:
+        async with AsyncRewardClient("", transports=[hung, good], timeout_s=0.2) as client:
+            return [(await client.evaluate([ProgressSample(SEEN)], return_errors=True))[0] for _ in range(6)]
+
+    outcomes = asyncio.run(asyncio.wait_for(rounds(), WITHIN_S))
+    assert [type(each) for each in outcomes if isinstance(each, Exception)] == [DeadlineExceededError]
 
 
 @pytest.mark.parametrize(

@@ -5,30 +5,18 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import os
-import signal
-import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import replace
-from pathlib import Path
 from typing import Any, get_args
 
-import httpx
 import numpy as np
 import pytest
-from prometheus_client.parser import text_string_to_metric_families
 
-import goldens
-import rfm_export
 import transports
-from engines import serve_config
-from mixtures import TOLD_S
+from engine_server import EngineServer
 from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,
     ModelNotFoundError,
-    ProcessEndedError,
     ProgressResult,
     RewardClient,
     ServerUnavailableError,
@@ -37,7 +25,7 @@ from rfm_client import (
 )
 from rfm_client.episodes import Episode
 from rfm_client.frames import Rule, Sampling
-from servers import Served, Serving, serving
+from shelves import Shelf
 from tolerances import BATCHED_VLM_TOLERANCE, TOLERANCE
 from transports import Answer, Tensors
 
@@ -53,8 +41,7 @@ def video(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array
 
 def offline(client: RewardClient, frames: UInt8Array, sampling: Sampling = FOUR, task: str = TASK) -> ProgressResult:
     """Return the scores of all prefixes, with all pixels sent."""
-    results = client.evaluate(list(sampling.samples(Trajectory(frames=frames, task=task))))
-    return sampling.joined([result for result in results if isinstance(result, ProgressResult)])
+    return client.curve(Trajectory(frames=frames, task=task), sampling)
 
 
 def online(episode: Episode, frames: UInt8Array) -> tuple[list[float], list[float]]:
@@ -83,8 +70,8 @@ class Recording(transports.Recording):
 
 
 @pytest.fixture
-def transport(served: Served) -> Recording:
-    return Recording(served.url("grpc"))
+def transport(engines: EngineServer) -> Recording:
+    return Recording(engines.url)
 
 
 @pytest.fixture
@@ -94,44 +81,35 @@ def client(transport: Recording) -> Iterator[RewardClient]:
 
 
 STEPPED = [
-    *((MODEL, rule, "grpc") for rule in get_args(Rule)),
-    *((model, rule, "http") for model in (IMAGES, VIDEO) for rule in ("rint_pad", "linspace_trunc")),
-    (IMAGES, "rint_pad", "grpc"),
+    *((MODEL, rule) for rule in get_args(Rule)),
+    *((model, rule) for model in (IMAGES, VIDEO) for rule in ("rint_pad", "linspace_trunc")),
 ]
 
 
-@pytest.mark.parametrize(("model", "rule", "protocol"), STEPPED)
-def test_steps_have_the_scores_of_the_whole(served: Served, model: str, rule: Rule, protocol: str) -> None:
+@pytest.mark.parametrize(("model", "rule"), STEPPED)
+def test_steps_have_the_scores_of_the_whole(engines: EngineServer, model: str, rule: Rule) -> None:
     number = None if rule == "all" or rule.startswith("rewind") else 7 if model == MODEL else 4
-    frames = video(get_args(Rule).index(rule), 16 if rule == "all" else 40, (40, 56) if model == MODEL else (56, 84))
-    with served.client(protocol, model) as client, client.episode(TASK, sampling=rule, frames=number) as episode:
+    frames = video(get_args(Rule).index(rule), 16 if rule == "all" else 24, (40, 56) if model == MODEL else (56, 84))
+    with engines.client(model) as client, client.episode(TASK, sampling=rule, frames=number) as episode:
         assert client.model_info(frames=True).by_digest
         tolerance = TOLERANCE if model == MODEL else BATCHED_VLM_TOLERANCE
         assert_same(online(episode, frames), offline(client, frames, Sampling(rule, number)), tolerance)
 
 
-def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: Served) -> None:
+def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(engines: EngineServer) -> None:
     """A video model encodes each new pair of frames; an image model encodes each frame."""
     encoders = {MODEL: f"{MODEL}_encoder", IMAGES: f"{IMAGES}_frames", VIDEO: f"{VIDEO}_frames"}
     frames = video(100, 12, (56, 84))
 
-    def encoded() -> dict[str, float]:
-        """Return the frames so far by model, after the models' reports."""
-        time.sleep(TOLD_S)
-        families = list(text_string_to_metric_families(httpx.get(served.endpoints.metrics_url).text))
-        samples = [sample for family in families for sample in family.samples]
-        named = {each.labels["model"]: each.value for each in samples if each.name == "rfm_frames_encoded_total"}
-        return {model: named[encoder] for model, encoder in encoders.items()}
-
     def step(model: str) -> tuple[Recording, tuple[list[float], list[float]]]:
-        transport = Recording(served.url("grpc"))
+        transport = Recording(engines.url)
         with RewardClient([], transports=[transport], model=model) as client, client.episode(TASK, frames=4) as episode:
             first = online(episode, frames)
             episode.reset()
             np.testing.assert_allclose(online(episode, frames), first, rtol=0, atol=BATCHED_VLM_TOLERANCE)
         return transport, first
 
-    before = encoded()
+    before = {model: engines.encoded[encoder] for model, encoder in encoders.items()}
     firsts = {}
     for model in encoders:
         transport, firsts[model] = step(model)
@@ -141,11 +119,11 @@ def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: S
         assert {inputs["frames"].shape for inputs in repeated} == {(1, 1, 1, 1, 3)}  # known: not even sent
     for model in encoders:  # another client sends them, and a caller of plain tensors uses the cache, too
         np.testing.assert_allclose(step(model)[1], firsts[model], rtol=0, atol=BATCHED_VLM_TOLERANCE)
-    with served.client("http", MODEL) as plain:
+    with engines.client(MODEL) as plain:
         plain.progress(Trajectory(frames=frames[::-1], task=TASK))
     pairs = {tuple(pair) for t in range(12) for pair in FOUR.prefix(t).indices.reshape(-1, 2).tolist()}
-    after = encoded()
-    assert {model: after[model] - before[model] for model in encoders} == {MODEL: 12, IMAGES: 12, VIDEO: 2 * len(pairs)}
+    new = {model: engines.encoded[encoder] - before[model] for model, encoder in encoders.items()}
+    assert new == {MODEL: 12, IMAGES: 12, VIDEO: 2 * len(pairs)}
 
 
 def test_episodes_side_by_side_are_one_request_and_score_alike(transport: Recording, client: RewardClient) -> None:
@@ -174,8 +152,8 @@ class Failing(Recording):
         return not self.is_down and await super().is_ready(model, timeout_s)
 
 
-def test_episodes_are_shared_out_among_servers_and_stay(served: Served) -> None:
-    transports = [Recording(served.url("grpc")) for _ in range(3)]
+def test_episodes_are_shared_out_among_servers_and_stay(engines: EngineServer) -> None:
+    transports = [Recording(engines.url) for _ in range(3)]
     videos = np.stack([video(seed, 6) for seed in range(210, 216)], axis=1)  # [T, N, H, W, 3]
     with RewardClient([], transports=transports, model=MODEL) as client:
         episodes = client.episodes(6, TASK, frames=4)
@@ -196,8 +174,8 @@ def test_episodes_are_shared_out_among_servers_and_stay(served: Served) -> None:
         assert asked == [2, 2, 2]  # the new ones went to the servers with the fewest
 
 
-def test_episodes_of_a_server_that_is_down_go_on_at_the_next(served: Served) -> None:
-    transports = [Failing(served.url("grpc")) for _ in range(2)]
+def test_episodes_of_a_server_that_is_down_go_on_at_the_next(engines: EngineServer) -> None:
+    transports = [Failing(engines.url) for _ in range(2)]
     videos = np.stack([video(seed, 6) for seed in (220, 221)], axis=1)
     with RewardClient([], transports=transports, model=MODEL, timeout_s=30) as client:
         episodes = client.episodes(2, TASK, frames=4)
@@ -242,40 +220,14 @@ def test_cameras_are_scored_apart_and_fused(client: RewardClient) -> None:
         episode.add({"front": front[0]})
 
 
-@pytest.mark.parametrize(
-    ("orient", "front_as", "wrist_as"),
-    [
-        ("rotate180", lambda frame: frame[::-1, ::-1], lambda frame: frame[::-1, ::-1]),
-        ({"front": "rotate90"}, lambda frame: np.rot90(frame, -1), lambda frame: frame),
-        ({"front": "flip-vertical", "wrist": "flip-horizontal"}, np.flipud, np.fliplr),
-        ({"wrist": "rotate270"}, lambda frame: frame, np.rot90),
-    ],
-    ids=["all cameras", "one of them", "each its own", "the other one"],
-)
-def test_frames_are_scored_as_they_are_turned(client: RewardClient, orient: Any, front_as: Any, wrist_as: Any) -> None:
+def test_frames_of_each_camera_are_turned_and_become_rgb(client: RewardClient) -> None:
     front, wrist = video(104, 3), video(105, 3, (48, 44))
     upright = client.episode(TASK, sampling="all", cameras=("front", "wrist"))
-    turned = client.episode(TASK, sampling="all", cameras=("front", "wrist"), orient=orient)
+    corrections: dict[str, Any] = {"orient": {"front": "rotate90"}, "channels": {"wrist": "bgr"}}
+    stored = client.episode(TASK, sampling="all", cameras=("front", "wrist"), **corrections)
     for a, b in zip(front, wrist, strict=True):
-        expected = upright.add({"front": front_as(a), "wrist": wrist_as(b)})
-        assert turned.add({"front": a, "wrist": b}).progress == pytest.approx(expected.progress, abs=TOLERANCE)
-
-
-@pytest.mark.parametrize(
-    ("channels", "swapped"),
-    [("bgr", ("front", "wrist")), ({"wrist": "bgr"}, ("wrist",)), ({"front": "rgb"}, ())],
-    ids=["all cameras", "one of them", "none"],
-)
-def test_frames_of_cameras_that_give_bgr_are_scored_as_rgb(client: RewardClient, channels: Any, swapped: Any) -> None:
-    front, wrist = video(104, 3), video(105, 3, (48, 44))
-    rgb = client.episode(TASK, sampling="all", cameras=("front", "wrist"), orient={"wrist": "rotate180"})
-    given = client.episode(
-        TASK, sampling="all", cameras=("front", "wrist"), orient={"wrist": "rotate180"}, channels=channels
-    )
-    for a, b in zip(front, wrist, strict=True):
-        frame = {"front": a, "wrist": b}
-        expected = rgb.add({name: each[..., ::-1] if name in swapped else each for name, each in frame.items()})
-        assert given.add(frame).progress == pytest.approx(expected.progress, abs=TOLERANCE)
+        expected = upright.add({"front": np.rot90(a, -1), "wrist": b[..., ::-1]})
+        assert stored.add({"front": a, "wrist": b}).progress == pytest.approx(expected.progress, abs=TOLERANCE)
 
 
 def test_a_frame_that_is_wrong_leaves_the_episode_as_it_was(client: RewardClient) -> None:
@@ -312,12 +264,12 @@ def test_the_newest_frame_takes_the_place_of_one_that_waits(client: RewardClient
     assert episode.add(frames[0]).step == 0
 
 
-def test_frames_stay_in_the_order_in_which_they_were_added(served: Served, client: RewardClient) -> None:
+def test_frames_stay_in_the_order_in_which_they_were_added(engines: EngineServer, client: RewardClient) -> None:
     """With and without waiting, with a reset in between, and after a caller stops waiting."""
     frames = video(113, 5)
 
     async def play() -> tuple[list[float], list[int]]:
-        async with AsyncRewardClient(served.url("grpc"), model=MODEL) as client:
+        async with AsyncRewardClient(engines.url, model=MODEL) as client:
             episode = client.episode(TASK, frames=4)
             open_, waiting = episode.add_nowait(frames[0]), episode.add_nowait(frames[3])
             second = await episode.add(frames[1])
@@ -342,8 +294,8 @@ def test_frames_stay_in_the_order_in_which_they_were_added(served: Served, clien
     np.testing.assert_allclose(progress, expected, rtol=0, atol=TOLERANCE)
 
 
-def test_an_episode_keeps_its_client(served: Served) -> None:
-    episode = RewardClient(served.url("grpc"), model=MODEL).episode(TASK, frames=4)
+def test_an_episode_keeps_its_client(engines: EngineServer) -> None:
+    episode = RewardClient(engines.url, model=MODEL).episode(TASK, frames=4)
     gc.collect()
     assert [episode.add(frame).step for frame in video(115, 2)] == [0, 1]
 
@@ -371,8 +323,8 @@ def test_kept_frames_are_scored_when_asked_and_several_episodes_in_one_request(
     assert score.progress == pytest.approx(scores[0].progress, abs=TOLERANCE)
 
 
-def test_kept_frames_stay_when_a_request_fails(served: Served) -> None:
-    server, frames = Failing(served.url("grpc")), video(122, 3)
+def test_kept_frames_stay_when_a_request_fails(engines: EngineServer) -> None:
+    server, frames = Failing(engines.url), video(122, 3)
     with RewardClient([], transports=[server], model=MODEL, retry=False) as client:
         episode = client.episode(TASK, env=3, frames=4)
         for frame in frames:
@@ -419,103 +371,57 @@ def test_a_request_of_very_many_frames_is_refused_before_memory_is_taken(transpo
         asyncio.run(ask())
 
 
-REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "no task": ({"task": " "}, "task: expected a task"),
-    "not UTF-8": ({"task": "\ud800"}, "task: expected text that UTF-8 can encode"),
-    "a camera": ({"cameras": "front"}, "^cameras: expected a sequence of names, got 'front'$"),
-    "a camera's frame": ({"frame": {"a": video(0, 1)[0]}}, r"^frames: .* of one camera .*, got frames of \['a'\]"),
+FRAME = video(0, 1)[0]
+WRIST = {"cameras": ["front"]}
+REFUSED: dict[str, tuple[dict[str, Any], Any, str]] = {
+    "not UTF-8": ({"task": "\ud800"}, FRAME, "task: expected text that UTF-8 can encode"),
+    "a camera": ({"cameras": "front"}, FRAME, "^cameras: expected a sequence of names, got 'front'$"),
+    "a camera's frame": ({}, {"a": FRAME}, r"frame: .* of one camera .*, got frames of \['a'\]"),
     "orient": (
-        {"cameras": ["front"], "orient": {"wrist": "rotate180"}},
+        {**WRIST, "orient": {"wrist": "rotate180"}},
+        FRAME,
         r"^orient: expected some of the cameras \['front'\], got 'wrist'$",
     ),
     "channels": (
-        {"cameras": ["front"], "channels": {"wrist": "bgr"}},
+        {**WRIST, "channels": {"wrist": "bgr"}},
+        FRAME,
         r"^channels: expected some of the cameras \['front'\], got 'wrist'$",
     ),
-}
-
-
-KEPT: dict[str, tuple[dict[str, Any], Any, str]] = {
     "no frame": ({}, None, r"^envs\[3\]\.frame: expected one to score, got none yet$"),
-    "no task": ({"task": " "}, video(0, 1)[0], r"^envs\[3\]\.task: expected a task sentence"),
-    "no camera": ({"cameras": ["a"]}, video(0, 1)[0], r"^envs\[3\]\.frame: .* the cameras \['a'\], got ndarray$"),
-    "another camera": (
-        {"cameras": ["a"]},
-        {"b": video(0, 1)[0]},
-        r"^envs\[3\]\.frame: expected frames of the cameras \['a'\], got frames of \['b'\]$",
-    ),
-    "env": ({"env": "3"}, video(0, 1)[0], "^env: expected a whole number, got '3'$"),
+    "no task": ({"task": " "}, FRAME, r"^envs\[3\]\.task: expected a task sentence"),
+    "no camera": (WRIST, FRAME, r"^envs\[3\]\.frame: .* the cameras \['front'\], got ndarray$"),
+    "env": ({"env": "3"}, FRAME, "^env: expected a whole number, got '3'$"),
 }
 
 
-@pytest.mark.parametrize(("given", "frame", "message"), KEPT.values(), ids=KEPT)
-def test_a_frame_that_cannot_be_kept_or_scored_is_refused_with_its_environment(
-    client: RewardClient, given: dict[str, Any], frame: Any, message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize(("given", "frame", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_right_is_refused_with_its_environment(given: dict[str, Any], frame: Any, message: str) -> None:
+    with RewardClient("", transports=[Shelf(has_encoder=False)]) as client, pytest.raises(ValueError, match=message):
         episode = client.episode(**{"task": TASK, "env": 3, "frames": 4, **given})
         if frame is not None:
             episode.keep(frame)
         client.score_episodes([episode])
 
 
-@pytest.mark.parametrize(("given", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_right_is_refused(client: RewardClient, given: dict[str, Any], message: str) -> None:
-    given = {"task": TASK, "frame": video(0, 1)[0], "frames": 4, **given}
-    frame = given.pop("frame")
-    with pytest.raises(ValueError, match=message):
-        client.episode(**given).add(frame)
-
-
-def test_a_model_that_is_not_served_and_tasks_that_are_too_few_are_told(served: Served) -> None:
-    with served.client("grpc", "not_served") as client:
+def test_a_model_that_is_not_served_and_tasks_that_are_too_few_are_told(engines: EngineServer) -> None:
+    with engines.client("not_served") as client:
         with pytest.raises(ModelNotFoundError):
             client.episode(TASK, frames=4).add(video(0, 1)[0])
         with pytest.raises(ValueError, match="expected one for each of 3 episodes"):
             client.episodes(3, ["a", "b"])
 
 
-@contextmanager
-def own(folder: Path, name: str, feature_cache_mib: int) -> Iterator[Serving]:
-    """An ``rfm serve`` with a model process that a test may kill."""
-    config, repository = goldens.config(name), folder / "model_repository"
-    export_config = replace(serve_config(config, name), feature_cache_mib=feature_cache_mib)
-    rfm_export.export(config.checkpoint, repository, export_config)
-    with serving(repository) as server:
-        server.wait_ready()
-        yield server
-
-
-@pytest.mark.slow
-@pytest.mark.triton
-def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(tmp_path: Path) -> None:
+def test_an_episode_goes_on_when_the_server_has_forgotten_its_frames(engines: EngineServer) -> None:
+    """As after a restart, or behind a load balancer."""
     frames = video(118, 9)
-    with (
-        own(tmp_path, IMAGES, feature_cache_mib=64) as server,
-        server.client(model=IMAGES) as client,
-        client.episode(TASK, frames=4) as episode,
-    ):
-        scores = [episode.add(frame) for frame in frames[:5]]
-        (pid,) = server.model_processes(f"{IMAGES}_frames")
-        os.kill(pid, signal.SIGKILL)
-        while len(scores) < len(frames):
-            with suppress(ServerUnavailableError, ProcessEndedError):  # then the episode has not grown
-                scores.append(episode.add(frames[len(scores)]))
-        expected = offline(client, frames)
-    assert [score.step for score in scores] == list(range(len(frames)))
-    assert_same(
-        ([score.progress for score in scores], [score.success for score in scores]), expected, BATCHED_VLM_TOLERANCE
-    )
-
-
-@pytest.mark.slow
-def test_a_server_that_knows_some_frames_and_one_that_keeps_none_score_alike(served: Served, tmp_path: Path) -> None:
-    frames = video(112, 12)
-    with (
-        own(tmp_path, MODEL, feature_cache_mib=0) as server,
-        RewardClient([served.url("grpc"), server.endpoints.grpc_url], model=MODEL) as client,
-    ):
-        expected = offline(client, frames)
-        for _ in range(3):
-            with client.episode(TASK, frames=4) as episode:
-                assert_same(online(episode, frames), expected)
+    for model, tolerance in ((MODEL, TOLERANCE), (IMAGES, BATCHED_VLM_TOLERANCE)):
+        with engines.client(model) as client, client.episode(TASK, frames=4) as episode:
+            scores = []
+            for t, frame in enumerate(frames):
+                if t in (4, 7):
+                    engines.forget_features()
+                scores.append(episode.add(frame))
+            expected = offline(client, frames)
+        assert [score.step for score in scores] == list(range(len(frames)))
+        told = [score.progress for score in scores], [score.success for score in scores]
+        assert_same(told, expected, tolerance)

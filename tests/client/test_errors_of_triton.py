@@ -10,10 +10,7 @@ import grpc
 import numpy as np
 import pytest
 
-from rfm_client import (
-    InvalidSampleError,
-    ServerUnavailableError,
-)
+from rfm_client import InvalidSampleError, ServerUnavailableError
 from rfm_client.contract.triton import error_of, invalid_sample
 from rfm_client.transport.connection import grpc_options
 from rfm_client.transport.request_size import check_size

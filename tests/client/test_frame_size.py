@@ -17,10 +17,7 @@ from rfm_client.frames.fit_to_checkpoint import fitted, snapshot
 
 @pytest.mark.parametrize(
     ("text", "size"),
-    [
-        ("shortest 256", FrameSize("shortest", (256,))),
-        ("exact 224x320", FrameSize("exact", (224, 320))),
-    ],
+    [("shortest 256", FrameSize("shortest", (256,))), ("exact 224x320", FrameSize("exact", (224, 320)))],
 )
 def test_a_frame_size_is_read_and_written(text: str, size: FrameSize) -> None:
     assert (FrameSize.parse(text), str(size)) == (size, text)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import av
 import numpy as np
@@ -16,6 +16,7 @@ from PIL import Image
 
 from pictures import TOP, WRIST
 from rfm_client import InvalidSampleError, Trajectory, UInt8Array, as_trajectory, load_trajectory
+from rfm_client.frames import Correction, Orientation
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (4, 6, 8, 3), np.uint8)
 
@@ -55,16 +56,6 @@ def test_frames_are_taken_from_a_tensor_without_a_copy() -> None:
     assert np.shares_memory(frames, FRAMES)
 
 
-def test_a_tensor_that_does_not_fit_is_refused_as_an_array_is() -> None:
-    with pytest.raises(InvalidSampleError) as refused:
-        Trajectory(frames=channels_first(FRAMES).bfloat16())  # type: ignore[arg-type]
-    assert str(refused.value).endswith(
-        "expected uint8 [T, H, W, 3] (see float_frames_to_uint8), got float32 [4, 3, 6, 8]"
-    )
-    with pytest.raises(InvalidSampleError, match=r"^video_embeddings: expected finite values, got nan at \[1, 0\]$"):
-        Trajectory(video_embeddings=torch.tensor([[0.0], [torch.nan]]))  # type: ignore[arg-type]
-
-
 def items(**more: Any) -> list[dict[str, Any]]:
     """One dict a step, as indexing a LeRobot dataset gives them."""
     return [
@@ -97,16 +88,11 @@ def test_an_episode_is_read_to_the_grey_level(episode: Any) -> None:
     np.testing.assert_array_equal(trajectory.frames, FRAMES)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64, torch.bfloat16], ids=str)
 def test_every_grey_level_survives_its_way_through_floats(dtype: torch.dtype) -> None:
     levels = np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 16, 16, 3)
-    np.testing.assert_array_equal(as_trajectory({TOP: channels_first(levels).to(dtype)}).positions, levels)
-
-
-def test_bfloat16_images_are_read_as_closely_as_they_are_told() -> None:
-    levels = np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 16, 16, 3)
-    read = as_trajectory({TOP: channels_first(levels).bfloat16()}).positions
-    assert np.abs(read.astype(int) - levels).max() <= 1
+    read = as_trajectory({TOP: channels_first(levels).to(dtype)}).positions
+    assert np.abs(read.astype(int) - levels).max() <= (dtype == torch.bfloat16)  # which has too few bits
 
 
 TASKS: dict[str, tuple[Any, str]] = {
@@ -129,6 +115,9 @@ def test_the_camera_is_picked_by_name() -> None:
     np.testing.assert_array_equal(as_trajectory(episode, camera="wrist").positions, FRAMES)
     np.testing.assert_array_equal(as_trajectory(episode, camera="image").positions, dark)
     np.testing.assert_array_equal(as_trajectory(episode | {"frames": dark}, camera="wrist").positions, FRAMES)
+    for camera in (None, "side"):
+        with pytest.raises(InvalidSampleError, match=f"^camera: expected one of .*top, wrist.*, got {camera!r}$"):
+            as_trajectory(episode, camera=camera)
 
 
 def test_steps_beyond_the_episode_s_ends_are_left_out() -> None:
@@ -150,90 +139,54 @@ def test_embeddings_are_read_from_a_dict() -> None:
     np.testing.assert_array_equal(trajectory.text_embedding, np.ones(2, np.float32))
 
 
-BAD_EPISODES: dict[str, tuple[Any, str | None, str]] = {
-    "no images": ({TOP: torch.ones(4, 5)}, None, f"{TOP}: expected {SHAPED}, got float32 [4, 5]"),
-    "one image": ({TOP: FRAMES[0]}, None, f"{TOP}: expected {SHAPED}, got uint8 [6, 8, 3]"),
-    "grey images": ({TOP: FRAMES[..., :1]}, None, f"{TOP}: expected {SHAPED}, got uint8 [4, 6, 8, 1]"),
-    "nothing in it": ({TOP: []}, None, f"{TOP}: expected images of one type and size, got none"),
+BAD_EPISODES: dict[str, tuple[Any, str]] = {
+    "one image": ({TOP: FRAMES[0]}, f"{TOP}: expected {SHAPED}, got uint8 [6, 8, 3]"),
+    "grey images": ({TOP: FRAMES[..., :1]}, f"{TOP}: expected {SHAPED}, got uint8 [4, 6, 8, 1]"),
+    "nothing in it": ({TOP: []}, f"{TOP}: expected images of one type and size, got none"),
     "images of several sizes": (
         {TOP: [FRAMES[0], FRAMES[0, :3]]},
-        None,
         f"{TOP}: expected images of one type and size, got uint8 [3, 8, 3] and uint8 [6, 8, 3]",
     ),
-    "a PIL image of depths": (
-        {TOP: [Image.new("I;16", (8, 6))]},
-        None,
-        f"{TOP}: expected {SHAPED}, got uint16 [1, 6, 8]",
-    ),
-    "a PIL image with a palette": (
-        {TOP: [Image.fromarray(FRAMES[0]).convert("P")]},
-        None,
-        f'{TOP}.picture: expected mode RGB, got mode P: call picture.convert("RGB")',
-    ),
+    "a PIL image of depths": ({TOP: [Image.new("I;16", (8, 6))]}, f"{TOP}: expected {SHAPED}, got uint16 [1, 6, 8]"),
     "a PIL image of other colours, which would be read as RGB": (
         {TOP: [Image.fromarray(FRAMES[0]).convert("HSV")]},
-        None,
         f'{TOP}.picture: expected mode RGB, got mode HSV: call picture.convert("RGB")',
     ),
     "floats in 0..255": (
         {TOP: FRAMES.astype(np.float32)},
-        None,
         f"{TOP}: expected {SHAPED}, got values from 0 to 249 (of floats in 0..255: float_frames_to_uint8)",
     ),
     "NaN": (
         {TOP: np.full((1, 2, 2, 3), np.nan)},
-        None,
         f"{TOP}: expected {SHAPED}, got values from nan to nan (of floats in 0..255: float_frames_to_uint8)",
     ),
-    "several cameras": ({TOP: FRAMES, WRIST: FRAMES}, None, "camera: expected one of top, wrist, got None"),
-    "another camera": ({TOP: FRAMES, WRIST: FRAMES}, "side", "camera: expected one of top, wrist, got 'side'"),
     "no camera": (
         {"observation.state": FRAMES, "action": FRAMES},
-        None,
         "episode: expected observation.images.<camera>, frames or video_embeddings, got the keys "
         "observation.state, action",
     ),
-    "frames and embeddings": (
-        {"frames": FRAMES, "video_embeddings": np.ones((4, 5), np.float32)},
-        None,
-        "trajectory: expected either frames or video_embeddings, got both",
-    ),
-    "several tasks": ({TOP: FRAMES, "task": ["a", "b"]}, None, "task: expected the same at all steps, got 'a' and 'b'"),
-    "a task that is no text": ({TOP: FRAMES, "task": torch.tensor(3)}, None, "task: expected str, got int"),
+    "several tasks": ({TOP: FRAMES, "task": ["a", "b"]}, "task: expected the same at all steps, got 'a' and 'b'"),
     "several episodes": (
         [*items(), *items(episode_index=torch.tensor(6))],
-        None,
         "episode_index: expected the same at all steps, got 5 and 6",
     ),
     "a step without the camera": (
         [*items(), {"task": "lift the cup", "episode_index": 5}],
-        None,
         f"{TOP}: expected images of one type and size, got float32 [3, 6, 8] and object []",
     ),
     "marks of another length": (
         {TOP: FRAMES, f"{TOP}_is_pad": np.array([True])},
-        None,
         f"{TOP}_is_pad: expected bool [4], got bool [1]",
     ),
-    "marks of another length for our own frames": (
-        {"frames": FRAMES, "frames_is_pad": np.array([True])},
-        None,
-        "frames_is_pad: expected bool [4], got bool [1]",
-    ),
-    "nothing but padding": (
-        {TOP: FRAMES, f"{TOP}_is_pad": np.ones(4, bool)},
-        None,
-        "frames: expected at least one frame of at least one pixel, got uint8 [0, 6, 8, 3]",
-    ),
-    "an array": (FRAMES, None, "episode: expected a dict, or one dict a step, got ndarray"),
-    "no steps": ([], None, "episode: expected a dict, or one dict a step, got nothing"),
+    "an array": (FRAMES, "episode: expected a dict, or one dict a step, got ndarray"),
+    "no steps": ([], "episode: expected a dict, or one dict a step, got nothing"),
 }
 
 
-@pytest.mark.parametrize(("episode", "camera", "message"), BAD_EPISODES.values(), ids=BAD_EPISODES)
-def test_an_episode_that_is_none_is_refused_with_the_place(episode: Any, camera: str | None, message: str) -> None:
+@pytest.mark.parametrize(("episode", "message"), BAD_EPISODES.values(), ids=BAD_EPISODES)
+def test_an_episode_that_is_none_is_refused_with_the_place(episode: Any, message: str) -> None:
     with pytest.raises(InvalidSampleError) as refused:
-        as_trajectory(episode, camera=camera)
+        as_trajectory(episode)
     assert str(refused.value) == message
 
 
@@ -267,26 +220,40 @@ def test_views_goal_and_descriptions_stand_beside_the_frames_of_a_file(tmp_path:
         load_trajectory(front, goal=front)
 
 
-def test_frames_of_files_are_turned_as_the_caller_says_and_embeddings_are_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "video.npy", FRAMES)
-    np.savez(tmp_path / "video.npz", frames=FRAMES, task="lift")
+def test_frames_of_files_are_corrected_as_the_caller_says_and_embeddings_are_refused(tmp_path: Path) -> None:
+    stored = FRAMES[..., ::-1]
+    np.save(tmp_path / "video.npy", stored)
+    np.savez(tmp_path / "video.npz", frames=stored, task="lift")
     np.save(tmp_path / "seen.npy", np.zeros((2, 3), np.float32))
     for name in ("video.npy", "video.npz"):
-        assert load_trajectory(tmp_path / name, orient="rotate180").positions.tolist() == FRAMES[:, ::-1, ::-1].tolist()
+        upright = load_trajectory(tmp_path / name, channels="bgr", orient="rotate90").positions
+        np.testing.assert_array_equal(upright, np.rot90(FRAMES, -1, axes=(1, 2)))
     with pytest.raises(InvalidSampleError, match=r"^orient: expected none for embeddings, .*, got rotate180"):
         load_trajectory(tmp_path / "seen.npy", orient="rotate180")
-
-
-def test_frames_of_files_that_are_stored_as_bgr_become_rgb(tmp_path: Path) -> None:
-    np.save(tmp_path / "video.npy", FRAMES[..., ::-1])
-    np.save(tmp_path / "seen.npy", np.zeros((2, 3), np.float32))
-    assert load_trajectory(tmp_path / "video.npy", channels="bgr").positions.tolist() == FRAMES.tolist()
-    both = load_trajectory(tmp_path / "video.npy", channels="bgr", orient="rotate90").positions
-    np.testing.assert_array_equal(both, np.rot90(FRAMES, -1, axes=(1, 2)))
     with pytest.raises(InvalidSampleError, match=r"^channels: expected rgb for embeddings, .*, got bgr"):
         load_trajectory(tmp_path / "seen.npy", channels="bgr")
-    with pytest.raises(ValueError, match=r"^channels: expected one of rgb, bgr, got 'RGB'$"):
-        load_trajectory(tmp_path / "video.npy", channels="RGB")  # type: ignore[arg-type]
+
+
+TURNED: dict[Orientation, Callable[[Any], Any]] = {
+    "none": lambda frames: frames,
+    "rotate180": lambda frames: frames[:, ::-1, ::-1],
+    "flip-vertical": lambda frames: frames[:, ::-1],
+    "flip-horizontal": lambda frames: frames[:, :, ::-1],
+    "rotate90": lambda frames: np.rot90(frames, -1, axes=(1, 2)),
+    "rotate270": lambda frames: np.rot90(frames, axes=(1, 2)),
+}
+
+
+def test_a_correction_turns_frames_and_swaps_red_and_blue() -> None:
+    """All readers and episodes end here."""
+    assert TURNED.keys() == set(get_args(Orientation))
+    for orient, turned in TURNED.items():
+        np.testing.assert_array_equal(Correction(orient).applied(FRAMES), turned(FRAMES))
+        np.testing.assert_array_equal(Correction(orient, "bgr").applied(FRAMES), turned(FRAMES)[..., ::-1])
+    for wrong in ({"orient": "rotate45"}, {"channels": "RGB"}):
+        ((name, value),) = wrong.items()
+        with pytest.raises(ValueError, match=rf"^{name}: expected one of .*, got '{value}'$"):
+            Correction(**wrong)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])

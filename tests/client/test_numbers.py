@@ -27,31 +27,27 @@ def client(**options: Any) -> None:
     RewardClient(URL, **options).close()
 
 
-SHARES: dict[str, Given] = {
-    "SuccessRule.threshold": SuccessRule,
-    "FrameScores.succeeded": lambda value: SCORES.succeeded(threshold=value),
-}
-COUNTS: dict[str, Given] = {
-    "SuccessRule.last": lambda value: SuccessRule(last=value),
-    "FrameScores.succeeded": lambda value: SCORES.succeeded(last=value),
-    "RewardOptions.every": lambda value: RewardOptions(every=value),
-    "RewardOptions.max_pending": lambda value: RewardOptions(max_pending=value),
-    "RewardOptions.max_frames": lambda value: RewardOptions(sampling="rint_pad", max_frames=value),
-    "EpisodeOptions.frames": lambda value: EpisodeOptions(sampling="rint_pad", frames=value),
-    "Sampling.frames": lambda value: Sampling("linspace_trunc", value),
-    "LabelOptions.workers": lambda value: LabelOptions(workers=value),
-    "LabelOptions.limit": lambda value: LabelOptions(limit=value),
-    "LabelOptions.frames": lambda value: LabelOptions(frames=value),
+def giving(kind: Callable[..., object], *names: str, **others: Any) -> dict[str, Given]:
+    """By name, what takes the number as this argument."""
+    return {f"{kind.__name__}.{name}": lambda value, name=name: kind(**others, **{name: value}) for name in names}
+
+
+SHARES = {**giving(SuccessRule, "threshold"), **giving(SCORES.succeeded, "threshold")}
+COUNTS = {
+    **giving(SuccessRule, "last"),
+    **giving(SCORES.succeeded, "last"),
+    **giving(RewardOptions, "every", "max_pending"),
+    **giving(RewardOptions, "max_frames", sampling="rint_pad"),
+    **giving(EpisodeOptions, "frames", sampling="rint_pad"),
+    **giving(Sampling, "frames", rule="linspace_trunc"),
+    **giving(LabelOptions, "workers", "limit", "frames"),
     "LabelOptions.shard": lambda value: LabelOptions(shard=(0, value)),
-    "RayOptions.actors": lambda value: RayOptions(actors=value),
-    "RewardClient.max_in_flight": lambda value: client(max_in_flight=value),
+    **giving(RayOptions, "actors"),
+    **giving(client, "max_in_flight"),
 }
 FROM_0: dict[str, Given] = {"LabelOptions.episodes": lambda value: LabelOptions(episodes=[value])}
-POSITIVES: dict[str, Given] = {"RewardClient.timeout_s": lambda value: client(timeout_s=value)}
-FINITES: dict[str, Given] = {
-    "RewardOptions.scale": lambda value: RewardOptions(scale=value),
-    "RayOptions.num_gpus_per_actor": lambda value: RayOptions(num_gpus_per_actor=value),
-}
+POSITIVES = giving(client, "timeout_s")
+FINITES = {**giving(RewardOptions, "scale"), **giving(RayOptions, "num_gpus_per_actor")}
 NO_NUMBERS = [math.nan, math.inf, True, "8"]
 
 

@@ -11,15 +11,13 @@ import pytest
 from pyarrow import parquet
 
 from client_commands import invoke
+from engine_server import EngineServer
 from rfm_client import RewardClient, load_trajectory
 from rfm_client.frames import Sampling
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
-from servers import Endpoints
 from tolerances import TOLERANCE
 from toy_world import Task, make_clip
 from toy_world.video import write_video
-
-pytestmark = pytest.mark.triton
 
 TASK = "put the red block in the bowl"
 
@@ -32,19 +30,20 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "success.mp4"
 
 
-def test_demo_score_episode_and_labels_agree_on_a_clip_of_the_demo(demo_server: Endpoints, video: Path) -> None:
+def test_demo_score_episode_and_labels_agree_on_a_clip_of_the_demo(engines: EngineServer, video: Path) -> None:
     trajectory = load_trajectory(video, task=TASK)
     assert trajectory.frames is not None
-    with RewardClient(demo_server.grpc_url) as client:
+    with RewardClient(engines.url) as client:
         info = client.model_info(frames=True)
         assert Sampling.of(None, None, info.max_frames, trained_padding=info.trained_padding) == Sampling("rint", 32)
         expected = client.progress(trajectory).progress  # as the demo asks
+        curve = client.curve(trajectory).progress
         with client.episode(TASK) as episode:
             stepped = [episode.add(frame).progress for frame in trajectory.frames]
         report = label(open_dataset(video.parent), ClientScorer(client), LabelOptions())
     labelled = parquet.read_table(report.files[0])["progress_sparse"].to_numpy()
-    shown = invoke("score", video, "--task", TASK, "--url", demo_server.http_url, "--json")
+    shown = invoke("score", video, "--task", TASK, "--url", engines.url, "--json")
     (scored,) = json.loads(shown.stdout)["videos"]
     assert expected[-1] > 0.95
-    for curve in (stepped, labelled, scored["progress"]):
-        np.testing.assert_allclose(curve, expected, rtol=0, atol=TOLERANCE)
+    for each in (curve, stepped, labelled, scored["progress"]):
+        np.testing.assert_allclose(each, expected, rtol=0, atol=TOLERANCE)

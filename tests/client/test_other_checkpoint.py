@@ -36,9 +36,9 @@ def test_as_many_frames_are_shown_as_the_checkpoint_was_trained_on_by_now(wraps:
 
 
 def test_frames_are_resized_as_the_checkpoint_reads_them_by_now() -> None:
+    """Kept frames have the size of the episode's first."""
     small, large = (
-        replace(SHORT, frame_size=FrameSize("exact", (8, 8))),
-        replace(LONG, frame_size=FrameSize("exact", (16, 16))),
+        replace(kept, frame_size=FrameSize("exact", (size, size))) for kept, size in ((SHORT, 8), (LONG, 16))
     )
     shelf = Shelf(small, large, after=1, has_encoder=False)
     with RewardClient("", transports=[shelf]) as client, client.episode(TASK, resize=True) as episode:
@@ -46,22 +46,13 @@ def test_frames_are_resized_as_the_checkpoint_reads_them_by_now() -> None:
             episode.add(FRAME)
         with pytest.raises(InvalidSampleError, match=r"as the episode's first, or a reset, got uint8 \[16, 16, 3\]"):
             episode.add(FRAME)
+        assert {shape[2:4] for shape in shelf.shapes} == {(8, 8)}
         episode.reset()
         episode.add(FRAME)
-    assert shelf.shapes[-1] == (1, 8, 16, 16, 3)
-    assert {shape[2:4] for shape in shelf.shapes[:-1]} == {(8, 8)}
-
-
-def test_kept_frames_have_the_size_that_the_checkpoint_read_at_the_first() -> None:
-    small, large = (
-        replace(SHORT, frame_size=FrameSize("exact", (8, 8))),
-        replace(LONG, frame_size=FrameSize("exact", (16, 16))),
-    )
-    shelf = Shelf(small, large, after=1, has_encoder=False)
-    with RewardClient("", transports=[shelf]) as client:
-        for _ in range(2):
-            episode = client.episode(TASK, resize=True)
-            for _ in range(3):
-                episode.keep(FRAME)
-                client.score_episodes([episode])
-    assert [shape[2:4] for shape in shelf.shapes] == [(8, 8)] * 3 + [(16, 16)] * 3
+        assert shelf.shapes[-1] == (1, 8, 16, 16, 3)
+        kept = client.episode(TASK, resize=True)
+        kept.keep(FRAME)
+        shelf.other = small
+        kept.keep(FRAME)
+        client.score_episodes([kept])
+        assert shelf.shapes[-1][2:4] == (16, 16)

@@ -16,11 +16,11 @@ import rerun
 from PIL import Image
 
 from client_commands import TASK, invoke
+from engine_server import EngineServer
 from rfm_client import FrameScores, load_trajectory
 from rfm_client.command_line import ExitCode
 from rfm_client.frames import frame_times_s
 from rfm_client.recording import Recording
-from servers import Endpoints
 
 JPEG_ERROR = 30  # largest difference after compression
 NS_PER_S = 1e9
@@ -39,15 +39,14 @@ def logged(file: Path, timeline: str, entity: str, component: str) -> tuple[list
     return [time for time, _ in rows], [value for _, value in rows]
 
 
-@pytest.mark.triton
-def test_score_records_frames_and_curves_on_one_timeline(demo_server: Endpoints, video: Path, tmp_path: Path) -> None:
+def test_score_records_frames_and_curves_on_one_timeline(engines: EngineServer, video: Path, tmp_path: Path) -> None:
     other, seen = tmp_path / "other clip.mp4", tmp_path / "seen.npz"
     shutil.copy(video, other)
     np.savez(seen, video_embeddings=np.ones((5, 64), np.float32), text_embedding=np.ones(32, np.float32))
     out, target = tmp_path / "out.rrd", tmp_path / "scores.json"
     result = invoke(
         *("score", video, other, "missing.mp4", seen, "--task", TASK, "--fps", 10, "--max-frames", 7),
-        *("--rrd", out, "--json", target, "--url", demo_server.grpc_url),
+        *("--rrd", out, "--json", target, "--url", engines.url),
     )
     assert result.exit_code == ExitCode.FAILED  # of the missing one alone
     of_video, of_seen = {"image", "progress", "success"}, {"progress", "success"}
@@ -92,16 +91,9 @@ def test_a_score_that_is_not_predicted_has_no_curve_and_nothing_makes_no_file(tm
 
 
 def test_a_missing_package_is_told_with_the_command_that_installs_it(
-    demo_server: Endpoints, video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    words = ("score", video, "--task", TASK, "--url", demo_server.grpc_url)
-    result = invoke(*words, "--rrd", tmp_path / "out.rrd")
+    result = invoke("score", video, "--task", TASK, "--url", "grpc://localhost:1", "--rrd", tmp_path / "out.rrd")
     assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
     assert result.stderr == 'rfm-client: recordings need rerun-sdk: pip install "./client[rerun]"\n'
-
-
-def test_a_recording_has_the_ending_that_the_viewer_opens(video: Path, tmp_path: Path) -> None:
-    result = invoke("score", video, "--rrd", tmp_path / "out.mp4")
-    assert result.exit_code == ExitCode.USAGE
-    assert "a file that ends in .rrd" in " ".join(result.stderr.split())

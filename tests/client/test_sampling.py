@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import goldens
-from client_commands import MODEL, TASK, ask, assert_scores, invoke
+from client_commands import MODEL, TASK, ask, assert_scores
+from engine_server import EngineServer
 from every_score import assert_same_scores, every_score
 from paths import GOLDEN
 from rfm_client import FrameScores, ProgressResult, ProgressSample, Trajectory, load_trajectory
 from rfm_client.frames import Rule, Sampling
 from rfm_client.frames.sampling import thinned
-from servers import Served
 
 VECTORS = GOLDEN / "sampling-vectors.json"
 ELSEWHERE = goldens.ROOT.parent / VECTORS.name  # beside the further reference cases, where there are some
@@ -130,16 +130,16 @@ def test_the_checkpoint_says_how_many_frames_if_the_caller_does_not() -> None:
         Sampling.of("rint_pad", None, None)
 
 
-@pytest.mark.parametrize("rule", ["linspace_trunc", "rint_pad", "rewind_pad16_offline", "all"])
-def test_score_scores_each_frame_on_its_prefix(served: Served, video: Path, rule: Any) -> None:
-    words = [] if rule in ("all", "rewind_pad16_online", "rewind_pad16_offline") else ["--frames", 4]
-    result = ask(served, "score", video, "--task", TASK, "--sampling", rule, *words, "--json")
+@pytest.mark.parametrize("rule", ["linspace_trunc", "rewind_pad16_offline"])
+def test_score_scores_each_frame_on_its_prefix(engines: EngineServer, video: Path, rule: Any) -> None:
+    words = ["--frames", 4] if rule == "linspace_trunc" else []
+    result = ask(engines, "score", video, "--task", TASK, "--sampling", rule, *words, "--json")
     assert (result.exit_code, result.stderr) == (0, "")
     (scored,) = json.loads(result.stdout)["videos"]
     trajectory = load_trajectory(video, task=TASK, fps=3.0)
     assert trajectory.frames is not None
     sampling = Sampling.of(rule, 4 if words else None, None)
-    with served.client("grpc", MODEL) as client:
+    with engines.client(MODEL) as client:
         shown = [sampling.prefix(t) for t in range(trajectory.num_frames)]
         results = client.evaluate(
             ProgressSample(Trajectory(frames=trajectory.frames[prefix.indices], task=TASK)) for prefix in shown
@@ -149,21 +149,3 @@ def test_score_scores_each_frame_on_its_prefix(served: Served, video: Path, rule
     for name in ("progress", "success"):
         expected = [getattr(each, name)[prefix.read] for each, prefix in zip(results, shown, strict=True)]
         np.testing.assert_allclose(scored[name], expected, rtol=0, atol=1e-5)
-
-
-CONTRADICTIONS = {
-    "a number without a rule": (["--frames", 4], "Error: Invalid value: --frames needs --sampling\n"),
-    "two ways of sampling": (["--sampling", "all", "--frame-steps", 4], "--sampling conflicts with --frame-steps"),
-    "a limit beside a rule": (["--sampling", "all", "--max-frames", 4], "--sampling conflicts with --max-frames"),
-    "a number that the rule does not take": (
-        ["--sampling", "all", "--frames", 4],
-        "Invalid value for '--frames': expected none with the rule all",
-    ),
-}
-
-
-@pytest.mark.parametrize(("words", "message"), CONTRADICTIONS.values(), ids=CONTRADICTIONS)
-def test_score_refuses_contradictory_sampling(video: Path, words: list[object], message: str) -> None:
-    result = invoke("score", video, "--task", TASK, *words)
-    assert result.exit_code == 2
-    assert message in result.stderr

@@ -52,7 +52,9 @@ TAGS = {
 FILMS = {
     **{f"{codec} {pixels}": (codec, pixels, []) for codec, (_, kinds) in CODECS.items() for pixels in kinds},
     **{
-        f"{pixels}, {name}": ("libx264", pixels, tags) for pixels in CODECS["libx264"][1] for name, tags in TAGS.items()
+        f"{pixels}, {name}": ("libx264", pixels, tags)
+        for pixels in ("yuv420p", "yuv444p10le")
+        for name, tags in TAGS.items()
     },
 }
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from engine_server import EngineServer
 from in_process import rfm, rfm_client
 from labelling import LEROBOT
 from paths import ROOT
@@ -49,47 +50,63 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
+def bad(option: str, problem: str) -> str:
+    return f"Invalid value for '{option}': {problem}"
+
+
 # Usage errors; the message follows "Error: ".
 USAGE = {
     "rfm-client score": "Missing argument 'VIDEO...'.",
     "rfm-client score a.mp4 --tsk x": "No such option: --tsk (Possible options: --fps, --task)",
     "rfm-client score a.mp4 --steps-frame 8": "No such option: --steps-frame (Possible options: --frame-steps)",
-    "rfm-client score a.mp4 --fps zero": "Invalid value for '--fps': expected a number, got 'zero'",
-    "rfm-client score a.mp4 --fps 0": "Invalid value for '--fps': expected at least 0.001, got 0.0",
-    "rfm-client score a.mp4 --fps nan": "Invalid value for '--fps': expected a finite number, got nan",
-    "rfm-client score a.mp4 --max-frames 1.5": "Invalid value for '--max-frames': expected a whole number, got '1.5'",
-    "rfm-client score a.mp4 --channels grb": "Invalid value for '--channels': 'grb' is not one of 'rgb', 'bgr'.",
+    "rfm-client score a.mp4 --fps zero": bad("--fps", "expected a number, got 'zero'"),
+    "rfm-client score a.mp4 --fps 0": bad("--fps", "expected at least 0.001, got 0.0"),
+    "rfm-client score a.mp4 --fps nan": bad("--fps", "expected a finite number, got nan"),
+    "rfm-client score a.mp4 --max-frames 1.5": bad("--max-frames", "expected a whole number, got '1.5'"),
+    "rfm-client score a.mp4 --channels grb": bad("--channels", "'grb' is not one of 'rgb', 'bgr'."),
     "rfm-client score a.mp4 --frames 8": "Invalid value: --frames needs --sampling",
     "rfm-client score a.mp4 --frame-steps 8 --sampling all": "Invalid value: --sampling conflicts with --frame-steps",
-    "rfm-client score a.mp4 --frame-steps 1": ("Invalid value for '--frame-steps': expected 0 or at least 2, got 1"),
-    "rfm-client score a.mp4 --plot a.jpg": (
-        "Invalid value for '--plot': expected a file that ends in .png, .pdf, .svg, got a.jpg"
+    "rfm-client score a.mp4 --frame-steps 1": bad("--frame-steps", "expected 0 or at least 2, got 1"),
+    "rfm-client score a.mp4 --plot a.jpg": bad("--plot", "expected a file that ends in .png, .pdf, .svg, got a.jpg"),
+    "rfm-client score a.mp4 --plot nowhere/a.png": bad(
+        "--plot", "expected a folder at nowhere, got none: mkdir -p nowhere"
     ),
-    "rfm-client score a.mp4 --plot nowhere/a.png": (
-        "Invalid value for '--plot': expected a folder at nowhere, got none: mkdir -p nowhere"
+    "rfm-client score a.mp4 --npy a.txt": bad("--npy", "expected a .npy file or a folder, got a.txt"),
+    "rfm-client score a.mp4 --url localhost:8001": bad("--url", f"{URL} 'localhost:8001'"),
+    "rfm-client score a.mp4 --url grpc://localhost:99999": bad("--url", f"{URL} 'grpc://localhost:99999'"),
+    "rfm-client score a.mp4 --ca-file nope.pem": bad(
+        "--ca-file", "expected certificates (PEM) at nope.pem, got No such file or directory"
     ),
-    "rfm-client score a.mp4 --npy a.txt": "Invalid value for '--npy': expected a .npy file or a folder, got a.txt",
-    "rfm-client score a.mp4 --url localhost:8001": f"Invalid value for '--url': {URL} 'localhost:8001'",
-    "rfm-client score a.mp4 --url grpc://localhost:99999": f"Invalid value for '--url': {URL} 'grpc://localhost:99999'",
-    "rfm-client score a.mp4 --ca-file nope.pem": (
-        "Invalid value for '--ca-file': expected certificates (PEM) at nope.pem, got No such file or directory"
-    ),
-    "rfm-client score a.mp4 --ca-file key.pem": (
-        "Invalid value for '--ca-file': expected certificates (PEM) at key.pem, got a file without certificate"
+    "rfm-client score a.mp4 --ca-file key.pem": bad(
+        "--ca-file", "expected certificates (PEM) at key.pem, got a file without certificate"
     ),
     "rfm-client score a.mp4 --client-certificate key.pem": ("Invalid value: --client-certificate needs --client-key"),
-    "rfm-client score a.mp4 --client-certificate key.pem --client-key key.pem": (
-        f"Invalid value for '--client-certificate': {PAIR} key.pem and key.pem, got a file in another format"
+    "rfm-client score a.mp4 --client-certificate key.pem --client-key key.pem": bad(
+        "--client-certificate", f"{PAIR} key.pem and key.pem, got a file in another format"
     ),
-    "rfm-client score a.mp4 --api-key-file nope.txt": (
-        "Invalid value for '--api-key-file': expected a text file, got nope.txt: No such file or directory"
+    "rfm-client score a.mp4 --api-key-file nope.txt": bad(
+        "--api-key-file", "expected a text file, got nope.txt: No such file or directory"
+    ),
+    "rfm-client score --json a.mp4 b.mp4": bad("--json", "expected a file that ends in .json or -, got a.mp4"),
+    "rfm-client score a.mp4 b.mp4 --npy a.npy": bad("--npy", "expected a folder for 2 videos, got a.npy"),
+    f"rfm-client score {' '.join(['a.mp4'] * 41)} --plot a.png": bad("--plot", "expected at most 40 videos, got 41"),
+    "rfm-client score a.mp4 --sampling all --max-frames 4": ("Invalid value: --sampling conflicts with --max-frames"),
+    "rfm-client score a.mp4 --sampling all --frames 4": bad("--frames", "expected none with the rule all, got 4"),
+    "rfm-client status --json /dev/null/a.json": bad(
+        "--json", "expected a folder at /dev/null, got none: mkdir -p /dev/null"
+    ),
+    "rfm-client status --url http://a:1 --url http://b:1 --metrics-url http://a:2": (
+        "Invalid value: --metrics-url needs a single --url"
+    ),
+    "rfm-client --api-key-file /nowhere status": bad(
+        "--api-key-file", "expected a text file, got /nowhere: No such file or directory"
     ),
     "rfm-client compare a.mp4": "Invalid value for VIDEO: expected at least 2 videos, got 1",
-    "rfm-client sample --num-frames 8-4": (
-        "Invalid value for '--num-frames': expected a length (8), several (4,8,16) or a range (4-16), got '8-4'"
+    "rfm-client sample --num-frames 8-4": bad(
+        "--num-frames", "expected a length (8), several (4,8,16) or a range (4-16), got '8-4'"
     ),
-    "rfm-client bench-input --output nowhere/a.json": (
-        "Invalid value for '--output': expected a folder at nowhere, got none: mkdir -p nowhere"
+    "rfm-client bench-input --output nowhere/a.json": bad(
+        "--output", "expected a folder at nowhere, got none: mkdir -p nowhere"
     ),
     "rfm-client --task x score a.mp4": (
         "No such option: --task: it stands after the command, as in rfm-client score --task"
@@ -97,26 +114,22 @@ USAGE = {
     "rfm-client stauts": "No such command 'stauts'. Did you mean 'status'?",
     "rfm-client serve my_models": "No such command 'serve': that is `rfm serve`",
     "rfm-client gateway": "Missing option '--triton'.",
-    "rfm-client gateway --triton localhost": f"Invalid value for '--triton': {URL} 'localhost'",
-    f"rfm-client gateway --triton {NOBODY} --metrics-url nope": (
-        "Invalid value for '--metrics-url': expected http://host:port/metrics, got 'nope'"
+    "rfm-client gateway --triton localhost": bad("--triton", f"{URL} 'localhost'"),
+    f"rfm-client gateway --triton {NOBODY} --metrics-url nope": bad(
+        "--metrics-url", "expected http://host:port/metrics, got 'nope'"
     ),
-    f"rfm-client gateway --triton {NOBODY} --allow-folder nope": (
-        "Invalid value for '--allow-folder': expected a folder, got nope: No such file or directory"
+    f"rfm-client gateway --triton {NOBODY} --allow-folder nope": bad(
+        "--allow-folder", "expected a folder, got nope: No such file or directory"
     ),
-    f"rfm-client gateway --triton {NOBODY} --dataset file.txt": f"Invalid value for '--dataset': {SHOWN} file.txt",
+    f"rfm-client gateway --triton {NOBODY} --dataset file.txt": bad("--dataset", f"{SHOWN} file.txt"),
     "rfm-client label": "Missing argument 'DATASET'.",
-    "rfm-client label dataset --episodes 5:2": (
-        "Invalid value for '--episodes': expected numbers and ranges such as 0:100,205, got '5:2'"
+    "rfm-client label dataset --episodes 5:2": bad(
+        "--episodes", "expected numbers and ranges such as 0:100,205, got '5:2'"
     ),
-    "rfm-client label dataset --format csv": (
-        "Invalid value for '--format': expected one of progress, signals, hdf5, got 'csv'"
-    ),
-    "rfm-client label dataset --shard 3": "Invalid value for '--shard': expected i/n, for example 0/8, got '3'",
+    "rfm-client label dataset --format csv": bad("--format", "expected one of progress, signals, hdf5, got 'csv'"),
+    "rfm-client label dataset --shard 3": bad("--shard", "expected i/n, for example 0/8, got '3'"),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
-    "rfm-client label dataset --name a/b": (
-        "Invalid value for '--name': expected 1 to 64 letters, digits, _ or -, got 'a/b'"
-    ),
+    "rfm-client label dataset --name a/b": bad("--name", "expected 1 to 64 letters, digits, _ or -, got 'a/b'"),
     "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
     "rfm demo": "No such command 'demo': it is now `rfm try`",
     "rfm try": "Missing argument 'VIDEO'.",
@@ -128,7 +141,7 @@ USAGE = {
         "No such option: --log-verbose: put options of tritonserver after --, as in rfm serve FOLDER -- "
         "--log-verbose=VALUE"
     ),
-    "rfm serve repository --http-port abc": "Invalid value for '--http-port': expected a whole number, got 'abc'",
+    "rfm serve repository --http-port abc": bad("--http-port", "expected a whole number, got 'abc'"),
     "rfm serve repository --gateway-dataset nope": (
         "Invalid value: --gateway-dataset needs --gateway-port, which starts the gateway"
     ),
@@ -169,7 +182,7 @@ FAILURES = {
         1,
         f"--grpc-certificate: {PAIR} key.pem and key.pem, got a file in another format",
     ),
-    "rfm serve repository --gateway-port 28100 --gateway-dataset nope": (1, f"--gateway-dataset: {SHOWN} nope"),
+    "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (1, f"--gateway-dataset: {SHOWN} nope"),
     "rfm serve repository --config nope.yaml": (
         1,
         "nope.yaml: expected a YAML file, got nope.yaml: No such file or directory",
@@ -224,7 +237,7 @@ AT_SERVER = {
 
 def answer(command: str) -> tuple[int, str]:
     """Return the exit code and the last line of standard error."""
-    program, *words = shlex.split(command)
+    program, *words = shlex.split(command.replace("FREE_PORT", str(Endpoints.free().http_port)))
     done = (rfm if program == "rfm" else rfm_client)(*words)
     return done.exit_code, done.stderr.splitlines()[-1]
 
@@ -241,18 +254,16 @@ def test_what_cannot_be_done_is_told_with_what_was_found(command: str, told: tup
     assert answer(command) == (code, f"{program}: {''.join(map(str, message))}")
 
 
-@pytest.mark.triton
 @pytest.mark.parametrize(("words", "told"), AT_SERVER.items(), ids=AT_SERVER)
 def test_inputs_that_a_server_would_score_are_told(
-    demo_server: Endpoints, words: str, told: tuple[int | str, ...]
+    engines: EngineServer, words: str, told: tuple[int | str, ...]
 ) -> None:
     code, *message = told
     expected = f"rfm-client: {''.join(map(str, message))}"
-    assert answer(f"rfm-client {words} --url {demo_server.grpc_url}") == (code, expected)
+    assert answer(f"rfm-client {words} --url {engines.url}") == (code, expected)
 
 
-def test_there_are_enough_of_them() -> None:
+def test_no_message_has_the_words_of_a_library() -> None:
     messages = [*USAGE.values(), *("".join(map(str, told)) for told in (*FAILURES.values(), *AT_SERVER.values()))]
-    assert len(messages) >= 60
     for words in (r"\[Errno", "pydantic", "Input should be", "Value error", r"_ssl\.c", "StatusCode", "last error"):
         assert not re.search(words, " ".join(messages))

@@ -8,18 +8,18 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from typer.testing import Result
 
 import clip
 from in_process import rfm_client as invoke
-from rfm_client import (
-    FrameScores,
-)
-from servers import Served
+from rfm_client import FrameScores
 from tolerances import TOLERANCE
+
+if TYPE_CHECKING:
+    from engine_server import EngineServer
 
 RFM_CLIENT = Path(sys.executable).parent / "rfm-client"
 
@@ -33,9 +33,9 @@ WIDTHS = (48, 32)  # of video and text embeddings
 TASK = clip.TASK
 
 
-def ask(served: Served, *words: object, protocol: str = "grpc", model: str = MODEL) -> Result:
+def ask(server: EngineServer, *words: object, model: str = MODEL) -> Result:
     """A command about the served model, in this process."""
-    return invoke(*words, "--url", served.url(protocol), "--model", model)
+    return invoke(*words, "--url", server.url, "--model", model)
 
 
 def run(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -82,12 +82,11 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         except ConfigError as error:
             raise _named(error, {each.name: each.option for some in options.values() for each in some}) from None
         except errors.LocatedError as error:  # of what an option names: a server, a dataset
-            place, _, name = error.where.rpartition(": ")
             typed = {each.name: each.option for some in options.values() for each in some if _key(each) in context.obj}
             typed |= {option.strip("-").replace("-", "_"): option for option in typed.values()}
-            if name not in typed or name == "frames":  # those of a sample
+            if error.where not in typed or error.where == "frames":  # those of a sample
                 raise
-            raise error.like(error, where=": ".join(filter(None, [place, typed[name]]))) from None
+            raise error.like(error, where=typed[error.where]) from None
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

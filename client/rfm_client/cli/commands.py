@@ -122,7 +122,6 @@ def score(
             return
         result = outcome.result
         _report_subsampled(outcome.name, len(result.progress), outcome.num_frames)
-        _report_blank(outcome.name, outcome.blank)
         for told in filter(None, (FRAME_SCORES[name].told(each) for name, each in result.arrays.items())):
             report(f"note: {outcome.name}: {told}")
         if arrays:
@@ -171,7 +170,6 @@ def compare(
         checkpoint = scoring.checkpoint_of(client, comparison.sources[0].trajectory)
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
-        _report_blank(source.name, source.blank)
     if output.prints_tables:
         print_tables(*comparison.tables())
     output.write_json(documents.comparison_document(server, video, comparison))
@@ -227,11 +225,7 @@ def wait(server: WaitOptions) -> None:
         with server.client() as client:
             client.wait_ready(server.timeout_s)
     except DeadlineExceededError as error:
-        servers = ", ".join(server.urls)
-        problem = str(error) if server.urls[0] in str(error) else f"{servers}: {error}"
-        raise DeadlineExceededError(
-            f"{problem}: start a server there (rfm serve), or wait longer (--timeout)"
-        ) from None
+        raise DeadlineExceededError(f"{error}: start a server there (rfm serve), or wait longer (--timeout)") from None
     typer.echo(f"ready after {time.monotonic() - started_s:.1f} s")
 
 
@@ -289,11 +283,6 @@ def bench_input(
 def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:
     if num_scored < num_frames:
         report(f"note: {name}: {num_scored} of {num_frames} frames were scored, evenly spaced")
-
-
-def _report_blank(name: str, blank: str) -> None:
-    if blank:
-        report(f"note: {name}: {blank}: its scores mean nothing")
 
 
 def _add_applications() -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import sys
 import time
 from collections import Counter
@@ -11,7 +10,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, TypeAlias, cast
 
@@ -32,10 +30,9 @@ from rfm_client.contract.errors import (
     RewardError,
     ServerUnavailableError,
 )
-from rfm_client.contract.results import FrameScores, ProgressResult, Result
+from rfm_client.contract.results import FrameScores, ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.contract.tasks import is_blank
-from rfm_client.frames.blank_frames import BlankFrames
 from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, with_frame_indices
 from rfm_client.frames.sampling import Sampling
 from rfm_client.plot import plot_scores
@@ -43,7 +40,6 @@ from rfm_client.plot import plot_scores
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PREFIXES_AT_A_TIME = 64  # of one video, since their frames are in memory
 WORKERS = 8  # videos in memory at a time
 PROBE_S = 2.0  # timeout of the check for a live server
 NOT_ASKED = "not asked, since no server answers any more"
@@ -81,11 +77,6 @@ class Source:
         has_times = not are_arrays and not is_url(name)
         return cls(name, trajectory, frame_times_s(name, trajectory.num_frames) if has_times else None)
 
-    @cached_property
-    def blank(self) -> str:
-        """What the frames show, as in ``BlankFrames.told``; empty: they show something, or are embeddings."""
-        return "" if self.trajectory.frames is None else BlankFrames(self.trajectory.frames).told
-
     def times_of(self, scores: FrameScores) -> Times | None:
         """Return the scored frames' times in the video, float64 [T]; None: unknown."""
         return None if self.times_s is None else self.times_s[scores.scored_frames]
@@ -102,7 +93,6 @@ class Scored:
     checkpoint: as in ``checkpoint_of``
     num_frames: frames that were read
     times_s: float64 [T], times of the T scored frames; None: unknown
-    blank: as in ``Source``
     """
 
     name: str
@@ -112,7 +102,6 @@ class Scored:
     times_s: Times | None
     panel: Panel
     took_s: float
-    blank: str
 
     @property
     def row(self) -> tuple[str, ...]:
@@ -196,7 +185,6 @@ class SourceScorer:
             times_s=source.times_of(result),
             panel=source.panel(PurePath(name).name, result),
             took_s=time.monotonic() - started_s,
-            blank=source.blank,
         )
 
     def _is_server_gone(self, error: Exception) -> bool:
@@ -258,17 +246,12 @@ def _evaluate(
         asked = replace(sent, frame_steps=prefix.frame_steps)
         (result,) = client.evaluate([asked], all_scores=True)
         return cast(ProgressResult, with_frame_indices(result, fit.frame_indices))
-    info.check_scores_prefixes()
     try:
         sampling = Sampling.of(prefix.sampling, prefix.frames, info.max_frames)
     except InvalidValueError as error:  # the options are valid: the checkpoint lacks the number
         raise InvalidSampleError.like(error, where=f"--{error.where}") from error
-    samples = sampling.samples(sent.trajectory)
-    results: list[Result] = []
-    while part := list(itertools.islice(samples, PREFIXES_AT_A_TIME)):
-        results += client.evaluate(part, all_scores=True)
-    told = sampling.joined(cast("list[ProgressResult]", results))
-    return cast(ProgressResult, with_frame_indices(told, fit.frame_indices))
+    curve = client.curve(sent.trajectory, sampling, all_scores=True)
+    return cast(ProgressResult, with_frame_indices(curve, fit.frame_indices))
 
 
 def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:

@@ -90,6 +90,8 @@ class StepScorer:
 
     async def _all_outcomes(self, windows: Sequence[Window], info: ModelInfo, call: Call) -> list[Result | RewardError]:
         self._scorer.tell_of_length(max((len(window.frames) for window in windows), default=0), info)
+        for window in windows:
+            self._scorer.tell_of_blank([frame.pixels for frame in dict.fromkeys(window.frames)])
         if not info.by_digest:
             return await self._whole(windows, call)
         num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame of each window is new

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,17 +18,9 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import FRAME_SCORES, FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, as_array, check_task
 from rfm_client.episodes.options import EpisodeOptions, StepScore, StepValue
-from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW, BlankFrames, is_black, is_blank
 from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.resize import resize_frames
 from rfm_client.frames.sampling import Prefix
-
-_BLACK = (
-    "black ones in a row: simulators in one process can blacken each other's pictures; give each a process of its own"
-)
-_STILL = "equal ones in a row: look at a frame, since the camera may be stuck, or render() may not draw anew"
-
-logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +84,7 @@ class Steps:
         self._where = where
         self._corrections = options.corrections
         self._frames: list[tuple[Frame, ...]] = []  # by step and camera
-        self._has_ended = self._has_warned = False
+        self._has_ended = False
 
     @property
     def newest(self) -> int:
@@ -130,21 +121,8 @@ class Steps:
         return tuple(kept)
 
     def append(self, frame: tuple[Frame, ...]) -> None:
-        """Add the frames that ``checked`` returned.
-
-        Warn, once an episode, if a camera shows the same picture, or nothing.
-        """
+        """Add the frames that ``checked`` returned."""
         self._frames.append(frame)
-        if len(self._frames) >= FRAMES_IN_A_ROW:
-            self._warn_of(self._frames[-FRAMES_IN_A_ROW:])
-
-    def _warn_of(self, last: Sequence[tuple[Frame, ...]]) -> None:
-        for number, camera in enumerate(self.options.cameras or ("",)):
-            fault = "" if self._has_warned else _fault_of([each[number].pixels for each in last])
-            if fault:
-                self._has_warned = True
-                where = ": ".join(filter(None, [self._where, f"frame[{camera!r}]" if camera else "frame"]))
-                logger.warning("%s: expected %s", where, fault)
 
     def remove(self, frame: tuple[Frame, ...]) -> None:
         """Remove a frame again, as if it had never been added."""
@@ -191,9 +169,7 @@ class Steps:
         require(name, name in predicted, "a score of each frame", got)
 
     def end(self) -> None:
-        """Warn if no frame of a short episode shows anything."""
-        if not self._has_ended and 0 < len(self._frames) < FRAMES_IN_A_ROW:
-            self._warn_of(self._frames)
+        """No step will follow."""
         self._has_ended = True
 
     def _located(self, error: RewardError) -> RewardError:
@@ -213,16 +189,6 @@ def _fused(of_cameras: Sequence[FrameScores], fuse: Fuse) -> FrameScores:
             sign = 1 if score.higher_is_better else -1
             fused[name] = np.any(arrays, axis=0) if score.mark else sign * FUSES[fuse](sign * np.array(arrays), axis=0)
     return FrameScores(**fused)
-
-
-def _fault_of(pixels: Sequence[UInt8Array]) -> str:
-    """What was expected of a camera's last pictures, or of all in a short episode, and what came; empty: no fault."""
-    *before, newest = pixels
-    is_still = len(pixels) == FRAMES_IN_A_ROW and all(np.array_equal(newest, each) for each in reversed(before))
-    if is_still and not (newest.any() and is_black(newest)):
-        return f"pictures that change, got {len(pixels)} {_STILL if newest.any() else _BLACK}"
-    told = BlankFrames(pixels).told if is_blank(newest) else ""
-    return told and f"pictures that show something, got {told}, {len(pixels)} in a row"
 
 
 def check_cameras(where: str, frames: Any, cameras: Sequence[str]) -> None:

@@ -16,7 +16,8 @@ from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError,
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import encoder_name
 from rfm_client.contract.results import Result
-from rfm_client.contract.samples import ProgressSample, Sample, Trajectory
+from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, UInt8Array
+from rfm_client.frames.blank_frames import BlankFrames, is_blank
 from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, whole, with_frame_indices
 from rfm_client.scoring.batching import groups, model_of, padded_bytes, parts
 from rfm_client.scoring.call import Call
@@ -46,6 +47,7 @@ class SampleScorer:
         self._concurrency = concurrency
         self._infos: dict[str, ModelInfo] = {}  # until another version of the model answers
         self._checks_lengths = True  # until one was too long
+        self._checks_blank = True  # until one was blank
         self._asking = asyncio.Lock()
 
     async def result(self, sample: Sample, call: Call) -> Result:
@@ -102,6 +104,13 @@ class SampleScorer:
         expected = "trajectory: expected at most %d frames, as in the training of %s, got %d: %s (logged once)"
         logger.warning(expected, limit, info.source or info.name, num_frames, remedy)
 
+    def tell_of_blank(self, frames: Sequence[UInt8Array]) -> None:
+        """Log a line about the first video that shows nothing. Its scores mean nothing."""
+        if self._checks_blank and len(frames) > 1 and all(map(is_blank, frames)):
+            self._checks_blank = False
+            expected = "frames: expected pictures that show something, got %d frames: %s (logged once)"
+            logger.warning(expected, len(frames), BlankFrames(frames).told)
+
     async def _check_lengths(self, samples: Sequence[Sample], deadline: Deadline) -> None:
         """Tell of samples that are too long. An unknown limit costs one question to the server."""
         lengths: dict[str, int] = {}
@@ -125,6 +134,8 @@ class SampleScorer:
     async def _fitted(self, sample: Sample, call: Call) -> FittedSample:
         """The sample as the call sends it. Raises RewardError."""
         fit = whole(sample)
+        for trajectory in fit.sample.trajectories if self._checks_blank else ():
+            self.tell_of_blank(() if trajectory.frames is None else trajectory.frames)
         if not (call.subsample or call.resize):
             return fit
         call.deadline.remaining_s()
