@@ -88,6 +88,8 @@ def load(
     video_prompt: VideoPrompt | None = None,
     strict_answers: bool = False,
     weights: Weights | None = None,
+    robot_description: str | None = None,
+    camera_description: str | None = None,
 ) -> Checkpoint:
     """Load the checkpoint of a local folder or Hugging Face id. Raises CheckpointError.
 
@@ -95,7 +97,10 @@ def load(
     others: as in ``rfm.family.Options``
     """
     folder = find(source)
-    options = Options(base_model, image_encoder, text_encoder, reward_model, video_prompt, strict_answers, weights)
+    options = Options(
+        base_model, image_encoder, text_encoder, reward_model, video_prompt, strict_answers, weights,
+        robot_description, camera_description,
+    )  # fmt: skip
     return load_from(folder, choose(folder, family, options), options)
 
 

@@ -73,7 +73,7 @@ class LanguageFolder:
         weights = {name: tensor for name, tensor in renamed(tensors, _NAMES).items() if "inv_freq" not in name}
         if any(name.startswith("progress_head") for name in weights):
             raise CheckpointError.at(folder, "an ordinary Qwen3-VL", "reward heads: leave out --as")
-        tie(weights, backbone, file)
+        _tie(weights, backbone, file)
         own = folder / PROCESSOR_FOLDER
         processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
         base = Decision("base_model", source_name(processor), _BASE_MODEL if options.base_model else "the checkpoint")
@@ -132,7 +132,7 @@ class LanguageFolder:
         )
 
 
-def tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> None:
+def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> None:
     """Drop a head that equals the embedding to which config.json ties it.
 
     Raises CheckpointError for a tied head with other values: transformers 4 reads the embedding in its place,

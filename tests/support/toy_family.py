@@ -104,9 +104,7 @@ class ToyPredictor:
     network: Redness
     works_ahead: bool = False
     has_progress: bool = True
-    reads_descriptions: bool = False
     reads_views: bool = False
-    writes_analyses: bool = False
     has_success: bool = True
 
     def rows(self, sample: Sample) -> list[list[np.ndarray]]:

@@ -14,7 +14,7 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.results import SUCCESS_THRESHOLD
-from rfm_client.contract.samples import Float32Array, Trajectory, UInt8Array
+from rfm_client.contract.samples import Float32Array, UInt8Array
 from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.sampling import Rule, Sampling
@@ -129,8 +129,6 @@ class StepKeywords(TypedDict, total=False):
     resize: bool
     success: SuccessRule
     live: StepView | None
-    robot_description: str
-    camera_description: str | Mapping[str, str]
     timeout_s: float | None
     score: StepValue
 
@@ -148,9 +146,6 @@ class FrameOptions:
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
     live: view for each step and the first camera's frame; it delays no step
-    robot_description: words for the robot in RynnValue's prompt; empty: as exported
-    camera_description: words for the camera: one text for all cameras, or a dict by camera. If either description is
-        given, both exported ones are replaced
     score: the score to make rewards from, ``progress`` or ``remaining_s``; a step raises ValueError if the checkpoint
         does not predict it
     """
@@ -162,8 +157,6 @@ class FrameOptions:
     channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
     resize: bool = False
     live: StepView | None = None
-    robot_description: str = ""
-    camera_description: str | Mapping[str, str] = ""
     score: StepValue = "progress"
 
     def __post_init__(self) -> None:
@@ -177,21 +170,11 @@ class FrameOptions:
         require("fuse", self.fuse in FUSES, f"one of {', '.join(FUSES)}", repr(self.fuse))
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one for all frames, as cameras names none"
-        by_camera = {name: getattr(self, name) for name in ("orient", "channels", "camera_description")}
+        by_camera = {name: getattr(self, name) for name in ("orient", "channels")}
         for name, given in by_camera.items():
             unknown = [] if isinstance(given, str) else [repr(each) for each in given if each not in cameras]
             require(name, not unknown, expected, ", ".join(unknown))
         self.corrections  # noqa: B018  raises ValueError for an unknown value
-        for descriptions in self.descriptions:
-            for name, text in zip(Trajectory.DESCRIPTION_FIELDS, descriptions, strict=True):
-                require(name, isinstance(text, str), "text", type(text).__name__)
-
-    @property
-    def descriptions(self) -> list[tuple[str, str]]:
-        """Descriptions of the robot and each camera, in camera order."""
-        given, cameras = self.camera_description, self.cameras or ("",)
-        of_cameras = [given.get(camera, "") if isinstance(given, Mapping) else given for camera in cameras]
-        return [(self.robot_description, text) for text in of_cameras]
 
     @property
     def corrections(self) -> list[Correction]:
