@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.provenance import Decision
+from rfm.checkpoint.provenance import Assumption
 from rfm.config import ExportConfig
 from rfm.config import VideoPrompt as VideoPrompt
 from rfm.config import Weights as Weights
@@ -169,8 +169,9 @@ class Checkpoint(Protocol):
     def skeleton(self) -> nn.Module:
         """Return the network without weights, on PyTorch's device ``meta``."""
 
-    def decisions(self) -> Sequence[Decision]:
-        """Return the source of each setting that scores depend on. Raises CheckpointError for missing files."""
+    @property
+    def assumptions(self) -> Sequence[Assumption]:
+        """The settings that neither weights nor files prove. Raises CheckpointError for missing files."""
 
     def flop(self, sample: Sample) -> float:
         """Return the floating-point operations to score a sample: about two for each parameter that a token passes.

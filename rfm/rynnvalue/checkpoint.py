@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
-from rfm.checkpoint.provenance import OF_WEIGHTS, Decision, source_name
+from rfm.checkpoint.provenance import source_name
 from rfm.checkpoint.weights import read_weights
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.pixels import Normalisation
@@ -24,13 +24,13 @@ from rfm.rynnvalue.settings import PUBLISHED, Settings
 from rfm.vlm.backbone import QWEN_NAMES, UNUSED, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
 from rfm.vlm.images import BoundedImages
-from rfm.vlm.language import EMBEDDING, REWARD_MODEL, LanguageCheckpoint, processor_name
+from rfm.vlm.language import EMBEDDING, REWARD_MODEL, LanguageCheckpoint
 from rfm.vlm.language_folder import dtype_of, reward_model_of
 from rfm.vlm.network import build_backbone
 from rfm.vlm.preprocessor import pixel_limits
 from rfm.vlm.processor import PROCESSOR_FOLDER, read_processor
 from rfm.vlm.qwen_checkpoint import SETTINGS, QwenCheckpoint
-from rfm.vlm.rounding import FLAG, decision, read_published, read_unrounded_config, round_layers
+from rfm.vlm.rounding import read_published, read_unrounded_config, round_layers
 from rfm_client.contract.description import Description
 
 MODEL_TYPE = "rynn_value_lang"
@@ -130,7 +130,7 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnC
     backbone = backbone_config({**told, "model_type": QWEN3}, file)
     tensors, _ = read_published(folder, read_unrounded_config(backbone, file), MODEL_TYPE)
     weights = {name: each for name, each in renamed(tensors, QWEN_NAMES).items() if not UNUSED.fullmatch(name)}
-    rows = _rows(backbone, weights, file)
+    _set_rows(backbone, weights, file)
     processor = options.base_model or folder
     tokenizer, preprocessor = read_processor(processor)
     fields["value_token"] = read.token("value_token_id", VALUE_TOKEN, tokenizer)
@@ -139,18 +139,16 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnC
     if fields["use_meta"] and not meta:
         expected = "robot_description, camera_description or both, which the prompt of this checkpoint names"
         raise CheckpointError.at(folder, expected, "neither", f"for example {_EXAMPLE}")
-    base = Decision("base_model", source_name(processor), "--base-model" if options.base_model else "the checkpoint")
-    dtype = dtype_of(backbone, file)
+    dtype, of_dtype = dtype_of(backbone, file)
     limits = pixel_limits(preprocessor, f"base model {processor}")
     config = RynnConfig(
         backbone=backbone,
-        dtype=dtype.value,
-        base_model_id=str(base.value),
+        dtype=dtype,
+        base_model_id=source_name(processor),
         **{**fields, **limits, **(meta if fields["use_meta"] else {})},
     )
-    size = [Decision(name, value, f"{processor_name(processor)}: size") for name, value in limits.items()]
-    decisions = (Decision("backbone", QWEN3, NETWORK_CONFIG), base, dtype, rows, *read.decisions, *size)
-    return _rounded(RynnCheckpoint(config, weights, processor, decisions, tuple(read.unexpected)), options)
+    assumptions = (*of_dtype, *read.assumptions)
+    return _rounded(RynnCheckpoint(config, weights, processor, assumptions, tuple(read.unexpected)), options)
 
 
 def _exported(folder: Path, content: dict[str, Any], options: Options) -> RynnCheckpoint:
@@ -166,19 +164,7 @@ def _exported(folder: Path, content: dict[str, Any], options: Options) -> RynnCh
     changed = _descriptions(options) if saved["use_meta"] else {}
     config = RynnConfig(backbone=backbone_config(content, folder / NETWORK_CONFIG), **{**saved, **changed})
     own = folder / PROCESSOR_FOLDER
-    names = [name for name in vars(config) if name not in ("backbone", "video_prompt", "weights", "causal_mask")]
-    source = {name: f"--{name.replace('_', '-')}" for name in changed}
-    decisions = [Decision(name, _plain(getattr(config, name)), source.get(name, NETWORK_CONFIG)) for name in names]
-    rounded = () if config.weights is None else (decision(config.weights, NETWORK_CONFIG),)
-    checkpoint = RynnCheckpoint(config, read_weights(folder), options.base_model or own, (*decisions, *rounded))
-    return _rounded(checkpoint, options)
-
-
-def _plain(value: Any) -> Any:
-    """Return a setting as a value of JSON, in short."""
-    if isinstance(value, Bins):
-        return f"{value.count} {value.transform} bins from {value.least_s:g} to {value.most_s:g} s"
-    return vars(value) if isinstance(value, HeadConfig) else value
+    return _rounded(RynnCheckpoint(config, read_weights(folder), options.base_model or own), options)
 
 
 def _rounded(checkpoint: RynnCheckpoint, options: Options) -> RynnCheckpoint:
@@ -192,18 +178,16 @@ def _rounded(checkpoint: RynnCheckpoint, options: Options) -> RynnCheckpoint:
             checkpoint,
             config=replace(config, weights=options.weights),
             weights={**rounded, **heads},
-            settings=(*checkpoint.settings, decision(options.weights, FLAG)),
         )
     checkpoint.check()
     return checkpoint
 
 
-def _rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Path) -> Decision:
+def _set_rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Path) -> None:
     """Take the rows of the embedding from the weights: its padding may have been kept or cut."""
     if EMBEDDING not in weights:
         raise CheckpointError.at(file.parent, f"a weight {EMBEDDING}", "none")
     backbone["text_config"]["vocab_size"] = len(weights[EMBEDDING])
-    return Decision("rows_of_the_embedding", len(weights[EMBEDDING]), OF_WEIGHTS)
 
 
 def _descriptions(options: Options) -> dict[str, str]:

@@ -252,8 +252,7 @@ def test_missing_settings_are_assumed_and_unexpected_keys_told(copied: Path) -> 
     changed(copied / "config.json", lambda config: config["value_head_config"].update(dropout=0.1))
     loaded = families.load(copied)
     assert loaded.config.attention == "isolated"
-    (told,) = [each for each in loaded.decisions() if each.name == "attn_implementation"]
-    assert told.is_assumed
+    assert [(each.name, each.value) for each in loaded.assumptions] == [("attn_implementation", ISOLATED)]
     assert loaded.notes == [
         f"config.json{where}: not expected, and not used: scores may differ from the original's"
         for where in (": 'success_head_config'", ": value_head_config: 'dropout'")
