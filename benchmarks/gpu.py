@@ -31,7 +31,7 @@ import report
 import torch
 from contestants import DEMO, DEMO_ENCODERS, Contestant, serving
 from load import Load
-from random_checkpoints import AS_RYNNVALUE, BASE_MODEL, QWEN, ROBOMETER, RYNNVALUE
+from random_checkpoints import BASE_MODEL, DESCRIBED, QWEN, ROBOMETER, RYNNVALUE
 from real_size import FRAMES, FULL, SMALLEST, Scale, described
 from report import Row
 
@@ -176,7 +176,7 @@ def rynnvalue(run: Run) -> Iterator[Row]:
     """Serve RynnValue, where the checkout has it."""
     if (run.checkout / "rfm" / "rynnvalue").exists():
         asked = [(n, FRAMES, run.scale.small_px, False) for n in run.scale.callers]
-        yield from served(run, "rynnvalue", run.checkpoint(RYNNVALUE), {"reward_model": AS_RYNNVALUE}, asked)
+        yield from served(run, "rynnvalue", run.checkpoint(RYNNVALUE), DESCRIBED, asked)
 
 
 def served(

@@ -20,7 +20,7 @@ import torch
 
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
 ROBOMETER, QWEN, RYNNVALUE = "robometer", "qwen", "rynnvalue"  # kinds of a checkpoint
-AS_RYNNVALUE = "rynnvalue,robot=a Franka single-arm robot,camera=the main right camera"
+DESCRIBED = {"robot_description": "a Franka single-arm robot", "camera_description": "the main right camera"}
 SOURCES = {  # small checkpoints with all other files
     ROBOMETER: GOLDEN / "vlm" / "q3_tok_disc10_bf16" / "checkpoint",
     QWEN: GOLDEN / "reward_models" / "roboreward" / "rr_tied_bf16" / "checkpoint",

@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 from load import Calls, Load, Measured, samples
-from random_checkpoints import AS_RYNNVALUE, BASE_MODEL, QWEN, QWEN3_VL_4B, ROBOMETER, RYNNVALUE, TINY, Size
+from random_checkpoints import BASE_MODEL, DESCRIBED, QWEN, QWEN3_VL_4B, ROBOMETER, RYNNVALUE, TINY, Size
 from torch.profiler import ProfilerActivity, profile
 
 from rfm import families
@@ -115,11 +115,12 @@ def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
         ("roboreward-expected", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
     ]
     if find_spec("rfm.rynnvalue"):
-        plans += [(AS_RYNNVALUE, RYNNVALUE, [(n, FRAMES, small) for n in (one, some, many)])]
+        plans += [("rynnvalue", RYNNVALUE, [(n, FRAMES, small) for n in (one, some, many)])]
     knows_graphs = "cuda_graphs" in inspect.signature(Engine.of).parameters
     for what, kind, sizes in plans:
         for graphs in (False, True) if knows_graphs and kind == ROBOMETER else (False,):
-            sources: dict[str, Any] = {"base_model": str(BASE_MODEL)} if kind == ROBOMETER else {"reward_model": what}
+            known: dict[str, dict[str, Any]] = {ROBOMETER: {"base_model": str(BASE_MODEL)}, RYNNVALUE: DESCRIBED}
+            sources = known.get(kind, {"reward_model": what})
             options: dict[str, Any] = {"cuda_graphs": True} if graphs else {}
             checkpoint = families.load(folder / kind, **sources)
             engine = Engine.of(checkpoint, device=scale.device, max_sample_tokens=MAX_TOKENS, **options)

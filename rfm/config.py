@@ -55,8 +55,8 @@ class CheckpointConfig(Settings):
     )
     reward_model: str | None = setting(
         None,
-        "How to ask a model that has no config.yaml: topreward, topreward-robometer, roboreward, roboreward-expected, "
-        "rynnvalue or robodopamine; settings follow: topreward,num_prefixes=15.",
+        "How to ask a model that has no config.yaml: topreward, topreward-robometer, roboreward, roboreward-expected "
+        "or robodopamine; settings follow: topreward,num_prefixes=15.",
         flag="--as",
         metavar="NAME",
     )
@@ -73,6 +73,8 @@ class CheckpointConfig(Settings):
         "Round the weights of a vision-language model to 8 bits (int8) or 4 bits (nf4), for GPUs of 8 or 12 GB. Scores "
         "are then not the full checkpoint's. Default: as in the checkpoint.",
     )
+    robot_description: str | None = setting(None, "Words for the robot in RynnValue's prompt.")
+    camera_description: str | None = setting(None, "Words for the camera in RynnValue's prompt.")
     dtype: Dtype | None = setting(None, "Number type of the network. Default: by checkpoint and device.")
 
     @property

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rfm.checkpoint.content import WEIGHTS, CheckpointError
 from rfm.checkpoint.hub import find as find
-from rfm.checkpoint.provenance import Decision, assumed
+from rfm.checkpoint.provenance import told
 from rfm.checkpoint.run_config import HEADS, SIMILARITY, constant_heads, training_notes
 from rfm.checkpoint.weights import check_values
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, VideoPrompt, Weights
@@ -17,7 +17,6 @@ from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, Vide
 __all__ = [
     "FAMILIES",
     "CheckpointError",
-    "Decision",
     "choose",
     "encoders_of",
     "find",
@@ -87,6 +86,8 @@ def load(
     video_prompt: VideoPrompt | None = None,
     strict_answers: bool = False,
     weights: Weights | None = None,
+    robot_description: str | None = None,
+    camera_description: str | None = None,
 ) -> Checkpoint:
     """Load the checkpoint of a local folder or Hugging Face id. Raises CheckpointError.
 
@@ -94,7 +95,10 @@ def load(
     others: as in ``rfm.family.Options``
     """
     folder = find(source)
-    options = Options(base_model, image_encoder, text_encoder, reward_model, video_prompt, strict_answers, weights)
+    options = Options(
+        base_model, image_encoder, text_encoder, reward_model, video_prompt, strict_answers, weights,
+        robot_description, camera_description,
+    )  # fmt: skip
     return load_from(folder, choose(folder, family, options), options)
 
 
@@ -120,4 +124,4 @@ def notes(folder: Path, checkpoint: Checkpoint, answered: Collection[str] = HEAD
     without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
     of_weights = constant_heads(checkpoint.parts[NETWORK], heads)
     of_run = training_notes(folder, heads)
-    return [*without, *of_run, *of_weights, *checkpoint.notes, *assumed(checkpoint.decisions())]
+    return [*without, *of_run, *of_weights, *checkpoint.notes, *told(checkpoint.assumptions)]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.provenance import Decision
+from rfm.checkpoint.provenance import Assumption
 from rfm.config import ExportConfig
 from rfm.config import VideoPrompt as VideoPrompt
 from rfm.config import Weights as Weights
@@ -27,19 +27,13 @@ if TYPE_CHECKING:
 
 NETWORK = "network"  # key in Checkpoint.parts: the weights of the network that scores
 # Fields of networks' configurations that are newer than some exports, with the value of those exports.
-_USUAL = {
-    "has_preference": True,
-    "has_success": True,
-    "video_prompt": "bare",
-    "strict_answers": False,
-    "weights": None,
-    "stops": (),
-}
+_USUAL = {"has_preference": True, "has_success": True, "video_prompt": "bare", "strict_answers": False, "weights": None}
 # Options, with the checkpoints that support them.
 _FOLLOWED_BY = {
     "video_prompt": "a checkpoint that shows videos to a Qwen3-VL",
     "strict_answers": "a RoboReward that writes its answers",
     "weights": "a vision-language checkpoint whose weights are not rounded (other networks are small)",
+    **dict.fromkeys(("robot_description", "camera_description"), "a RynnValue whose prompt names robot and camera"),
 }
 
 
@@ -55,6 +49,7 @@ class Options:
     video_prompt: form of a Qwen3-VL's video prompt; None: as the checkpoint's ``transformers_version`` tells
     strict_answers: refuse an unclear written answer; False: mark it
     weights: round the weights of a vision-language network's layers; None: as in the checkpoint
+    robot_description, camera_description: words for the robot and the camera in RynnValue's prompt; None: not named
     """
 
     base_model: str | None = None
@@ -64,6 +59,8 @@ class Options:
     video_prompt: VideoPrompt | None = None
     strict_answers: bool = False
     weights: Weights | None = None
+    robot_description: str | None = None
+    camera_description: str | None = None
 
     @classmethod
     def of(cls, settings: ExportConfig) -> Options:
@@ -172,8 +169,9 @@ class Checkpoint(Protocol):
     def skeleton(self) -> nn.Module:
         """Return the network without weights, on PyTorch's device ``meta``."""
 
-    def decisions(self) -> Sequence[Decision]:
-        """Return the source of each setting that scores depend on. Raises CheckpointError for missing files."""
+    @property
+    def assumptions(self) -> Sequence[Assumption]:
+        """The settings that neither weights nor files prove. Raises CheckpointError for missing files."""
 
     def flop(self, sample: Sample) -> float:
         """Return the floating-point operations to score a sample: about two for each parameter that a token passes.

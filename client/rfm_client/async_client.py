@@ -68,13 +68,10 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         self._loop: asyncio.AbstractEventLoop | None = None  # of the first call
 
     async def progress(
-        self, trajectory: Trajectory, *, frame_steps: int = 0, analysis: bool = False, **options: Unpack[CallOptions]
+        self, trajectory: Trajectory, *, frame_steps: int = 0, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Return progress and success at each frame. Raises RewardError.
-
-        frame_steps, analysis: as in ProgressSample
-        """
-        return cast(ProgressResult, await self.score(ProgressSample(trajectory, frame_steps, analysis), **options))
+        """Return progress and success at each frame; ``frame_steps`` as in ProgressSample. Raises RewardError."""
+        return cast(ProgressResult, await self.score(ProgressSample(trajectory, frame_steps=frame_steps), **options))
 
     async def preference(
         self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]

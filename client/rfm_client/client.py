@@ -41,13 +41,10 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         self._finalizer = weakref.finalize(self, _close, self._client, self._loop)
 
     def progress(
-        self, trajectory: Trajectory, *, frame_steps: int = 0, analysis: bool = False, **options: Unpack[CallOptions]
+        self, trajectory: Trajectory, *, frame_steps: int = 0, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Return progress and success at each frame. Raises RewardError.
-
-        frame_steps, analysis: as in ProgressSample
-        """
-        return self._loop.wait(self._client.progress(trajectory, frame_steps=frame_steps, analysis=analysis, **options))
+        """Return progress and success at each frame; ``frame_steps`` as in ProgressSample. Raises RewardError."""
+        return self._loop.wait(self._client.progress(trajectory, frame_steps=frame_steps, **options))
 
     def preference(
         self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]

@@ -15,7 +15,6 @@ from typing import Annotated, Any
 
 import typer
 
-from rfm.checkpoint.provenance import table
 from rfm.config import ExportConfig, ServeConfig
 from rfm.launch.admin_key import take_key
 from rfm.launch.endpoints import Endpoints
@@ -102,9 +101,6 @@ def export(
     check: Annotated[
         bool, typer.Option("--check", help="Write nothing; compare the repository with what would be written.")
     ] = False,
-    explain: Annotated[
-        bool, typer.Option("--explain", help="Write nothing; print the source of each setting of the checkpoint.")
-    ] = False,
 ) -> None:
     """Write a checkpoint into a model repository, as a new version.
 
@@ -127,9 +123,6 @@ def export(
         return
     if settings.checkpoint is None:
         fail("CHECKPOINT: expected a checkpoint, here or as export.checkpoint in --config, got none")
-    if explain:
-        typer.echo(table(rfm_export.explain(settings.checkpoint, settings, say=say)))
-        return
     version = rfm_export.export(
         settings.checkpoint, repository, settings, other_machine=other_machine, device=device, say=say
     )

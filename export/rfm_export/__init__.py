@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING, Any
 
 from rfm_export.errors import ExportDiffersError, ExportError
 
-__all__ = ["ExportDiffersError", "ExportError", "check", "explain", "export"]
+__all__ = ["ExportDiffersError", "ExportError", "check", "export"]
 
 if TYPE_CHECKING:
-    from rfm_export.exporter import check, explain, export
+    from rfm_export.exporter import check, export
 else:
 
     def __getattr__(name: str) -> Any:
         """Import an exporter function at its first use: the exporter needs PyTorch, which takes seconds to import."""
-        if name not in ("check", "explain", "export"):
+        if name not in ("check", "export"):
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from rfm_export import exporter
 

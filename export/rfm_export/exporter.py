@@ -13,7 +13,7 @@ from google.protobuf.text_format import ParseError
 from safetensors import SafetensorError
 
 from rfm import families
-from rfm.checkpoint.provenance import Decision, write
+from rfm.checkpoint.provenance import write
 from rfm.config import ExportConfig
 from rfm.family import Options
 from rfm.launch.repository_folder import CONFIG_FILE
@@ -31,7 +31,6 @@ from rfm_export.source import (
     num_gpus,
     origin_in,
     read_for_export,
-    read_source,
     with_batch_size,
 )
 from rfm_export.verify import compare
@@ -79,20 +78,6 @@ def export(
     return version.number
 
 
-def explain(
-    source: str | Path,
-    settings: ExportConfig,
-    *,
-    family: str | None = None,
-    say: Say = _nobody,
-) -> Sequence[Decision]:
-    """Return all settings that the scores of the checkpoint at ``source`` depend on, with sources. Write nothing.
-
-    Parameters as of ``export``. Raises CheckpointError.
-    """
-    return read_source(source, settings, family, say).decisions
-
-
 @contextmanager
 def _needing_disk(repository: Path) -> Iterator[None]:
     """Raise ExportError if the repository's disk is full."""
@@ -106,7 +91,7 @@ def _needing_disk(repository: Path) -> Iterator[None]:
 def _save(source: Source, version: Version, staged: Path) -> None:
     folder = version.checkpoint_folder(source.checkpoint.description, staged)
     source.checkpoint.save(folder)
-    write(source.decisions, folder)
+    write(source.checkpoint.assumptions, source.description.computation, folder)
     if source.encoders is not None:
         source.encoders.save(version.encoders_folder(staged))
 

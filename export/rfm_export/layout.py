@@ -112,16 +112,9 @@ def generated_models(description: Description, encoders: Description | None, ver
     keeps = description.keeps_features and cache_mib > 0 and settings.instances == 1
     # A frame reference needs the cache that holds the frame, but Triton chooses the instance: so only one may exist.
     has_one_cache = cache_mib > 0 and version.num_gpus <= 1
-    outputs = wire.score_outputs(
-        description.progress_bins, description.more_scores, analysed=description.writes_analyses
-    )
+    outputs = wire.score_outputs(description.progress_bins, description.more_scores)
     has_digests = keeps and has_one_cache
-    inputs = wire.frame_inputs(
-        by_digest=has_digests,
-        described=description.reads_descriptions,
-        with_views=description.reads_views,
-        analysed=description.writes_analyses,
-    )
+    inputs = wire.frame_inputs(by_digest=has_digests, with_views=description.reads_views)
     inputs = inputs if widths is None else wire.embedding_inputs(*widths)
     scorer = Interface(scorer_name(description, name), inputs, outputs, description)
     version = replace(version, settings=settings)

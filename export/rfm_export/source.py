@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from google.protobuf.text_format import ParseError
 from rfm import families
 from rfm.checkpoint.content import read_run_config
 from rfm.checkpoint.hub import check_links, commit_of
-from rfm.checkpoint.provenance import Decision, is_folder, license_of, source_name
+from rfm.checkpoint.provenance import is_folder, license_of, source_name
 from rfm.checkpoint.run_config import find_run_config
 from rfm.checkpoint.weights import num_values
 from rfm.config import ExportConfig
@@ -59,7 +59,6 @@ class Source:
     settings: with a ``max_batch_size``
     num_gpus: that serve the export; 0: the CPU
     device: for the comparison of scores, as the user names it; None: the default
-    decisions: settings that the scores depend on
     full: loads the checkpoint with full weights; None: the settings round nothing
     """
 
@@ -71,7 +70,6 @@ class Source:
     settings: ExportConfig
     num_gpus: int
     device: torch.device | None = None
-    decisions: Sequence[Decision] = ()
     full: Callable[[], Checkpoint] | None = None
 
 
@@ -99,18 +97,15 @@ def read_source(source: str | Path, settings: ExportConfig, family: str | None, 
         say(f"{run_config}: read as the settings of the training run")
     for note in families.notes(folder, checkpoint):
         say(note)
-    told = [] if settings.dtype is None else [Decision("served_dtype", settings.dtype, "--dtype")]
     gpus = num_gpus(settings)
     computed = computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0)
-    told.append(Decision("computation", computed, "installed PyTorch"))
     origin = origin_of(source, folder, computed)
     of_encoders = None if encoders is None else described_encoders(encoders.description, origin)
     full = (
         None if options.weights is None else partial(families.load_from, folder, kind, replace(options, weights=None))
     )
-    decisions = [*checkpoint.decisions(), *told]
     description = described(checkpoint, origin)
-    return Source(kind, checkpoint, encoders, description, of_encoders, settings, gpus, None, decisions, full)
+    return Source(kind, checkpoint, encoders, description, of_encoders, settings, gpus, None, full)
 
 
 def device_named(name: str) -> torch.device:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The source of each setting that a checkpoint's scores depend on, and digests that identify the checkpoint."""
+"""Where a checkpoint comes from, the settings that had to be assumed, and digests that identify it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from typing import Any
 from rfm.checkpoint.content import NETWORK_CONFIG, is_there, read_json
 
 PROVENANCE = "provenance.json"  # beside an exported checkpoint's config.json; nothing reads it
-OF_WEIGHTS = "weights"
 OF_UPSTREAM = "default of upstream"
 
 MODEL_CARD = "README.md"
@@ -25,28 +24,22 @@ HUB_FOLDER = "models--"  # begins the name of a repository's folder in the Hub's
 
 
 @dataclass(frozen=True)
-class Decision:
-    """A setting that scores depend on, with its source.
+class Assumption:
+    """A setting that scores depend on and neither weights nor files prove, so training may have used another.
 
     value: a value of JSON
-    source: OF_WEIGHTS, a file and its key, the caller's option, or a default and its author
-    is_assumed: neither weights nor files prove the value, so training may have used another
+    source: a default and its author, or the caller's option
     """
 
     name: str
     value: Any
     source: str
-    is_assumed: bool = False
 
     @property
     def text(self) -> str:
-        """The value as one line."""
+        """The assumption on one line."""
         is_plain = isinstance(self.value, str) and self.value.isprintable()
-        return self.value if is_plain else json.dumps(self.value)
-
-
-# The reason why clients pad short trajectories by default, for every family.
-TRAINED_WITH_PADDING = Decision("trained_padding", True, "upstream: every training run pads")
+        return f"{self.name} {self.value if is_plain else json.dumps(self.value)} ({self.source})"
 
 
 def snapshot_of(folder: Path) -> Path | None:
@@ -86,28 +79,17 @@ def file_name(file: Path, folder: Path) -> str:
     return os.path.relpath(file, folder if file.is_relative_to(folder) else folder.resolve())
 
 
-def assumed(decisions: Sequence[Decision]) -> list[str]:
-    """Return one line for the user about all assumed settings, or no line."""
-    listed = [f"{each.name} {each.text} ({each.source})" for each in decisions if each.is_assumed]
-    if not listed:
-        return []
-    return [
-        f"assumed, and not shown by the checkpoint: {'; '.join(listed)}; scores differ from the run's if it had "
-        "others; rfm export --explain shows what decided each setting"
-    ]
+def told(assumptions: Sequence[Assumption]) -> list[str]:
+    """Return one line for the user about all assumptions, or no line."""
+    listed = "; ".join(each.text for each in assumptions)
+    line = f"assumed, and not shown by the checkpoint: {listed}; scores differ from the run's if it had others"
+    return [line] if assumptions else []
 
 
-def table(decisions: Sequence[Decision]) -> str:
-    """Return the decisions as lines, with columns for name, source and value."""
-    rows = [(each.name, each.source + (", assumed" if each.is_assumed else ""), each.text) for each in decisions]
-    widths = [max((len(row[column]) for row in rows), default=0) for column in range(2)]
-    return "\n".join(f"{name:{widths[0]}}  {source:{widths[1]}}  {text}" for name, source, text in rows)
-
-
-def write(decisions: Sequence[Decision], folder: Path) -> None:
-    """Write PROVENANCE into an exported checkpoint's folder."""
-    content = json.dumps([asdict(each) for each in decisions], indent=2)
-    (folder / PROVENANCE).write_text(content + "\n")
+def write(assumptions: Sequence[Assumption], computation: str | None, folder: Path) -> None:
+    """Write PROVENANCE, with the versions in ``Description.computation``, into an exported checkpoint's folder."""
+    content = {"assumed": [asdict(each) for each in assumptions], "computation": computation}
+    (folder / PROVENANCE).write_text(json.dumps(content, indent=2) + "\n")
 
 
 DIGEST_DIGITS = 16  # of 64; enough to identify a checkpoint and to detect damage

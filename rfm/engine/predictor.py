@@ -15,7 +15,6 @@ from rfm.engine.execution import Execution
 from rfm.engine.graphs import Graphs
 from rfm.engine.layers import progress_from_logits
 from rfm_client.contract import (
-    Analysis,
     FrameScores,
     InvalidSampleError,
     PreferenceSample,
@@ -44,16 +43,8 @@ class Predictor(Protocol[Row, Batch]):
         """False if the network does not predict success, which is NaN then."""
 
     @property
-    def reads_descriptions(self) -> bool:
-        """True if the network reads descriptions of robot and camera."""
-
-    @property
     def reads_views(self) -> bool:
         """True if the network reads views of further cameras and a goal."""
-
-    @property
-    def writes_analyses(self) -> bool:
-        """True if the network writes an analysis of a trajectory on request."""
 
     @property
     def works_ahead(self) -> bool:
@@ -104,13 +95,11 @@ class RowScores:
     frames: scores for each trajectory
     query: the preference or similarity of two trajectories; None: the row asks for neither
     is_of_prefixes: the row has several prefixes (dense mode), with one value for the last frame of each
-    analysis: of the trajectory; None: the row asks for none
     """
 
     frames: list[FrameScores]
     query: float | None = None
     is_of_prefixes: bool = False
-    analysis: Analysis | None = None
 
 
 def check_type(sample: Sample, config: Any) -> None:

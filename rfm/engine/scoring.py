@@ -177,13 +177,6 @@ class Engine:
             expected = "none (this checkpoint reads the frames of one camera)"
             return Prepared(sample, InvalidSampleError.at("views, goal", expected, "views or a goal"))
         try:
-            if any(sample.trajectories[0].descriptions) and not self.predictor.reads_descriptions:
-                expected = "none, as the prompt of this checkpoint names neither robot nor camera"
-                got = str(sample.trajectories[0].descriptions)
-                raise InvalidSampleError.at(" or ".join(sample.trajectories[0].DESCRIPTION_FIELDS), expected, got)
-            if isinstance(sample, ProgressSample) and sample.analysis and not self.predictor.writes_analyses:
-                expected, remedy = "False, as this checkpoint writes none", "only a RynnValue writes analyses"
-                raise InvalidSampleError.at("analysis", expected, "True", remedy)
             rows = self.predictor.rows(embedded_sample)
         except RewardError as error:
             return Prepared(sample, error)
@@ -285,7 +278,7 @@ class Engine:
             return next(row for row in scores if isinstance(row, RewardError))
         if isinstance(sample, ProgressSample):
             frames = self.predictor.joined(sample, rows)
-            return ProgressResult(**vars(frames), timing=timing, analysis=rows[0].analysis)
+            return ProgressResult(**vars(frames), timing=timing)
         first, second = rows[0].frames
         query = rows[0].query
         assert query is not None  # every row of two trajectories has a query

@@ -29,14 +29,7 @@ from rfm.checkpoint.content import (
     read_run_config,
     shown,
 )
-from rfm.checkpoint.provenance import (
-    OF_UPSTREAM,
-    OF_WEIGHTS,
-    TRAINED_WITH_PADDING,
-    Decision,
-    file_name,
-    source_name,
-)
+from rfm.checkpoint.provenance import OF_UPSTREAM, Assumption, source_name
 from rfm.checkpoint.run_config import MAX_COUNT, check_progress, find_run_config, frame_count, trained_frames
 from rfm.checkpoint.weights import check_shapes, has_head, read_weights, take_prefix
 from rfm.engine.feature_cache import FeatureCache
@@ -58,10 +51,6 @@ _FIRST_FIELDS = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_lay
 # Upper limits of a network's sizes, against files that would only cost memory and time; the lower limit is 1.
 _LIMITS = dict.fromkeys((*_FIRST_FIELDS, "progress_bins"), MAX_COUNT) | {"num_layers": 1024}
 _LAYERS = "transformer.layers."
-_OF_WEIGHTS = (
-    "video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "use_per_frame_progress_token",
-    "progress_bins", "has_similarity", "has_preference", "has_success",
-)  # fmt: skip
 _STATED_TYPES: dict[str, type] = {"num_attention_heads": int, "max_len": int, "causal_mask": bool}
 
 # The paper's code, the first (https://github.com/Jiahui-3205/ReWiND_Release), has progress alone, other names and no
@@ -69,10 +58,7 @@ _STATED_TYPES: dict[str, type] = {"num_attention_heads": int, "max_len": int, "c
 # default.
 _FIRST_CODES_FRAME = "first_pos_embed"  # [1, D]; added to the first frame
 _FIRST_CODES_UNREAD = "class_token"  # a parameter that the network never reads
-_FIRST_CODES_SETTINGS = {
-    name: Decision(name, value, "default of the first ReWiND code", is_assumed=True)
-    for name, value in {"num_attention_heads": 8, "causal_mask": True, "max_len": 16}.items()
-}
+_FIRST_CODES_SETTINGS = {"num_attention_heads": 8, "causal_mask": True, "max_len": 16}
 
 
 @dataclass(frozen=True)
@@ -82,7 +68,7 @@ class RewindCheckpoint:
     network: weights of RewindTransformer
     image_encoder, text_encoder: weights of encoders without their prefix; empty if the checkpoint has none
     image_source, text_source: image_encoder and text_encoder of ``rfm.family.Options``
-    settings: the source of each setting of the configuration
+    assumed: settings of the configuration that nothing proves
     """
 
     config: RewindConfig
@@ -91,7 +77,7 @@ class RewindCheckpoint:
     text_encoder: dict[str, Tensor] = field(default_factory=dict)
     image_source: str | None = None
     text_source: str | None = None
-    settings: tuple[Decision, ...] = ()
+    assumed: tuple[Assumption, ...] = ()
 
     @property
     def description(self) -> Description:
@@ -128,23 +114,17 @@ class RewindCheckpoint:
             if found
         ]
 
-    def decisions(self) -> list[Decision]:
-        """Return the source of each setting and encoder; no file of a training run names encoders.
-
-        Raises CheckpointError if the encoders' files are missing.
-        """
-        decided = [*self.settings]
-        if not self._has_encoders:
-            return decided
+    @property
+    def assumptions(self) -> list[Assumption]:
+        """The settings that nothing proves, and the encoders, which no file of a training run names."""
+        found = [*self.assumed]
         named, weights = (self.image_source, self.text_source), (self.image_encoder, self.text_encoder)
-        encoders = zip(("image", "text"), self._sources, named, weights, self._facts(), strict=True)
-        for kind, source, option, own, facts in encoders:
+        encoders = zip(("image", "text"), self._sources, named, weights, strict=True) if self._has_encoders else ()
+        for kind, source, option, own in encoders:
             given = f"--{kind}-encoder" if option else OF_UPSTREAM
             whose = "weights of the checkpoint" if own else "only its width agrees"
-            source = source_name(source)
-            decided.append(Decision(f"{kind}_encoder", source, f"{given}; {whose}", is_assumed=True))
-            decided.append(Decision(f"{kind}_encoder_settings", facts, f"files of {source}"))
-        return decided
+            found.append(Assumption(f"{kind}_encoder", source_name(source), f"{given}; {whose}"))
+        return found
 
     @property
     def _has_encoders(self) -> bool:
@@ -237,14 +217,14 @@ def load(folder: Path, options: Options) -> RewindCheckpoint:
         return _of_first_code(folder, network, options)
     image_encoder = take_prefix(network, IMAGE_ENCODER_PREFIX)
     text_encoder = take_prefix(network, TEXT_ENCODER_PREFIX)
-    stated = _stated(folder)
+    stated, assumed = _stated(folder)
     config = _config(folder, network, stated)
     if not config.has_preference:  # upstream's networks have these weights even without the heads that use them
         network.pop("preference_token", None)
     if not config.has_pairs:
         network.pop("first_embedding_B", None)
-    sources, settings = (options.image_encoder, options.text_encoder), _settings(config, stated)
-    checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder, *sources, settings)
+    sources = options.image_encoder, options.text_encoder
+    checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder, *sources, assumed)
     checkpoint.check()
     return checkpoint
 
@@ -260,33 +240,26 @@ def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -
             f"{folder}: encoders: expected none for a checkpoint of the first ReWiND code, which crops frames and does "
             "not resize them; encode frames as it does, and send video_embeddings and text_embedding"
         )
-    read = {name: decision for name, decision in _stated(folder).items() if not decision.is_assumed}
-    stated = _FIRST_CODES_SETTINGS | read
-    stated["trained_frames"] = Decision("trained_frames", stated["max_len"].value, "max_len")
-    config = _config(folder, weights, stated)
-    checkpoint = RewindCheckpoint(config, weights, settings=_settings(config, stated))
+    read, unproven = _stated(folder)
+    read = {name: value for name, value in read.items() if name not in {each.name for each in unproven}}
+    stated = {**_FIRST_CODES_SETTINGS, **read}
+    config = _config(folder, weights, {**stated, "trained_frames": stated["max_len"]})
+    defaults = {name: value for name, value in _FIRST_CODES_SETTINGS.items() if name not in read}
+    assumed = (Assumption(name, value, "default of the first ReWiND code") for name, value in defaults.items())
+    checkpoint = RewindCheckpoint(config, weights, assumed=tuple(assumed))
     checkpoint.check()
     return checkpoint
 
 
-def _settings(config: RewindConfig, stated: Mapping[str, Decision]) -> tuple[Decision, ...]:
-    of_weights = (*_OF_WEIGHTS, *(["max_len"] if config.use_per_frame_progress_token else []))
-    return (
-        *(Decision(name, getattr(config, name), OF_WEIGHTS) for name in of_weights),
-        *(decision for name, decision in stated.items() if name not in of_weights),
-    )
-
-
-def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, Decision]) -> RewindConfig:
+def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, Any]) -> RewindConfig:
     def required(name: str) -> Any:
         if name not in stated:
             places = f"{NETWORK_CONFIG} or model.rewind of {RUN_CONFIG}"
             got = "got it in neither; weights do not tell it"
             raise CheckpointError(f"{folder}: {name}: expected it in {places}, {got}")
-        return stated[name].value
+        return stated[name]
 
     has_progress_tokens = "prog_token_A" in weights
-    padding = stated["trained_padding"]
     try:
         max_len = _shape(weights, "prog_token_A", 3)[1] if has_progress_tokens else required("max_len")
         hidden_dim, video_feature_dim = _shape(weights, "video_proj.weight", 2)
@@ -301,8 +274,8 @@ def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, De
             use_per_frame_progress_token=has_progress_tokens,
             progress_bins=_shape(weights, "progress_head.4.weight", 2)[0],
             has_similarity="similarity_head.0.weight" in weights,
-            trained_frames=stated["trained_frames"].value,
-            trained_padding=None if padding is TRAINED_WITH_PADDING else padding.value,
+            trained_frames=stated["trained_frames"],
+            trained_padding=stated["trained_padding"],
             has_preference=has_head(weights, "preference"),
             has_success=has_head(weights, "success"),
         )
@@ -328,11 +301,13 @@ def _saved(folder: Path) -> dict[str, Any]:
     return read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
 
 
-def _stated(folder: Path) -> dict[str, Decision]:
-    """Return the network's settings in config.json and config.yaml. Raises CheckpointError if the files disagree."""
+def _stated(folder: Path) -> tuple[dict[str, Any], tuple[Assumption, ...]]:
+    """Return the network's settings by config.json and config.yaml, and those of them that neither proves.
+
+    Raises CheckpointError if the files disagree.
+    """
     saved, run, run_file = _saved(folder), {}, find_run_config(folder)
     network: Any = {}
-    places = {NETWORK_CONFIG: NETWORK_CONFIG}
     if run_file is not None:
         run = read_run_config(run_file)
         check_progress(run, run_file)
@@ -340,11 +315,10 @@ def _stated(folder: Path) -> dict[str, Decision]:
         network = model.get("rewind") or {} if isinstance(model, dict) else model
         if not isinstance(network, dict):
             raise CheckpointError.at(f"{run_file}: model.rewind", "a mapping", shown(network))
-        places[RUN_CONFIG] = f"{file_name(run_file, folder)}: model.rewind"
     if saved.get("model_type", MODEL_TYPE) != MODEL_TYPE:
         got = cut(str(saved["model_type"]))
         raise CheckpointError.at(f"{folder / NETWORK_CONFIG}: model_type", MODEL_TYPE, got)
-    stated: dict[str, Decision] = {}
+    stated: dict[str, Any] = {}
     sources = {NETWORK_CONFIG: saved, RUN_CONFIG: network}
     for name, kind in _STATED_TYPES.items():
         values = {source: content[name] for source, content in sources.items() if content.get(name) is not None}
@@ -354,26 +328,17 @@ def _stated(folder: Path) -> dict[str, Decision]:
         if name != "max_len" and len(set(values.values())) > 1:  # where max_len matters, the weights show it
             raise CheckpointError.at(f"{folder}: {name}", f"{' and '.join(values)} to agree", values)
         if values:
-            stated[name] = Decision(name, next(iter(values.values())), " and ".join(places[each] for each in values))
-    if any(content.keys() >= {*_FIRST_FIELDS} for content in sources.values()):
-        older = Decision("causal_mask", False, f"{OF_UPSTREAM} of before causal_mask", is_assumed=True)
-        stated.setdefault("causal_mask", older)
+            stated[name] = next(iter(values.values()))
+    assumed: tuple[Assumption, ...] = ()
+    if "causal_mask" not in stated and any(content.keys() >= {*_FIRST_FIELDS} for content in sources.values()):
+        stated["causal_mask"] = False
+        assumed = (Assumption("causal_mask", False, f"{OF_UPSTREAM} of before causal_mask"),)
     # ``save`` wrote these into config.json; else the run's file has them.
-    frames, source = (
-        frame_count(saved.get("trained_frames"), f"{folder / NETWORK_CONFIG}: trained_frames"),
-        NETWORK_CONFIG,
-    )
+    frames = frame_count(saved.get("trained_frames"), f"{folder / NETWORK_CONFIG}: trained_frames")
     if frames is None and run_file is not None:
-        frames, source = trained_frames(run, run_file), f"{file_name(run_file, folder)}: data.max_frames"
-    elif frames is None:
-        source = "no file says it"
-    stated["trained_frames"] = Decision("trained_frames", frames, source)
+        frames = trained_frames(run, run_file)
     padding = saved.get("trained_padding")
     if padding is not None and not isinstance(padding, bool):
         where = f"{folder / NETWORK_CONFIG}: trained_padding"
         raise CheckpointError.at(where, "true or false", shown(padding))
-    is_said = padding is not None
-    stated["trained_padding"] = (
-        Decision("trained_padding", padding, NETWORK_CONFIG) if is_said else TRAINED_WITH_PADDING
-    )
-    return stated
+    return {**stated, "trained_frames": frames, "trained_padding": padding}, assumed

@@ -149,9 +149,7 @@ class RewindPredictor:
 
     works_ahead = False
     has_progress = True
-    reads_descriptions = False
     reads_views = False
-    writes_analyses = False
 
     def __init__(self, network: RewindTransformer, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
         self.network = network.to(device, dtype).eval()

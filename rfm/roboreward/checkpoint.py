@@ -10,7 +10,6 @@ from typing import Any
 import torch
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json
-from rfm.checkpoint.provenance import Decision
 from rfm.checkpoint.run_config import find_run_config
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.pixels import Normalisation
@@ -21,7 +20,7 @@ from rfm.vlm.collator import QWEN3
 from rfm.vlm.images import QwenImages
 from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork
 from rfm.vlm.language_folder import LanguageFolder, reward_model_of
-from rfm.vlm.written import GENERATION_CONFIG, is_named, stops_of
+from rfm.vlm.written import is_named, stops_of
 from rfm_client.contract.description import Description
 
 WRITTEN, EXPECTED = "roboreward", "roboreward-expected"  # of ``--as``
@@ -79,25 +78,13 @@ def load(folder: Path, options: Options) -> RoboRewardCheckpoint:
     options.settings({})
     files = LanguageFolder.read(folder, options)
     config = files.saved(RoboRewardConfig)
-    is_export = config is not None
     if config is None:
-        files = replace(files, dtype=Decision("dtype", "bfloat16", "upstream: always"))
+        files = replace(files, dtype="bfloat16", assumed=tuple(each for each in files.assumed if each.name != "dtype"))
         config = RoboRewardConfig(**files.made_of, stops=stops_of(folder), is_expected=name == EXPECTED)
     elif name is not None and config.is_expected != (name == EXPECTED):
         raise CheckpointError.at("--as", "the reward model of this export", name, "export the checkpoint again")
     if options.strict_answers and not config.is_expected:
         config = replace(config, strict_answers=True)
-    named_by = "--as" if name else "the name of the folder"
-    sources = {"is_expected": named_by, "stops": f"{GENERATION_CONFIG}: eos_token_id", "max_new_tokens": "upstream"}
-    sources = dict.fromkeys(sources, NETWORK_CONFIG) if is_export else sources
-    sources["strict_answers"] = (
-        "--strict-answers" if options.strict_answers else NETWORK_CONFIG if config.strict_answers else "default"
-    )
-    told = [
-        Decision(key, getattr(config, key), source)
-        for key, source in sources.items()
-        if key == "is_expected" or not config.is_expected  # the others are about written answers
-    ]
-    checkpoint = RoboRewardCheckpoint(config, files.weights, files.processor, (*files.decisions(config), *told))
+    checkpoint = RoboRewardCheckpoint(config, files.weights, files.processor, files.assumptions(config))
     checkpoint.check()
     return checkpoint

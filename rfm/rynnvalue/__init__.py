@@ -2,6 +2,6 @@
 """RynnValue: a Qwen3-VL with heads that predict the remaining seconds of a task at each frame."""
 
 from rfm.family import Family
-from rfm.rynnvalue.checkpoint import REWARD_MODELS, load, reads
+from rfm.rynnvalue.checkpoint import load, reads
 
-FAMILY = Family(name="rfm.rynnvalue", reads=reads, load=load, reward_models=REWARD_MODELS)
+FAMILY = Family(name="rfm.rynnvalue", reads=reads, load=load)

@@ -12,34 +12,30 @@ import torch
 from torch import Tensor
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
-from rfm.checkpoint.provenance import OF_WEIGHTS, Decision, source_name
+from rfm.checkpoint.provenance import source_name
 from rfm.checkpoint.weights import read_weights
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.pixels import Normalisation
 from rfm.family import Options
 from rfm.rynnvalue.network import Bins, HeadConfig, RynnConfig, RynnNetwork
 from rfm.rynnvalue.predictor import RynnPredictor
-from rfm.rynnvalue.prompts import END_OF_TURN, RELATIVE_TOKEN, VALUE_TOKEN, RynnCollator
+from rfm.rynnvalue.prompts import META, RELATIVE_TOKEN, VALUE_TOKEN, RynnCollator
 from rfm.rynnvalue.settings import PUBLISHED, Settings
 from rfm.vlm.backbone import QWEN_NAMES, UNUSED, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
 from rfm.vlm.images import BoundedImages
-from rfm.vlm.language import EMBEDDING, HEAD, REWARD_MODEL, LanguageCheckpoint, processor_name
-from rfm.vlm.language_folder import dtype_of, reward_model_of, tie
+from rfm.vlm.language import EMBEDDING, REWARD_MODEL, LanguageCheckpoint
+from rfm.vlm.language_folder import dtype_of, reward_model_of
 from rfm.vlm.network import build_backbone
 from rfm.vlm.preprocessor import pixel_limits
 from rfm.vlm.processor import PROCESSOR_FOLDER, read_processor
 from rfm.vlm.qwen_checkpoint import SETTINGS, QwenCheckpoint
-from rfm.vlm.rounding import FLAG, decision, read_published, read_unrounded_config, round_layers
-from rfm.vlm.written import GENERATION_CONFIG, stops_of
+from rfm.vlm.rounding import read_published, read_unrounded_config, round_layers
 from rfm_client.contract.description import Description
 
-NAME = "rynnvalue"  # of ``--as``
-REWARD_MODELS = (NAME,)
 MODEL_TYPE = "rynn_value_lang"
 TRAINED_FRAMES = 8
-_OF_USER = {"robot": str, "camera": str}  # settings that ``--as`` takes
-_EXAMPLE = f"--as '{NAME},robot=a Franka single-arm robot,camera=the main right camera'"
+_EXAMPLE = '--robot-description "a Franka single-arm robot" --camera-description "the main right camera"'
 _OF_BACKBONE = "model."  # begins the names of the backbone's weights
 
 
@@ -65,8 +61,6 @@ class RynnCheckpoint(LanguageCheckpoint):
             has_progress=False,
             more_scores=("remaining_s", "relative_s", "entropy"),
             asks_in_words=True,
-            reads_descriptions=self.config.use_meta,
-            writes_analyses=bool(self.config.stops),
             keeps_features=True,
             uses_graphs=self.config.attention == "causal",  # else the groups need a mask
             is_large=True,
@@ -102,12 +96,12 @@ class RynnCheckpoint(LanguageCheckpoint):
         return RynnPredictor(network, self.collator, device, cache)
 
     def loaded(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the weights, with the embedding as the language head if the network has one that is tied to it."""
-        return super().loaded(weights) if self.config.stops else {**weights}
+        """Return the weights: no language head is tied to the embedding."""
+        return {**weights}
 
     def build(self, dtype: torch.dtype | None = None) -> Any:
         """Return the network with these weights, as ``QwenCheckpoint.build``. Raises CheckpointError."""
-        return super().build(dtype) if self.config.stops else QwenCheckpoint.build(self, dtype)
+        return QwenCheckpoint.build(self, dtype)
 
 
 def reads(folder: Path) -> bool:
@@ -135,31 +129,26 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnC
     told = {name: value for name, value in content.items() if name not in PUBLISHED and "value_token_id" not in name}
     backbone = backbone_config({**told, "model_type": QWEN3}, file)
     tensors, _ = read_published(folder, read_unrounded_config(backbone, file), MODEL_TYPE)
-    named = renamed(tensors, QWEN_NAMES)
-    weights = {name: each for name, each in named.items() if name == HEAD or not UNUSED.fullmatch(name)}
-    tie(weights, backbone, file)
-    rows = _rows(backbone, weights, file)
+    weights = {name: each for name, each in renamed(tensors, QWEN_NAMES).items() if not UNUSED.fullmatch(name)}
+    _set_rows(backbone, weights, file)
     processor = options.base_model or folder
     tokenizer, preprocessor = read_processor(processor)
     fields["value_token"] = read.token("value_token_id", VALUE_TOKEN, tokenizer)
     fields["relative_token"] = read.token("relative_value_token_id", RELATIVE_TOKEN, tokenizer)
-    if is_there(folder / GENERATION_CONFIG):
-        stops_of(folder)  # raises for settings that change an analysis; the original ends at END_OF_TURN alone
-    fields["stops"] = (tokenizer.convert_tokens_to_ids(END_OF_TURN),)
-    meta = _meta(options, use_meta=fields["use_meta"])
-    base = Decision("base_model", source_name(processor), "--base-model" if options.base_model else "the checkpoint")
-    dtype = dtype_of(backbone, file)
+    meta = _descriptions(options)
+    if fields["use_meta"] and not meta:
+        expected = "robot_description, camera_description or both, which the prompt of this checkpoint names"
+        raise CheckpointError.at(folder, expected, "neither", f"for example {_EXAMPLE}")
+    dtype, of_dtype = dtype_of(backbone, file)
     limits = pixel_limits(preprocessor, f"base model {processor}")
     config = RynnConfig(
         backbone=backbone,
-        dtype=dtype.value,
-        base_model_id=str(base.value),
-        **{**fields, **limits, **{each.name: each.value for each in meta}},
+        dtype=dtype,
+        base_model_id=source_name(processor),
+        **{**fields, **limits, **(meta if fields["use_meta"] else {})},
     )
-    size = [Decision(name, value, f"{processor_name(processor)}: size") for name, value in limits.items()]
-    stops = Decision("stops", fields["stops"], f"{END_OF_TURN}, as in the original")
-    decisions = (Decision("backbone", QWEN3, NETWORK_CONFIG), base, dtype, rows, *read.decisions, stops, *meta, *size)
-    return _rounded(RynnCheckpoint(config, weights, processor, decisions, tuple(read.unexpected)), options)
+    assumptions = (*of_dtype, *read.assumptions)
+    return _rounded(RynnCheckpoint(config, weights, processor, assumptions, tuple(read.unexpected)), options)
 
 
 def _exported(folder: Path, content: dict[str, Any], options: Options) -> RynnCheckpoint:
@@ -169,24 +158,13 @@ def _exported(folder: Path, content: dict[str, Any], options: Options) -> RynnCh
     for name, made in parts.items():
         told = {key: tuple(each) if isinstance(each, list) else each for key, each in saved[name].items()}
         saved[name] = made(**told)
-    saved["stops"] = tuple(saved.get("stops", ()))
-    changed = options.settings(_OF_USER)
+    for name in ("robot", "camera"):  # in exports of 0.4
+        if name in saved:
+            saved[f"{name}_description"] = saved.pop(name)
+    changed = _descriptions(options) if saved["use_meta"] else {}
     config = RynnConfig(backbone=backbone_config(content, folder / NETWORK_CONFIG), **{**saved, **changed})
     own = folder / PROCESSOR_FOLDER
-    names = [name for name in vars(config) if name not in ("backbone", "video_prompt", "weights", "causal_mask")]
-    decisions = [
-        Decision(name, _plain(getattr(config, name)), "--as" if name in changed else NETWORK_CONFIG) for name in names
-    ]
-    rounded = () if config.weights is None else (decision(config.weights, NETWORK_CONFIG),)
-    checkpoint = RynnCheckpoint(config, read_weights(folder), options.base_model or own, (*decisions, *rounded))
-    return _rounded(checkpoint, options)
-
-
-def _plain(value: Any) -> Any:
-    """Return a setting as a value of JSON, in short."""
-    if isinstance(value, Bins):
-        return f"{value.count} {value.transform} bins from {value.least_s:g} to {value.most_s:g} s"
-    return vars(value) if isinstance(value, HeadConfig) else value
+    return _rounded(RynnCheckpoint(config, read_weights(folder), options.base_model or own), options)
 
 
 def _rounded(checkpoint: RynnCheckpoint, options: Options) -> RynnCheckpoint:
@@ -200,26 +178,18 @@ def _rounded(checkpoint: RynnCheckpoint, options: Options) -> RynnCheckpoint:
             checkpoint,
             config=replace(config, weights=options.weights),
             weights={**rounded, **heads},
-            settings=(*checkpoint.settings, decision(options.weights, FLAG)),
         )
     checkpoint.check()
     return checkpoint
 
 
-def _rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Path) -> Decision:
+def _set_rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Path) -> None:
     """Take the rows of the embedding from the weights: its padding may have been kept or cut."""
     if EMBEDDING not in weights:
         raise CheckpointError.at(file.parent, f"a weight {EMBEDDING}", "none")
     backbone["text_config"]["vocab_size"] = len(weights[EMBEDDING])
-    return Decision("rows_of_the_embedding", len(weights[EMBEDDING]), OF_WEIGHTS)
 
 
-def _meta(options: Options, *, use_meta: bool) -> list[Decision]:
-    """Return the user's descriptions of robot and camera. Raises CheckpointError if the prompt needs one."""
-    given = options.settings(_OF_USER)
-    if given and not use_meta:
-        raise CheckpointError.at("--as", "no description: the prompt of this checkpoint has none", ", ".join(given))
-    if use_meta and not given:
-        expected = "robot=..., camera=... or both, which the prompt of this checkpoint names"
-        raise CheckpointError.at("--as", expected, "neither", f"for example {_EXAMPLE}")
-    return [Decision(name, given.get(name), "--as" if name in given else "default: not named") for name in _OF_USER]
+def _descriptions(options: Options) -> dict[str, str]:
+    """Return the user's descriptions of robot and camera, by setting."""
+    return {name: words for name in META if (words := getattr(options, name))}

@@ -20,7 +20,6 @@ from rfm.engine.graphs import Graphs
 from rfm.rynnvalue.batch import RynnBatch
 from rfm.vlm.language import LanguageConfig
 from rfm.vlm.network import qwen_states
-from rfm.vlm.qwen import KeyValues
 
 Attention: TypeAlias = Literal["isolated", "causal"]
 Transform: TypeAlias = Literal["symlog", "linear", "quantile"]
@@ -93,10 +92,8 @@ class RynnConfig(LanguageConfig):
     value_copies, relative_copies: R, number of copies of each
     num_heads: of the remaining seconds; their mean is the score
     use_meta: the prompt names the robot and the camera
-    robot, camera: their descriptions; None: not named
+    robot_description, camera_description: their words in the prompt; None: not named
     least_px, most_px: of a frame after resizing
-    stops: ids of the tokens that end an analysis; empty: an export without the language head, which writes none
-    max_new_tokens: most tokens of an analysis
     causal_mask: always True: no frame's value depends on later frames, so one pass scores every prefix
     """
 
@@ -113,14 +110,12 @@ class RynnConfig(LanguageConfig):
     use_meta: bool
     least_px: int
     most_px: int
-    robot: str | None = None
-    camera: str | None = None
-    stops: tuple[int, ...] = ()
+    robot_description: str | None = None
+    camera_description: str | None = None
     causal_mask: Literal[True] = True
 
     reward_model: ClassVar[str] = "rynnvalue"
     multi_image: ClassVar[bool] = True
-    max_new_tokens: ClassVar[int] = 128
 
 
 class BroBlock(nn.Module):
@@ -177,18 +172,16 @@ class ValueHead(nn.Module):
 class RynnOutput:
     """Logits of the values, [heads, G, K], and of the relative values, [G, K], of a batch.
 
-    next_tokens: logits of the token behind each conversation that is analysed, [A, V]; None: there is none
     made: features from the vision tower, [merged tokens, levels, D]; None: all shots are cached
     """
 
     values: Tensor
     relatives: Tensor
-    next_tokens: Tensor | None
     made: Tensor | None
 
 
 class RynnNetwork(nn.Module):
-    """The backbone, its heads, and the language head that writes an analysis."""
+    """The backbone and its heads."""
 
     graphs: Graphs | None = None
 
@@ -200,21 +193,15 @@ class RynnNetwork(nn.Module):
         of_relative = config.relative_head, config.relative_copies * config.hidden_dim, config.relative_bins.count
         self.value_heads = nn.ModuleList(ValueHead(*of_value) for _ in range(config.num_heads))
         self.relative_value_head = ValueHead(*of_relative)
-        if config.stops:
-            self.lm_head = nn.Linear(config.hidden_dim, config.backbone["text_config"]["vocab_size"], bias=False)
 
-    def forward(self, batch: RynnBatch, key_values: KeyValues | None = None) -> RynnOutput:
-        """Return the logits of each group of a batch, which is on the network's device.
-
-        key_values: receives the keys and values of the conversations; None: no conversation is analysed
-        """
-        hidden, made = qwen_states(self.model, batch, key_values, self.graphs)
+    def forward(self, batch: RynnBatch) -> RynnOutput:
+        """Return the logits of each group of a batch, which is on the network's device."""
+        hidden, made = qwen_states(self.model, batch, graphs=self.graphs)
         states = hidden.flatten(0, 1)
         values = _of_groups(states, batch.values, self.config.value_copies)
         relatives = _of_groups(states, batch.relatives, self.config.relative_copies)
         logits = torch.stack([head(values) for head in self.value_heads])
-        next_tokens = None if key_values is None else self.lm_head(states[batch.last_tokens])
-        return RynnOutput(logits, self.relative_value_head(relatives), next_tokens, made)
+        return RynnOutput(logits, self.relative_value_head(relatives), made)
 
 
 def _of_groups(states: Tensor, firsts: Tensor, copies: int) -> Tensor:

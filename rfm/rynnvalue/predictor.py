@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The predictor of RynnValue: the seconds that remain at each frame, those since the frame before, and an analysis."""
+"""The predictor of RynnValue: the seconds that remain at each frame, and those since the frame before."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,59 +11,35 @@ import torch
 
 from rfm.engine.execution import Execution
 from rfm.engine.predictor import RowScores, no_success
-from rfm.rynnvalue.batch import RynnRow
 from rfm.rynnvalue.network import RynnConfig, RynnOutput, entropy
 from rfm.rynnvalue.prompts import RynnCollator
-from rfm.vlm.qwen import KeyValues
-from rfm.vlm.written import TextPredictor, not_finite
-from rfm_client.contract import Analysis, FrameScores, RewardError
+from rfm.vlm.predictor import VlmPredictor
+from rfm.vlm.row import VlmRow
+from rfm_client.contract import FrameScores, RewardError
 from rfm_client.contract.samples import Float32Array
 
 
-class RynnPredictor(TextPredictor):
+class RynnPredictor(VlmPredictor):
     """A RynnValue on a device."""
 
     collator: RynnCollator
     has_progress = False
 
-    @property
-    def reads_descriptions(self) -> bool:  # type: ignore[override]  # by the configuration
-        """True if the prompt names robot and camera."""
-        return self._config.use_meta
-
-    @property
-    def writes_analyses(self) -> bool:  # type: ignore[override]  # by the configuration
-        """True if the network has a language head."""
-        return bool(self._config.stops)
-
     @torch.inference_mode()
-    def score(  # type: ignore[override]  # rows of its own
-        self, rows: Sequence[RynnRow], batch: Any, execution: Execution
-    ) -> list[RowScores | RewardError]:
-        """Return each row's scores from one forward pass; further passes write analyses."""
+    def score(self, rows: Sequence[VlmRow], batch: Any, execution: Execution) -> list[RowScores | RewardError]:
+        """Run one forward pass; return each row's scores."""
         self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
-        key_values = KeyValues() if any(row.is_analysed for row in rows) else None
-        output = self._output(batch, key_values)
+        output = self._output(batch)
         remaining_s, entropies, relative_s, may_keep = self._read(output)
         if may_keep:
             self._keep(rows, batch.layout, output.made)
         counts = np.array([self.collator.num_groups(row) for row in rows])
         of_values, of_relatives = np.cumsum(counts, axis=0)[:-1].T
         parts = np.split(remaining_s, of_values), np.split(entropies, of_values), np.split(relative_s, of_relatives)
-        scores = [
+        return [
             RowScores([_scores(*part)], is_of_prefixes=row.picked is not None)
             for row, *part in zip(rows, *parts, strict=True)
         ]
-        if key_values is None:
-            return list(scores)
-        analysed = [index for index, row in enumerate(rows) if row.is_analysed]
-        key_values.keep(analysed)
-        answers = self.written([rows[index] for index in analysed], output.next_tokens[:, None], key_values, execution)
-        found: dict[int, RowScores | RewardError] = dict(enumerate(scores))
-        for index, answer in zip(analysed, answers, strict=True):
-            analysis = Analysis(self.text(answer))
-            found[index] = replace(scores[index], analysis=analysis) if answer.is_finite else not_finite()
-        return [*found.values()]
 
     def _read(self, output: RynnOutput) -> tuple[Float32Array, Float32Array, Float32Array, bool]:
         """Return remaining seconds, entropies, relative seconds, and True if the pass's features are finite.

@@ -15,13 +15,13 @@ import numpy as np
 
 from rfm.checkpoint.content import CheckpointError
 from rfm.engine.predictor import check_type
-from rfm.rynnvalue.batch import RynnBatch, RynnRow
+from rfm.rynnvalue.batch import RynnBatch
 from rfm.rynnvalue.network import RynnConfig
 from rfm.vlm.collator import IMAGE_PAD, VISION_END, VISION_START, VlmCollator, video_of
 from rfm.vlm.images import BoundedImages
 from rfm.vlm.leaves import Leaf, fits
 from rfm.vlm.prompts import KEPT_TEXTS
-from rfm.vlm.row import Spans, VlmRow
+from rfm.vlm.row import VlmRow
 from rfm.vlm.tree import trees
 from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import ProgressSample, Sample
@@ -29,8 +29,7 @@ from rfm_client.contract import ProgressSample, Sample
 VALUE_TOKEN, RELATIVE_TOKEN = "<value>", "<relative_value>"
 IMAGE = VISION_START + IMAGE_PAD + VISION_END
 END_OF_TURN = "<|im_end|>"
-META = ("The agent is {}.", "The observation is captured from {}.")  # robot and camera
-UNDESCRIBED = ("", "")
+META = {"robot_description": "The agent is {}.", "camera_description": "The observation is captured from {}."}
 BEFORE_FRAMES = (
     "The agent is performing the following task: {task}."
     "Question: For each frame after the first, what is the time delta from the previous frame?"
@@ -70,15 +69,12 @@ class Conversation:
 class RynnCollator(VlmCollator):
     """The collator of RynnValue: a conversation about all frames, in dense mode one for each prefix.
 
-    A row ends with the last value token, since nothing behind it changes a value, or with the request for an analysis.
-    With isolated attention, it has no value tokens at all: nobody sees them, so the groups follow the conversation as
-    leaves.
+    A row ends with the last value token: nothing behind it changes a value. With isolated attention, it has no value
+    tokens at all: nobody sees them, so the groups follow the conversation as leaves.
     """
 
     config: RynnConfig  # type: ignore[assignment]  # not a VlmConfig, whose heads differ
     images: BoundedImages
-    draft: Indices = np.zeros(0, np.int64)  # of an analysis: none
-    digits = ()
 
     def __init__(self, config: RynnConfig, tokenizer: Any, images: BoundedImages) -> None:
         super().__init__(config, tokenizer, images)  # type: ignore[arg-type]  # not a VlmConfig
@@ -86,13 +82,17 @@ class RynnCollator(VlmCollator):
 
     def check_template(self) -> None:
         """Raise CheckpointError unless a prompt has its frame once, in a turn that ends."""
+        for name in META:
+            words = getattr(self.config, name) or ""
+            if unfit := [token for token in self._special_tokens if token in words]:
+                raise CheckpointError.at(name, "text without the model's special tokens", repr(unfit[0]))
         text = self._template("TASK")
         if text.count(IMAGE) != 1 or END_OF_TURN not in text.partition(IMAGE)[2]:
             raise CheckpointError.at("chat template", f"one {IMAGE} and then {END_OF_TURN}", repr(text))
 
     def example(self) -> str:
         """Return the prompt of an example task with two frames."""
-        before, behind = self._around_frames("TASK", UNDESCRIBED)
+        before, behind = self._around_frames("TASK")
         relative, value = RELATIVE_TOKEN * self.config.relative_copies, VALUE_TOKEN * self.config.value_copies
         return before + IMAGE + value + IMAGE + relative + value + behind
 
@@ -102,28 +102,19 @@ class RynnCollator(VlmCollator):
         assert isinstance(sample, ProgressSample)  # by check_type
         (trajectory,) = sample.trajectories
         self._check_task(trajectory.task)
-        for name, text in zip(trajectory.DESCRIPTION_FIELDS, trajectory.descriptions, strict=True):
-            self._check_special_tokens(name, text)
         video = video_of(trajectory, sample.frame_steps)
-        conversation = self.conversation(video, trajectory.task, trajectory.descriptions)
+        conversation = self.conversation(video, trajectory.task)
         read = conversation.groups[-1:] if sample.frame_steps else conversation.groups
         of_prefixes = video.conversations if sample.frame_steps else [None]
-        end = len(conversation.input_ids) if sample.analysis else read[-1][-1][1]
         if self.config.attention == "causal":
-            spans = [(of_frame[0][0], of_frame[-1][1]) for of_frame in read]
-            whole = Conversation(conversation.input_ids[:end], conversation.position_ids[:, :end], read)
-            return [_row(whole, video, spans, picked, sample) for picked in of_prefixes]
-        bare, groups = _without_groups(conversation, read, end, video.conversations[0][:1])
-        nothing = len(bare.input_ids), len(bare.input_ids)
-        rows = [_row(bare, video, [nothing], picked, sample) for picked in of_prefixes]
+            return [_causal(conversation, video, read, picked) for picked in of_prefixes]
+        bare, groups = _without_groups(conversation, read, video.conversations[0][:1])
+        rows = [_bare(bare, video, picked) for picked in of_prefixes]
         return [_with_groups(row, groups) for row in trees(rows, self.visual_pad, are_images=True)]
 
-    def conversation(self, video: VlmVideo, task: str, descriptions: tuple[str, str] = UNDESCRIBED) -> Conversation:
-        """Return the whole conversation about ``video.num_shown`` frames.
-
-        descriptions: of robot and camera, as in ``Trajectory``
-        """
-        before, behind = (self._chat.tokens(text) for text in self._around_frames(task, descriptions))
+    def conversation(self, video: VlmVideo, task: str) -> Conversation:
+        """Return the whole conversation about ``video.num_shown`` frames."""
+        before, behind = (self._chat.tokens(text) for text in self._around_frames(task))
         start, pad, end = map(self.tokenizer.convert_tokens_to_ids, (VISION_START, IMAGE_PAD, VISION_END))
         frame = np.array([start, *[pad] * self.grid(video).tokens_per_group, end])
         relative = np.full(self.config.relative_copies, self.config.relative_token)
@@ -140,12 +131,9 @@ class RynnCollator(VlmCollator):
         ids = np.concatenate([*parts, behind]).astype(np.int64)
         return Conversation(ids, self._position_ids(ids, (video,)), groups)
 
-    def collate(  # type: ignore[override]  # rows of its own
-        self, rows: Sequence[RynnRow], length: int | None = None
-    ) -> RynnBatch:
+    def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> RynnBatch:
         """Return the batch of conversations. length: as in ``VlmCollator.collate``"""
-        relative = self.config.relative_token, self.config.relative_copies
-        return RynnBatch.of(super().collate(rows, length), rows, *relative)
+        return RynnBatch.of(super().collate(rows, length), self.config.relative_token, self.config.relative_copies)
 
     def num_groups(self, row: VlmRow) -> tuple[int, int]:
         """Return the number of values and of relative values that are read of a row."""
@@ -154,40 +142,37 @@ class RynnCollator(VlmCollator):
         values, relatives = ((ids == token).sum() for token in (self.config.value_token, self.config.relative_token))
         return int(values) // self.config.value_copies, int(relatives) // self.config.relative_copies
 
-    def _rendered(self, task: str, descriptions: tuple[str, str]) -> tuple[str, str]:
+    def _rendered(self, task: str) -> tuple[str, str]:
         """Return the text before the first frame, and behind the value tokens of the last."""
-        before, _, behind = self._template(task, descriptions).partition(IMAGE)
+        before, _, behind = self._template(task).partition(IMAGE)
         return before, behind.rpartition(END_OF_TURN)[0]
 
-    def _template(self, task: str, descriptions: tuple[str, str] = UNDESCRIBED) -> str:
-        before = self._meta(descriptions) + BEFORE_FRAMES.replace("{task}", task)
+    def _template(self, task: str) -> str:
+        words = {name: getattr(self.config, name) for name in META}
+        meta = " ".join(META[name].format(text) for name, text in words.items() if text is not None)
+        before = meta + BEFORE_FRAMES.replace("{task}", task)
         content = [{"type": "text", "text": before}, {"type": "image"}, {"type": "text", "text": BEHIND_FRAMES}]
         return str(self.tokenizer.apply_chat_template([{"role": "user", "content": content}], tokenize=False))
 
-    def _meta(self, descriptions: tuple[str, str]) -> str:
-        """Return the sentences about robot and camera: the sample's, if it describes either, else the export's."""
-        given = (
-            [text or None for text in descriptions] if any(descriptions) else [self.config.robot, self.config.camera]
-        )
-        told = [text.format(of) for text, of in zip(META, given, strict=True) if of is not None]
-        return " ".join(told) if self.config.use_meta else ""
 
-
-def _row(
-    conversation: Conversation, video: VlmVideo, spans: Spans, picked: Indices | None, sample: ProgressSample
-) -> RynnRow:
-    ids, at = conversation.input_ids, conversation.position_ids
-    return RynnRow(ids, (video,), (spans,), None, False, picked=picked, position_ids=at, is_analysed=sample.analysis)
+def _causal(
+    conversation: Conversation, video: VlmVideo, read: list[list[tuple[int, int]]], picked: Indices | None
+) -> VlmRow:
+    """Return the row of a conversation whose value tokens are ordinary tokens."""
+    spans = [(of_frame[0][0], of_frame[-1][1]) for of_frame in read]
+    end = spans[-1][1]
+    ids, at = conversation.input_ids[:end], conversation.position_ids[:, :end]
+    return VlmRow(ids, (video,), (spans,), None, False, picked=picked, position_ids=at)
 
 
 def _without_groups(
-    conversation: Conversation, read: list[list[tuple[int, int]]], end: int, a_frame: Indices
+    conversation: Conversation, read: list[list[tuple[int, int]]], a_frame: Indices
 ) -> tuple[Conversation, list[Leaf]]:
-    """Return the conversation up to token ``end``, without value tokens, and the groups that are read, as leaves.
+    """Return the conversation up to the last frame, without value tokens, and the groups that are read, as leaves.
 
     a_frame: any frame of the video, for leaves that show none
     """
-    is_kept = (conversation.slots < 0) & (np.arange(len(conversation.slots)) < end)
+    is_kept = (conversation.slots < 0) & (np.arange(len(conversation.slots)) < read[-1][-1][1])
     ids, at = conversation.input_ids, conversation.position_ids
     leaves = [
         Leaf(
@@ -198,6 +183,13 @@ def _without_groups(
         for first, behind in of_frame
     ]  # fmt: skip
     return Conversation(ids[is_kept], at[:, is_kept], []), leaves
+
+
+def _bare(conversation: Conversation, video: VlmVideo, picked: Indices | None) -> VlmRow:
+    """Return the row of a conversation of which nothing is read."""
+    end = len(conversation.input_ids)
+    ids, at = conversation.input_ids, conversation.position_ids
+    return VlmRow(ids, (video,), ([(end, end)],), None, False, picked=picked, position_ids=at)
 
 
 def _with_groups(row: VlmRow, groups: Sequence[Leaf]) -> VlmRow:

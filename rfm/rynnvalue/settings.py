@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The settings of a RynnValue, from config.json and processor_config.json, with the source of each."""
+"""The settings of a RynnValue, from config.json and processor_config.json."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
-from rfm.checkpoint.provenance import Decision
+from rfm.checkpoint.provenance import Assumption
 from rfm.rynnvalue.network import ACTIVATIONS, Bins, HeadConfig, Transform
 from rfm.vlm.preprocessor import PROCESSOR_CONFIG
 
@@ -56,7 +56,7 @@ class Settings:
     folder: Path
     content: Mapping[str, Any]
     processor: Mapping[str, Any]
-    decisions: list[Decision] = field(default_factory=list)
+    assumptions: list[Assumption] = field(default_factory=list)
     unexpected: list[str] = field(default_factory=list)
 
     @classmethod
@@ -92,7 +92,6 @@ class Settings:
         if stated not in (None, known):
             where = f"{self._file}: {key}"
             raise CheckpointError.at(where, f"{known}, the tokenizer's id of {token}", shown(stated), _COPY)
-        self._decide(key, known, f"{NETWORK_CONFIG} and the tokenizer" if stated is not None else "the tokenizer")
         return int(known)
 
     @property
@@ -104,19 +103,13 @@ class Settings:
         if stated != ISOLATED and stated not in _CAUSAL:
             expected = f"{ISOLATED} or one of {', '.join(_CAUSAL)}"
             raise CheckpointError.at(f"{self._file}: attn_implementation", expected, shown(stated))
-        attention = "isolated" if stated == ISOLATED else "causal"
-        self._decide("attention", attention, f"{NETWORK_CONFIG}: attn_implementation")
-        return attention
+        return "isolated" if stated == ISOLATED else "causal"
 
     def _use_meta(self) -> bool:
         stated = self.processor.get("use_meta")
         if stated is not None and type(stated) is not bool:
             raise CheckpointError.at(f"{self.folder / PROCESSOR_CONFIG}: use_meta", "true or false", shown(stated))
-        is_assumed = stated is None
-        used = bool(PUBLISHED["use_meta"] if is_assumed else stated)
-        source = "default, as the published checkpoints" if is_assumed else f"{PROCESSOR_CONFIG}: use_meta"
-        self._decide("use_meta", used, source, is_assumed=is_assumed)
-        return used
+        return bool(self._assumed("use_meta", PUBLISHED["use_meta"]) if stated is None else stated)
 
     def _check_style(self) -> None:
         stated = self.processor.get("conversation_style")
@@ -171,33 +164,19 @@ class Settings:
             raise CheckpointError.at(f"{self._file}: {key}", "settings", shown(stated))
         self._tell_unknown(f"{NETWORK_CONFIG}: {key}", stated, PUBLISHED[key].keys() | _IDLE)
         for name in PUBLISHED[key].keys() - stated.keys() - {"bin_edges"}:
-            source = "default, as the published checkpoints"
-            self._decide(f"{key}.{name}", PUBLISHED[key][name], source, is_assumed=True)
+            self._assumed(f"{key}.{name}", PUBLISHED[key][name])
         return {**PUBLISHED[key], **stated}
 
     def _value(self, key: str) -> Any:
         stated = self.content.get(key)
-        is_assumed = stated is None
-        value = PUBLISHED[key] if is_assumed else stated
-        told = _told(value)
-        source = "default, as the published checkpoints" if is_assumed else f"{NETWORK_CONFIG}: {key}"
-        self._decide(key, told, source, is_assumed=is_assumed)
-        return value
+        return self._assumed(key, PUBLISHED[key]) if stated is None else stated
 
-    def _decide(self, name: str, value: Any, source: str, *, is_assumed: bool = False) -> None:
-        self.decisions.append(Decision(name, value, source, is_assumed))
+    def _assumed(self, name: str, value: Any) -> Any:
+        self.assumptions.append(Assumption(name, value, "default, as the published checkpoints"))
+        return value
 
     def _tell_unknown(self, where: str, content: Mapping[str, Any], known: Any) -> None:
         self.unexpected += [f"{where}: {shown(name)}" for name in sorted(content.keys() - known)]
-
-
-def _told(value: Any) -> Any:
-    """Return a section in short, without keys that change no score, and without the edges of its bins."""
-    if not isinstance(value, Mapping):
-        return value
-    read = {name: each for name, each in value.items() if name not in _IDLE and each is not None}
-    edges = read.get("bin_edges")
-    return {**read, "bin_edges": f"{len(edges)} edges"} if isinstance(edges, list) else read
 
 
 def _is_number(value: Any) -> bool:

@@ -12,13 +12,12 @@ import torch
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
 from rfm.checkpoint.hub import find
-from rfm.checkpoint.provenance import Decision
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.pixels import Normalisation
 from rfm.family import Options
 from rfm.topreward.predictor import TopRewardPredictor
 from rfm.topreward.prompts import PROMPT_PREFIX, PROMPT_SUFFIX, TopRewardCollator, TopRewardConfig, TopRewardImages
-from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork, processor_name
+from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork
 from rfm.vlm.language_folder import LanguageFolder, reward_model_of
 from rfm.vlm.preprocessor import (
     OF_VIDEOS,
@@ -48,7 +47,6 @@ _DECIDING = {
     "prompt_prefix": "prompt_prefix",
     "prompt_suffix_template": "prompt_suffix",
 }
-_LIMITS = ("least_px", "most_px")
 _OF_USER = {"num_prefixes": int, "fps": float, "chat_template": bool, "max_frames": int}  # settings that ``--as`` takes
 
 
@@ -103,25 +101,17 @@ def load(folder: Path, options: Options) -> TopRewardCheckpoint:
     config = files.saved(TopRewardConfig)
     if config is None:
         config = TopRewardConfig(**files.made_of, **_settings(files, of_lerobot, options))
-        sources = {key: f"{NETWORK_CONFIG}: {stated}" for stated, key in _DECIDING.items() if key in of_lerobot}
-        sources |= {"variant": f"{NETWORK_CONFIG}: type" if of_lerobot else "--as"} | dict.fromkeys(given, "--as")
-        sources |= dict.fromkeys(_LIMITS, f"{processor_name(files.processor)}: size")
-        told = _decisions(config, sources, "default")
     elif given or name not in (None, LEROBOT if config.variant == "lerobot" else ROBOMETER):
         raise CheckpointError("--as: expected none for an export, which has its own; export the checkpoint again")
-    else:
-        told = _decisions(config, {}, NETWORK_CONFIG)
-    checkpoint = TopRewardCheckpoint(config, files.weights, files.processor, (*files.decisions(config), *told))
+    checkpoint = TopRewardCheckpoint(config, files.weights, files.processor, files.assumptions(config))
     checkpoint.check()
     return checkpoint
 
 
 def _named_by_lerobot(content: Mapping[str, Any], options: Options) -> LanguageFolder:
     """Read the Qwen3-VL that LeRobot's config.json or the caller names."""
-    named_by = "--base-model" if options.base_model else f"{NETWORK_CONFIG}: vlm_name"
     folder = find(options.base_model or str(content.get("vlm_name")))
-    files = LanguageFolder.read(folder, replace(options, base_model=None))
-    return replace(files, base_model=replace(files.base_model, source=named_by))
+    return LanguageFolder.read(folder, replace(options, base_model=None))
 
 
 def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: Options) -> dict[str, Any]:
@@ -144,13 +134,6 @@ def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: Opt
         raise CheckpointError(f"--as: fps: expected none for {ROBOMETER}, which takes each video for 24 frames/s")
     _check(settings)
     return settings
-
-
-def _decisions(config: TopRewardConfig, sources: Mapping[str, str], otherwise: str) -> list[Decision]:
-    """Return the source of each setting that has an effect. otherwise: source of the settings not in ``sources``"""
-    idle = () if config.variant == "lerobot" else ("fps", *_LIMITS)
-    keys = ("variant", "chat_template", "fps", "num_prefixes", "max_frames", "prompt_prefix", "prompt_suffix", *_LIMITS)
-    return [Decision(key, getattr(config, key), sources.get(key, otherwise)) for key in keys if key not in idle]
 
 
 def _lerobot_settings(content: Mapping[str, Any], file: Path) -> dict[str, Any]:

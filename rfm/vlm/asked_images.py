@@ -15,20 +15,19 @@ import numpy as np
 import torch
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json
-from rfm.checkpoint.provenance import Decision
 from rfm.checkpoint.run_config import find_run_config
 from rfm.engine.feature_cache import FeatureCache
 from rfm.family import Family, Options
 from rfm.vlm.collator import IMAGE_PAD, VISION_END, VISION_START, expanded
 from rfm.vlm.images import MERGE
-from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork, processor_name
+from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork
 from rfm.vlm.language_folder import ONLY_QWEN3, LanguageFolder, reward_model_of
 from rfm.vlm.preprocessor import pixel_limits
 from rfm.vlm.processor import read_processor
 from rfm.vlm.qwen import Box, Indices, positions
 from rfm.vlm.row import VlmRow
 from rfm.vlm.video import VlmVideo
-from rfm.vlm.written import GENERATION_CONFIG, WritingCollator, WritingConfig, WritingPredictor, is_named, stops_of
+from rfm.vlm.written import WritingCollator, WritingConfig, WritingPredictor, is_named, stops_of
 from rfm_client.contract import InvalidSampleError
 from rfm_client.contract.description import Description
 from rfm_client.contract.samples import UInt8Array
@@ -177,18 +176,12 @@ class ImagesCheckpoint(LanguageCheckpoint):
         given = options.settings(cls.of_user)
         files = LanguageFolder.read(folder, options, cls.backbones)
         config = files.saved(cls.made_of)
-        sources = dict.fromkeys(("stops", "max_new_tokens", *cls.of_user), NETWORK_CONFIG if config else "default")
         if config is None:
             limits = _limits(files) if cls.is_bounded else {}
             config = cls.made_of(**{**files.made_of, **limits}, stops=stops_of(folder))
-            sources["stops"] = f"{GENERATION_CONFIG}: eos_token_id"
-            sources |= dict.fromkeys(limits, processor_name(files.processor))
         config = replace(config, **given)
         config.check()
-        sources |= dict.fromkeys(given, "--as")
-        told = [Decision(name, getattr(config, name), source) for name, source in sources.items()]
-        likeliest = Decision("decoding", "the likeliest token", "this server")
-        checkpoint = cls(config, files.weights, files.processor, (*files.decisions(config), *told, likeliest))
+        checkpoint = cls(config, files.weights, files.processor, files.assumptions(config))
         checkpoint.check()
         return checkpoint
 

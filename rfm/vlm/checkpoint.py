@@ -24,7 +24,7 @@ from rfm.checkpoint.content import (
     is_there,
     read_json,
 )
-from rfm.checkpoint.provenance import Decision
+from rfm.checkpoint.provenance import Assumption
 from rfm.checkpoint.run_config import check_progress
 from rfm.checkpoint.weights import has_head, read_weights
 from rfm.engine.feature_cache import FeatureCache
@@ -60,12 +60,11 @@ from rfm.vlm.processor import (
     frame_size,
     is_published,
     load_collator,
-    of_processor,
 )
 from rfm.vlm.prompts import OF_AN_OLD_RUN
 from rfm.vlm.qwen_checkpoint import LORA, SETTINGS, QwenCheckpoint
-from rfm.vlm.rounding import FLAG, decision, kind_of, read_published, read_unrounded_config, round_layers
-from rfm.vlm.run_config import RunConfig, base_of_adapter, decisions_of
+from rfm.vlm.rounding import kind_of, read_published, read_unrounded_config, round_layers
+from rfm.vlm.run_config import RunConfig, assumptions_of, base_of_adapter
 from rfm.vlm.video_prompt import decided
 from rfm_client.contract.description import Description
 
@@ -78,14 +77,14 @@ class VlmCheckpoint(QwenCheckpoint):
     factors: of LoRA, with the names of ``rfm.vlm.lora.split``; empty without LoRA
     processor: the checkpoint's own folder of tokenizer and image preprocessing; None: the base model's are used
     base_model: folder or id from the caller; None: as the checkpoint names it
-    settings: the source of each setting of the configuration
+    assumptions: settings that neither weights nor files prove
     """
 
     config: VlmConfig
     factors: dict[str, Tensor]
     processor: Path | None = None
     base_model: str | None = None
-    settings: tuple[Decision, ...] = ()
+    assumptions: tuple[Assumption, ...] = ()
 
     @property
     def description(self) -> Description:
@@ -127,10 +126,6 @@ class VlmCheckpoint(QwenCheckpoint):
                 "run's"
             )
         return lines
-
-    def decisions(self) -> list[Decision]:
-        """Return the source of each setting. Raises CheckpointError if the processor is missing or does not fit."""
-        return [*self.settings, *of_processor(self.collator, PROCESSOR_FOLDER if self._is_own else self._source)]
 
     @property
     def _source(self) -> str | Path:
@@ -177,43 +172,43 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
     with expecting("a vision-language checkpoint", folder):
         content = {} if has_adapter(folder) else read_json(folder / NETWORK_CONFIG)
         read = _exported if SETTINGS in content else _by_lerobot if is_lerobot(content) else _trained
-        config, weights, factors, settings = read(folder, content, options.base_model)
+        config, weights, factors, assumptions = read(folder, content, options.base_model)
         if config.family == QWEN3 and not config.multi_image:
             config, form = _with_video_prompt(config, content, options)
-            settings = (*settings, form)
+            assumptions = (*assumptions, *form)
         if options.weights is not None and config.weights is None:
             weights, factors = round_layers(weights, factors, options.weights, config.torch_dtype)
-            config, settings = replace(config, weights=options.weights), (*settings, decision(options.weights, FLAG))
-    checkpoint = VlmCheckpoint(config, weights, factors, processor, options.base_model, settings)
+            config = replace(config, weights=options.weights)
+    checkpoint = VlmCheckpoint(config, weights, factors, processor, options.base_model, assumptions)
     checkpoint.check()
     return checkpoint
 
 
-def _with_video_prompt(config: VlmConfig, content: Mapping[str, Any], options: Options) -> tuple[VlmConfig, Decision]:
-    """Return the configuration with the form of its video prompts, and the source of the form.
+def _with_video_prompt(
+    config: VlmConfig, content: Mapping[str, Any], options: Options
+) -> tuple[VlmConfig, tuple[Assumption, ...]]:
+    """Return the configuration with the form of its video prompts, and the form if it is assumed.
 
     content: config.json of the run; empty for an adapter, whose base model may be saved by another transformers
     """
     if SETTINGS in content:
-        return config, Decision("video_prompt", config.video_prompt, NETWORK_CONFIG)
+        return config, ()
     file = f"{NETWORK_CONFIG}: {LEROBOT_BACKBONE}" if is_lerobot(content) else NETWORK_CONFIG
-    form, decision = decided(options.video_prompt, config.backbone if content else {}, file)
-    return replace(config, video_prompt=form), decision
+    form, assumed = decided(options.video_prompt, config.backbone if content else {}, file)
+    return replace(config, video_prompt=form), assumed
 
 
-_Parts: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], tuple[Decision, ...]]
+_Parts: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], tuple[Assumption, ...]]
 
 
-def _exported(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Parts:
+def _exported(folder: Path, content: Mapping[str, Any], _: str | None) -> _Parts:
     """Read a checkpoint that ``VlmCheckpoint.save`` wrote, with every setting in config.json."""
     file = folder / NETWORK_CONFIG
     backbone = backbone_config(content, file)
     check_not_quantized(backbone, file, UNQUANTIZED)
     config = _saved_config(backbone)
     weights, factors = _used(renamed(read_weights(folder), QWEN_NAMES))
-    told = decisions_of(config, None, base_model)
-    rounded = () if config.weights is None else (decision(config.weights, NETWORK_CONFIG),)
-    return config, weights, factors, (*told, *rounded)
+    return config, weights, factors, ()
 
 
 def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Parts:
@@ -225,7 +220,7 @@ def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None
     weights, factors = _used(lerobot_weights(read_weights(folder), backbone))
     check_bins(content, weights, file)
     config = _config(folder, backbone, run, weights)
-    return config, weights, factors, decisions_of(config, run, base_model)
+    return config, weights, factors, assumptions_of(config, run, base_model)
 
 
 def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Parts:
@@ -244,8 +239,7 @@ def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -
         backbone, tensors, scaling = adapted(folder, base_model or base_of_adapter(folder, run))
     weights, factors = _used(tensors, scaling)
     config = _config(folder, backbone, run, weights)
-    told = decisions_of(config, run, base_model, scaling, is_adapter=not content, num_nf4=num_nf4)
-    return config, weights, factors, told
+    return config, weights, factors, assumptions_of(config, run, base_model, num_nf4)
 
 
 def _saved_config(content: Mapping[str, Any]) -> VlmConfig:

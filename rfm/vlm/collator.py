@@ -153,12 +153,9 @@ class VlmCollator:
         """Raise InvalidSampleError for an empty task or special tokens in it: a task is data."""
         if not task.strip():
             raise InvalidSampleError.at("task", "a task sentence", repr(task))
-        self._check_special_tokens("task", task)
-
-    def _check_special_tokens(self, where: str, text: str) -> None:
         for token in self._special_tokens:
-            if token in text:
-                raise InvalidSampleError.at(where, "text without the model's special tokens", repr(token))
+            if token in task:
+                raise InvalidSampleError.at("task", "text without the model's special tokens", repr(token))
 
     def to_size(
         self, video: VlmVideo, cache: FeatureCache[Any] | None = None, threads: FrameThreads = IN_TURN

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError
-from rfm.checkpoint.provenance import Decision, source_name
+from rfm.checkpoint.content import CheckpointError
+from rfm.checkpoint.provenance import Assumption
 from rfm.engine.graphs import Graphs
 from rfm.engine.pixels import Normalisation
 from rfm.engine.predictor import check_type
@@ -34,7 +34,7 @@ from rfm.vlm.collator import (
 from rfm.vlm.images import MERGE, QwenImages
 from rfm.vlm.network import BackboneConfig, build_backbone, qwen_states
 from rfm.vlm.preprocessor import SIZED_BY_PROCESSOR, normalisation_of, patch_px, without_limits
-from rfm.vlm.processor import PROCESSOR_FOLDER, check_tokens, read_processor
+from rfm.vlm.processor import check_tokens, read_processor
 from rfm.vlm.qwen import Box, KeyValues, positions
 from rfm.vlm.qwen_checkpoint import QwenCheckpoint
 from rfm.vlm.row import VlmRow
@@ -158,11 +158,11 @@ class LanguageCheckpoint(QwenCheckpoint):
 
     weights: of LanguageNetwork; the head's only if it is not tied to the embedding
     processor: folder or id with tokenizer and preprocessing
-    settings: the source of each setting of the configuration
+    assumptions: settings that neither weights nor files prove
     """
 
     processor: str | Path
-    settings: tuple[Decision, ...] = ()
+    assumptions: tuple[Assumption, ...] = ()
 
     reads_videos: ClassVar[bool] = True  # else separate images
 
@@ -175,15 +175,6 @@ class LanguageCheckpoint(QwenCheckpoint):
     def notes(self) -> list[str]:
         """Return no line: no facts of training are known here."""
         return []
-
-    def decisions(self) -> list[Decision]:
-        """Return the source of each setting. Raises CheckpointError if the processor is missing or does not fit."""
-        name = processor_name(self.processor)
-        images = self.collator.images.to_config()
-        del images["rescale_factor"]  # the same for every processor that loads
-        read = [Decision(fact, value, name) for fact, value in images.items() if fact != "patch_size"]
-        patch = Decision("patch_size", images["patch_size"], f"{NETWORK_CONFIG}: vision_config")
-        return [*self.settings, Decision("prompt", self.collator.example(), name), patch, *read]
 
     @cached_property
     def collator(self) -> LanguageCollator:
@@ -225,12 +216,3 @@ class LanguageCheckpoint(QwenCheckpoint):
     def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> LanguageCollator:
         """Return the collator with this tokenizer and preprocessing."""
         raise NotImplementedError
-
-
-def processor_name(processor: str | Path) -> str:
-    """Return the name of a processor, as the source of a setting."""
-    return f"{PROCESSOR_FOLDER}/" if _is_exported(processor) else f"processor of {source_name(str(processor))}"
-
-
-def _is_exported(processor: str | Path) -> bool:
-    return isinstance(processor, Path) and processor.name == PROCESSOR_FOLDER

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -12,21 +12,20 @@ import torch
 from torch import Tensor
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
-from rfm.checkpoint.provenance import OF_WEIGHTS, Decision, source_name
+from rfm.checkpoint.provenance import Assumption, source_name
 from rfm.checkpoint.weights import read_weights
-from rfm.family import Options, Weights
+from rfm.family import Options, VideoPrompt, Weights
 from rfm.vlm.backbone import QWEN_2_5, QWEN_NAMES, Renames, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
 from rfm.vlm.language import EMBEDDING, HEAD, REWARD_MODEL, LanguageConfig
 from rfm.vlm.processor import PROCESSOR_FOLDER
 from rfm.vlm.qwen_checkpoint import SETTINGS
-from rfm.vlm.rounding import FLAG, decision, kind_of, read_published, read_unrounded_config, round_layers
+from rfm.vlm.rounding import kind_of, read_published, read_unrounded_config, round_layers
 from rfm.vlm.run_config import DTYPES
-from rfm.vlm.video_prompt import WRAPPED, decided
+from rfm.vlm.video_prompt import decided
 
 _NAMES: Renames = ((r"^model\.lm_head\.", "lm_head."), *QWEN_NAMES)
 _TIED = "tie_word_embeddings"
-_BASE_MODEL = "--base-model"
 ONLY_QWEN3 = {QWEN3: "Qwen3-VL"}
 ANY_QWEN = {QWEN_2_5: "Qwen2.5-VL", **ONLY_QWEN3}
 
@@ -39,10 +38,11 @@ class LanguageFolder:
 
     backbone: as ``BackboneConfig``'s
     settings: this project's settings, in an export; None: the folder is no export
-    dtype: stated by config.json, with its source
-    base_model: source of the tokenizer and processor, with the reason
+    dtype: stated by config.json
+    base_model: source of the tokenizer and processor
     video_prompt: form of the prompt, of a folder that is no export
-    rounded: form of rounded layers, with the source of this setting; None: not rounded
+    rounded: form of rounded layers; None: not rounded
+    assumed: dtype and video_prompt, if no file of a folder that is no export proves them
     """
 
     folder: Path
@@ -50,10 +50,11 @@ class LanguageFolder:
     settings: dict[str, Any] | None
     weights: dict[str, Tensor]
     processor: str | Path
-    dtype: Decision
-    base_model: Decision
-    video_prompt: Decision
-    rounded: tuple[Weights, str] | None = None
+    dtype: str
+    base_model: str
+    video_prompt: VideoPrompt
+    rounded: Weights | None = None
+    assumed: tuple[Assumption, ...] = ()
 
     @classmethod
     def read(cls, folder: Path, options: Options, backbones: Mapping[str, str] = ONLY_QWEN3) -> LanguageFolder:
@@ -73,27 +74,28 @@ class LanguageFolder:
         weights = {name: tensor for name, tensor in renamed(tensors, _NAMES).items() if "inv_freq" not in name}
         if any(name.startswith("progress_head") for name in weights):
             raise CheckpointError.at(folder, "an ordinary Qwen3-VL", "reward heads: leave out --as")
-        tie(weights, backbone, file)
+        _tie(weights, backbone, file)
         own = folder / PROCESSOR_FOLDER
         processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
-        base = Decision("base_model", source_name(processor), _BASE_MODEL if options.base_model else "the checkpoint")
-        dtype, form = dtype_of(backbone, file), _video_prompt(backbone, options)
-        kind = kind_of(weights) if settings is None else settings.get("weights")
-        rounded = None if kind is None else (kind, OF_WEIGHTS if settings is None else NETWORK_CONFIG)
+        dtype, of_dtype = dtype_of(backbone, file)
+        form, of_form = decided(options.video_prompt, backbone, NETWORK_CONFIG, may_be_saved_later=True)
+        rounded = kind_of(weights) if settings is None else settings.get("weights")
         if rounded is None and options.weights is not None:
-            weights, _ = round_layers(weights, {}, options.weights, getattr(torch, dtype.value))
-            rounded = options.weights, FLAG
-        return cls(folder, backbone, settings, weights, processor, dtype, base, form, rounded)
+            weights, _ = round_layers(weights, {}, options.weights, getattr(torch, dtype))
+            rounded = options.weights
+        assumed = (*of_dtype, *of_form) if settings is None else ()
+        name = source_name(processor)
+        return cls(folder, backbone, settings, weights, processor, dtype, name, form, rounded, assumed)
 
     @property
     def made_of(self) -> dict[str, Any]:
         """The fields of LanguageConfig for a folder that is no export."""
         return {
             "backbone": self.backbone,
-            "dtype": self.dtype.value,
-            "base_model_id": self.base_model.value,
-            "video_prompt": self.video_prompt.value,
-            "weights": self.rounded and self.rounded[0],
+            "dtype": self.dtype,
+            "base_model_id": self.base_model,
+            "video_prompt": self.video_prompt,
+            "weights": self.rounded,
         }
 
     def saved(self, config: type[Config]) -> Config | None:
@@ -112,27 +114,14 @@ class LanguageFolder:
             if name != REWARD_MODEL
         }
         made: Any = config
-        return cast(Config, made(**{"backbone": self.backbone, **fields, "weights": self.rounded and self.rounded[0]}))
+        return cast(Config, made(**{"backbone": self.backbone, **fields, "weights": self.rounded}))
 
-    def decisions(self, config: LanguageConfig) -> tuple[Decision, ...]:
-        """Return the source of the settings that all reward models of a Qwen3-VL share."""
-        head, why = ("own", OF_WEIGHTS) if HEAD in self.weights else ("tied to the embedding", NETWORK_CONFIG)
-        shared = [self.base_model, self.dtype, *([] if config.multi_image else [self.video_prompt])]
-        if self.settings is not None:
-            told = {"base_model": config.base_model_id, "dtype": config.dtype}
-            told |= {} if config.multi_image else {"video_prompt": config.video_prompt}
-            shared = [Decision(name, value, NETWORK_CONFIG) for name, value in told.items()]
-            shared[:1] = [self.base_model] if self.base_model.source == _BASE_MODEL else shared[:1]
-        return (
-            Decision("backbone", self.backbone["model_type"], NETWORK_CONFIG),
-            *shared,
-            Decision("language_head", head, f"{why}: {HEAD if why == OF_WEIGHTS else _TIED}"),
-            Decision("rows_of_the_language_head", self.backbone["text_config"]["vocab_size"], OF_WEIGHTS),
-            *([] if self.rounded is None else [decision(*self.rounded)]),
-        )
+    def assumptions(self, config: LanguageConfig) -> tuple[Assumption, ...]:
+        """Return the settings that nothing proves and that have an effect."""
+        return tuple(each for each in self.assumed if not (config.multi_image and each.name == "video_prompt"))
 
 
-def tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> None:
+def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> None:
     """Drop a head that equals the embedding to which config.json ties it.
 
     Raises CheckpointError for a tied head with other values: transformers 4 reads the embedding in its place,
@@ -155,21 +144,18 @@ def tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> No
         del weights[HEAD]
 
 
-def dtype_of(config: Mapping[str, Any], file: Path) -> Decision:
-    """Return the number type of the network, which config.json states. Raises CheckpointError."""
+def dtype_of(config: Mapping[str, Any], file: Path) -> tuple[str, tuple[Assumption, ...]]:
+    """Return the number type of the network, and the type as an assumption if config.json states none.
+
+    Raises CheckpointError.
+    """
     key = next((name for name in ("dtype", "torch_dtype") if config.get(name)), None)
     if key is None:
-        return Decision("dtype", "bfloat16", f"default, as {NETWORK_CONFIG} has no dtype", is_assumed=True)
+        return "bfloat16", (Assumption("dtype", "bfloat16", f"default, as {NETWORK_CONFIG} has no dtype"),)
     dtype = str(config[key]).removeprefix("torch.")
     if dtype not in DTYPES:
         raise CheckpointError.at(f"{file}: {key}", f"one of {', '.join(DTYPES)}", shown(dtype))
-    return Decision("dtype", dtype, f"{NETWORK_CONFIG}: {key}")
-
-
-def _video_prompt(backbone: Mapping[str, Any], options: Options) -> Decision:
-    """Return the form of the prompt. Later transformers may only have saved the file, so wrapped is an assumption."""
-    form, decision = decided(options.video_prompt, backbone, NETWORK_CONFIG)
-    return replace(decision, is_assumed=True) if form == WRAPPED and options.video_prompt is None else decision
+    return dtype, ()
 
 
 def reward_model_of(folder: Path) -> str | None:

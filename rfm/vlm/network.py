@@ -168,7 +168,7 @@ def qwen_states(
 
     The states have the shape [B, L, D], or [1, all tokens, D] for a batch with packs.
 
-    key_values: receives the keys and values of the conversations, for ``next_hidden_state``; none of packs
+    key_values: receives the keys and values of all tokens, for ``next_hidden_state``
     graphs: for small batches; the language model uses none if ``key_values`` is given
     """
     made = None
@@ -179,7 +179,7 @@ def qwen_states(
     shots = [*([] if made is None else [made]), *batch.layout.kept.values()]
     merged = concatenated(shots)
     if batch.packs:
-        return tree_hidden_states(backbone.language_model, batch.inputs, batch.packs, merged, key_values), made
+        return tree_hidden_states(backbone.language_model, batch.inputs, batch.packs, merged), made
     if graphs is not None and key_values is None:
         return graphed_hidden_state(graphs, backbone.language_model, batch.inputs, merged), made
     return last_hidden_state(backbone.language_model, batch.inputs, merged, key_values), made

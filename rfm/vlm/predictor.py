@@ -36,9 +36,7 @@ class VlmPredictor:
 
     works_ahead = True
     has_progress = True
-    reads_descriptions = False
     reads_views = False
-    writes_analyses = False
 
     def __init__(
         self, network: Any, collator: VlmCollator, device: torch.device, cache: FeatureCache[Any] | None = None

@@ -11,7 +11,6 @@ from typing import Any
 
 from rfm.checkpoint.content import PREPROCESSOR_CONFIG, CheckpointError, is_there, read_json
 from rfm.checkpoint.hub import local_copy
-from rfm.checkpoint.provenance import Decision, source_name
 from rfm.vlm.backbone import QWEN_2_5, is_at_least
 from rfm.vlm.collator import (
     IMAGE_PAD,
@@ -208,11 +207,3 @@ def differences(collator: VlmCollator) -> list[str]:
     known["prompt"] = known["prompt"].format(**words)
     got = facts(collator)
     return [f"{name}: expected {value!r}, got {got[name]!r}" for name, value in known.items() if got[name] != value]
-
-
-def of_processor(collator: VlmCollator, source: object) -> list[Decision]:
-    """Return the decisions about prompts and images. ``source``: folder or id of the processor."""
-    name = f"processor of {source_name(str(source))}" if source != PROCESSOR_FOLDER else f"{PROCESSOR_FOLDER}/"
-    tokens = [collator.tokenizer.convert_tokens_to_ids(token) for token in SPECIAL_TOKENS]
-    read = [Decision(fact, value, name) for fact, value in facts(collator).items()]
-    return [*read, Decision("special_tokens", tokens, "weights: last rows of the embedding")]

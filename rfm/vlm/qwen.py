@@ -297,11 +297,6 @@ class KeyValues:
         self._next: Tensor | None = None  # int64 [B], the slots of the next tokens among all B * S
         self._num_seen = 0
 
-    def keep(self, conversations: Sequence[int]) -> None:
-        """Forget all conversations but these, which are numbered anew. Call it before ``place``."""
-        chosen = list(conversations)
-        self._of_layers = {layer: (keys[chosen], values[chosen]) for layer, (keys, values) in self._of_layers.items()}
-
     def place(self, lengths: Tensor, longest: int) -> None:
         """Put the next token of each conversation behind its first tokens. Forget what was there.
 

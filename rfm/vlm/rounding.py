@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, shown
-from rfm.checkpoint.provenance import Decision
 from rfm.checkpoint.weights import DECODED, read_weights
 from rfm.family import Weights
 from rfm.vlm.backbone import NF4, QUANTIZED, UNQUANTIZED, check_not_quantized, quantization
@@ -19,7 +18,6 @@ from rfm.vlm.lora import changed_by, merged
 from rfm.vlm.nf4 import dequantize
 from rfm.vlm.rounded import may_be_rounded, rounded
 
-FLAG = "--weights"
 _NF4: Weights = "nf4"
 
 
@@ -75,8 +73,3 @@ def round_layers(
         own = {factor: rest.pop(factor) for factor in factors if changed_by(factor) == name}
         whole |= rounded(name, merged({name: weight}, own, torch.float32)[name], kind, dtype)
     return whole, rest
-
-
-def decision(kind: Weights, source: str) -> Decision:
-    """Return the form of rounded weights as a setting that scores depend on."""
-    return Decision("weights", f"{kind}: rounded, so the scores are not the full checkpoint's", source)

@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 
 from rfm.checkpoint.content import (
     ADAPTER_CONFIG,
-    NETWORK_CONFIG,
     RUN_CONFIG,
     CheckpointError,
     cut,
@@ -22,10 +21,10 @@ from rfm.checkpoint.content import (
     read_run_config,
     shown,
 )
-from rfm.checkpoint.provenance import OF_UPSTREAM, OF_WEIGHTS, TRAINED_WITH_PADDING, Decision, file_name, source_name
+from rfm.checkpoint.provenance import OF_UPSTREAM, Assumption, file_name, source_name
 from rfm.checkpoint.run_config import find_run_config, frame_count
 from rfm.vlm.backbone import DEQUANTIZED, QWEN_2_5
-from rfm.vlm.lora import MERGE, Scaling
+from rfm.vlm.lora import MERGE
 from rfm.vlm.network import VlmConfig
 from rfm_client.contract.checks import require
 
@@ -45,8 +44,6 @@ SETTINGS = {
     "size_px": ("data.resized_height", "data.resized_width"),
     "trained_frames": ("data.max_frames",),
 }
-_OF_WEIGHTS = ("progress_bins", "has_similarity", "has_preference", "has_success")
-_BASE_MODEL = "--base-model"
 _VARIANT = re.compile(r"-unsloth$")  # Unsloth's name for its copy of a base model
 _FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # Unsloth's names of base models rounded to fewer bits, for training
 _DROPPED = ("pairwise_progress", "use_progress_token")  # settings of prompts that upstream has dropped
@@ -145,18 +142,6 @@ class RunConfig:
         height, width = (frame_count(self.sections["data"].get(key), f"{self.file}: data.{key}") for key in keys)
         return None if height is None or width is None else (height, width)
 
-    def decision(self, setting: str, value: Any) -> Decision:
-        """Return the source of one of SETTINGS: its keys, or upstream's default."""
-        places = SETTINGS[setting]
-        there = [self.shown(place) for place in places if self.states(place)]
-        if value is None:
-            return Decision(setting, value, f"{self.name}: no {' and '.join(map(self.shown, places))}")
-        if not there:
-            return Decision(
-                setting, value, f"{OF_UPSTREAM}, as {self.name} has no {self.shown(places[0])}", is_assumed=True
-            )
-        return Decision(setting, value, f"{self.name}: {', '.join(there)}")
-
     def shown(self, place: str) -> str:
         """Return ``section.key`` as the file has it."""
         return place if self.has_sections else place.partition(".")[2]
@@ -219,58 +204,34 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
     return base
 
 
-def decisions_of(
-    config: VlmConfig,
-    run: RunConfig | None,
-    base_model: str | None,
-    scaling: Scaling | None = None,
-    *,
-    is_adapter: bool = False,
-    num_nf4: int = 0,
-) -> tuple[Decision, ...]:
-    """Return the source of each setting of a checkpoint.
+def assumptions_of(
+    config: VlmConfig, run: RunConfig, base_model: str | None, num_nf4: int = 0
+) -> tuple[Assumption, ...]:
+    """Return the settings of a checkpoint that neither weights nor files prove.
 
-    run: None: ``rfm export`` wrote the checkpoint, whose config.json has every setting
     base_model: the caller's option
-    scaling: of LoRA factors; None: there are none
-    is_adapter: the base model's weights are not in the checkpoint
     num_nf4: number of weights in NF4, which may have been rounded after training
     """
     idle = {"average_temporal_patches", "size_px"} if config.multi_image else set()  # settings without effect
     idle |= set() if config.pools_images else {"frame_pooling"}
     idle |= set() if config.pools_by_attention else {"pooling_temperature"}
-    deciding = {name: getattr(config, name) for name in SETTINGS if name not in idle}
-    decided = [
-        Decision("backbone", config.family, f"{NETWORK_CONFIG} of base_model" if is_adapter else NETWORK_CONFIG),
-        _base_model(config.base_model_id, run, base_model),
-    ]
-    if run is not None and scaling is not None:
-        file = ADAPTER_CONFIG if scaling.file.name == ADAPTER_CONFIG else f"{run.name}: peft"
-        decided.append(Decision("lora", {"r": scaling.rank, "lora_alpha": scaling.alpha}, f"{file}: r, lora_alpha"))
-    decided += [Decision(name, getattr(config, name), OF_WEIGHTS) for name in _OF_WEIGHTS]
-    for name, value in deciding.items():
-        decided.append(Decision(name, value, NETWORK_CONFIG) if run is None else run.decision(name, value))
-    decided.append(TRAINED_WITH_PADDING)
-    if run is not None and config.family == QWEN_2_5 and not config.multi_image:
-        version = config.backbone.get("transformers_version")  # for 5 and later, VlmCheckpoint.notes has a line
-        stated = f"{NETWORK_CONFIG}: transformers_version {version}"
-        source = stated if str(version).startswith("4.") else "default: no file names transformers 4"
-        decided.append(Decision("positions_behind_videos", "as transformers 4", source, is_assumed=version is None))
+    found = []
+    named = config.base_model_id
+    if base_model is not None and named and _model_name(named) not in base_model.lower():
+        found.append(Assumption("base_model", source_name(base_model), f"--base-model, for {named} of {run.name}"))
+    for name, places in SETTINGS.items():
+        value = getattr(config, name)
+        if name not in idle and value is not None and not any(map(run.states, places)):
+            source = f"{OF_UPSTREAM}, as {run.name} has no {run.shown(places[0])}"
+            found.append(Assumption(name, value, source))
+    reads_videos = config.family == QWEN_2_5 and not config.multi_image
+    if reads_videos and config.backbone.get("transformers_version") is None:
+        source = "default: no file names transformers 4"
+        found.append(Assumption("positions_behind_videos", "as transformers 4", source))
     if num_nf4:
-        rounded, source = f"{num_nf4} in NF4 of bitsandbytes", f"{OF_WEIGHTS}, rounded in training too"
-        decided.append(Decision("rounded_weights", rounded, source, is_assumed=True))
-    return tuple(decided)
-
-
-def _base_model(named: str, run: RunConfig | None, given: str | None) -> Decision:
-    """Return the source of tokenizer and image preprocessing, and of an adapter's base weights."""
-    if given is None:
-        file = NETWORK_CONFIG if run is None else f"{run.name}: {run.shown('model.base_model_id')}"
-        return Decision("base_model", source_name(named), file)
-    if run is None or not named or _model_name(named) in given.lower():
-        return Decision("base_model", source_name(given), _BASE_MODEL)
-    source = f"{_BASE_MODEL}, for {named} of {run.name}"
-    return Decision("base_model", source_name(given), source, is_assumed=True)
+        rounded = f"{num_nf4} in NF4 of bitsandbytes"
+        found.append(Assumption("rounded_weights", rounded, "weights, rounded in training too"))
+    return tuple(found)
 
 
 def _model_name(base: str) -> str:

@@ -14,27 +14,25 @@ import torch
 from torch import Tensor
 
 from rfm.vlm.leaves import Packs
-from rfm.vlm.qwen import KeyValues, _cached
+from rfm.vlm.qwen import _cached
 
 
 class TrunkKeyValues:
     """The keys and values of a layer's trunks, in the form of transformers' cache.
 
-    kept: receives those of all layers; None: they are not needed
     packs: those whose tokens the layer computes; None: it computes the trunks
     """
 
     packs: Packs | None = None
 
-    def __init__(self, kept: KeyValues | None = None) -> None:
-        self._kept = kept
-        self._of_trunks: tuple[Tensor, Tensor]
+    def __init__(self) -> None:
+        self._of_trunks: tuple[Tensor, ...] = ()
 
-    def update(self, keys: Tensor, values: Tensor, layer: int, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+    def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
         """Keep a trunk's keys and values, [B, heads, L, D / heads]; return those that the tokens of a call may see."""
         if self.packs is None:
             self._of_trunks = keys, values
-            return self._of_trunks if self._kept is None else self._kept.update(keys, values, layer)
+            return keys, values
         before = [each[self.packs.trunks, :, : self.packs.num_keys] for each in self._of_trunks]
         return torch.cat([before[0], keys], dim=2), torch.cat([before[1], values], dim=2)
 
@@ -57,19 +55,12 @@ class _Part:
             self.hidden.flatten(0, 1).index_add_(0, self._at, added)
 
 
-def tree_hidden_states(
-    language: Any,
-    inputs: dict[str, Tensor],
-    packs: Sequence[Packs],
-    features: Tensor,
-    key_values_of_trunks: KeyValues | None = None,
-) -> Tensor:
+def tree_hidden_states(language: Any, inputs: dict[str, Tensor], packs: Sequence[Packs], features: Tensor) -> Tensor:
     """Return the hidden states behind the final norm, of the trunks and then of each call, [1, all tokens, D].
 
     language, inputs, features: as in ``rfm.vlm.qwen.last_hidden_state``, of the trunks
-    key_values_of_trunks: receives the keys and values of the trunks; None: they are not needed
     """
-    key_values = TrunkKeyValues(key_values_of_trunks)
+    key_values = TrunkKeyValues()
     options = _cached(language, key_values)  # type: ignore[arg-type]  # transformers asks for ``update`` alone
     trunks, *calls = (_Part(language, each, features) for each in (inputs, *(each.inputs for each in packs)))
     # The mask of a single call is kept; those of several are made anew for each layer, so that memory holds one.

@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, Final
 
-from rfm.checkpoint.provenance import Decision
+from rfm.checkpoint.provenance import Assumption
 from rfm.family import VideoPrompt
 
 BARE: Final = "bare"
@@ -23,19 +23,23 @@ _VERSION = re.compile(r"(\d+)\.(\d+)")
 _SETTING, _STATED = "video_prompt", "transformers_version"
 
 
-def decided(given: VideoPrompt | None, backbone: Mapping[str, Any], file: str) -> tuple[VideoPrompt, Decision]:
-    """Return the form of a checkpoint's video prompts, and its source.
+def decided(
+    given: VideoPrompt | None, backbone: Mapping[str, Any], file: str, *, may_be_saved_later: bool = False
+) -> tuple[VideoPrompt, tuple[Assumption, ...]]:
+    """Return the form of a checkpoint's video prompts, and the form as an assumption if no file proves it.
 
     given: the caller's option
     backbone: config.json as transformers saved it with the weights; empty: no file of the run is there
     file: its name, for the source
+    may_be_saved_later: a later transformers than that of training may have saved the file
     """
     if given is not None:
-        return given, Decision(_SETTING, given, "--video-prompt")
+        return given, ()
     stated = str(backbone.get(_STATED))
     match = _VERSION.match(stated)
     if match is None:
         source = f"default, as no file tells the run's {_STATED}; --video-prompt names the form"
-        return BARE, Decision(_SETTING, BARE, source, is_assumed=True)
+        return BARE, (Assumption(_SETTING, BARE, source),)
     form: VideoPrompt = WRAPPED if (int(match[1]), int(match[2])) >= WRAPPED_SINCE else BARE
-    return form, Decision(_SETTING, form, f"{file}: {_STATED} {stated}")
+    is_assumed = form == WRAPPED and may_be_saved_later
+    return form, (Assumption(_SETTING, form, f"{file}: {_STATED} {stated}"),) if is_assumed else ()

@@ -111,78 +111,8 @@ class WrittenAnswer:
     is_finite: bool = True
 
 
-class TextPredictor(VlmPredictor):
-    """A vision-language model on a device, which writes text behind its prompts.
-
-    collator: with ``draft``, ``digits`` and a ``config`` as those of a WritingCollator
-    """
-
-    collator: Any
-
-    def written(
-        self, rows: Sequence[VlmRow], logits: Tensor, key_values: KeyValues, execution: Execution
-    ) -> list[WrittenAnswer]:
-        """Return the text behind each row, each token the likeliest.
-
-        logits: of the first pass, [B, N + 1, V], behind the prompt and each token of the draft
-        key_values: of the first pass
-        execution: its ``on_forward`` is called after each forward pass
-        """
-        tokens, digit_logits = self._likeliest(logits)
-        answers, num_right = self._begun(tokens, digit_logits)
-        execution.on_forward()
-        tokens = tokens[np.arange(len(rows)), num_right]
-        lengths = np.array([row.num_tokens for row in rows]) + num_right
-        positions = np.array([row.position_ids[0, -1] for row in rows]) + 1 + num_right
-        while not all(answer.has_ended for answer in answers):
-            with memory_errors():
-                fed = tokens.clip(min=0)  # instead of NOT_FINITE
-                hidden = next_hidden_state(self.network.model.language_model, fed, positions, lengths, key_values)
-                tokens, digit_logits = self._likeliest(self.network.lm_head(hidden))
-            for answer, token, logits_of in zip(answers, tokens, digit_logits, strict=True):
-                self._add(answer, token, logits_of)
-            execution.on_forward()
-            lengths, positions = lengths + 1, positions + 1
-        return answers
-
-    def text(self, answer: WrittenAnswer) -> str:
-        """Return the text of an answer, without special tokens."""
-        return str(self.collator.tokenizer.decode(answer.tokens, skip_special_tokens=True))
-
-    def _begun(self, tokens: Indices, digit_logits: Float32Array) -> tuple[list[WrittenAnswer], Indices]:
-        """Return the answers after the first pass, and how many of the draft's tokens each answer accepts.
-
-        tokens, digit_logits: int64 [B, N + 1], float32 [B, N + 1, D], behind the prompt and each token of the draft
-        """
-        num_right: Indices = (tokens[:, :-1] == self.collator.draft).cumprod(axis=1).sum(axis=1)
-        answers = [WrittenAnswer() for _ in tokens]
-        for index, answer in enumerate(answers):
-            for step in range(num_right[index] + 1):
-                self._add(answer, tokens[index, step], digit_logits[index, step])
-        return answers, num_right
-
-    def _likeliest(self, logits: Tensor) -> tuple[Indices, Float32Array]:
-        """Return the likeliest tokens, or NOT_FINITE, and the digits' logits: [..., V] -> int64 [...], [..., D]."""
-        tokens = torch.where(logits.isfinite().all(-1), logits.argmax(-1), NOT_FINITE)
-        return tokens.cpu().numpy(), logits[..., list(self.collator.digits)].float().cpu().numpy()
-
-    def _add(self, answer: WrittenAnswer, token: int, digit_logits: Float32Array) -> None:
-        """Add the next token to an answer that has not ended. digit_logits: float32 [D]"""
-        config = self.collator.config
-        if answer.has_ended:
-            return
-        answer.is_finite = token != NOT_FINITE
-        if not answer.is_finite or token in config.stops:
-            answer.has_ended = True
-            return
-        if answer.digit_logits is None and token in self.collator.digits:
-            answer.digit_logits = digit_logits
-        answer.tokens.append(int(token))
-        answer.has_ended = len(answer.tokens) == config.max_new_tokens
-
-
-class WritingPredictor(TextPredictor):
-    """A vision-language model on a device, which writes answers with its scores.
+class WritingPredictor(VlmPredictor):
+    """A vision-language model on a device, which writes answers.
 
     expected: what an answer must hold, for the error of one that cannot be read
     """
@@ -222,12 +152,58 @@ class WritingPredictor(TextPredictor):
         """
         key_values = KeyValues()
         output = self._output(batch, key_values)
-        return self.written(rows, output.logits.unflatten(0, (len(rows), -1)), key_values, execution), output.made
+        tokens, digit_logits = self._likeliest(output.logits.unflatten(0, (len(rows), -1)))
+        answers, num_right = self._begun(tokens, digit_logits)
+        execution.on_forward()
+        tokens = tokens[np.arange(len(rows)), num_right]
+        lengths = np.array([row.num_tokens for row in rows]) + num_right
+        positions = np.array([row.position_ids[0, -1] for row in rows]) + 1 + num_right
+        while not all(answer.has_ended for answer in answers):
+            with memory_errors():
+                fed = tokens.clip(min=0)  # instead of NOT_FINITE
+                hidden = next_hidden_state(self.network.model.language_model, fed, positions, lengths, key_values)
+                tokens, digit_logits = self._likeliest(self.network.lm_head(hidden))
+            for answer, token, logits in zip(answers, tokens, digit_logits, strict=True):
+                self._add(answer, token, logits)
+            execution.on_forward()
+            lengths, positions = lengths + 1, positions + 1
+        return answers, output.made
+
+    def _begun(self, tokens: Indices, digit_logits: Float32Array) -> tuple[list[WrittenAnswer], Indices]:
+        """Return the answers after the first pass, and how many of the draft's tokens each answer accepts.
+
+        tokens, digit_logits: int64 [B, N + 1], float32 [B, N + 1, D], behind the prompt and each token of the draft
+        """
+        num_right: Indices = (tokens[:, :-1] == self.collator.draft).cumprod(axis=1).sum(axis=1)
+        answers = [WrittenAnswer() for _ in tokens]
+        for index, answer in enumerate(answers):
+            for step in range(num_right[index] + 1):
+                self._add(answer, tokens[index, step], digit_logits[index, step])
+        return answers, num_right
+
+    def _likeliest(self, logits: Tensor) -> tuple[Indices, Float32Array]:
+        """Return the likeliest tokens, or NOT_FINITE, and the digits' logits: [..., V] -> int64 [...], [..., D]."""
+        tokens = torch.where(logits.isfinite().all(-1), logits.argmax(-1), NOT_FINITE)
+        return tokens.cpu().numpy(), logits[..., list(self.collator.digits)].float().cpu().numpy()
+
+    def _add(self, answer: WrittenAnswer, token: int, digit_logits: Float32Array) -> None:
+        """Add the next token to an answer that has not ended. digit_logits: float32 [D]"""
+        config = self.collator.config
+        if answer.has_ended:
+            return
+        answer.is_finite = token != NOT_FINITE
+        if not answer.is_finite or token in config.stops:
+            answer.has_ended = True
+            return
+        if answer.digit_logits is None and token in self.collator.digits:
+            answer.digit_logits = digit_logits
+        answer.tokens.append(int(token))
+        answer.has_ended = len(answer.tokens) == config.max_new_tokens
 
     def _read(self, answer: WrittenAnswer, row: VlmRow, execution: Execution) -> RowScores | RewardError:
         if not answer.is_finite:
-            return not_finite()
-        text = self.text(answer)
+            return InferenceFailedError("the network gave a score that is not finite")
+        text = self.collator.tokenizer.decode(answer.tokens, skip_special_tokens=True)
         scores = self.read(text, answer, row, execution)
         if scores is not None:
             return scores
@@ -244,11 +220,6 @@ def progress_of(score: float) -> RowScores:
     """Return the scores of a row whose answer holds one number."""
     progress = np.array([score])
     return RowScores([FrameScores(progress=progress, success=no_success(progress))])
-
-
-def not_finite() -> InferenceFailedError:
-    """Return the error of an answer among whose logits some are not finite."""
-    return InferenceFailedError("the network gave a score that is not finite")
 
 
 def unread(expected: str, text: str) -> InvalidSampleError:

@@ -202,18 +202,17 @@ def test_npy_files_hold_frames_or_embeddings(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_trajectory(str(tmp_path / "embeddings.npy")).video_embeddings, embeddings)
 
 
-def test_views_goal_and_descriptions_stand_beside_the_frames_of_a_file(tmp_path: Path) -> None:
+def test_views_and_goal_stand_beside_the_frames_of_a_file(tmp_path: Path) -> None:
     for name, frames in {"front": FRAMES, "left": FRAMES[::-1], "short": FRAMES[:1]}.items():
         np.save(tmp_path / f"{name}.npy", frames)
     Image.fromarray(FRAMES[1]).save(tmp_path / "goal.png")
     front, left = tmp_path / "front.npy", tmp_path / "left.npy"
     goal = tmp_path / "goal.png"
-    loaded = load_trajectory(front, orient="rotate180", views=[left, front], goal=goal, robot_description="an arm")
+    loaded = load_trajectory(front, orient="rotate180", views=[left, front], goal=goal)
     turned = FRAMES[:, ::-1, ::-1]
     for array, expected in zip((loaded.positions, *loaded.views), (turned, turned[::-1], turned), strict=True):
         np.testing.assert_array_equal(array, expected)
     np.testing.assert_array_equal(loaded.goal, FRAMES[1])
-    assert loaded.descriptions == ("an arm", "")
     with pytest.raises(InvalidSampleError, match=rf"short\.npy: expected {len(FRAMES)} frames, as {front}, got 1$"):
         load_trajectory(front, views=[tmp_path / "short.npy"])
     with pytest.raises(InvalidSampleError, match=r"front\.npy: expected an image, got "):

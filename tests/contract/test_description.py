@@ -18,7 +18,7 @@ FULL = Description(
     video_dim=4, text_dim=2, progress_bins=10, trained_frames=16, trained_padding=False, network_frames=32,
     frame_size=FrameSize("exact", (224, 320)), frames_per_value=2, has_progress=False, has_preference=True, has_success=True,
     has_similarity=True, more_scores=("log_prob", "unclear"), scores_whole_prefixes=True, may_not_answer=True, needs_whole_episode=True,
-    asks_in_words=True, reads_descriptions=True, reads_views=True, writes_analyses=True, keeps_features=True, uses_graphs=True, is_large=True,
+    asks_in_words=True, reads_views=True, keeps_features=True, uses_graphs=True, is_large=True,
     weights_digest="12ab", settings_digest="34cd",
 )  # fmt: skip
 CONFIG: dict[str, Any] = {"name": "rfm", "max_batch_size": 64, "input": [], "output": []}

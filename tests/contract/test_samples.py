@@ -135,9 +135,9 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: PreferenceSample(embedded(), filmed()),
         "second: expected video_embeddings, as the first trajectory, got frames",
     ),
-    "a pair with a description, which the wire has for the first alone": (
-        lambda: PreferenceSample(filmed(), replace(filmed(), camera_description="a camera on the wrist")),
-        "second: expected trajectories without views, goal and descriptions, which only progress has, got them",
+    "a pair with a goal, which the wire has for the first alone": (
+        lambda: PreferenceSample(filmed(), replace(filmed(), goal=FRAMES[0])),
+        "second: expected trajectories without views and goal, which only progress has, got them",
     ),
     "unequal widths": (
         lambda: PreferenceSample(embedded(), embedded(width=6)),

@@ -237,10 +237,6 @@ def request(lengths: tuple[int, int], kind: int, steps: int = 0, stray: int = 0)
     }
 
 
-def analysed(value: int) -> wire.Tensors:
-    return {"write_analysis": np.array([[value]], np.uint8)}
-
-
 @pytest.mark.parametrize(
     ("tensors", "message"),
     [
@@ -258,9 +254,6 @@ def analysed(value: int) -> wire.Tensors:
             "video_embeddings: expected zeros behind the 1 frames that num_frames states, got .*",
         ),
         (request((2, 3), 1), r"num_frames: expected at most the 4 frames in video_embeddings, got 5"),
-        (request((1, 1), 1) | analysed(1), "write_analysis: expected 0, or 1 with a sample of type progress, got 1"),
-        (request((1, 0), 0) | analysed(2), "write_analysis: expected 0, or 1 with a sample of type progress, got 2"),
-        (request((2, 0), 0, 2) | analysed(1), "analysis: expected frame_steps 0 with it, .*, got frame_steps 2"),
     ],
 )
 def test_numbers_that_mean_nothing_are_refused(tensors: wire.Tensors, message: str) -> None:

@@ -17,7 +17,6 @@ from torch import Tensor
 import goldens
 import rfm_export
 from captures import CalledAgain
-from engines import serve_config
 from in_process import rfm
 from labelling import LEROBOT
 from rfm import families
@@ -151,23 +150,6 @@ def test_seconds_of_graphs_may_differ_as_their_size_lets_them() -> None:
     verify_graphs(lambda: cast(Engine, OfSeconds(5e-6)), description, print)
     with pytest.raises(ExportDiffersError, match="a difference of 2e-05 times the largest"):
         verify_graphs(lambda: cast(Engine, OfSeconds(2e-5)), description, print)
-
-
-def test_graphs_are_refused_where_nothing_uses_them(tmp_path: Path) -> None:
-    settings = replace(serve_config(PLAIN), cuda_graphs=True)
-    with pytest.raises(rfm_export.ExportError, match="cuda_graphs: expected an export for GPUs, got one for the CPU"):
-        rfm_export.export(PLAIN.checkpoint, tmp_path, settings)
-    with pytest.raises(rfm_export.ExportError, match=r"cuda_graphs: expected an RFM, .*leave out --cuda-graphs$"):
-        rfm_export.export(SMALL.checkpoint, tmp_path, replace(serve_config(SMALL), cuda_graphs=True, num_gpus=0))
-
-
-@pytest.mark.parametrize("cuda_graphs", [False, True])
-def test_a_configuration_names_graphs_only_if_they_are_on(tmp_path: Path, cuda_graphs: bool) -> None:
-    settings = replace(serve_config(PLAIN), cuda_graphs=cuda_graphs, num_gpus=1)
-    said: list[str] = []
-    rfm_export.export(PLAIN.checkpoint, tmp_path, settings, other_machine=True, device="cpu", say=said.append)
-    assert ("cuda_graphs" in (tmp_path / "rfm_frames" / "config.pbtxt").read_text()) == cuda_graphs
-    assert any(line.startswith("cuda_graphs: not compared with plain passes") for line in said) == cuda_graphs
 
 
 def test_label_refuses_a_device_that_is_not_there(free_bytes: list[float]) -> None:

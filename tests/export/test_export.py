@@ -19,17 +19,16 @@ import goldens
 import rfm_export
 from engines import serve_config, training_run
 from in_process import rfm
-from paths import ROOT
 from repositories import changing, description_of, forget_input
 from rfm.families import CheckpointError
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Origin
 from rfm_export import ExportDiffersError, ExportError
-from rfm_export.source import origin_of
+from rfm_export.source import origin_of, read_source
 
 EMBEDDINGS = goldens.config("c1_t1_disc10")
 FRAMES = goldens.config("enc_c1_t1_disc10")
-REPOSITORY = ROOT / "model_repository"
+SMALL = goldens.config("legacy_keys_l2")
 
 
 def export(config: goldens.Config, repository: Path, **changes: Any) -> int:
@@ -51,80 +50,6 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     export(EMBEDDINGS, repository)
     export(FRAMES, repository, name="video")
     return repository
-
-
-def test_the_scorers_configuration_is_the_wire_contract(exported: Path) -> None:
-    config = read(exported, "rfm")
-    assert config.backend == "python"
-    assert config.max_batch_size == 64
-    assert dims(config.input) == {
-        "sample_type": ("UINT8", [1]),
-        "num_frames": ("INT32", [2]),
-        "frame_steps": ("INT32", [1]),
-        "video_embeddings": ("FP32", [-1, 768]),
-        "text_embedding": ("FP32", [384]),
-    }
-    assert dims(config.output) == {
-        "progress": ("FP32", [-1]),
-        "success": ("FP32", [-1]),
-        "preference": ("FP32", [1]),
-        "similarity": ("FP32", [1]),
-        "progress_logits": ("FP32", [-1, 10]),
-        "timing_ms": ("FP32", [2]),
-    }
-    assert [tensor.name for tensor in config.input if tensor.allow_ragged_batch] == ["video_embeddings"]
-    batching = config.dynamic_batching
-    assert not batching.max_queue_delay_microseconds  # a delay would cost every lone request
-    assert not batching.HasField("default_queue_policy")
-    assert not config.HasField("sequence_batching")
-    assert [warmup.name for warmup in config.model_warmup] == ["progress", "preference", "similarity"]
-
-
-def test_a_checkpoint_is_asked_for_what_it_has(tmp_path: Path) -> None:
-    export(goldens.config("legacy_keys_l2"), tmp_path / "continuous", max_queue_size=7, queue_timeout_ms=250)
-    config = read(tmp_path / "continuous", "rfm")
-    assert "progress_logits" not in dims(config.output)
-    # by default the queue is not bounded: with a bound, Triton 2.51 at times notices a free instance half a second late
-    policy = config.dynamic_batching.default_queue_policy
-    assert (policy.max_queue_size, policy.default_timeout_microseconds) == (7, 250_000)
-    assert policy.allow_timeout_override
-    export(goldens.config("robometer_c1_t1_disc10"), tmp_path / "no similarity")
-    warmups = read(tmp_path / "no similarity", "rfm").model_warmup
-    assert [warmup.name for warmup in warmups] == ["progress", "preference"]
-
-
-def test_frames_go_through_the_encoder_into_the_scorer(exported: Path) -> None:
-    encoder, ensemble = read(exported, "video_encoder"), read(exported, "video_frames")
-    assert dims(encoder.output) == {"video_embeddings": ("FP32", [-1, 48]), "text_embedding": ("FP32", [32])}
-    assert [tensor.name for tensor in encoder.input if tensor.allow_ragged_batch] == [
-        "frames",
-        "second_frames",
-        "frame_digests",
-    ]
-    for config in (encoder, ensemble):
-        assert [tensor.name for tensor in config.input if tensor.optional] == ["second_frames", "frame_digests"]
-    assert dims(ensemble.input) == {
-        "sample_type": ("UINT8", [1]),
-        "num_frames": ("INT32", [2]),
-        "frame_steps": ("INT32", [1]),
-        "frames": ("UINT8", [-1, -1, -1, 3]),
-        "second_frames": ("UINT8", [-1, -1, -1, 3]),
-        "frame_digests": ("UINT8", [-1, 32]),
-        "task": ("STRING", [1]),
-    }
-    steps = [(step.model_name, step.model_version) for step in ensemble.ensemble_scheduling.step]
-    assert steps == [("video_encoder", 1), ("video", 1)]
-    assert dims(ensemble.output) == dims(read(exported, "video").output)
-
-
-def test_two_instances_a_gpu_or_one_on_the_cpu(exported: Path, tmp_path: Path) -> None:
-    """Two instances of a network over embeddings: one scores while the other reads."""
-    (group,) = read(exported, "rfm").instance_group
-    assert (group.kind, group.count, list(group.gpus)) == (pb.ModelInstanceGroup.KIND_CPU, 1, [])
-    settings = replace(serve_config(EMBEDDINGS), num_gpus=2)
-    rfm_export.export(EMBEDDINGS.checkpoint, tmp_path, settings, other_machine=True)
-    (group,) = read(tmp_path, "rfm").instance_group
-    assert (group.kind, group.count, list(group.gpus)) == (pb.ModelInstanceGroup.KIND_GPU, 2, [0, 1])
 
 
 def test_an_export_holds_what_serving_needs_and_nothing_of_the_training_run(exported: Path) -> None:
@@ -255,27 +180,19 @@ def test_an_export_says_what_the_run_did_not_train(
         run[section] |= values
     (checkpoint / "config.yaml").write_text(yaml.safe_dump(run))
     said: list[str] = []
-    rfm_export.export(checkpoint, tmp_path / "repository", serve_config(EMBEDDINGS), say=said.append)
+    read_source(checkpoint, serve_config(EMBEDDINGS), None, said.append)
     assert len(said) == 1 + len(expected)
     assert all(map(str.startswith, said, [of_run(checkpoint), *expected]))
 
 
-def test_an_export_says_which_config_yaml_and_which_encoders_it_took(tmp_path: Path) -> None:
+def test_an_export_says_which_config_yaml_it_took(exported: Path) -> None:
     said: list[str] = []
-    settings = serve_config(FRAMES)
-    rfm_export.export(FRAMES.checkpoint, tmp_path, settings, say=said.append)
+    for config in (FRAMES, EMBEDDINGS):
+        read_source(config.checkpoint, serve_config(config), None, said.append)
     assert said[0] == of_run(FRAMES.checkpoint)
-    assert said[-1] == (
-        "assumed, and not shown by the checkpoint: "
-        "image_encoder encoders/image_encoder (--image-encoder; weights of the checkpoint); "
-        "text_encoder encoders/text_encoder (--text-encoder; weights of the checkpoint); "
-        "scores differ from the run's if it had others; rfm export --explain shows what decided each setting"
-    )
-    rfm_export.export(EMBEDDINGS.checkpoint, tmp_path / "above", serve_config(EMBEDDINGS), say=said.append)
     assert of_run(EMBEDDINGS.checkpoint.parent) in said
     again: list[str] = []
-    checkpoint = tmp_path / "above" / "rfm" / "1" / "checkpoint"
-    rfm_export.export(checkpoint, tmp_path / "again", serve_config(EMBEDDINGS), say=again.append)
+    read_source(exported / "rfm" / "1" / "checkpoint", serve_config(EMBEDDINGS), None, again.append)
     assert again == []  # an export of an export knows of no run
 
 
@@ -334,19 +251,25 @@ def test_check_names_a_broken_description(exported: Path, tmp_path: Path) -> Non
         rfm_export.check(repository, serve_config(FRAMES, "video"))
 
 
-def test_the_digest_of_settings_is_of_the_dtype_too(exported: Path, tmp_path: Path) -> None:
-    export(FRAMES, tmp_path, name="video", dtype="bfloat16")
-    told = [description_of(repository / "video") for repository in (exported, tmp_path)]
-    assert len({each.weights_digest for each in told}) == 1
-    assert len({each.settings_digest for each in told}) == 2
-
-
-def test_clients_learn_number_type_pytorch_and_attention(exported: Path, tmp_path: Path) -> None:
+def test_the_digest_of_settings_is_of_the_dtype_too_and_clients_learn_what_computes(
+    exported: Path, tmp_path: Path
+) -> None:
     export(FRAMES, tmp_path, name="video", dtype="bfloat16")
     for repository, dtype in ((exported, "float32"), (tmp_path, "bfloat16")):
         expected = f"{dtype}, torch {torch.__version__}, scaled_dot_product_attention"
         assert description_of(repository / "video").computation == expected
         assert description_of(repository / "video_frames").computation == expected
+    told = [description_of(repository / "video") for repository in (exported, tmp_path)]
+    assert len({each.weights_digest for each in told}) == 1
+    assert len({each.settings_digest for each in told}) == 2
+
+
+def test_a_set_size_of_batches_wins_also_in_the_check(tmp_path: Path) -> None:
+    settings = replace(serve_config(SMALL), max_batch_size=7)
+    rfm_export.export(SMALL.checkpoint, tmp_path, settings)
+    assert read(tmp_path, "rfm").max_batch_size == 7
+    assert rfm_export.check(tmp_path, settings) == []
+    assert rfm_export.check(tmp_path, replace(settings, max_batch_size=None))  # 64
 
 
 def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:

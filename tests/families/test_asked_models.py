@@ -19,7 +19,7 @@ from reward_models import ROOT, as_before_marks
 from rfm import families
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.families import CheckpointError, Decision
+from rfm.families import CheckpointError
 from rfm_client import ProgressResult, ProgressSample, Trajectory
 
 CHECKPOINT = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
@@ -45,7 +45,7 @@ def with_head(folder: Path, stated: tuple[bool | None, bool | None], head: Calla
 
 
 def test_a_head_scores_as_config_json_says(tmp_path: Path) -> None:
-    log_probs, told = {}, {}
+    log_probs = {}
     for name, stated, head in (
         ("own", (False, False), lambda head, _: head),
         ("equal, own", (False, False), lambda _, embedding: embedding),
@@ -55,21 +55,50 @@ def test_a_head_scores_as_config_json_says(tmp_path: Path) -> None:
         (result,) = Engine.of(checkpoint).evaluate([SAMPLE])
         assert isinstance(result, ProgressResult)
         log_probs[name] = result.log_prob
-        told[name] = next((d.value, d.source) for d in checkpoint.decisions() if d.name == "language_head")
-    assert told == {
-        "own": ("own", "weights: lm_head.weight"),
-        "equal, own": ("own", "weights: lm_head.weight"),
-        "equal, tied": ("tied to the embedding", "config.json: tie_word_embeddings"),
-    }
     np.testing.assert_array_equal(log_probs["equal, own"], log_probs["equal, tied"])
     assert np.abs(np.subtract(log_probs["own"], log_probs["equal, own"])).max() > 1
 
 
-def explained(source: Path, **options: Any) -> tuple[dict[str, Decision], list[str]]:
-    """The decisions on the checkpoint by name, and the lines for the user."""
-    said: list[str] = []
-    decisions = rfm_export.explain(source, ExportConfig(num_gpus=0, **options), say=said.append)
-    return {each.name: each for each in decisions if each.name != "computation"}, said
+@pytest.mark.parametrize(
+    ("source", "options"),
+    [
+        (CHECKPOINT, {"reward_model": "topreward,max_frames=9"}),
+        (CHECKPOINT, {"reward_model": "topreward-robometer"}),
+        (OF_LEROBOT, {"base_model": str(CHECKPOINT)}),
+        (CHECKPOINT, {"reward_model": "topreward", "base_model": str(BASE)}),
+        (ROBO, {"reward_model": "roboreward"}),
+    ],
+)
+def test_an_ordinary_model_lacks_no_head_and_nothing_is_assumed(source: Path, options: dict[str, Any]) -> None:
+    assert families.notes(source, families.load(source, **options)) == []
+
+
+def test_a_checkpoint_in_the_hub_s_cache_is_named_by_its_id_and_commit(tmp_path: Path) -> None:
+    snapshot = tmp_path / "models--Qwen--Qwen3-VL-8B-Instruct" / "snapshots" / "0123abcd"
+    shutil.copytree(CHECKPOINT, snapshot)
+    config = families.load(snapshot, reward_model="topreward").config
+    assert config.base_model_id == "Qwen/Qwen3-VL-8B-Instruct@0123abcd"
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "is_expected"),
+    [
+        ("robo", {"reward_model": "roboreward"}, False),
+        ("robo", {"reward_model": "roboreward-expected"}, True),
+        ("RoboReward-4B", {}, False),
+        ("RoboReward-4B", {"strict_answers": True}, False),
+    ],
+)
+def test_the_options_or_the_name_decide_how_roboreward_is_asked(
+    tmp_path: Path, name: str, options: dict[str, Any], is_expected: bool
+) -> None:
+    checkpoint = families.load(shutil.copytree(ROBO, tmp_path / "models" / name), **options)
+    config = checkpoint.config
+    assert (config.is_expected, config.dtype) == (is_expected, "bfloat16")
+    assert checkpoint.collator.example().endswith("ANSWER: ") is is_expected
+    assert config.strict_answers is options.get("strict_answers", False)
+    checkpoint.save(tmp_path / "saved")
+    assert families.load(tmp_path / "saved").config == config
 
 
 @pytest.mark.parametrize("reward_model", ["roboreward-expected", "topreward"])
@@ -84,9 +113,8 @@ def test_a_file_without_a_dtype_gets_a_line(tmp_path: Path) -> None:
     content = json.loads((folder / "config.json").read_text())
     del content["dtype"]
     (folder / "config.json").write_text(json.dumps(content))
-    decisions, (line,) = explained(folder, reward_model="topreward")
-    assert decisions["dtype"] == Decision("dtype", "bfloat16", "default, as config.json has no dtype", is_assumed=True)
-    assert "assumed, and not shown by the checkpoint: dtype bfloat16" in line
+    (line,) = families.notes(folder, families.load(folder, reward_model="topreward"))
+    assert "assumed, and not shown by the checkpoint: dtype bfloat16 (default, as config.json has no dtype);" in line
 
 
 def test_a_model_of_before_marks_may_gain_them(tmp_path: Path) -> None:

@@ -37,7 +37,6 @@ class Pipelined:
 
     has_progress = has_success = True
     reads_views = False
-    writes_analyses = False
 
     def __init__(self, batches: int) -> None:
         self.collated = [threading.Event() for _ in range(batches)]
@@ -96,7 +95,6 @@ class Fixed:
 
     has_progress = True
     reads_views = False
-    writes_analyses = False
 
     def __init__(self, scores: Sequence[RowScores], *, has_success: bool = True) -> None:
         self.scores, self.has_success = iter(scores), has_success

@@ -22,7 +22,7 @@ from engines import serve_config
 from repositories import description_of
 from rfm import families
 from rfm.engine import Engine
-from rfm.families import CheckpointError, Decision
+from rfm.families import CheckpointError
 from rfm.family import Checkpoint, Options
 from rfm_client import (
     InvalidSampleError,
@@ -199,10 +199,7 @@ def test_a_checkpoint_of_the_first_rewind_code_is_exported_and_labels(run: Path,
     assert scorer.checkpoint().max_frames == 32
     assert "causal_mask" in scorer.notes[1]
     assert "max_len" not in scorer.notes[1]
-    decisions = {each.name: each for each in checkpoint.decisions()}
-    assert decisions["max_len"] == Decision("max_len", 32, "config.json")
-    assert decisions["trained_frames"] == Decision("trained_frames", 32, "max_len")
-    assert decisions["has_success"] == Decision("has_success", False, "weights")
+    assert [each.name for each in checkpoint.assumptions] == ["num_attention_heads", "causal_mask"]
 
 
 def test_a_checkpoint_of_the_first_rewind_code_is_causal_whatever_upstream_s_older_files_mean(run: Path) -> None:

@@ -138,8 +138,8 @@ def test_config_json_may_say_nothing_of_nf4_but_nothing_wrong(both: tuple[Path, 
     """A trainer that saves weights alone keeps the base model's configuration."""
     few_bits, full = both
     shutil.copyfile(full / "config.json", few_bits / "config.json")
-    assert "rounded_weights" in [each.name for each in load(PLAIN, few_bits).decisions()]
-    assert "rounded_weights" not in [each.name for each in load(PLAIN, full).decisions()]
+    assert "rounded_weights" in [each.name for each in load(PLAIN, few_bits).assumptions]
+    assert "rounded_weights" not in [each.name for each in load(PLAIN, full).assumptions]
     change_config(full, "nf4")
     expected = (
         r"config\.json: quantization_config: expected weights in NF4, got none; if they are meant in full precision"

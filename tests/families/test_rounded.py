@@ -154,14 +154,10 @@ def test_an_export_holds_the_rounded_weights_and_says_how_far_scores_are(tmp_pat
     (other,) = {*KINDS} - {kind}
     with pytest.raises(ExportError, match=rf"expected weights in {other}, got {kind}; leave out --weights"):
         rfm_export.check(tmp_path, replace(settings, weights=other))
-    table = json.loads((folder / "1" / "checkpoint" / "provenance.json").read_text())
-    (row,) = [each for each in table if each["name"] == "weights"]
-    assert row["value"] == f"{kind}: rounded, so the scores are not the full checkpoint's"
-    assert row["source"] == "--weights"
     stored = load_file(folder / "1" / "checkpoint" / "model.safetensors")
     assert not any("lora" in key for key in stored)
     again = families.load(folder / "1" / "checkpoint", weights=kind)  # the same may be asked for again
-    assert {each.source for each in again.decisions() if each.name == "weights"} == {"config.json"}
+    assert again.config.weights == kind
 
 
 def test_an_export_of_an_export_keeps_the_difference_that_was_measured(tmp_path: Path) -> None:
@@ -237,7 +233,7 @@ def test_an_ordinary_qwen_in_nf4_is_read(tmp_path: Path) -> None:
     (folder / "config.json").write_text(json.dumps(content))
     published = families.load(folder, reward_model="roboreward-expected")
     rounded_here = families.load(ROBOREWARD, reward_model="roboreward-expected", weights="nf4")
-    assert {each.source for each in published.decisions() if each.name == "weights"} == {"weights"}
+    assert published.config.weights == "nf4"
     scores = [Engine.of(each).evaluate(SAMPLES) for each in (published, rounded_here)]
     for result, expected in zip(*scores, strict=True):
         assert_close(result, expected, 1e-6)

@@ -167,7 +167,7 @@ def test_a_saved_model_scores_the_same(tmp_path: Path, robometer: Engine) -> Non
     assert isinstance(result, ProgressResult)
     assert isinstance(expected, ProgressResult)
     np.testing.assert_array_equal(result.progress, expected.progress)
-    assert not [decision.name for decision in checkpoint.decisions() if decision.is_assumed]
+    assert checkpoint.assumptions == ()
 
 
 def test_an_export_keeps_its_reward_model(tmp_path: Path) -> None:

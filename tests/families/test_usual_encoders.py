@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 import goldens
-import rfm_export
-from rfm.config import ExportConfig
+from rfm import families
 from rfm.rewind import pretrained as usual
 from spoilt import Spoil, settings
 
@@ -70,10 +69,8 @@ def test_encoders_that_are_not_upstream_s_are_told(tmp_path: Path) -> None:
         hidden_size=384, num_hidden_layers=6, num_attention_heads=12, intermediate_size=8, vocab_size=180
     )
     AutoModel.from_config(config).save_pretrained(text)
-    said: list[str] = []
-    config = ExportConfig(num_gpus=0, image_encoder=str(image), text_encoder=str(text))
-    decisions = {each.name: each for each in rfm_export.explain(CHECKPOINT, config, say=said.append)}
-    *_, of_image, of_text, assumed = said
+    checkpoint = families.load(CHECKPOINT, image_encoder=str(image), text_encoder=str(text))
+    *_, of_image, of_text, assumed = families.notes(CHECKPOINT, checkpoint)
     assert of_image.startswith(
         f"{image}: differs from upstream's facebook/dinov2-base in num_hidden_layers: expected 12, got 1; "
     )
@@ -82,4 +79,3 @@ def test_encoders_that_are_not_upstream_s_are_told(tmp_path: Path) -> None:
         "vocab_size: expected 30522, got 180: scores are right only if the run's embeddings were made with it"
     )
     assert "--text-encoder; only its width agrees" in assumed
-    assert decisions["image_encoder_settings"].value["crop_px"] == [56, 56]

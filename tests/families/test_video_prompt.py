@@ -21,14 +21,11 @@ from transformers.models.qwen2_5_vl.processing_qwen2_5_vl import Qwen2_5_VLProce
 from transformers.models.qwen3_vl.processing_qwen3_vl import Qwen3VLProcessor
 
 import goldens
-import rfm_export
 from paths import GOLDEN
 from reward_models import BASE, ROOT
 from rfm import families
-from rfm.checkpoint.provenance import assumed
-from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.families import CheckpointError, Decision
+from rfm.families import CheckpointError
 from rfm.vlm.video_prompt import WRAPPED_SINCE, decided
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Trajectory
 
@@ -182,20 +179,20 @@ def test_the_version_of_transformers_decides_the_form(
 ) -> None:
     options: dict[str, Any] = OF_BASE if source == ROBOMETER else {"reward_model": "topreward"}
     checkpoint = families.load(with_version(source, tmp_path / "checkpoint", version), **options)
-    (decision,) = (each for each in checkpoint.decisions() if each.name == "video_prompt")
-    assert (checkpoint.config.video_prompt, decision.value) == (form, form)
-    assert decision.source.endswith(ending)
+    assert checkpoint.config.video_prompt == form
+    assumed = [each for each in checkpoint.assumptions if each.name == "video_prompt"]
     # A later transformers may only have saved an ordinary model.
-    assert decision.is_assumed is (is_assumed or (source == TOP and form == "wrapped"))
-    said = [line for line in assumed(checkpoint.decisions()) if "video_prompt" in line]
-    assert bool(said) is decision.is_assumed
+    assert [each.value for each in assumed] == [form] * (is_assumed or (source == TOP and form == "wrapped"))
+    assert all(each.source.endswith(ending) for each in assumed)
     asked = families.load(tmp_path / "checkpoint", **options, video_prompt="wrapped")
-    assert Decision("video_prompt", "wrapped", "--video-prompt") in asked.decisions()
+    assert asked.config.video_prompt == "wrapped"
+    assert "video_prompt" not in [each.name for each in asked.assumptions]
 
 
 def test_an_adapter_s_base_model_does_not_tell_the_version_of_its_run() -> None:
-    assert decided(None, {}, "config.json")[1].is_assumed
-    assert decided("wrapped", {}, "config.json")[0] == "wrapped"
+    (assumed,) = decided(None, {}, "config.json")[1]
+    assert assumed.value == "bare"
+    assert decided("wrapped", {}, "config.json") == ("wrapped", ())
 
 
 @pytest.mark.parametrize("name", ["robometer", "topreward", "roboreward"])
@@ -205,8 +202,7 @@ def test_an_export_keeps_its_form(tmp_path: Path, name: str) -> None:
         families.load(case.source, **case.options, video_prompt=form).save(tmp_path / form)
         saved = Engine.of(families.load(tmp_path / form))
         assert list(saved.predictor.rows(case.sample)[-1].input_ids) == case.ids(form)
-        (decision,) = (d for d in families.load(tmp_path / form).decisions() if d.name == "video_prompt")
-        assert decision == Decision("video_prompt", form, "config.json")
+        assert families.load(tmp_path / form).config.video_prompt == form
     settings = json.loads((tmp_path / "bare" / "config.json").read_text())["rfm"]
     assert "video_prompt" not in settings  # as in exports before the setting, which keep the digest
     with pytest.raises(CheckpointError, match="leave it out, or export the checkpoint again"):
@@ -217,7 +213,6 @@ def test_an_export_keeps_its_form(tmp_path: Path, name: str) -> None:
     "folder", [goldens.config("c1_t1_disc10").checkpoint, ROOT / "lerobot_robometer" / "tok_disc10"]
 )
 def test_a_form_that_nothing_follows_is_refused(folder: Path) -> None:
-    settings = ExportConfig(base_model=str(BASE), video_prompt="wrapped")
     source = folder / "checkpoint" if (folder / "checkpoint").exists() else folder
     with pytest.raises(CheckpointError, match="--video-prompt: expected a checkpoint that shows videos to a Qwen3-VL"):
-        rfm_export.explain(source, settings)
+        families.load(source, base_model=str(BASE), video_prompt="wrapped")

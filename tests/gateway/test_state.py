@@ -213,8 +213,7 @@ def test_the_client_encodes_a_trajectory_once_for_many_questions(encoders: Gatew
         np.testing.assert_allclose(first.success, second.success, rtol=0, atol=TOLERANCE)
         with pytest.raises(InvalidSampleError, match="trajectory: expected frames, got video_embeddings"):
             client.encode(encoded)
-        for more in (replace(frames, robot_description="an arm"), replace(frames, goal=frames.positions[0])):
-            with pytest.raises(InvalidSampleError, match=r"expected a model .*, got .*; leave out"):
-                client.encode(more)
+        with pytest.raises(InvalidSampleError, match=r"expected a model .*, got .*; leave out"):
+            client.encode(replace(frames, goal=frames.positions[0]))
     with tiny.client() as client, pytest.raises(ModelNotFoundError, match="rfm_encoder"):
         client.encode(frames)

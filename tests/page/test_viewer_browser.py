@@ -564,7 +564,7 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page, theme: str
 SKIPPING = """
 const done = arguments[0];
 Promise.all([import("/viewer/curves.js"), import("/viewer/figure.js")]).then(([{ Curve }, { svgFigure }]) => {
-  const settings = { task: "lift", model: "m", rule: "all", fps: 1, descriptions: {} };
+  const settings = { task: "lift", model: "m", rule: "all", fps: 1 };
   const curve = new Curve({ title: "a.mp4", id: 1 }, settings);
   curve.take("video", { num_frames: 7, times_s: null });
   curve.take("scores", {

@@ -253,9 +253,8 @@ def options(command: Command) -> Iterator[Parameter]:
 
 def test_every_tensor_of_the_contract_is_documented() -> None:
     contract = CONTRACT.read_text()
-    inputs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(described=True, analysed=True))
-    specs = (*inputs, *wire.score_outputs(10, FRAME_SCORES, analysed=True))
-    for spec in specs:
+    inputs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(by_digest=True, with_views=True))
+    for spec in (*inputs, *wire.score_outputs(10, FRAME_SCORES)):
         assert f"| `{spec.name}` |" in contract
 
 

@@ -19,25 +19,31 @@ from rfm_client import ProgressSample, Trajectory
 
 FOLDER = ROOT / "rynnvalue"
 FRAME_STEPS = 8  # of the original's server
-LOGIT_TOLERANCE = 1e-3  # of the language head, in float32
 RELATIVE_TOLERANCE = 2e-4  # of seconds, relative and absolute
 ISOLATED = "pred_slot_isolated_eager"
-# The original's table of descriptions, for a request without them.
+# The original's table of descriptions of robot and camera, for a request without them.
 SOURCES = {"usc_xarm_policy_ranking": ("an xArm single-arm robot", "the main right camera")}
 USUAL = ("a Franka single-arm robot", "the main right camera")
-
-OTHERS = ("a robot of another kind", "another camera")
+UNSAID = (None, None)
 
 Meta = tuple[str | None, str | None]
 
 
 @dataclass(frozen=True)
 class Asked:
-    """One sample of a case. prefix: of its arrays; meta: descriptions of robot and camera"""
+    """One sample of a case, and the engine of an export with its descriptions of robot and camera.
+
+    prefix: of its arrays
+    """
 
     sample: ProgressSample
     prefix: str
+    checkpoint: Path
     meta: Meta
+
+    @property
+    def engine(self) -> Engine:
+        return engine_of(self.checkpoint, self.meta)
 
 
 @dataclass(frozen=True)
@@ -58,12 +64,6 @@ class Case(Reference):
         array = self.arrays[f"{prefix}{rounded}{self.attention}.{name}"]
         return array.mean(0) if name.startswith("value") else array.reshape(-1)
 
-    def generated(self, prefix: str) -> dict[str, Any] | None:
-        """The original's analysis of a sample; None: it is not stored."""
-        sample = self.content["samples"][int(prefix.removeprefix("sample_").removesuffix("."))]
-        found: dict[str, Any] | None = sample["generation"].get(self.attention)
-        return found
-
     def asked(self) -> list[Asked]:
         inputs = self.file.parent / self.content["inputs"]
         request, arrays = json.loads(inputs.with_suffix(".json").read_text()), np.load(inputs.with_suffix(".npz"))
@@ -76,33 +76,24 @@ class Case(Reference):
             steps = FRAME_STEPS if request["use_frame_steps"] else 0
             told = trajectory.get("metadata")
             meta = SOURCES[trajectory["data_source"]] if not told else _descriptions(told)
-            meta = meta if self.summary["use_meta"] else (None, None)
-            robot, camera = (text or "" for text in meta)
-            described = Trajectory(
-                frames=frames, task=trajectory["task"], robot_description=robot, camera_description=camera
-            )
-            found.append(Asked(ProgressSample(described, steps), f"sample_{index}.", meta))
+            shown = ProgressSample(Trajectory(frames=frames, task=trajectory["task"]), steps)
+            meta = meta if self.summary["use_meta"] else UNSAID
+            found.append(Asked(shown, f"sample_{index}.", self.checkpoint, meta))
         return found
-
-    @property
-    def engine(self) -> Engine:
-        """Of an export with descriptions that no case has."""
-        return engine_of(self.checkpoint, OTHERS if self.summary["use_meta"] else (None, None))
 
 
 def _descriptions(metadata: dict[str, Any]) -> Meta:
     return metadata.get("robot_description"), metadata.get("camera_description")
 
 
-def said(meta: Meta) -> str:
-    """The argument of ``--as`` with these descriptions."""
-    given = [f"{name}={text}" for name, text in zip(("robot", "camera"), meta, strict=True) if text is not None]
-    return ",".join(["rynnvalue", *given])
+def said(meta: Meta) -> dict[str, str | None]:
+    """The options of an export with these descriptions."""
+    return dict(zip(("robot_description", "camera_description"), meta, strict=True))
 
 
 @lru_cache(maxsize=8)
 def engine_of(checkpoint: Path, meta: Meta) -> Engine:
-    return Engine.of(families.load(checkpoint, reward_model=said(meta)))
+    return Engine.of(families.load(checkpoint, **said(meta)))
 
 
 CASES = [Case(file) for file in sorted(FOLDER.glob("*/cases/*.json"))]

@@ -21,7 +21,6 @@ from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS
 from rfm.engine import Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import RowScores, frame_scores, of_rows, prefix_indices
-from rfm.families import Decision
 from rfm.family import NETWORK, Family, Options
 from rfm_client import (
     FrameScores,
@@ -104,9 +103,7 @@ class ToyPredictor:
     network: Redness
     works_ahead: bool = False
     has_progress: bool = True
-    reads_descriptions: bool = False
     reads_views: bool = False
-    writes_analyses: bool = False
     has_success: bool = True
 
     def rows(self, sample: Sample) -> list[list[np.ndarray]]:
@@ -175,8 +172,9 @@ class ToyCheckpoint:
     def skeleton(self) -> Redness:
         return Redness(self.config)
 
-    def decisions(self) -> list[Decision]:
-        return [Decision("num_colours", self.config.num_colours, NETWORK_CONFIG)]
+    @property
+    def assumptions(self) -> tuple[()]:
+        return ()
 
     def flop(self, sample: Sample) -> float:
         return 2.0 * sum(trajectory.num_frames for trajectory in sample.trajectories) * self.config.num_colours

@@ -105,7 +105,7 @@ def test_the_gateway_and_the_page_answer_null_at_frames_without_an_answer(endpoi
         served = requests.get(f"{gateway.url}/{SERVED}", timeout=60).json()["models"]
         _, (_, points), _ = events(post(gateway.url, SCORE, {"video": video}, task=trajectory["task"], fps="10"))
     about = next(model for model in served if model["name"] == "forward")
-    assert (about["rule"], about["reads_views"], about["reads_descriptions"]) == ("all", True, False)
+    assert (about["rule"], about["reads_views"]) == ("all", True)
     assert (points["progress"][0], points["answered"]) == (None, [False, True, True])
     np.testing.assert_allclose(points["progress"][1:], expected.progress[1:], rtol=0, atol=1e-6)
     (values,) = answer["outputs_progress"]["progress_pred"]
@@ -146,7 +146,6 @@ def test_the_command_line_sends_views_and_a_goal_and_only_where_they_are_read(
     assert told["views"] == [str(files["left"]), str(files["right"])]
     for wrong, fault in (
         (["--view", files["left"]], "--view: expected none with this model, which reads one camera and no goal"),
-        (["--camera-description", "c"], "--camera-description: expected none with this model, whose prompt names"),
         ([files["left"], *views], "'--view': expected a single VIDEO, of which they are views, got 2"),
     ):
         refused = rfm_client(*words, "--model", "robo", *wrong)

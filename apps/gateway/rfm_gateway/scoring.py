@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 from traceback import clear_frames
-from typing import Any, TypeAlias, cast
+from typing import TypeAlias, cast
 
 import numpy as np
 
@@ -242,9 +242,8 @@ class _Conversion:
         if self.frame_model is None:
             expected = "embeddings, since no model for raw frames is served"
             raise InvalidSampleError.at("frames", expected, "frames")
-        described = _descriptions(given) if self.frame_model.reads_descriptions else {}
         frames = self.files.frames(given.frames) if isinstance(given.frames, list) else given.uint8_frames
-        trajectory = Trajectory(frames=frames, task=given.task or "", **described)
+        trajectory = Trajectory(frames=frames, task=given.task or "")
         if self.refuse_blank:
             refuse_blank_frames(trajectory)
         return trajectory
@@ -252,16 +251,6 @@ class _Conversion:
 
 def _frame_steps(frames: ModelInfo | None) -> int:
     return FRAME_STEPS if frames is None or frames.has_progress else FRAME_STEPS_OF_SECONDS
-
-
-def _descriptions(given: schema.TrajectoryInput) -> dict[str, Any]:
-    """Return the descriptions of robot and camera in a trajectory's metadata. Raises InvalidSampleError."""
-    told = given.metadata if isinstance(given.metadata, Mapping) else {}
-    found = {key: told[key] for key in Trajectory.DESCRIPTION_FIELDS if told.get(key) is not None}
-    for key, text in found.items():
-        if not isinstance(text, str) or not text.strip():
-            raise InvalidSampleError.at(f"metadata.{key}", "a description, or null", repr(text))
-    return found
 
 
 def _prefixes(sample: Sample) -> list[Sample]:

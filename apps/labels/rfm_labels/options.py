@@ -123,10 +123,6 @@ class LabelOptions(Settings):
         "How progress is made of remaining seconds, for a model without progress: "
         "remaining_over_first: 1 - the seconds / those of the episode's first frame.",
     )
-    robot_description: str = setting("", "Words for the robot in RynnValue's prompt. Default: those of the export.")
-    camera_description: str = setting(
-        "", "Words for the camera, with a single camera. If either is given, they replace both of the export."
-    )
     mode: Mode = setting("prefix", "prefix: frame t is scored on the frames up to t. whole: all frames together.")
     resize: bool = setting(False, "Downscale frames to the model's input size before sending.")
     episodes: Sequence[int] | None = setting(

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
-from rfm_client import InvalidSampleError, RewardError, Trajectory
+from rfm_client import InvalidSampleError, RewardError
 from rfm_client.frames import ChannelOrder, Correction, Fuse, Orientation, Sampling
 from rfm_client.options import InvalidValueError, first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
@@ -22,7 +22,7 @@ from rfm_labels.options import QUIET, LabelOptions, Mode, ProgressRule, Watch, c
 from rfm_labels.scorer import CheckpointFacts, Scorer
 
 _RECIPE_FORMAT = 4  # increased when the same recipe gives other scores or other digests
-_OPTIONAL = ("progress_rule", *Trajectory.DESCRIPTION_FIELDS)  # labels made before have no such fields
+_OPTIONAL = ("progress_rule",)  # labels made before have no such field
 _OF_TRAINING = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
 _OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
 
@@ -37,7 +37,6 @@ class Recipe:
     corrections: of the cameras whose frames are turned, or stored as BGR
     verify: True: videos are identified by their content
     progress_rule: makes progress of remaining seconds; None: the checkpoint predicts progress
-    robot_description, camera_description: for the checkpoint's prompt, as in ``rfm_client.Trajectory``
     """
 
     checkpoint: CheckpointFacts
@@ -50,8 +49,6 @@ class Recipe:
     resize: bool
     verify: bool
     progress_rule: ProgressRule | None = None
-    robot_description: str = ""
-    camera_description: str = ""
     views: tuple[str, ...] = ()
     goal: Goal | None = None
 
@@ -69,7 +66,6 @@ class Recipe:
             why = "of this model, whose scores are relative to the whole episode"
             raise InvalidSampleError.at("mode", f"whole {why}", f"{options.mode}; give --mode whole")
         _check_progress(options.progress_rule, checkpoint)
-        _check_descriptions(options, cameras, checkpoint)
         _check_views(options, cameras, checkpoint)
         decoded = (*cameras, *views)
         rule = "all" if options.mode == "whole" else options.sampling
@@ -91,8 +87,6 @@ class Recipe:
             resize=options.resize,
             verify=options.verify,
             progress_rule=options.progress_rule,
-            robot_description=options.robot_description,
-            camera_description=options.camera_description,
             views=views,
             goal=None if options.goal is None else Goal.of(options.goal),
         )
@@ -249,17 +243,6 @@ def _check_progress(rule: ProgressRule | None, checkpoint: CheckpointFacts) -> N
         known = " or ".join(get_args(ProgressRule))
         expected = f"{known} with this model, which predicts remaining seconds and no progress"
         raise InvalidSampleError.at("progress_rule", expected, f"none; give --progress-rule {known}")
-
-
-def _check_descriptions(options: LabelOptions, cameras: Sequence[str], checkpoint: CheckpointFacts) -> None:
-    """Raise InvalidSampleError for descriptions that the prompt does not take, or a camera's for several cameras."""
-    given = [name for name in Trajectory.DESCRIPTION_FIELDS if getattr(options, name)]
-    if given and not checkpoint.reads_descriptions:
-        expected = "none with this model, whose prompt names neither robot nor camera"
-        raise InvalidSampleError.at(given[0], expected, repr(getattr(options, given[0])))
-    if options.camera_description and len(cameras) > 1:
-        expected, remedy = "a single camera, which it describes", "choose one (--cameras)"
-        raise InvalidSampleError.at("camera_description", expected, ", ".join(cameras), remedy)
 
 
 def _check_views(options: LabelOptions, cameras: Sequence[str], checkpoint: CheckpointFacts) -> None:

@@ -32,7 +32,6 @@ class CheckpointFacts:
     encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
     is_causal: True if no frame's score depends on later frames
     has_progress: False if it predicts remaining seconds in place of progress
-    reads_descriptions: True if its prompt names the robot and the camera
     reads_views: True if it reads views of further cameras and a goal
     """
 
@@ -49,7 +48,6 @@ class CheckpointFacts:
     computation: str | None = None
     weights: str | None = None
     has_progress: bool = True
-    reads_descriptions: bool = False
     reads_views: bool = False
 
     @classmethod

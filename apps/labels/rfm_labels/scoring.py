@@ -304,8 +304,7 @@ def _held(
     goal = None if recipe.goal is None else recipe.goal.picture(frames)
     if goal is not None and recipe.resize and recipe.checkpoint.frame_size is not None:
         (goal,) = resize_frames(goal[np.newaxis], recipe.checkpoint.frame_size)
-    described = {name: getattr(recipe, name) for name in Trajectory.DESCRIPTION_FIELDS}
-    return Trajectory(frames=frames, task=task, views=tuple(views), goal=goal, **described)
+    return Trajectory(frames=frames, task=task, views=tuple(views), goal=goal)
 
 
 def _filled(first: UInt8Array, others: Iterator[UInt8Array], count: int) -> UInt8Array:

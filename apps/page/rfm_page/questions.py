@@ -50,7 +50,6 @@ class VideoRequest(BaseModel):
     rule, frames: sampling of each prefix; None: the checkpoint's default
     resize: frames are shrunk to the checkpoint's input size
     orient, channels: how frames become upright RGB first
-    robot_description, camera_description: as in ``rfm_client.Trajectory``
     """
 
     task: Annotated[str, StringConstraints(strip_whitespace=True)]
@@ -61,8 +60,6 @@ class VideoRequest(BaseModel):
     resize: bool = False
     orient: Orientation = "none"
     channels: ChannelOrder = "rgb"
-    robot_description: str = ""
-    camera_description: str = ""
 
     @classmethod
     def of(cls, fields: Mapping[str, str], default_model: str) -> VideoRequest:
@@ -116,8 +113,7 @@ class VideoRequest(BaseModel):
             except InvalidSampleError as error:
                 raise InvalidSampleError.like(error, source=name) from None
         frames = Correction(self.orient, self.channels).applied(frames)
-        described = {name: getattr(self, name) for name in Trajectory.DESCRIPTION_FIELDS}
-        return ShownVideo(Trajectory(frames=frames, task=self.task, **described), times_s)
+        return ShownVideo(Trajectory(frames=frames, task=self.task), times_s)
 
 
 def _container(beginning: bytes) -> str | None:

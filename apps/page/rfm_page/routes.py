@@ -156,8 +156,8 @@ def _told_of(name: str, info: ModelInfo) -> dict[str, Any]:
     usual = Sampling.of(None, 1, None, trained_padding=info.trained_padding).rule
     rule = "all" if info.needs_whole_episode else usual
     about = {"name": name, "max_frames": info.max_frames, "rule": rule}
-    reads = {"reads_descriptions": info.reads_descriptions, "reads_views": info.reads_views}
-    return {**about, **reads, "has_success": info.has_success, "versions": list(info.versions), "source": info.source}
+    about |= {"reads_views": info.reads_views, "has_success": info.has_success}
+    return {**about, "versions": list(info.versions), "source": info.source}
 
 
 def _frames_of(rule: Rule) -> int | str | None:

@@ -45,9 +45,9 @@ def trajectory_of(
 
 
 def as_configured(trajectory: Trajectory, config: RfmRewardConfig) -> Trajectory:
-    """Return the trajectory with frames turned as ``config.orient`` says, and with the configuration's descriptions."""
+    """Return the trajectory with frames turned as ``config.orient`` says."""
     frames = None if trajectory.frames is None else config.correction.applied(trajectory.frames)
-    return replace(trajectory, frames=frames, **config.descriptions)
+    return replace(trajectory, frames=frames)
 
 
 def images_of(batch: Mapping[str, Any], key: str) -> Any:

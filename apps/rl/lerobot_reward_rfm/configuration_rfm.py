@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 from lerobot.configs.rewards import RewardModelConfig
 
-from rfm_client import RewardClient, Trajectory
+from rfm_client import RewardClient
 from rfm_client.episodes import SuccessRule
 from rfm_client.frames import Correction, Orientation, Rule
 from rfm_client.options import checked_count, checked_finite, require
@@ -35,8 +35,6 @@ class RfmRewardConfig(RewardModelConfig):
     sampling, frames: as in ``client.episode``; None: as the checkpoint was trained
     orient: rotation or flip that makes the camera's frames upright
     resize: True: shrink frames to the checkpoint's size before they travel (needs Pillow)
-    robot_description, camera_description: the words for the robot and the camera in RynnValue's prompt; empty: those of
-        the export
     reward_output: the reward of ``compute_reward``: ``progress``, 0 to 1, ``success``, 1.0 or 0.0, or ``remaining_s``,
         minus the remaining seconds
     success_threshold: least probability of a ``success``
@@ -56,8 +54,6 @@ class RfmRewardConfig(RewardModelConfig):
     frames: int | None = None
     orient: str = "none"
     resize: bool = False
-    robot_description: str = ""
-    camera_description: str = ""
     reward_output: str = "progress"
     success_threshold: float = SuccessRule.threshold
 
@@ -86,11 +82,6 @@ class RfmRewardConfig(RewardModelConfig):
     def correction(self) -> Correction:
         """How the camera's frames become upright."""
         return Correction(self.orient)  # type: ignore[arg-type]  # checked above; LeRobot's parser knows no Literal
-
-    @property
-    def descriptions(self) -> dict[str, Any]:
-        """The fields of a Trajectory that describe robot and camera, by name."""
-        return {name: getattr(self, name) for name in Trajectory.DESCRIPTION_FIELDS}
 
     def connect(self) -> RewardClient:
         """Return a client of the server. Raises ValueError for options that contradict, OSError for a missing file."""

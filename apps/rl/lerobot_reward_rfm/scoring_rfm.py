@@ -40,7 +40,6 @@ class RfmFrameScorer:
         config, info = self.model.config, self.model.client.model_info(frames=True)
         rule = asdict(rule_of(info, config))
         own = {name: getattr(config, name) for name in ("image_key", "default_task", "orient", "resize")}
-        own |= {name: text for name, text in config.descriptions.items() if text}
         checkpoint = {name: getattr(info, name) for name in ("name", "source", "revision", "weights_digest")}
         return {"sampling": rule["rule"], "frames": rule["frames"], **own, "checkpoint": checkpoint}
 

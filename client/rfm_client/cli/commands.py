@@ -42,14 +42,7 @@ from rfm_client.cli.options import (
     WaitOptions,
     check_folder,
 )
-from rfm_client.cli.show import (
-    StreamedTable,
-    analysis_lines,
-    in_place_of_progress,
-    print_tables,
-    scores_table,
-    status_tables,
-)
+from rfm_client.cli.show import StreamedTable, in_place_of_progress, print_tables, scores_table, status_tables
 from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames, write_perf_analyzer_input
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import DeadlineExceededError, RewardError
@@ -111,8 +104,6 @@ def score(
     video.begin(videos)
     if prefix.sampling is not None and video.max_frames is not None:
         raise ConfigError.of_two("sampling", "conflicts with", "max_frames")
-    if output.analysis and prefix.scores_prefixes:
-        raise ConfigError.of_two("analysis", "conflicts with", "frame_steps" if prefix.frame_steps else "sampling")
     rows = StreamedTable(scoring.COLUMNS, videos)
     arrays = output.array_files(scoring.unique_stems(videos))
 
@@ -128,12 +119,10 @@ def score(
             np.save(arrays[number], np.stack([result.progress, result.success], axis=1))  # NaN: not predicted
         if output.prints_tables:
             rows.write(outcome.row)
-            if result.analysis is not None:
-                rows.write_below(analysis_lines(result.analysis))
 
     with scoring.recorder(output.rrd, videos) as record, server.connected() as client:
         video.check_read(client)
-        outcomes = scoring.SourceScorer(client, video, prefix, output.analysis, record).score_all(videos, tell)
+        outcomes = scoring.SourceScorer(client, video, prefix, record).score_all(videos, tell)
     scored = [outcome for outcome in outcomes if isinstance(outcome, scoring.Scored)]
     rows.end(" ".join(filter(None, (prefix.rule, in_place_of_progress(each.result for each in scored)))))
     output.write_json(documents.score_document(server, video, prefix, outcomes))

@@ -89,9 +89,7 @@ def result_document(result: Result, times_s: Sequence[Times | None] = (None, Non
     """
     version = {"model_version": result.model_version}
     if isinstance(result, ProgressResult):
-        written = result.analysis
-        told = {} if written is None else {"analysis": {"text": written.text, **written.parts}}
-        return {**version, **frame_document(result, times_s[0]), **told}
+        return {**version, **frame_document(result, times_s[0])}
     of_both = zip(trajectory_scores(result).items(), times_s, strict=True)
     return {**version, **answer(result), **{name: frame_document(scores, times) for (name, scores), times in of_both}}
 

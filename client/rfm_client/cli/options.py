@@ -22,7 +22,7 @@ from rfm_client.contract import errors
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
 from rfm_client.contract.names import DEFAULT_MODEL
-from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS, Trajectory
+from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.frames.orientation import ChannelOrder, Orientation
 from rfm_client.frames.sampling import RULES, Rule, Sampling
@@ -186,7 +186,7 @@ class VideoOptions(FrameRate, VideoFiles):
 class ScoredVideos(VideoOptions):
     """Videos, and what only some models read besides them. Raises ConfigError."""
 
-    TITLE: ClassVar[str] = "Robo-Dopamine and RynnValue"
+    TITLE: ClassVar[str] = "Robo-Dopamine"
 
     views: Texts = setting(
         (),
@@ -195,8 +195,6 @@ class ScoredVideos(VideoOptions):
         metavar="VIDEO",
     )
     goal: str | None = setting(None, "Picture of the task done, for Robo-Dopamine.", metavar="IMAGE")
-    robot_description: str = setting("", "Words for the robot in RynnValue's prompt. Default: those of the export.")
-    camera_description: str = setting("", "Words for the camera. If either is given, they replace both of the export.")
 
     def begin(self, videos: Sequence[str]) -> None:
         """Raise ConfigError for views of more than one video."""
@@ -206,13 +204,10 @@ class ScoredVideos(VideoOptions):
     def check_read(self, client: RewardClient) -> None:
         """Raise InvalidSampleError if an option is given that the model does not read."""
         for name, value in self.more.items():
-            if not value:
-                continue
-            info = client.model_info(frames=True)
-            is_read, why = info.reads_views, "which reads one camera and no goal"
-            if name in Trajectory.DESCRIPTION_FIELDS:
-                is_read, why = info.reads_descriptions, "whose prompt names neither robot nor camera"
-            require(name, is_read, f"none with this model, {why}", repr(value), InvalidSampleError)
+            if value:
+                expected = "none with this model, which reads one camera and no goal"
+                is_read = client.model_info(frames=True).reads_views
+                require(name, is_read, expected, repr(value), InvalidSampleError)
 
 
 @dataclass(frozen=True)
@@ -249,11 +244,6 @@ class PrefixOptions(Settings):
             Sampling.of(self.sampling, self.frames, trained_frames=1)
         except InvalidValueError as error:
             raise ConfigError.like(error) from None
-
-    @property
-    def scores_prefixes(self) -> bool:
-        """True if each frame is scored on frames sampled from its prefix."""
-        return self.frame_steps > 0 or self.sampling is not None
 
     @property
     def rule(self) -> str:
@@ -341,9 +331,6 @@ class OutputOptions(PlotOutput):
     )
     rrd: Path | None = setting(
         None, "Record frames and scores on one timeline for Rerun's viewer: .rrd.", metavar="FILE"
-    )
-    analysis: bool = setting(
-        False, "Also show what the model writes about each video (RynnValue): description, match and success."
     )
     npy: Path | None = setting(
         None,

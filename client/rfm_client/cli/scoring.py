@@ -132,14 +132,12 @@ Record = Callable[[int, Source, FrameScores], None]  # any thread calls it
 class SourceScorer:
     """Scores sources, in several threads, until no server answers any more.
 
-    analysis: True: ask for an analysis of each source
     record: takes each source with its frames, before memory is freed; None: no record
     """
 
     client: RewardClient
     video: VideoOptions
     prefix: PrefixOptions
-    analysis: bool = False
     record: Record | None = None
     _gone: RewardError | None = None
 
@@ -165,9 +163,7 @@ class SourceScorer:
             source = Source.read(name, self.video)
             if self._gone is not None:
                 return Failed(name, self._gone, NOT_ASKED, is_server_gone=True)
-            result = _evaluate(
-                self.client, ProgressSample(source.trajectory, analysis=self.analysis), self.video, self.prefix
-            )
+            result = _evaluate(self.client, ProgressSample(source.trajectory), self.video, self.prefix)
             checkpoint = checkpoint_of(self.client, source.trajectory)
         except ImportError as error:
             return Failed(name, error, missing_package(error))
@@ -238,7 +234,8 @@ def fitted_to(
 def _evaluate(
     client: RewardClient, sample: ProgressSample, video: VideoOptions, prefix: PrefixOptions
 ) -> ProgressResult:
-    fit = fitted_to(client, sample, video, samples_prefixes=prefix.scores_prefixes)
+    samples_prefixes = prefix.frame_steps > 0 or prefix.sampling is not None
+    fit = fitted_to(client, sample, video, samples_prefixes=samples_prefixes)
     sent = cast(ProgressSample, fit.sample)
     info = client.model_info(frames=sent.trajectory.frames is not None)
     # Of an episode as a whole, all frames are shown at once.

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from rfm_client.contract.results import (
     FRAME_SCORES,
-    Analysis,
     FrameScores,
     PreferenceResult,
     ProgressResult,
@@ -45,12 +44,6 @@ def at_end(scores: FrameScores) -> str:
     """Return progress at the last frame as text, or what the model predicts in its place, with the unit."""
     last, unit = float(scores.arrays[scores.leading][-1]), FRAME_SCORES[scores.leading].unit
     return f"{number(last, 2)} {unit}" if unit else number(last)
-
-
-def analysis_lines(analysis: Analysis) -> list[str]:
-    """Return a line for each part of an analysis: ``match: Yes``."""
-    words = {None: "not written", True: "Yes", False: "No"}
-    return [f"{name}: {told if isinstance(told, str) else words[told]}" for name, told in analysis.parts.items()]
 
 
 def in_place_of_progress(results: Iterable[FrameScores]) -> str:
@@ -178,11 +171,6 @@ class StreamedTable:
         for line in lines:
             row = GAP.join(cell.ljust(width) for cell, width in zip(line, self._widths, strict=True))
             print(f"{GAP}{row}".rstrip(), flush=True)
-
-    def write_below(self, lines: Sequence[str]) -> None:
-        """Write lines about the row above."""
-        for line in lines:
-            print(f"{GAP}{GAP}{line}", flush=True)
 
     def end(self, text: str) -> None:
         """Write a line below the table, if it has a row."""

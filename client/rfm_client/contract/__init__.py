@@ -17,7 +17,6 @@ from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import (
     FRAME_SCORES,
-    Analysis,
     BatchTiming,
     FrameScores,
     PreferenceResult,
@@ -37,7 +36,6 @@ from rfm_client.contract.samples import (
 __all__ = [
     "FRAME_SCORES",
     "AccessDeniedError",
-    "Analysis",
     "BatchTiming",
     "ClientClosedError",
     "DeadlineExceededError",

@@ -63,9 +63,7 @@ class Description(Origin):
         does not load a model whose warm-up fails
     needs_whole_episode: True if its scores are relative to the whole episode, so it cannot score while one runs
     asks_in_words: True for an ordinary language model, or one with heads of its own, so that no reward head is missing
-    reads_descriptions: True if its prompt names the robot and the camera, which samples may describe
     reads_views: True if it reads views of further cameras and a goal; all others refuse samples with them
-    writes_analyses: True if it writes an analysis of a trajectory on request
     keeps_features: True if it can cache features of frames; it then takes samples with frame references
     uses_graphs: True if its predictor can score small batches with CUDA graphs
     is_large: True if float32 on the CPU is slow; exports are verified in the dtype that serves, on a GPU with room
@@ -93,9 +91,7 @@ class Description(Origin):
     may_not_answer: bool = False
     needs_whole_episode: bool = False
     asks_in_words: bool = False
-    reads_descriptions: bool = False
     reads_views: bool = False
-    writes_analyses: bool = False
     keeps_features: bool = False
     uses_graphs: bool = False
     is_large: bool = False

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_type_hints
@@ -23,7 +22,6 @@ SUCCESS_THRESHOLD = 0.5
 PAIR_SCORES = ("preference", "similarity")  # of two trajectories
 EVEN = 0.5  # preference for neither trajectory
 ProgressRule: TypeAlias = Literal["remaining_over_first"]
-_DESCRIPTION = re.compile(r"-\s*Video Description:[^\S\n]*(\S.*)", re.IGNORECASE)  # on one line
 
 
 @dataclass(frozen=True)
@@ -245,53 +243,13 @@ FRAME_SCORES: Mapping[str, Score] = {
 }
 
 
-@dataclass(frozen=True)
-class Analysis:
-    """What RynnValue writes about a whole trajectory, each token the likeliest. No score depends on it.
-
-    The original server reads "No" in "Not sure", and takes the line behind an empty description for it. Both are None
-    here. After "Match: No" it replaces all scores by -100; here they stay as they are.
-
-    text: as written, up to 128 tokens
-    """
-
-    text: str
-
-    @property
-    def description(self) -> str | None:
-        """What the agent does in the video; None: no line of the text says it."""
-        found = _DESCRIPTION.search(self.text)
-        return found[1].strip() if found else None
-
-    @property
-    def match(self) -> bool | None:
-        """True if the video matches the task; None: the text says neither Yes nor No."""
-        return self._said("Match")
-
-    @property
-    def success(self) -> bool | None:
-        """True if the agent has completed the task; None: the text says neither Yes nor No."""
-        return self._said("Success")
-
-    @property
-    def parts(self) -> dict[str, str | bool | None]:
-        """Description, match and success by name."""
-        return {name: getattr(self, name) for name in ("description", "match", "success")}
-
-    def _said(self, name: str) -> bool | None:
-        found = re.search(rf"-\s*{name}:\s*(Yes|No)(?![\w/])", self.text, re.IGNORECASE)
-        return found[1].lower() == "yes" if found else None
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProgressResult(FrameScores):
     """Answer to a ProgressSample: the scores of its trajectory's frames.
 
-    analysis: if the sample asks for it, else None
     model_version: version of the checkpoint that answered
     """
 
-    analysis: Analysis | None = None
     timing: BatchTiming | None = None
     model_version: str | None = None
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, ClassVar, TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -36,27 +36,19 @@ class Trajectory:
     video_embeddings: float32 [T, D], in place of ``frames``
     text_embedding: float32 [Dt], embedding of the task, for ``video_embeddings``
     task: a sentence, for ``frames``
-    robot_description, camera_description: for ``frames``, the words for the robot and the camera in RynnValue's prompt;
-        if either is given, they replace both of the export; empty: none
     views: with ``frames``, those of further cameras at the same times, uint8 [T, H, W, 3] each; Robo-Dopamine reads
         those of the left and the right wrist, in this order
     goal: with ``frames``, a picture of the task done, uint8 [H, W, 3], RGB; Robo-Dopamine reads it
     named: in place of ``frames``, on a server: the digest of each frame with its pixels, uint8 [H, W, 3], or with its
         embedding, float32 [D], which the encoders kept
 
-    DESCRIPTION_FIELDS: the names of the descriptions
-
     Raises InvalidSampleError.
     """
-
-    DESCRIPTION_FIELDS: ClassVar[tuple[str, str]] = ("robot_description", "camera_description")
 
     frames: UInt8Array | None = None
     video_embeddings: Float32Array | None = None
     text_embedding: Float32Array | None = None
     task: str = ""
-    robot_description: str = ""
-    camera_description: str = ""
     views: tuple[UInt8Array, ...] = ()
     goal: UInt8Array | None = None
     named: tuple[NamedFrame, ...] | None = None
@@ -67,11 +59,6 @@ class Trajectory:
             got = "both" if given else "neither"
             raise InvalidSampleError.at("trajectory", "either frames or video_embeddings", got)
         check_task(self.task)
-        for name in self.DESCRIPTION_FIELDS:
-            check_text(name, getattr(self, name))
-        if self.video_embeddings is not None and any(self.descriptions):
-            expected = "none with video_embeddings"
-            raise InvalidSampleError.at(" or ".join(self.DESCRIPTION_FIELDS), expected, str(self.descriptions))
         if self.frames is not None and self.text_embedding is not None:
             raise InvalidSampleError.at("text_embedding", "None with frames, which go with task", "an embedding")
         if self.frames is not None:
@@ -107,11 +94,6 @@ class Trajectory:
         return array
 
     @property
-    def descriptions(self) -> tuple[str, str]:
-        """The descriptions of robot and camera."""
-        return self.robot_description, self.camera_description
-
-    @property
     def num_frames(self) -> int:
         """T, the number of frames."""
         return len(self.positions if self.named is None else self.named)
@@ -140,22 +122,14 @@ class ProgressSample:
 
     frame_steps: 0 scores the trajectory as a whole. N >= 2 is dense mode: frame t is scored on its prefix 0..t alone,
         sampled to N frames, as an RL loop sees it at that step
-    analysis: True: the model also writes an ``Analysis`` of the whole trajectory, which costs a pass for each of its
-        tokens, up to 128. Only RynnValue does, and not in dense mode
     """
 
     trajectory: Trajectory
     frame_steps: int = 0
-    analysis: bool = False
 
     def __post_init__(self) -> None:
         _check_text(self.trajectory, "trajectory")
         check_frame_steps(self.frame_steps)
-        if not isinstance(self.analysis, (bool, np.bool_)):
-            raise InvalidSampleError.at("analysis", "True or False", repr(self.analysis))
-        if self.analysis and self.frame_steps:
-            expected = "frame_steps 0 with it, since an analysis is of the whole trajectory"
-            raise InvalidSampleError.at("analysis", expected, f"frame_steps {self.frame_steps}")
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
@@ -226,15 +200,10 @@ def check_frame_steps(steps: Any) -> None:
 
 def check_task(task: Any) -> None:
     """Raise InvalidSampleError unless ``task`` is text that UTF-8 can encode."""
-    check_text("task", task)
-
-
-def check_text(where: str, text: Any) -> None:
-    """Raise InvalidSampleError unless ``text`` is text that UTF-8 can encode."""
-    if not isinstance(text, str):
-        raise InvalidSampleError.at(where, "str", type(text).__name__)
-    if any(0xD800 <= ord(character) <= 0xDFFF for character in text):
-        raise InvalidSampleError.at(where, "text that UTF-8 can encode", "a lone surrogate")
+    if not isinstance(task, str):
+        raise InvalidSampleError.at("task", "str", type(task).__name__)
+    if any(0xD800 <= ord(character) <= 0xDFFF for character in task):
+        raise InvalidSampleError.at("task", "text that UTF-8 can encode", "a lone surrogate")
 
 
 def stackable(trajectories: Sequence[Trajectory]) -> list[list[Trajectory]]:
@@ -362,8 +331,8 @@ def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
     if not isinstance(second, Trajectory):
         raise InvalidSampleError.at(where, "Trajectory", type(second).__name__)
     for each in (first, second):
-        if each.has_views or any(each.descriptions):
-            expected = "trajectories without views, goal and descriptions, which only progress has"
+        if each.has_views:
+            expected = "trajectories without views and goal, which only progress has"
             raise InvalidSampleError.at(where, expected, "them")
     if (first.frames is None) != (second.frames is None):
         expected, got = ("video_embeddings", "frames") if first.frames is None else ("frames", "video_embeddings")

@@ -15,7 +15,7 @@ from urllib.parse import urljoin
 
 from rfm_client.contract import errors
 from rfm_client.contract.names import frames_name
-from rfm_client.contract.wire import ANALYSIS, DESCRIPTIONS, GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS
+from rfm_client.contract.wire import GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 
@@ -55,9 +55,9 @@ _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed
 _WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not make
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
 )
-_NO_TENSOR = re.compile(
-    r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*(?:in|out)put )"
-    rf"'(?P<name>{'|'.join((SECOND_FRAMES, DESCRIPTIONS, ANALYSIS, *VIEWS, GOAL))})'"
+_NO_INPUT = re.compile(
+    r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*input )"
+    rf"'(?P<name>{'|'.join((SECOND_FRAMES, *VIEWS, GOAL))})'"
 )
 _OF_VIEWS = (
     "a model that reads views and a goal, such as Robo-Dopamine",
@@ -68,16 +68,6 @@ _OLD = "one that was exported before there was this input"
 # By optional input, and by the output that comes with one: a model that has it, one that has not, and the remedy.
 _WITHOUT = {
     SECOND_FRAMES: ("a model that takes pairs of two frame sizes", _OLD, "export it again, or resize a trajectory"),
-    DESCRIPTIONS: (
-        "a model whose prompt names robot and camera, such as RynnValue",
-        f"another, or {_OLD}",
-        "leave out robot_description and camera_description, or export a RynnValue again",
-    ),
-    ANALYSIS: (
-        "a model that writes analyses, such as RynnValue",
-        "another, or one that was exported before there was this output",
-        "leave out analysis (--analysis), or export a RynnValue again",
-    ),
     **dict.fromkeys((*VIEWS, GOAL), _OF_VIEWS),
 }
 _NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
@@ -162,7 +152,7 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
     shape = _WRONG_SHAPE.search(text)
     if shape is not None:
         return errors.InvalidSampleError.at(shape["name"], f"[{shape['expected']}]", f"[{shape['got']}]")
-    without = _NO_TENSOR.search(text)
+    without = _NO_INPUT.search(text)
     if without is not None:
         expected, got, remedy = _WITHOUT[without["name"]]
         return errors.InvalidSampleError.at(without["name"], expected, got, remedy)

@@ -14,7 +14,7 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.results import SUCCESS_THRESHOLD
-from rfm_client.contract.samples import Float32Array, Trajectory
+from rfm_client.contract.samples import Float32Array
 from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.sampling import Rule, Sampling
@@ -111,8 +111,6 @@ class StepKeywords(TypedDict, total=False):
     channels: ChannelOrder | Mapping[str, ChannelOrder]
     resize: bool
     success: SuccessRule
-    robot_description: str
-    camera_description: str | Mapping[str, str]
     timeout_s: float | None
     score: StepValue
 
@@ -129,9 +127,6 @@ class FrameOptions:
     channels: colour order in the given frames, ``rgb`` or ``bgr``: one for all cameras, or a dict by camera
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
-    robot_description: words for the robot in RynnValue's prompt; empty: as exported
-    camera_description: words for the camera: one text for all cameras, or a dict by camera. If either description is
-        given, both exported ones are replaced
     score: the score to make rewards from, ``progress`` or ``remaining_s``; a step raises ValueError if the checkpoint
         does not predict it
     """
@@ -142,8 +137,6 @@ class FrameOptions:
     orient: Orientation | Mapping[str, Orientation] = "none"
     channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
     resize: bool = False
-    robot_description: str = ""
-    camera_description: str | Mapping[str, str] = ""
     score: StepValue = "progress"
 
     def __post_init__(self) -> None:
@@ -157,21 +150,11 @@ class FrameOptions:
         require("fuse", self.fuse in FUSES, f"one of {', '.join(FUSES)}", repr(self.fuse))
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one for all frames, as cameras names none"
-        by_camera = {name: getattr(self, name) for name in ("orient", "channels", "camera_description")}
+        by_camera = {name: getattr(self, name) for name in ("orient", "channels")}
         for name, given in by_camera.items():
             unknown = [] if isinstance(given, str) else [repr(each) for each in given if each not in cameras]
             require(name, not unknown, expected, ", ".join(unknown))
         self.corrections  # noqa: B018  raises ValueError for an unknown value
-        for descriptions in self.descriptions:
-            for name, text in zip(Trajectory.DESCRIPTION_FIELDS, descriptions, strict=True):
-                require(name, isinstance(text, str), "text", type(text).__name__)
-
-    @property
-    def descriptions(self) -> list[tuple[str, str]]:
-        """Descriptions of the robot and each camera, in camera order."""
-        given, cameras = self.camera_description, self.cameras or ("",)
-        of_cameras = [given.get(camera, "") if isinstance(given, Mapping) else given for camera in cameras]
-        return [(self.robot_description, text) for text in of_cameras]
 
     @property
     def corrections(self) -> list[Correction]:

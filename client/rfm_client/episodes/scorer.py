@@ -167,8 +167,7 @@ class StepScorer:
         request_id = next(call.request_ids)
         num_bytes = _padded_bytes(len(windows), len(sent), sent[0].nbytes if sent else 0)
         videos, tasks = [window.digests for window in windows], [window.task for window in windows]
-        descriptions = [window.descriptions for window in windows]
-        tensors = partial(wire.encode_refs, videos, tasks, sent, descriptions)
+        tensors = partial(wire.encode_refs, videos, tasks, sent)
         try:
             answer = await self._scorer.infer(self._model, num_bytes, tensors, outputs, call, request_id)
         except RewardError as error:

@@ -40,13 +40,11 @@ class Window:
     """Frames of one size and a task, to be scored for progress. Raises InvalidSampleError for an invalid task.
 
     episode: identifies the episode; all windows of an episode go to one server
-    descriptions: robot and camera, as in Trajectory
     """
 
     frames: tuple[Frame, ...]
     task: str
     episode: object
-    descriptions: tuple[str, str] = ("", "")
 
     def __post_init__(self) -> None:
         check_task(self.task)
@@ -61,11 +59,8 @@ class Window:
     @property
     def sample(self) -> ProgressSample:
         """The window as a sample, with all pixels. Raises InvalidSampleError."""
-        robot, camera = self.descriptions
         frames = np.stack([frame.pixels for frame in self.frames])
-        return ProgressSample(
-            Trajectory(frames=frames, task=self.task, robot_description=robot, camera_description=camera)
-        )
+        return ProgressSample(Trajectory(frames=frames, task=self.task))
 
     @property
     def digests(self) -> list[bytes]:
@@ -137,8 +132,7 @@ class Steps:
         try:
             require("frame", step >= 0, "one to score", "none yet", InvalidSampleError)
             shown = [self._frames[index] for index in prefix.indices]
-            of_cameras = zip(zip(*shown, strict=True), self.options.descriptions, strict=True)
-            return prefix, [Window(frames, self.task, self, described) for frames, described in of_cameras]
+            return prefix, [Window(frames, self.task, self) for frames in zip(*shown, strict=True)]
         except InvalidSampleError as error:
             raise self._located(error) from None
 

@@ -49,8 +49,6 @@ def load_trajectory(
     channels: ChannelOrder = "rgb",
     views: Sequence[str | Path] = (),
     goal: str | Path | None = None,
-    robot_description: str = "",
-    camera_description: str = "",
 ) -> Trajectory:
     """Return the trajectory in a file or behind an http(s) URL.
 
@@ -64,7 +62,6 @@ def load_trajectory(
     channels: order in which their colours are stored
     views: files or URLs with the frames of further cameras, of which the same part is taken
     goal: file with a picture, shown as it is stored, upright by its EXIF data. Needs Pillow
-    robot_description, camera_description: as in Trajectory
 
     Raises InvalidSampleError, also for arrays of Python objects, because reading them runs code, and for a video of
     several LeRobot v3.0 episodes, unless ``start_s`` and ``end_s`` select a part.
@@ -78,13 +75,7 @@ def load_trajectory(
             got = "embeddings" if frames is None else len(frames)
             raise InvalidSampleError.at(view, f"{trajectory.num_frames} frames, as {source}", got)
         others.append(frames)
-    return replace(
-        trajectory,
-        views=tuple(others),
-        goal=None if goal is None else _picture(goal),
-        robot_description=robot_description,
-        camera_description=camera_description,
-    )
+    return replace(trajectory, views=tuple(others), goal=None if goal is None else _picture(goal))
 
 
 def as_trajectory(

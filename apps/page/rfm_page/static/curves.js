@@ -12,7 +12,6 @@ const ASKED = {
   rule: ({ rule, frames }) => (frames ? `${rule}, ${frames} frames` : rule),
   fps: ({ fps }) => `${fps} fps`,
   resize: ({ resize }) => (resize ? "downscaled" : "full size"),
-  described: ({ descriptions }) => Object.values(descriptions).join("; ") || "as exported",
 };
 
 /** One question about one video, and its points. */
@@ -36,7 +35,7 @@ export class Curve {
   questionColour = null; // that somebody gave its question
   leaving = new AbortController(); // aborted as soon as the curve is removed
 
-  /** settings: task, model, rule, frames, fps, orient, channels, resize, as in the form; descriptions: those that are given */
+  /** settings: task, model, rule, frames, fps, orient, channels, resize, as in the form */
   constructor(video, settings) {
     Object.assign(this, { video, ...settings, frames: settings.frames || null });
     this.allTimes = null;
@@ -44,8 +43,8 @@ export class Curve {
 
   /** The same for two curves that ask the same. */
   get identity() {
-    const { video, task, model, rule, frames, fps, orient, channels, resize, descriptions } = this;
-    return JSON.stringify([video.id, task, model, rule, frames, fps, orient, channels, resize, descriptions]);
+    const { video, task, model, rule, frames, fps, orient, channels, resize } = this;
+    return JSON.stringify([video.id, task, model, rule, frames, fps, orient, channels, resize]);
   }
 
   get sampling() {

@@ -141,7 +141,6 @@ function failed(error, title = "That did not work", retry = null) {
 function chooseRule() {
   const model = gateway.models.find(({ name }) => name === page.model.value);
   if (model) page.rule.value = model.rule;
-  page.descriptions.hidden = !model?.reads_descriptions;
   page["one-view"].hidden = !model?.reads_views;
   page.threshold.parentElement.hidden = model?.has_success === false;
   showLimits();
@@ -186,12 +185,6 @@ function go(params) {
 function settings() {
   const { model, rule, frames, fps, resize } = page;
   return { model: model.value, rule: rule.value, frames: frames.value, fps: Number(fps.value), resize: resize.checked };
-}
-
-/** What is said of the robot and the camera to a model whose prompt names them. */
-function descriptions() {
-  const said = { robot_description: page.robot.value.trim(), camera_description: page.camera.value.trim() };
-  return page.descriptions.hidden ? {} : Object.fromEntries(Object.entries(said).filter(([, text]) => text));
 }
 
 /** How stored frames become upright RGB. */
@@ -268,7 +261,7 @@ function scoreAll() {
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
-      const curve = new Curve(video, { task, ...settings(), descriptions: descriptions(), orient: video.orient, channels: video.channels });
+      const curve = new Curve(video, { task, ...settings(), orient: video.orient, channels: video.channels });
       if (known.has(curve.identity)) continue;
       curves = curves.filter(({ identity }) => identity !== curve.identity); // one that failed is asked again
       curves.push(curve);
@@ -280,8 +273,8 @@ function scoreAll() {
 
 async function ask(curve, signal) {
   if (signal.aborted) return;
-  const { video, task, model, rule, frames, fps, orient, channels, resize, descriptions: described } = curve;
-  const fields = { task, model, sampling: rule, frames, fps, orient, channels, resize, ...described };
+  const { video, task, model, rule, frames, fps, orient, channels, resize } = curve;
+  const fields = { task, model, sampling: rule, frames, fps, orient, channels, resize };
   try {
     await score(form(fields, { video: video.file }), signal, (name, document) => {
       curve.take(name, document);

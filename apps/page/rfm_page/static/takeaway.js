@@ -8,13 +8,12 @@ const LOOPBACK = /^\w+:\/\/(localhost|127\.[\d.]+|\[::1\])([:/]|$)/;
 /** The curves as CSV, one line a point. */
 export function csv(curves) {
   const instead = insteadOf(curves);
-  const names = [...new Set(curves.flatMap(({ descriptions }) => Object.keys(descriptions)))].sort();
-  const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "orient", "channels", "frame", "time_s", "progress", "success", ...instead, ...names];
+  const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "orient", "channels", "frame", "time_s", "progress", "success", ...instead];
   const lines = curves.flatMap((curve) =>
     curve.times.map((time, index) => [
       curve.video.name, curve.task, curve.model, curve.version, curve.rule, curve.sampledFrames, curve.fps,
       curve.orient, curve.channels, index, time, curve.progress[index], curve.success[index],
-      ...instead.map((name) => curve[name]?.[index]), ...names.map((name) => curve.descriptions[name]),
+      ...instead.map((name) => curve[name]?.[index]),
     ]),
   );
   return [columns, ...lines].map((values) => values.map(csvField).join(",") + "\r\n").join("");
@@ -43,7 +42,6 @@ export function json(url, curves, verdicts) {
     orient: curve.orient,
     channels: curve.channels,
     resize: curve.resize,
-    ...curve.descriptions,
     num_frames: curve.numFrames,
     progress: curve.progress,
     success: curve.success,
@@ -68,7 +66,7 @@ export function commands(url, curves, verdicts) {
   const scores = groups.map((group, index) => {
     const [{ rule, sampledFrames }] = group;
     const target = `scores${groups.length > 1 ? `_${index + 1}` : ""}.json`;
-    return line("score", group.map(({ video }) => video), group[0], url, [...described(group[0]), ...sampling(rule, sampledFrames), "--json", target]);
+    return line("score", group.map(({ video }) => video), group[0], url, [...sampling(rule, sampledFrames), "--json", target]);
   });
   const comparisons = verdicts.flatMap((verdict) => [
     line("compare", verdict.videos, verdict, url, []),
@@ -83,22 +81,17 @@ function grouped(curves, askedOf) {
   return [...alike.values()];
 }
 
-function asked({ task, model, rule, sampledFrames, fps, orient, channels, resize, descriptions }) {
-  return JSON.stringify([task, model, rule, sampledFrames, fps, orient, channels, resize, descriptions]);
+function asked({ task, model, rule, sampledFrames, fps, orient, channels, resize }) {
+  return JSON.stringify([task, model, rule, sampledFrames, fps, orient, channels, resize]);
 }
 
-function askedOfEpisode({ video, task, model, rule, sampledFrames, fps, resize, descriptions }) {
+function askedOfEpisode({ video, task, model, rule, sampledFrames, fps, resize }) {
   const { dataset, episode } = video.origin;
-  return JSON.stringify([dataset, episode, task, model, rule, sampledFrames, fps, resize, descriptions]);
+  return JSON.stringify([dataset, episode, task, model, rule, sampledFrames, fps, resize]);
 }
 
 function sampling(rule, frames) {
   return ["--sampling", rule, ...(frames === null ? [] : ["--frames", frames])];
-}
-
-/** The options that describe robot and camera, if any are given. */
-function described({ descriptions }) {
-  return Object.entries(descriptions).flatMap(([name, text]) => [`--${name.replace("_", "-")}`, text]);
 }
 
 /** The command that labels an episode of a dataset as the page has scored it. */
@@ -110,7 +103,7 @@ function labelLine(group, url) {
   const corrections = group.flatMap(({ video, orient, channels }) => corrected({ orient, channels }, `${video.origin.camera}=`));
   const options = ["--episodes", origin.episode, "--cameras", cameras.join(","), ...corrections, ...sampling(rule, sampledFrames)];
   const given = task === origin.task ? [] : ["--task", task, "--override-task"];
-  const words = ["rfm-client", "label", origin.dataset, ...serverOption(url), "--model", model, ...given, ...described(group[0]), ...options];
+  const words = ["rfm-client", "label", origin.dataset, ...serverOption(url), "--model", model, ...given, ...options];
   const target = ["--output", `${origin.dataset}_episode_${origin.episode}`, "--format", "progress"];
   return [...words, ...(resize ? ["--resize"] : []), ...target].map(quoted).join(" ");
 }

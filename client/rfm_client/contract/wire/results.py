@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.contract.results import (
     FRAME_SCORES,
     PAIR_SCORES,
-    Analysis,
     BatchTiming,
     FrameScores,
     PreferenceResult,
@@ -24,7 +22,7 @@ from rfm_client.contract.results import (
     trajectory_scores,
 )
 from rfm_client.contract.samples import Float32Array, PreferenceSample, ProgressSample, Sample, SimilaritySample
-from rfm_client.contract.wire.specs import ANALYSIS, PREFERENCE, SIMILARITY, TIMING_MS, Tensors, pad_stack
+from rfm_client.contract.wire.specs import PREFERENCE, SIMILARITY, TIMING_MS, Tensors, pad_stack
 
 
 def outputs_for(samples: Sequence[Sample], given: Collection[str] = (), *, all_scores: bool = False) -> tuple[str, ...]:
@@ -41,15 +39,11 @@ def outputs_for(samples: Sequence[Sample], given: Collection[str] = (), *, all_s
         if score.asked == "always"
         or (name in given and (score.asked == "if given" or (all_scores and not score.is_per_bin)))
     ]
-    is_analysed = any(getattr(sample, "analysis", False) for sample in samples)
-    return (*of_frames, *(name for name, kind in asked_by.items() if kind in kinds), *[ANALYSIS] * is_analysed)
+    return (*of_frames, *(name for name, kind in asked_by.items() if kind in kinds))
 
 
 def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
-    """Return the requested outputs; P = ``num_positions``.
-
-    Scores are float32 [B, ...], and a missing one is NaN, never 0. An analysis is UTF-8, empty if it was not asked for.
-    """
+    """Return the requested outputs, float32 [B, ...]; P = ``num_positions``. A missing score is NaN, never 0."""
     return {name: _encoded(name, results, num_positions) for name in outputs}
 
 
@@ -73,7 +67,7 @@ def decode_progress(
     return ProgressResult(**scores, timing=_timing(tensors, row), model_version=model_version)
 
 
-def _encoded(name: str, results: Sequence[Result], num_positions: int) -> npt.NDArray[Any]:
+def _encoded(name: str, results: Sequence[Result], num_positions: int) -> Float32Array:
     if name in FRAME_SCORES:
         trajectories = [trajectory_scores(result).values() for result in results]
         rows = [[np.asarray(getattr(each, name), np.float32) for each in of_result] for of_result in trajectories]
@@ -83,9 +77,6 @@ def _encoded(name: str, results: Sequence[Result], num_positions: int) -> npt.ND
     if name == TIMING_MS:
         timings = [result.timing or BatchTiming(np.nan, np.nan) for result in results]
         return np.array([[timing.collate_ms, timing.forward_ms] for timing in timings], np.float32)
-    if name == ANALYSIS:
-        written = [getattr(result, "analysis", None) for result in results]
-        return np.array([[b"" if each is None else each.text.encode()] for each in written], np.object_)
     raise KeyError(name)
 
 
@@ -94,8 +85,7 @@ def _decode_result(
 ) -> Result:
     num_first, *num_second = (trajectory.num_frames for trajectory in sample.trajectories)
     if isinstance(sample, ProgressSample):
-        result = decode_progress(tensors, row, num_first, model_version)
-        return replace(result, analysis=_analysis(tensors, row)) if sample.analysis else result
+        return decode_progress(tensors, row, num_first, model_version)
     first = _scores_between(tensors, row, slice(0, num_first))
     second = _scores_between(tensors, row, slice(num_first, num_first + sum(num_second)))
     of_request: dict[str, Any] = {"timing": _timing(tensors, row), "model_version": model_version}
@@ -104,15 +94,6 @@ def _decode_result(
         return PreferenceResult(preference=preference, first=first, second=second, **of_request)
     similarity = float(_present(tensors, SIMILARITY, row, slice(0, 1))[0])
     return SimilarityResult(similarity=similarity, reference=first, other=second, **of_request)
-
-
-def _analysis(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Analysis:
-    try:
-        return Analysis(tensors[ANALYSIS][row][0].decode())
-    except (AttributeError, LookupError, UnicodeDecodeError):
-        raise InferenceFailedError(
-            f"{ANALYSIS}: expected UTF-8 text for sample {row}, got something else or nothing"
-        ) from None
 
 
 def _timing(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> BatchTiming | None:

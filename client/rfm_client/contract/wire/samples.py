@@ -23,7 +23,6 @@ from rfm_client.contract.samples import (
     stackable,
 )
 from rfm_client.contract.wire.specs import (
-    DESCRIPTIONS,
     DIGEST_BYTES,
     FRAME_DIGESTS,
     FRAME_STEPS,
@@ -37,7 +36,6 @@ from rfm_client.contract.wire.specs import (
     UNKNOWN_FRAMES,
     VIDEO_EMBEDDINGS,
     VIEWS,
-    WRITE_ANALYSIS,
     SampleType,
     Tensors,
     frame_digest,
@@ -66,8 +64,6 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
         NUM_FRAMES: np.array([_lengths(sample) for sample in samples], np.int32),
         FRAME_STEPS: np.array([[getattr(sample, "frame_steps", 0)] for sample in samples], np.int32),
     }
-    if any(is_analysed := [getattr(sample, "analysis", False) for sample in samples]):
-        tensors[WRITE_ANALYSIS] = np.array(is_analysed, np.uint8)[:, np.newaxis]
     texts = [sample.trajectories[0] for sample in samples]
     has_frames = texts[0].frames is not None
     arrays = zip(*(stackable(sample.trajectories) for sample in samples), strict=True)
@@ -79,7 +75,6 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
         tensors[GOAL] = np.stack([text.goal for text in texts if text.goal is not None])
     if has_frames:
         tensors[TASK] = np.array([[text.task.encode()] for text in texts], np.object_)
-        tensors |= _descriptions([text.descriptions for text in texts])
     else:
         embeddings = [text.text_embedding for text in texts if text.text_embedding is not None]
         tensors[TEXT_EMBEDDING] = embeddings[0][np.newaxis] if len(embeddings) == 1 else np.stack(embeddings)
@@ -119,17 +114,11 @@ def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | No
     return _decode_rows(tensors, kept, _decode_encoder_sample)
 
 
-def encode_refs(
-    videos: Sequence[Sequence[bytes]],
-    tasks: Sequence[str],
-    sent: Sequence[UInt8Array],
-    descriptions: Sequence[tuple[str, str]] = (),
-) -> Tensors:
+def encode_refs(videos: Sequence[Sequence[bytes]], tasks: Sequence[str], sent: Sequence[UInt8Array]) -> Tensors:
     """Return one request for the progress of videos whose frames are named by their digests.
 
     videos, tasks: the digests of the frames of each video, and its task
     sent: frames that the model may lack, uint8 [H, W, 3] of one size; empty: it has all frames
-    descriptions: of robot and camera, for each video; empty: those of the export
     """
     count = len(videos)
     num_rows = -(-len(sent) // count)
@@ -145,7 +134,6 @@ def encode_refs(
         FRAMES: frames,
         FRAME_DIGESTS: pad_stack(digests),
         TASK: np.array([[task.encode()] for task in tasks], np.object_),
-        **_descriptions(descriptions),
     }
 
 
@@ -158,13 +146,6 @@ def encode_trajectories(encoded: Sequence[EncoderSample], num_positions: int, ou
         TEXT_EMBEDDING: np.stack([text for text in texts if text is not None]),
     }
     return {name: embeddings[name] for name in outputs}
-
-
-def _descriptions(descriptions: Sequence[tuple[str, str]]) -> Tensors:
-    """Return the optional tensor of the descriptions, unless all are empty."""
-    if not any(map(any, descriptions)):
-        return {}
-    return {DESCRIPTIONS: np.array([[text.encode() for text in each] for each in descriptions], np.object_)}
 
 
 def _lengths(sample: Sample) -> tuple[int, int]:
@@ -198,13 +179,10 @@ def _decode_rows(
 
 def _decode_sample(row: Row, known: Known) -> Sample:
     sample_type, frame_steps = int(row[SAMPLE_TYPE][0]), int(row[FRAME_STEPS][0])
-    analysis = int(row[WRITE_ANALYSIS][0]) if WRITE_ANALYSIS in row else 0
     lengths = row[NUM_FRAMES].tolist()
     if sample_type not in list(SampleType):
         types = ", ".join(f"{t.value} ({t.name.lower()})" for t in SampleType)
         raise InvalidSampleError.at(SAMPLE_TYPE, f"one of {types}", str(sample_type))
-    if analysis > (sample_type == SampleType.PROGRESS):
-        raise InvalidSampleError.at(WRITE_ANALYSIS, "0, or 1 with a sample of type progress", str(analysis))
     if sample_type == SampleType.PROGRESS:
         if lengths[0] < 1 or lengths[1] != 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
@@ -213,7 +191,7 @@ def _decode_sample(row: Row, known: Known) -> Sample:
         trajectory = _trajectory(row, positions, known)
         if views or GOAL in row:
             trajectory = replace(trajectory, views=views, goal=row.get(GOAL))
-        return ProgressSample(trajectory, frame_steps, bool(analysis))
+        return ProgressSample(trajectory, frame_steps)
     if given := [name for name in (*VIEWS, GOAL) if name in row]:
         raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {given[0]}", SampleType(sample_type).name.lower())
     if FRAME_DIGESTS in row:
@@ -238,8 +216,7 @@ def _trajectory(row: Row, positions: npt.NDArray[Any], known: Known) -> Trajecto
         shown: dict[str, Any] = {"frames": positions}
         if FRAME_DIGESTS in row:
             shown = {"named": _named([bytes(digest) for digest in positions], known)}
-        robot, camera = (_text(row, DESCRIPTIONS, place) for place in (0, 1)) if DESCRIPTIONS in row else ("", "")
-        return Trajectory(**shown, task=_text(row, TASK), robot_description=robot, camera_description=camera)
+        return Trajectory(**shown, task=_task(row))
     return Trajectory(video_embeddings=positions, text_embedding=row[TEXT_EMBEDDING])
 
 
@@ -276,9 +253,9 @@ def _unpadded(row: Row, name: str, total: int) -> npt.NDArray[Any]:
     return positions[:total]
 
 
-def _text(row: Row, name: str, place: int = 0) -> str:
-    raw = row[name][place]
+def _task(row: Row) -> str:
+    raw = row[TASK][0]
     try:
         return raw.decode() if isinstance(raw, bytes) else str(raw)
     except UnicodeDecodeError:
-        raise InvalidSampleError.at(name, "UTF-8 text", "other bytes") from None
+        raise InvalidSampleError.at(TASK, "UTF-8 text", "other bytes") from None

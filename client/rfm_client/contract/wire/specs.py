@@ -29,8 +29,6 @@ LEFT_FRAMES, RIGHT_FRAMES, GOAL = "left_frames", "right_frames", "goal"
 VIEWS = (LEFT_FRAMES, RIGHT_FRAMES)
 FRAME_DIGESTS = "frame_digests"
 TASK = "task"
-DESCRIPTIONS = "descriptions"
-WRITE_ANALYSIS, ANALYSIS = "write_analysis", "analysis"  # the request, and the answer
 
 PROGRESS = "progress"
 SUCCESS = "success"
@@ -83,8 +81,6 @@ _VIEWS_SPECS = (
     TensorSpec(GOAL, "UINT8", (VARIABLE, VARIABLE, 3), ragged=True, optional=True),
 )
 _DIGESTS_SPEC = TensorSpec(FRAME_DIGESTS, "UINT8", (VARIABLE, DIGEST_BYTES), ragged=True, optional=True)
-_DESCRIPTIONS_SPEC = TensorSpec(DESCRIPTIONS, "BYTES", (2,), optional=True)
-_WRITE_ANALYSIS_SPEC = TensorSpec(WRITE_ANALYSIS, "UINT8", (1,), optional=True)
 
 
 def frame_digest(frame: UInt8Array) -> bytes:
@@ -100,19 +96,13 @@ def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
     return (*_QUESTION_SPECS, video, TensorSpec(TEXT_EMBEDDING, "FP32", (text_dim,)))
 
 
-def frame_inputs(
-    *, by_digest: bool = False, described: bool = False, with_views: bool = False, analysed: bool = False
-) -> tuple[TensorSpec, ...]:
+def frame_inputs(*, by_digest: bool = False, with_views: bool = False) -> tuple[TensorSpec, ...]:
     """Return the inputs of a model that scores raw frames.
 
     by_digest: with the digests of frames
-    described: with descriptions of robot and camera
     with_views: with the frames of further cameras, and a goal
-    analysed: with the request for an analysis
     """
-    of_words = (*[_DESCRIPTIONS_SPEC] * described, *[_WRITE_ANALYSIS_SPEC] * analysed)
-    more = (*_VIEWS_SPECS * with_views, *of_words, *[_DIGESTS_SPEC] * by_digest)
-    return (*_QUESTION_SPECS, *_FRAMES_SPECS, *more)
+    return (*_QUESTION_SPECS, *_FRAMES_SPECS, *_VIEWS_SPECS * with_views, *[_DIGESTS_SPEC] * by_digest)
 
 
 def encoder_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
@@ -129,14 +119,11 @@ def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
     )
 
 
-def score_outputs(
-    progress_bins: int | None, more: Collection[str] = (), *, analysed: bool = False
-) -> tuple[TensorSpec, ...]:
+def score_outputs(progress_bins: int | None, more: Collection[str] = ()) -> tuple[TensorSpec, ...]:
     """Return the outputs of a reward model.
 
     progress_bins: K of a discrete checkpoint; None: continuous
     more: scores of frames that the model gives beside those of every model, and of progress bins
-    analysed: with an analysis
     """
     of_every_model = [name for name, score in FRAME_SCORES.items() if score.asked == "always"]
     of_bins = [name for name, score in FRAME_SCORES.items() if score.is_per_bin and progress_bins is not None]
@@ -147,7 +134,6 @@ def score_outputs(
         TensorSpec(TIMING_MS, "FP32", (2,)),
         *(TensorSpec(name, "FP32", (VARIABLE, progress_bins or 1)) for name in of_bins),
         *(TensorSpec(name, "FP32", (VARIABLE,)) for name in FRAME_SCORES if name in more),
-        *[TensorSpec(ANALYSIS, "BYTES", (1,))] * analysed,
     )
 
 
