@@ -9,8 +9,8 @@ WORKERS := --numprocesses 3 --dist loadgroup --no-loadscope-reorder
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
-.PHONY: help demo install test fast test-more test-all nightly test-newest check parity differences bench bench-full gpu gpu-packages perf chaos soak format model_repository \
-  clean ops-check ops-tools audit lock mutate docs reference prose internal-imports pictures version
+.PHONY: help demo install test fast test-more test-all nightly test-newest check parity bench bench-full gpu gpu-packages perf chaos soak format model_repository \
+  clean ops-check ops-tools audit lock mutate docs reference version
 
 # What can be made: this list.
 help:
@@ -66,11 +66,6 @@ check: $(INSTALLED)
 # How far the scores are from the original's: every reference case, through Triton.
 parity: $(INSTALLED)
 	$(TOOL) tools/parity.py
-
-# How the gateway's answers differ from the original evaluation server's: a table.
-# ORIGINAL=URL names such a server with the same weights; else its recorded answers are shown.
-differences: $(INSTALLED)
-	$(TOOL) tools/original_differences.py $(if $(ORIGINAL),--original $(ORIGINAL))
 
 # Measure this server beside the bare engine, the FastAPI server's design, LitServe and mosec.
 bench: $(INSTALLED)
@@ -165,18 +160,6 @@ docs: | $(BIN)/uv
 # Write the lists of docs/reference that come from the code.
 reference: $(INSTALLED)
 	$(BIN)/python tools/reference.py
-
-# Count the words that make docstrings, comments and documents hard to read. It fails nothing.
-prose:
-	$(PYTHON) tools/prose.py
-
-# Print the share of test lines in files that import internal names, for each folder of tests.
-internal-imports:
-	$(PYTHON) tools/internal_imports.py
-
-# Draw the pictures of the page in docs/images anew. Needs Chromium: make ops-tools.
-pictures: $(INSTALLED)
-	PYTHONPATH=tests/support:tests/page:examples $(BIN)/python tools/page_pictures.py
 
 # Report known vulnerabilities of the pinned packages. Needs the network.
 audit: $(INSTALLED)

@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import rfm_export
-from reward_models import ROOT, as_before_marks
+from reward_models import BASE, ROOT, as_before_marks
 from rfm import families
 from rfm.config import ExportConfig
 from rfm.engine import Engine
@@ -23,6 +23,7 @@ from rfm.families import CheckpointError
 from rfm_client import ProgressResult, ProgressSample, Trajectory
 
 CHECKPOINT = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
+OF_LEROBOT = ROOT / "topreward" / "lerobot_plain" / "lerobot"
 ROBO = ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint"
 SAMPLE = ProgressSample(
     Trajectory(frames=np.random.default_rng(0).integers(0, 256, (3, 64, 96, 3), np.uint8), task="stack the cups")

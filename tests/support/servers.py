@@ -140,7 +140,9 @@ class Served:
         """Have the server serve a reference checkpoint, too."""
         if name in {config.name for config in goldens.ON_DEMAND} and not (self.repository / name).exists():
             before = set(self.repository.iterdir())
-            rfm_export.export(goldens.config(name).checkpoint, self.repository, serve_config(goldens.config(name), name))
+            rfm_export.export(
+                goldens.config(name).checkpoint, self.repository, serve_config(goldens.config(name), name)
+            )
             with RepositoryApi(self.url("grpc"), self.server.admin_key) as api:
                 for model in sorted(set(self.repository.iterdir()) - before):
                     api.load(model.name)
