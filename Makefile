@@ -21,10 +21,10 @@ help:
 demo: $(RUNS)
 	$(BIN)/python examples/demo.py
 
-# Install everything into .venv: packages for development, tests, labels, RL. make test does it, too.
+# Install everything into .venv, for tests, labels and RL, too. make test does it as well.
 install: $(INSTALLED)
 
-# Lint, types, generated files, and tests against a real Triton: at most four minutes. Needs no programs but the server's.
+# Lint, types, generated files, and tests against a real Triton: four minutes.
 test: $(INSTALLED)
 	+$(MAKE) --jobs 2 check fast
 
@@ -67,16 +67,14 @@ check: $(INSTALLED)
 parity: $(INSTALLED)
 	$(TOOL) tools/parity.py
 
-# Measure this server beside the bare engine, the FastAPI server's design, LitServe and mosec.
+# Measure this server beside the bare engine, the FastAPI server's design and mosec.
 bench: $(INSTALLED)
 	$(INSTALL) --editable ".[bench]"
 	$(BIN)/python benchmarks/bench.py
 
 # The same with all loads, half an hour.
-# Before it the engine without a server: beside the original's forward, and as the work grows.
 bench-full: $(INSTALLED)
 	$(INSTALL) --editable ".[bench]"
-	$(BIN)/python benchmarks/engine.py forward
 	$(BIN)/python benchmarks/bench.py --full
 
 # The packages from build/gpu.tar.xz if it exists, else those of $(VENV).
