@@ -5,10 +5,7 @@ from __future__ import annotations
 
 import re
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from click import Command
@@ -16,8 +13,6 @@ from click.testing import CliRunner
 from typer.main import get_command
 
 from in_process import rfm_app, rfm_client_app
-from rfm.config import ServeConfig
-from rfm_gateway import GatewayConfig
 
 COMMON = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
 
@@ -43,11 +38,20 @@ def assert_whole(shown: str, command: Command) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_no_name_and_no_sentence_is_cut_off(name: str) -> None:
-    top = COMMANDS[name.split()[0]]
-    done = CliRunner().invoke(top, [*name.split()[1:], "--help"], env=COMMON, prog_name=name.split()[0])
+def test_help_is_whole_says_defaults_as_one_writes_them_and_has_an_example_that_the_command_takes(name: str) -> None:
+    program, *words = name.split()
+    done = CliRunner().invoke(COMMANDS[program], [*words, "--help"], env=COMMON, prog_name=program)
     assert done.exit_code == 0
     assert_whole(done.output, COMMANDS[name])
+    shown = " ".join(done.output.split())
+    for unwritten in ("None", "<", "factory", "True", "False", "list[", "x>=", ".0;", ".0]", "PosixPath", "2147483647"):
+        assert unwritten not in shown
+    if hasattr(COMMANDS[name], "commands"):
+        return
+    (example,) = re.findall(r"^  Example: (.*)$", done.output, re.MULTILINE)
+    assert example.startswith((f"{name} ", f"{name.replace('rfm ', 'rfm-client ')} "))  # `rfm gateway` is the same
+    context = COMMANDS[name].make_context(name, shlex.split(example)[len(name.split()) :])
+    assert all(context.params[each.name] is not None for each in COMMANDS[name].params if each.required and each.name)
 
 
 def test_a_command_of_the_other_program_is_told_with_that_program() -> None:
@@ -59,52 +63,6 @@ def test_a_command_of_the_other_program_is_told_with_that_program() -> None:
             done = CliRunner().invoke(COMMANDS[program], [name, "a.mp4"], env=COMMON, prog_name=program)
             assert done.exit_code == 2
             assert f"No such command '{name}': that is `{other} {name}`" in done.stderr
-
-
-def test_a_renamed_command_is_told_with_the_new_name() -> None:
-    done = CliRunner().invoke(COMMANDS["rfm"], ["demo", "--video", "a.mp4"], env=COMMON, prog_name="rfm")
-    assert (done.exit_code, done.stderr.splitlines()[-1]) == (2, "Error: No such command 'demo': it is now `rfm try`")
-
-
-def test_the_help_of_each_program_names_the_other() -> None:
-    for program, other in (("rfm", "rfm-client --help"), ("rfm-client", "rfm --help")):
-        shown = CliRunner().invoke(COMMANDS[program], ["--help"], env=COMMON, prog_name=program).output
-        assert other in " ".join(shown.split())
-
-
-@pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if not hasattr(command, "commands")])
-def test_each_command_has_an_example_of_itself_before_the_options(name: str) -> None:
-    top = COMMANDS[name.split()[0]]
-    shown = CliRunner().invoke(top, [*name.split()[1:], "--help"], env=COMMON, prog_name=name.split()[0]).output
-    (example,) = re.findall(r"^  Example: (.*)$", shown, re.MULTILINE)
-    named = {name, name.replace("rfm ", "rfm-client ")}  # `rfm gateway` is the same command
-    assert any(example.startswith(f"{each} ") for each in named)
-    assert shown.index("Example:") < shown.index("  -h, --help")
-    context = COMMANDS[name].make_context(name, shlex.split(example)[len(name.split()) :])
-    assert all(context.params[each.name] is not None for each in COMMANDS[name].params if each.required and each.name)
-
-
-def test_options_stand_in_groups() -> None:
-    shown = CliRunner().invoke(COMMANDS["rfm"], ["serve", "--help"], env=COMMON, prog_name="rfm").output
-    places = [shown.index(f"\n{title}:\n") for title in ("Options", ServeConfig.TITLE, GatewayConfig.TITLE)]
-    assert places == sorted(places)
-
-
-def test_what_is_needed_stands_first_and_certificates_last() -> None:
-    shown = CliRunner().invoke(COMMANDS["rfm-client"], ["gateway", "--help"], env=COMMON).output
-    options = re.findall(r"^  (--[\w-]+)", shown.partition("Gateway:")[2], re.MULTILINE)
-    assert options[0] == "--triton"
-    assert options[-5:] == ["--certificate", "--key", "--triton-ca-file", "--triton-certificate", "--triton-key"]
-    shown = CliRunner().invoke(COMMANDS["rfm-client"], ["--help"], env=COMMON).output
-    assert shown.index("\nCommands:") < shown.index("\nOptions:") < shown.index("\nCredentials:")
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_defaults_bounds_and_placeholders_are_as_one_writes_them(name: str) -> None:
-    top = COMMANDS[name.split()[0]]
-    shown = " ".join(CliRunner().invoke(top, [*name.split()[1:], "--help"], env=COMMON).output.split())
-    for unwritten in ("None", "<", "factory", "True", "False", "list[", "x>=", ".0;", ".0]", "PosixPath", "2147483647"):
-        assert unwritten not in shown
 
 
 DEFAULTS = {
@@ -126,21 +84,6 @@ def test_every_default_is_shown(name: str, told: list[str]) -> None:
         assert text in shown, text
 
 
-def test_what_chooses_frames_stands_in_one_group_of_score() -> None:
-    shown = CliRunner().invoke(COMMANDS["rfm-client"], ["score", "--help"], env=COMMON).output
-    _, _, below = shown.partition("\nFrames:\n")
-    group, _, _ = below.partition("\n\n")
-    first_words = [line.split()[0] for line in group.splitlines() if line.startswith("  --")]
-    assert first_words == ["--fps", "--max-frames", "--subsample", "--sampling", "--frames", "--frame-steps"]
-
-
-@pytest.mark.parametrize("name", ["rfm-client score", "rfm-client compare", "rfm-client label"])
-def test_the_server_stands_last(name: str) -> None:
-    shown = CliRunner().invoke(COMMANDS["rfm-client"], [*name.split()[1:], "--help"], env=COMMON).output
-    titles = re.findall(r"^(\w[\w -]*):$", shown, re.MULTILINE)
-    assert titles[-2:] == ["Server", "Credentials"]
-
-
 ALTERNATIVES = {
     "rfm label": "rfm-client label",
     "rfm-client label": "rfm label",
@@ -154,11 +97,3 @@ ALTERNATIVES = {
 def test_help_says_which_other_command_does_the_same_job(name: str, other: str) -> None:
     shown = " ".join(str(COMMANDS[name].help).split())
     assert other in shown
-
-
-def test_so_it_is_where_there_is_the_gateway_alone(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "rfm_gateway", "--help"], env=COMMON, cwd=tmp_path, text=True, capture_output=True
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert_whole(done.stdout, COMMANDS["rfm gateway"])

@@ -257,13 +257,6 @@ def test_every_docstring_stands_alone(package: str) -> None:
         assert not [text for text in texts if len(text.split()) < FEWEST_WORDS], file
 
 
-@pytest.mark.parametrize("package", FOLDERS)
-def test_every_ignored_type_error_has_a_code_and_a_reason(package: str) -> None:
-    for file in (ROOT / FOLDERS[package] / package).rglob("*.py"):
-        ignores = re.findall(r"# type: ignore.*", file.read_text())
-        assert not [ignore for ignore in ignores if not re.match(r"# type: ignore\[[\w,-]+\]  # \w", ignore)], file
-
-
 @pytest.mark.parametrize(
     "package",
     ["rfm_client", "rfm_client.contract", "rfm_rl", "rfm_labels", "rfm_labels.commands", "rfm_labels.datasets"],
@@ -276,20 +269,22 @@ def test_a_package_exports_all_that_it_imports_for_its_users(package: str) -> No
     assert sorted(module.__all__) == sorted(name for name in names if not name.startswith("_"))
 
 
-def test_files_say_their_licence() -> None:
-    files = [
-        file
-        for part in ("client", "apps", "rfm", "export", "commands", "examples", "benchmarks", "tests", "tools")
-        for file in (ROOT / part).rglob("*.py")
-    ]
-    assert files
-    for file in files:
-        assert re.match(r"# SPDX-License-Identifier: MIT\n", file.read_text()), file
-
-
 def test_the_keywords_of_an_episode_are_its_options() -> None:
     """A TypedDict cannot be derived from a dataclass."""
     options = get_type_hints(EpisodeOptions)
     for method in (RewardClient.episode, RewardClient.episodes, AsyncRewardClient.episode, AsyncRewardClient.episodes):
         (keywords,) = get_args(get_type_hints(method, localns={"Unpack": Unpack})["options"])
         assert get_type_hints(keywords) == {field.name: options[field.name] for field in fields(EpisodeOptions)}
+
+
+@pytest.mark.parametrize(
+    "part", ["client", "apps", "rfm", "export", "commands", "examples", "benchmarks", "tests", "tools"]
+)
+def test_files_say_their_licence_and_why_they_ignore_a_type_error(part: str) -> None:
+    files = [*(ROOT / part).rglob("*.py")]
+    assert files
+    for file in files:
+        text = file.read_text()
+        assert text.startswith("# SPDX-License-Identifier: MIT\n"), file
+        ignores = re.findall(r"# type: ignore.*", text) if part not in ("tests", "tools") else []
+        assert not [ignore for ignore in ignores if not re.match(r"# type: ignore\[[\w,-]+\]  # \w", ignore)], file
