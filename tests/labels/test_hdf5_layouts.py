@@ -24,8 +24,6 @@ SWAPPED = {name: [jpeg(frame[..., ::-1]) for frame in video(LENGTH, 0)] for name
 MARKED = {name: [jpeg(frame, RGB_MARK) for frame in video(LENGTH, 0)] for name in ("head_camera",)}
 EMBODIMENTS = {
     "h5_franka_3rgb": ("camera_left", "camera_right", "camera_top"),
-    "h5_agilex_3rgb": ("camera_front", "camera_left_wrist", "camera_right_wrist"),
-    "h5_tienkung_gello_1rgb": ("camera_top",),
 }
 
 Expected = dict[str, UInt8Array]
@@ -47,10 +45,6 @@ def robotwin_before(root: Path) -> tuple[Path, Expected]:
     return file, {name: pixels(files)[..., ::-1] for name, files in SWAPPED.items()}
 
 
-def robotwin_since(root: Path) -> tuple[Path, Expected]:
-    return writers.write_robotwin(root, MARKED), {name: pixels(files) for name, files in MARKED.items()}
-
-
 def robomind(embodiment: str) -> Writer:
     def write(root: Path) -> tuple[Path, Expected]:
         cameras = dict(zip(EMBODIMENTS[embodiment], FILES.values(), strict=False))
@@ -63,17 +57,10 @@ def robomind(embodiment: str) -> Writer:
     return write
 
 
-def maniskill(root: Path) -> tuple[Path, Expected]:
-    expected = {"base_camera": video(LENGTH, 1), "hand_camera": video(LENGTH, 2)}
-    return writers.write_maniskill(root / "trajectory.rgb.pd_ee_delta_pose.physx_cpu.h5", {0: expected}), expected
-
-
 WRITERS: dict[str, Writer] = {
     "ALOHA": aloha,
     "RoboTwin": robotwin_before,
-    "RoboTwin since September 2026": robotwin_since,
     **{f"RoboMIND {name}": robomind(name) for name in EMBODIMENTS},
-    "ManiSkill": maniskill,
 }
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import sys
@@ -77,26 +76,6 @@ def test_both_commands_write_the_same_labels_and_tell_what_they_did(demo_server:
     assert told.column_names == other.column_names
     for name in told.column_names:
         np.testing.assert_allclose(told[name], other[name], rtol=0, atol=1e-5)
-
-
-@pytest.mark.triton
-def test_both_commands_make_frames_as_small_as_what_reads_them_first(demo_server: Endpoints, output: Path) -> None:
-    settings = MODELS / "rfm_encoder" / "1" / "image_encoder" / "preprocessor_config.json"
-    size = f"shortest {json.loads(settings.read_text())['size']['shortest_edge']}"
-    words = (DATASET, "--episodes", "2", "--frames", 4, "--cameras", "front", "--no-picture", "--format", "progress")
-    names = ("served", "own", "whole")
-    for name in names:
-        (output / name).mkdir()
-    done = [invoke("label", *words, "--resize", "--output", output / "served", "--url", demo_server.grpc_url)]
-    done += [own(*words, *ENGINE, "--resize", "--output", output / "own")]
-    done += [own(*words, *ENGINE, "--output", output / "whole")]
-    assert [result.exit_code for result in done] == [0, 0, 0], done
-    tables = {name: parquet.read_table(output / name / FILES[0]) for name in names}
-    for name, resize in {"served": size, "own": size, "whole": None}.items():
-        assert json.loads(tables[name].schema.metadata[b"rfm.provenance"]).get("resize") == resize
-    scores = {name: table["progress_sparse"] for name, table in tables.items()}
-    np.testing.assert_allclose(scores["own"], scores["served"], rtol=0, atol=1e-5)
-    assert not np.array_equal(scores["own"], scores["whole"])  # or this test would see nothing
 
 
 @pytest.mark.triton
