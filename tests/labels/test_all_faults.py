@@ -248,12 +248,6 @@ def longer_metadata(root: Path) -> None:
 
 
 BROKEN_LEROBOT: dict[str, tuple[Callable[..., Path], Callable[[Path], object], str]] = {
-    "v2.1, no table": (v21, lambda root: tables_of(root, "data")[1].unlink(), "expected a Parquet file, got none"),
-    "v2.1, no video": (
-        v21,
-        lambda root: (root / "videos" / "chunk-000" / WRIST / "episode_000001.mp4").unlink(),
-        "expected a video file, got none",
-    ),
     "v2.1, metadata": (v21, longer_metadata, "length: expected a whole number"),
     "v3.0, rows": (v30, changed("data", lambda row: row.update(frame_index=7)), "episode 1: .* frame_index: expected"),
     "v3.0, metadata": (

@@ -118,7 +118,8 @@ def test_labelled_episodes_are_recorded_with_the_frames_and_scores_of_each_camer
         assert result.exit_code == 0, result.stderr
         files = [folder / f"episode_{index:06d}.rrd" for index in (2, 3)]
         assert [line for line in result.stdout.splitlines() if line.endswith(".rrd")] == list(map(str, files))
-    chosen = (*words[:2], "--episodes", 3, *words[4:6], "--rrd", output / "look", "--output", output)
+    chosen = (*words[:2], "--episodes", 3, *words[4:6], "--rrd", output / "look", "--output", output / "one")
+    chosen = (*chosen, "--parts", output / ".rfm_parts")
     assert invoke(*chosen, "--url", demo_server.grpc_url).exit_code == 0
     assert [file.name for file in (output / "look").iterdir()] == ["episode_000003.rrd"]
     labels = parquet.read_table(output / FILES[0])
@@ -151,6 +152,7 @@ def test_no_frame_is_scored_where_the_package_for_recordings_is_missing(
     assert list(output.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_pictures_that_are_stored_as_bgr_get_the_labels_of_rgb(output: Path) -> None:
     task = Task("red", "bowl")
     frames = make_clip("success", task, 2_000_000).frames

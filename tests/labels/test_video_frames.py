@@ -229,14 +229,13 @@ def test_a_truncated_video_is_refused_or_read_as_far_as_its_whole_frames_go(
     shown = read_video(file)
     assert len(shown) == len(labelled(file)) == NUM_FRAMES
     whole = file.read_bytes()
-    for share in (0.31, 0.77):
-        file.write_bytes(whole[: int(len(whole) * share)])
-        for read in (read_video, labelled):
-            try:
-                frames = read(file)
-            except (InvalidSampleError, DatasetError):
-                continue
-            np.testing.assert_array_equal(frames, shown[: len(frames)])
+    file.write_bytes(whole[: int(len(whole) * 0.31)])
+    for read in (read_video, labelled):
+        try:
+            frames = read(file)
+        except (InvalidSampleError, DatasetError):
+            continue
+        np.testing.assert_array_equal(frames, shown[: len(frames)])
 
 
 def test_damage_counts_up_to_the_next_key_frame_and_only_in_frames_that_are_used(tmp_path: Path) -> None:
