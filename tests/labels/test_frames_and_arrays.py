@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import h5py
 import numpy as np
 import pytest
 from PIL import Image
-from pyarrow import parquet
 
 from hdf5_writers import write_robomimic
 from labelling import BrightnessScorer, brightness, command
@@ -36,22 +34,6 @@ def folders(tmp_path: Path) -> Path:
     for name in ("0", "2", "10"):
         write_frames(root / name, numbered(COUNT))
     return root
-
-
-def test_labels_of_folders_of_frames_stay_and_new_folders_are_added(folders: Path) -> None:
-    """Also with labels and picture in the dataset's folder."""
-    scorer = BrightnessScorer()
-    report = label(open_dataset(folders, task=TASK), scorer, LabelOptions(episodes=[0, 1]))
-    (folders / "rfm_summary.png").write_bytes((folders / "0" / "frame_0.png").read_bytes())
-    scored = scorer.num_samples
-    label(open_dataset(folders, task=TASK), scorer, LabelOptions())
-    assert scorer.num_samples == scored * 3 // 2
-    table = parquet.read_table(report.files[0])
-    assert table["episode_index"].to_pylist() == [0] * COUNT + [1] * COUNT + [2] * COUNT
-    np.testing.assert_allclose(table["progress_sparse"].to_numpy()[:COUNT], brightness(numbered(COUNT)), atol=1e-6)
-    os.utime(folders / "2" / "frame_3.png", (1, 1))
-    with pytest.raises(DatasetError, match=r"expected labels of the episodes as they are now, got others for 1, whose"):
-        label(open_dataset(folders, task=TASK), scorer, LabelOptions())
 
 
 @pytest.mark.parametrize("column", ["video", "episode"])
