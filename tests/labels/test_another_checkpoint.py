@@ -37,11 +37,9 @@ def assert_of_one_checkpoint(output: Path) -> None:
 
 ALL = ("rfm", "rfm_encoder", "rfm_frames")
 REPLACED: dict[str, tuple[Kept, tuple[str, ...], bool]] = {  # and whether embeddings are asked for
-    "all": (V2, ALL, True),
     "the one model that there is": (V2, ALL, False),
     "the weights": (Kept(0.9, weights="weights-of-v2"), ALL, False),
     "the settings": (Kept(0.9, settings="settings-of-v2"), ALL, True),
-    "one model, in the middle of a rollout": (V2, ("rfm",), True),
     "the encoder, in the middle of a rollout": (V2, ("rfm_encoder",), True),
 }
 

@@ -73,9 +73,17 @@ def of_files(write: Callable[..., Path], mark: bytes = b"", **more: Any) -> Call
     """A file of one episode, whose frames are JPEG files."""
 
     def written(folder: Path) -> Written:
-        files = {name: [jpeg(frame, mark) for frame in video(4, seed)] for seed, name in enumerate(("high", "left"))}
-        pixels = {name: np.stack([decoded(each) for each in stored]) for name, stored in files.items()}
-        return Written(write(folder / "data" / "episode_0.hdf5", files, **more), [(0, TASK, pixels)])
+        stored: dict[str, Any] = {
+            name: [jpeg(frame, mark) for frame in video(4, seed)] for seed, name in enumerate(("high", "left"))
+        }
+        pixels = {name: np.stack([decoded(each) for each in files]) for name, files in stored.items()}
+        if write is hdf5_writers.write_aloha:
+            stored["raw"] = pixels["raw"] = video(4, 5)
+        elif write is hdf5_writers.write_robomind:
+            stored["high"][2] = pixels["high"][2][..., ::-1].tobytes()  # pixels as OpenCV has them
+        elif not mark:
+            pixels = {name: frames[..., ::-1] for name, frames in pixels.items()}  # RoboTwin's before its mark
+        return Written(write(folder / "data" / "episode_0.hdf5", stored, **more), [(0, TASK, pixels)])
 
     return written
 
@@ -118,6 +126,7 @@ def pictures(folder: Path) -> Written:
         (folder / f"{number}").mkdir()
         for t, frame in enumerate(clip):
             Image.fromarray(frame).save(folder / f"{number}" / f"frame_{t + 8}.png")  # 8, 9, 10, ...
+    Image.fromarray(CLIPS[0][0]).save(folder / "rfm_summary.png")  # of earlier labels
     episodes: list[Any] = [(number, TASK, {"frames": clip}) for number, clip in enumerate(CLIPS)]
     return Written(folder, episodes, lambda: (folder / "1" / "frame_9.png").write_bytes(b"no picture"), task=TASK)
 
@@ -135,6 +144,7 @@ FORMATS: dict[str, Callable[[Path], Written]] = {
     "robomimic": robomimic,
     "ALOHA": of_files(hdf5_writers.write_aloha, task=TASK),
     "RoboTwin": of_files(robotwin, hdf5_writers.RGB_MARK),
+    "RoboTwin before its mark": of_files(robotwin),
     "RoboMIND": of_files(hdf5_writers.write_robomind),
     "ManiSkill": maniskill,
     "RLDS": rlds,
@@ -206,7 +216,7 @@ def test_a_camera_is_turned_and_its_colours_swapped_on_request_and_the_recipe_sa
 ) -> None:
     there, stored = written(write, tmp_path)
     camera, *others = stored.chosen_cameras()
-    swapped = "rgb" if stored.corrections.get(camera) else "bgr"
+    swapped = "rgb" if stored.corrections.get(camera) else "bgr"  # other than by default
     dataset = open_dataset(there.source, task=there.task, orient={camera: "rotate90"}, channels={camera: swapped})
     episode = stored.episodes[0]
     pixels = np.stack(list(stored.stored_frames(episode, camera)))

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 from PIL import Image
-from pyarrow import parquet
 
+from hdf5_writers import write_robomimic
 from labelling import BrightnessScorer, brightness, command
 from pictures import numbered
 from rfm_client.command_line import ExitCode
@@ -36,22 +34,6 @@ def folders(tmp_path: Path) -> Path:
     for name in ("0", "2", "10"):
         write_frames(root / name, numbered(COUNT))
     return root
-
-
-def test_labels_of_folders_of_frames_stay_and_new_folders_are_added(folders: Path) -> None:
-    """Also with labels and picture in the dataset's folder."""
-    scorer = BrightnessScorer()
-    report = label(open_dataset(folders, task=TASK), scorer, LabelOptions(episodes=[0, 1]))
-    (folders / "rfm_summary.png").write_bytes((folders / "0" / "frame_0.png").read_bytes())
-    scored = scorer.num_samples
-    label(open_dataset(folders, task=TASK), scorer, LabelOptions())
-    assert scorer.num_samples == scored * 3 // 2
-    table = parquet.read_table(report.files[0])
-    assert table["episode_index"].to_pylist() == [0] * COUNT + [1] * COUNT + [2] * COUNT
-    np.testing.assert_allclose(table["progress_sparse"].to_numpy()[:COUNT], brightness(numbered(COUNT)), atol=1e-6)
-    os.utime(folders / "2" / "frame_3.png", (1, 1))
-    with pytest.raises(DatasetError, match=r"expected labels of the episodes as they are now, got others for 2, whose"):
-        label(open_dataset(folders, task=TASK), scorer, LabelOptions())
 
 
 @pytest.mark.parametrize("column", ["video", "episode"])
@@ -139,18 +121,15 @@ def test_a_table_of_folders_tells_what_it_lacks_and_what_is_missing(folders: Pat
         _ = dataset.episodes
 
 
-def write_demos(file: Path, task: str, num_demos: int = 1) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with h5py.File(file, "w") as opened:
-        opened.create_group("data").attrs["env_args"] = json.dumps({"env_name": "Lift", "lang": task})
-        for index in range(num_demos):
-            opened[f"data/demo_{index}/obs/front"] = numbered(5)
+def write_demos(file: Path, task: str) -> None:
+    write_robomimic(file, [{"front": numbered(5)}], task)
 
 
 def asked(source: Path, labels: LabelOptions, *, dry_run: bool = False) -> tuple[int, list[str], set[str]]:
     """Return the exit code, the output lines, and the scored tasks."""
     scorer, said = BrightnessScorer(), list[str]()
-    return command(source, labels, scorer, said.append, dry_run=dry_run), said, scorer.tasks
+    picture = not source.joinpath("task_2.rfm_summary.png").exists()
+    return command(source, labels, scorer, said.append, dry_run=dry_run, picture=picture), said, scorer.tasks
 
 
 def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -188,3 +167,61 @@ def test_a_folder_of_hdf5_files_is_refused_before_a_score(tmp_path: Path, labels
     with pytest.raises(DatasetError, match=message):
         asked(tmp_path, labels)
     assert not list(tmp_path.rglob("*.parquet"))
+
+
+UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the end of the message
+    "TFRecord files alone": (["1.0.0/a.tfrecord-00000-of-00001"], "1.0.0", "got TFRecord files without features.json"),
+    "Zarr": ([".zgroup", "data/.zgroup"], "", "got Zarr arrays: convert them to LeRobot, or"),
+    "Zarr in an archive": (["buffer.zarr.zip"], "buffer.zarr.zip", "got Zarr arrays: convert them to LeRobot, or"),
+    "a rosbag of ROS 2": (["metadata.yaml", "a_0.db3"], "", "got a rosbag: convert them to LeRobot, or"),
+    "a rosbag of ROS 1": (["a.bag"], "a.bag", "got a rosbag: convert them to LeRobot, or"),
+    "MCAP files": (["a.mcap", "b.mcap"], "", "got a rosbag: convert them to LeRobot, or"),
+    "LeRobot v1": (["meta_data/info.json"], "", "got a LeRobot dataset of v1: convert it to v2.0 with LeRobot 0.3"),
+    "HDF5 files in folders": (["a/x.hdf5"], "", "each a dataset of its own: rfm-client label takes the folder, open_"),
+    "pictures": (["1.png", "2.png"], "", "got pictures outside of the folder of an episode"),
+    "pictures of cameras": (["a/front/1.jpg"], "", "list the folders of one camera (a/front) in tasks.csv"),
+    "pictures and a video": (
+        ["0/1.png", "a.mp4"],
+        "",
+        "expected episodes of one kind, got videos (a.mp4) and folders of pictures (0): give each kind a folder of its",
+    ),
+    "HDF5 files and arrays": (["a.hdf5", "a.npy"], "", "of one kind, got arrays (a.npy) and HDF5 files (a.hdf5): give"),
+    "pictures beside folders": (
+        ["0/1.png", "1.png"],
+        "",
+        "got folders of pictures (0) and pictures (1.png): give each",
+    ),
+    "folders without a table": (
+        ["0/1.png"],
+        "",
+        "with the task of each folder, got none: write it, or, if all of them",
+    ),
+    "a video": (["a.mp4"], "a.mp4", 'got a video: label its folder, with --task "SENTENCE" or with tasks.csv in it'),
+    "videos without a table": (
+        ["a.mp4"],
+        "",
+        'got none: write it, or, if all of them have one task, give it: --task "SE',
+    ),
+    "an empty folder": ([".hidden"], "", "got an empty folder: put a video, an array or a folder of pictures for each"),
+    "other files": (["a.txt"], "", "got other files: put a video, an array or a folder of pictures for each episode"),
+    "another file": (["a.txt"], "a.txt", "or a Hub id org/name[@revision], got another file"),
+}
+
+
+@pytest.mark.parametrize("name", ["/nothing/here", "no dataset"])
+def test_what_is_not_there_is_refused(name: str) -> None:
+    with pytest.raises(DatasetError, match=f"^{name}: expected a LeRobot dataset .* got none$"):
+        open_dataset(name)
+
+
+@pytest.mark.parametrize(("files", "opened", "message"), UNREAD.values(), ids=UNREAD)
+def test_a_layout_that_is_not_read_is_named_with_what_to_do(
+    tmp_path: Path, files: list[str], opened: str, message: str
+) -> None:
+    root = tmp_path / "data"
+    for name in files:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b"x")
+    with pytest.raises(DatasetError) as refused:
+        open_dataset(root / opened)
+    assert message.replace("ROOT", str(root)) in str(refused.value)

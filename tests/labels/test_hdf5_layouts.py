@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,81 +21,14 @@ LENGTH = 6
 FILES = {name: [jpeg(frame) for frame in video(LENGTH, seed)] for seed, name in enumerate(("high", "left", "right"))}
 SWAPPED = {name: [jpeg(frame[..., ::-1]) for frame in video(LENGTH, 0)] for name in ("head_camera",)}
 MARKED = {name: [jpeg(frame, RGB_MARK) for frame in video(LENGTH, 0)] for name in ("head_camera",)}
-EMBODIMENTS = {
-    "h5_franka_3rgb": ("camera_left", "camera_right", "camera_top"),
-    "h5_agilex_3rgb": ("camera_front", "camera_left_wrist", "camera_right_wrist"),
-    "h5_tienkung_gello_1rgb": ("camera_top",),
-}
-
-Expected = dict[str, UInt8Array]
-Writer = Callable[[Path], tuple[Path, Expected]]
 
 
 def pixels(files: list[bytes]) -> UInt8Array:
     return np.stack([decoded(each) for each in files])
 
 
-def aloha(root: Path) -> tuple[Path, Expected]:
-    raw = video(LENGTH, 5)
-    file = writers.write_aloha(root / "episode_0.hdf5", {**FILES, "raw": raw}, language_instruction=TASK)
-    return file, {**{name: pixels(files) for name, files in FILES.items()}, "raw": raw}
-
-
-def robotwin_before(root: Path) -> tuple[Path, Expected]:
-    file = writers.write_robotwin(root, SWAPPED)
-    return file, {name: pixels(files)[..., ::-1] for name, files in SWAPPED.items()}
-
-
-def robotwin_since(root: Path) -> tuple[Path, Expected]:
-    return writers.write_robotwin(root, MARKED), {name: pixels(files) for name, files in MARKED.items()}
-
-
-def robomind(embodiment: str) -> Writer:
-    def write(root: Path) -> tuple[Path, Expected]:
-        cameras = dict(zip(EMBODIMENTS[embodiment], FILES.values(), strict=False))
-        expected = {name: pixels(files) for name, files in cameras.items()}
-        first = EMBODIMENTS[embodiment][0]
-        raw = expected[first][2][..., ::-1].tobytes()  # pixels as OpenCV has them
-        mixed = {**cameras, first: [*cameras[first][:2], raw, *cameras[first][3:]]}
-        return writers.write_robomind(root / embodiment / "success_episodes/1/data/trajectory.hdf5", mixed), expected
-
-    return write
-
-
-def maniskill(root: Path) -> tuple[Path, Expected]:
-    expected = {"base_camera": video(LENGTH, 1), "hand_camera": video(LENGTH, 2)}
-    return writers.write_maniskill(root / "trajectory.rgb.pd_ee_delta_pose.physx_cpu.h5", {0: expected}), expected
-
-
-WRITERS: dict[str, Writer] = {
-    "ALOHA": aloha,
-    "RoboTwin": robotwin_before,
-    "RoboTwin since September 2026": robotwin_since,
-    **{f"RoboMIND {name}": robomind(name) for name in EMBODIMENTS},
-    "ManiSkill": maniskill,
-}
-
-
 def frames_of(dataset: Dataset, camera: str) -> UInt8Array:
     return np.stack(list(dataset.frames(dataset.episodes[0], camera)))
-
-
-def opened(file: Path) -> Dataset:
-    return open_dataset(file, task=TASK if "trajectory.rgb" in file.name else None)
-
-
-@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_a_file_gives_its_cameras_task_and_frames(tmp_path: Path, write: Writer) -> None:
-    file, expected = write(tmp_path)
-    dataset = opened(file)
-    assert set(dataset.cameras) == set(expected)
-    (episode,) = dataset.episodes
-    assert (episode.index, episode.name, episode.task, episode.num_frames) == (0, "demo_0", TASK, LENGTH)
-    (line,) = (note for note in dataset.notes if note.startswith("layout: "))
-    assert all(camera in line for camera in expected)
-    for camera, frames in expected.items():
-        assert dataset.check(episode, camera) > 0
-        np.testing.assert_array_equal(frames_of(dataset, camera), frames)
 
 
 def test_red_and_blue_are_as_the_mark_of_robotwin_says_unless_the_caller_does(tmp_path: Path) -> None:

@@ -20,7 +20,10 @@ from encoding import encode_here
 from labelling import FRONT, LEROBOT, BrightnessScorer, Notes
 from pictures import write_video
 from rfm_client import UInt8Array
+from rfm_client.frames import video_file
+from rfm_client.frames.video_decoding import read_packets
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+from rfm_labels.datasets import lerobot
 
 FPS = 10
 LENGTHS = (58, 39, 59, 21)  # of the episodes in the first video of the front camera, in both datasets
@@ -214,3 +217,20 @@ def test_times_that_fit_from_0_and_from_the_first_frame_are_refused(tmp_path: Pa
         DatasetError, match=r"expected times that count from 0 s or from the first frame, got a frame at"
     ):
         dataset.check(dataset.episode(0), FRONT)
+
+
+def test_a_check_reads_the_packets_of_each_video_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also with more cameras than videos that otherwise stay in memory."""
+    read: list[Path] = []
+
+    def counted(file: Any, container: str | None = None) -> Any:
+        read.append(Path(file.name))
+        return read_packets(file, container)
+
+    monkeypatch.setattr(video_file, "read_packets", counted)
+    monkeypatch.setattr(lerobot, "_VIDEOS_AT_A_TIME", 1)
+    dataset = open_dataset(LEROBOT / "toy_v30_many")
+    for episode in dataset.episodes:
+        for camera in dataset.cameras:
+            dataset.check(episode, camera)
+    assert len(read) == len(set(read)) > len(dataset.cameras)

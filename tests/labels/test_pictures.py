@@ -4,17 +4,14 @@
 from __future__ import annotations
 
 import io
-import json
 import struct
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image, ImageOps, PngImagePlugin
-from pyarrow import parquet
 
 from pictures import numbered, numbers
 from rfm_client import UInt8Array
@@ -127,11 +124,11 @@ def with_xmp() -> bytes:
 
 
 TURNED = {
-    **{f"JPEG {number}": with_exif(number, "JPEG") for number in range(2, 9)},
+    **{f"JPEG {number}": with_exif(number, "JPEG") for number in (3, 6, 7)},
     "PNG": with_exif(6, "PNG"),
     "XMP": with_xmp(),
 }
-AS_STORED = {f"JPEG {number}": with_exif(number, "JPEG") for number in (0, 1, 9)}
+AS_STORED = {f"JPEG {number}": with_exif(number, "JPEG") for number in (1, 9)}
 
 
 def shown(picture: bytes) -> UInt8Array:
@@ -191,7 +188,3 @@ def test_exif_data_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
     assert dataset.identity(episode, "frames", verify=False)
     with pytest.raises(DatasetError, match=r"0\.png: expected an image, got not a TIFF file"):
         list(dataset.frames(episode, "frames"))
-
-
-def provenance(file: Path) -> Any:
-    return json.loads(parquet.read_schema(file).metadata[b"rfm.provenance"])

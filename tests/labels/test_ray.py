@@ -75,7 +75,6 @@ def test_the_options_of_a_server_with_tls_reach_an_actor(tmp_path: Path) -> None
 
 
 @pytest.mark.nightly  # a minute
-@pytest.mark.nightly
 def test_a_cluster_goes_on_without_a_node_that_is_killed_and_one_machine_with_what_it_has_left(
     output: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,6 +16,7 @@ from pyarrow import parquet
 
 from labelling import FEW, FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, tasks_of
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
+from rfm_labels.datasets.lerobot_rows import read_sentences
 
 V21, V30 = LEROBOT / "toy_v21", LEROBOT / "toy_v30_many"
 LENGTH = 58  # of episode 0 of V30
@@ -282,3 +283,20 @@ def test_a_table_of_tasks_out_of_order_is_told_since_lerobot_counts_its_rows(tmp
     assert dataset.episode(0).task == open_dataset(V30).episode(0).task
     label(dataset, BrightnessScorer(), LabelOptions(output=output, limit=1, **FEW), notes)
     assert any("meta/tasks.parquet is not in the order of task_index: LeRobot finds" in line for line in notes.lines)
+
+
+TABLES: dict[str, tuple[dict[str, list[Any]], list[str]]] = {
+    "an index without a name": ({"task_index": [0, 1], "__index_level_0__": ["a b", "c d"]}, ["a b", "c d"]),
+    "a column of sentences": ({"task": ["a b", "c d"], "task_index": [0, 1]}, ["a b", "c d"]),
+    "further columns": ({"task_index": [0, 1], "task": ["a b", "c d"], "robot": ["x", "y"]}, ["a b", "c d"]),
+    "another name": ({"task_index": [0, 1], "sentence": ["a b", "c d"]}, ["a b", "c d"]),
+}
+
+
+@pytest.mark.parametrize(("columns", "expected"), TABLES.values(), ids=TABLES)
+def test_a_table_of_tasks_is_read_as_its_writers_name_its_columns(
+    tmp_path: Path, columns: dict[str, list[Any]], expected: list[str]
+) -> None:
+    (tmp_path / "meta").mkdir()
+    parquet.write_table(pa.table(columns), tmp_path / "meta" / "tasks.parquet")
+    assert list(read_sentences(tmp_path / "meta" / "tasks.parquet").values()) == expected

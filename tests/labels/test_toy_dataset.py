@@ -38,6 +38,7 @@ def rows(text: str) -> dict[str, list[float]]:
     return {name: [float(cell.rstrip("%")) for cell in cells.split()] for name, cells in ROW.findall(text)}
 
 
+@pytest.mark.slow
 def test_the_guide_s_commands_tell_the_trained_checkpoint_from_the_early_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -234,8 +234,8 @@ def _unread(path: Path) -> str | None:
     if hdf5_files(path):
         remedy = "rfm-client label takes the folder, open_dataset each file"
         return f"a folder of HDF5 files, each a dataset of its own: {remedy}"
-    if pictures := [file for file in path.iterdir() if _is_frame(file)]:
-        return f"pictures outside of the folder of an episode ({pictures[0].name})"
+    if any(_is_frame(file) for file in path.iterdir()):
+        return "pictures outside of the folder of an episode"
     deeper = next((file for file in path.glob("*/*/*") if is_picture(file)), None)
     listed = deeper and deeper.parent.relative_to(path)
     return f"pictures two levels down: list the folders of one camera ({listed}) in tasks.csv" if deeper else None
