@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from engines import asked_engine
 from reward_models import ROOT, Reference, references
 from rfm import families
 from rfm.engine import Engine, Execution
@@ -46,9 +47,7 @@ def engine_of(case: Reference, num_prefixes: int | None) -> Engine:
     settings |= {} if num_prefixes is None else {"num_prefixes": num_prefixes}
     said = ",".join([name, *(f"{key}={value}" for key, value in settings.items())])
     dtype = torch.bfloat16 if summary["vlm_dtype"] == "torch.bfloat16" else None
-    return Engine.of(
-        families.load(str((case.config / summary["checkpoint"]).resolve()), reward_model=said), dtype=dtype
-    )
+    return asked_engine((case.config / summary["checkpoint"]).resolve(), said, dtype)
 
 
 def check(result: Any, expected: dict[str, Any], curve: list[float], *, is_rounded: bool) -> None:

@@ -209,20 +209,6 @@ def test_clients_are_told_no_size_that_is_ignored(copied: Callable[[str], Path],
     assert description_of(tmp_path / "repository" / "rfm_frames").frame_size is None
 
 
-DECIDED = {
-    PLAIN: set(),
-    "q25_mean_l2": {"frame_pooling"},
-    "q25_attention_disc10": {"frame_pooling", "pooling_temperature"},
-    "q25_video_avg_disc10": {"average_temporal_patches", "size_px"},
-}
-
-
-@pytest.mark.parametrize(("name", "told"), DECIDED.items(), ids=DECIDED)
-def test_only_settings_that_change_scores_are_told(name: str, told: set[str]) -> None:
-    settings = {"frame_pooling", "pooling_temperature", "average_temporal_patches", "size_px"}
-    assert {decision.name for decision in load(name).decisions()} & settings == told
-
-
 def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(
     copied: Callable[[str], Path], base: Path, tmp_path: Path
 ) -> None:
