@@ -32,10 +32,9 @@ from rfm.checkpoint.content import (
     shown,
 )
 from rfm.checkpoint.hub import local_copy
-from rfm.checkpoint.weights import check_one_form, refuse_pickles
+from rfm.checkpoint.weights import read_weights, refuse_pickles
 from rfm.vlm.backbone import (
     ADAPTER_NAMES,
-    BACKBONES,
     DEQUANTIZED,
     QWEN_NAMES,
     backbone_config,
@@ -196,6 +195,7 @@ _NO_EMBEDDING = (
 )
 # In names of LoRA factors of embeddings, and of an embedding that PEFT saves in two ways at once.
 _OTHER = re.compile(r"\.(lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
+_BASE_NAMES = ((r"^language_model\.", "model.language_model."), *QWEN_NAMES)  # the first: saved without a head
 _PARTS = ("model.language_model.", "model.visual.")  # in names of an adapter around all of them
 
 
@@ -248,28 +248,17 @@ def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Te
 
 def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return a base model's backbone: its configuration, and its weights under VlmRewardModel's names."""
-    import transformers
-
+    where = f"base model {base_model}"
     try:
         folder = local_copy(base_model, with_weights=True)
-        check_one_form(folder)
-        content = transformers.PretrainedConfig.get_config_dict(folder)[0]
-        file = f"base model {base_model}: {NETWORK_CONFIG}"
-        backbone = backbone_config(content, file)
-        check_not_quantized(backbone, file, DEQUANTIZED.format(base=base_model))
-        network_class = getattr(transformers, BACKBONES[backbone["model_type"]])
-        network, loaded = network_class.from_pretrained(
-            folder,
-            config=network_class.config_class.from_dict(backbone),
-            use_safetensors=True,
-            dtype="auto",
-            output_loading_info=True,
-        )
-    except (OSError, RecursionError, ValueError) as error:
-        hint = "name its folder with --base-model"
-        raise CheckpointError(f"base model {base_model}: cannot be had: {cut(str(error))} ({hint})") from error
-    if loaded["missing_keys"]:
-        raise CheckpointError(f"base model {base_model}: missing keys: {listed(sorted(loaded['missing_keys']))}")
-    config = backbone_config(network.config.to_dict(), base_model)
-    config.pop("transformers_version", None)  # the installed version, not that of training
-    return config, {f"model.{name}": tensor for name, tensor in network.state_dict().items()}
+    except OSError as error:
+        raise CheckpointError(
+            f"{where}: cannot be had: {cut(str(error))} (name its folder with --base-model)"
+        ) from error
+    content = read_json(folder / NETWORK_CONFIG)
+    config = backbone_config(content, f"{where}: {NETWORK_CONFIG}")
+    check_not_quantized(config, f"{where}: {NETWORK_CONFIG}", DEQUANTIZED.format(base=base_model))
+    config.pop("transformers_version", None)  # of whoever saved the base model, not that of training
+    weights = renamed(read_weights(folder), _BASE_NAMES)
+    dtype = getattr(torch, str(content.get("dtype") or content.get("torch_dtype")), None)  # in which transformers loads
+    return config, {n: w.to(dtype) if dtype and w.is_floating_point() else w for n, w in weights.items()}

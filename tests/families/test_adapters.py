@@ -73,6 +73,26 @@ def beside_its_adapter(folder: Path) -> None:
     (folder / "peft_target_module.json").write_text('{"target_module": "language_model", "adapter_dir": "."}')
 
 
+def on_a_published_base(names: tuple[str, str]) -> Spoil:
+    """Divides a run into an adapter and a base model. names: pattern and replacement for those of the base model"""
+
+    def divide(folder: Path) -> None:
+        beside_its_adapter(folder)
+        tensors = load_file(folder / "model.safetensors")
+        base = {
+            re.sub(*names, name.replace(".base_model.model.", ".").replace(".base_layer.", ".")): tensor
+            for name, tensor in tensors.items()
+            if name.startswith("model.") and ".lora_" not in name
+        }
+        save_file(base, folder.parent / "base_model" / "model.safetensors", {"format": "pt"})
+        embedding = tensors["model.language_model.base_model.model.embed_tokens.weight"]
+        in_adapter(lambda adapter: adapter.update({"base_model.model.embed_tokens.weight": embedding}))(folder)
+        for name in ("model.safetensors", "config.json", "peft_target_module.json"):
+            (folder / name).unlink()
+
+    return divide
+
+
 def with_lora_of_the_language_head(folder: Path) -> None:
     shapes = {"base_layer": (32, 32), "lora_A.default": (4, 32), "lora_B.default": (32, 4)}
     more = {f"model.lm_head.{name}.weight": torch.ones(shape) for name, shape in shapes.items()}
@@ -86,6 +106,8 @@ SAME: dict[str, tuple[str, Spoil]] = {
     "around the language model": (ADAPTER, renamed(r"^base_model\.model\.language_model\.", "base_model.model.", FACTORS)),
     "around the whole model": (LORA_INSIDE, renamed(r"^model\.language_model\.base_model\.model\.", "model.base_model.model.language_model.")),
     "beside the whole model": (LORA_INSIDE, beside_its_adapter),
+    "on a Qwen3-VL with a language head": (LORA_INSIDE, on_a_published_base(("^$", ""))),
+    "on a Qwen3-VL without a language head": (LORA_INSIDE, on_a_published_base((r"^model\.", ""))),
     "of the language head, too": (LORA_INSIDE, with_lora_of_the_language_head),
 }  # fmt: skip
 
@@ -277,7 +299,7 @@ BASES = {
 }
 
 
-@pytest.mark.parametrize(("base_model", "message"), BASES.items(), ids=map(repr, BASES))
+@pytest.mark.parametrize(("base_model", "message"), BASES.items(), ids=[*map(repr, BASES)])
 def test_an_adapter_on_another_base_model_needs_its_option(
     tmp_path: Path, base_model: str | None, message: str
 ) -> None:

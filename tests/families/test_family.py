@@ -92,6 +92,7 @@ def running(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
         yield Running(repository, server.endpoints.grpc_url)
 
 
+@pytest.mark.slow
 @pytest.mark.triton
 def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> None:
     first, second = [0.1, 0.5, 0.9], [0.8, 0.2]
@@ -119,6 +120,7 @@ def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> No
     }
 
 
+@pytest.mark.slow
 @pytest.mark.triton
 def test_a_family_from_elsewhere_is_served_beside_one_of_this_package(running: Running) -> None:
     demo = running.repository / "rfm" / "1" / "checkpoint"
@@ -130,6 +132,7 @@ def test_a_family_from_elsewhere_is_served_beside_one_of_this_package(running: R
     np.testing.assert_allclose(result.progress, expected.progress, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.triton
 def test_a_score_that_is_no_number_is_an_error_to_every_client(running: Running) -> None:
     """A client that reads tensors itself must not take NaN for a score, nor Triton's metrics for a success."""

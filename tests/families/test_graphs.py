@@ -35,8 +35,14 @@ def engine_with(graphs: Graphs, config: goldens.Config, feature_cache_mib: int =
     return Engine(checkpoint.predictor(CPU, None, cache), graphs=graphs)
 
 
-@pytest.mark.parametrize("config", goldens.VLM, ids=lambda config: config.name)
-@pytest.mark.parametrize("feature_cache_mib", [0, 4])
+@pytest.mark.parametrize(
+    ("config", "feature_cache_mib"),
+    [
+        (goldens.config(name), mib)
+        for name, mib in ((PLAIN, 0), (PLAIN, 4), ("q25_attention_disc10", 4), ("q25_video_last_l2", 0))
+    ],
+    ids=str,
+)
 def test_replays_give_the_reference_answers(config: goldens.Config, feature_cache_mib: int) -> None:
     cases = [case for case in config.cases() if not case.is_refused][:3]
     asked = [(case, *pair) for case in cases for pair in zip(case.samples(), case.expected(), strict=True)] * 4

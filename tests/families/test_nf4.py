@@ -12,16 +12,10 @@ import pytest
 import torch
 from torch import Tensor
 
-import goldens
-import rfm_export
-from engines import load_engine, serve_config
-from few_bits import TOLERANCES, as_bytes, case, change_config, in_both_forms
-from rfm import families
-from rfm.engine import Engine
+from few_bits import as_bytes, case, change_config, in_both_forms
 from rfm.families import CheckpointError
 from rfm.vlm import nf4
-from rfm_client import ProgressSample
-from vlm import PLAIN, assert_close, load, video
+from vlm import PLAIN, load
 
 CASES = ("nested", "plain", "float32", "blocks_across_rows", "odd")
 STATE = "weight.quant_state.bitsandbytes__nf4"
@@ -63,27 +57,17 @@ def stating(**changes: object) -> Callable[[dict[str, Tensor]], object]:
 SPOILED: dict[str, tuple[Callable[[dict[str, Tensor]], object], str]] = {
     "no scales": (lambda t: t.pop("weight.absmax"), r"weight\.absmax: expected 257 numbers of torch\.uint8, got none; copy this checkpoint again, or export the full checkpoint that was rounded to NF4$"),
     "a scale too few": (lambda t: t.update({"weight.absmax": t["weight.absmax"][1:]}), r"weight\.absmax: expected 257 numbers of torch\.uint8, got 256 of"),
-    "scales of another type": (lambda t: t.update({"weight.absmax": t["weight.absmax"].float()}), r"weight\.absmax: expected 257 .*uint8, got 257 of torch\.float32"),
     "no codes": (lambda t: t.pop("weight.quant_map"), r"weight\.quant_map: expected 16 numbers"),
     "codes of another type": (lambda t: t["weight.quant_map"].mul_(0.5), r"weight\.quant_map: expected the codes of NF4, got \[-0\.5"),
     "no scales of scales": (lambda t: t.pop("weight.nested_absmax"), r"weight\.nested_absmax: expected 2 numbers of torch\.float32, got none"),
-    "no codes of scales": (lambda t: t.pop("weight.nested_quant_map"), r"weight\.nested_quant_map: expected 256 numbers"),
     "no weight": (lambda t: t.pop("weight"), r"^weight: expected 4112 numbers of torch\.uint8, got none"),
-    "another weight": (lambda t: t.update(weight=t["weight"][:-1]), r"^weight: expected 4112 numbers of torch\.uint8, got 4111"),
     "no JSON": (lambda t: t.update({STATE: as_bytes(b"{")}), r"^weight: expected quant_state.* in JSON, got "),
-    "no JSON object": (lambda t: t.update({STATE: as_bytes(b"[]")}), r"expected quant_state.* in JSON, got \[\]"),
-    "nested JSON without end": (lambda t: t.update({STATE: as_bytes(b"[" * 60_000)}), r"expected quant_state.* in JSON, got "),
     "a huge state": (lambda t: t.update({STATE: as_bytes(b" " * 100_000)}), r"expected quant_state.* in JSON, got \[100000\] of torch\.uint8"),
-    "a state of numbers": (lambda t: t.update({STATE: torch.ones(4)}), r"expected quant_state.* in JSON, got \[4\] of torch\.float32"),
     "no shape": (stating(shape=None), r"expected the shape of the weight in its quant_state, got None"),
-    "a shape of nothing": (stating(shape=[0, 32]), r"expected the shape of the weight in its quant_state, got \[0, 32\]"),
     "another type of 4 bits": (stating(quant_type="fp4"), r"expected quant_type nf4 in its quant_state, got 'fp4'"),
     "a block of no size": (stating(blocksize=0), r"expected blocksize 32 or 64 or .* in its quant_state, got 0"),
-    "a block of half a size": (stating(blocksize=32.0), r"expected blocksize 32 or .*, got 32\.0"),
     "blocks of another size": (stating(blocksize=64), r"weight\.nested_absmax: expected 1 numbers of torch\.float32, got 2 of"),
-    "no block size": (stating(blocksize=None), r"expected blocksize 32 or .*, got None"),
     "a type that is none": (stating(dtype="int8"), r"expected dtype bfloat16 or float16 or float32 in its quant_state, got 'int8'"),
-    "no offset": (stating(nested_offset=None), r"weight\.absmax: expected 257 numbers of torch\.float32, got 257 of torch\.uint8"),
     "an offset in words": (stating(nested_offset="none"), r"expected a number as nested_offset of its quant_state, got 'none'"),
     "scales of another type of number": (stating(nested_dtype="float16"), r"expected nested_dtype float32 in its quant_state, got 'float16'"),
     "scales without blocks": (stating(nested_blocksize=None), r"expected nested_blocksize 32 or .*, got None"),
@@ -101,30 +85,6 @@ def test_parts_that_do_not_fit_are_refused(spoil: Callable[[dict[str, Tensor]], 
 @pytest.fixture
 def both(tmp_path: Path) -> tuple[Path, Path]:
     return in_both_forms(PLAIN, tmp_path)
-
-
-@pytest.mark.parametrize("name", TOLERANCES)
-def test_an_export_scores_as_the_values_of_its_weights(tmp_path: Path, name: str) -> None:
-    few_bits, full = in_both_forms(name, tmp_path)
-    said: list[str] = []
-    rfm_export.export(few_bits, tmp_path / "repository", serve_config(goldens.config(name)), say=said.append)
-    note = "in NF4 of bitsandbytes (weights, rounded in training too)"
-    assert sum(note in line for line in said) == 1
-    exported = tmp_path / "repository" / "rfm_frames" / "1" / "checkpoint"
-    assert "quantization_config" not in json.loads((exported / "config.json").read_text())
-
-    base_model = str(goldens.config(name).base_model)
-    engines = [
-        Engine.of(families.load(exported)),
-        Engine.of(families.load(full, base_model=base_model)),
-        load_engine(name),
-    ]
-    (result,), (expected,), (unrounded,) = (
-        engine.evaluate([ProgressSample(video(0, 3, 60, 84))]) for engine in engines
-    )
-    assert_close(result, expected, TOLERANCES[name])
-    with pytest.raises(AssertionError):
-        assert_close(result, unrounded, 1e-2)
 
 
 @pytest.mark.parametrize("kind", ["fp4", "int8"])

@@ -31,9 +31,9 @@ from rfm_client.contract import wire
 from small_network import SMALL
 
 # The same examples each time, so a failure repeats everywhere.
-THOROUGH = settings(max_examples=200, deadline=None, derandomize=True, database=None)
+THOROUGH = settings(max_examples=100, deadline=None, derandomize=True, database=None)
 SLOW = settings(
-    max_examples=100, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
+    max_examples=50, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
 )
 Array = npt.NDArray[Any]
 

@@ -18,10 +18,9 @@ from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
 from rfm.engine.layers import progress_from_logits
 from rfm.engine.predictor import prefix_indices
-from rfm.rewind.network import Packing, RewindBatch, RewindConfig, RewindTransformer, rounded_up
-from rfm.rewind.predictor import MAX_EMBEDDING, RewindCollator, RewindPredictor
+from rfm.rewind.network import Packing, RewindConfig, RewindTransformer, rounded_up
+from rfm.rewind.predictor import RewindCollator, RewindPredictor
 from rfm_client import (
-    InferenceFailedError,
     InvalidSampleError,
     PreferenceSample,
     ProgressResult,
@@ -144,8 +143,11 @@ def test_every_variant_scores_as_torchs_own_transformer(config: RewindConfig) ->
         np.testing.assert_allclose(numbers(outcome), expected.numpy(), rtol=0, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
-@pytest.mark.parametrize("token_budget", [64, 16_384])
+@pytest.mark.parametrize(
+    ("config", "token_budget"),
+    [*((each, 64) for each in VARIANTS.values()), (SMALL, 16_384)],
+    ids=[*VARIANTS, "one batch"],
+)
 def test_no_mix_of_lengths_and_types_changes_a_result(config: RewindConfig, token_budget: int) -> None:
     random = np.random.default_rng(token_budget)
     samples = samples_for(config)
@@ -195,29 +197,11 @@ def test_a_row_over_the_token_budget_runs_alone() -> None:
     assert rows == [2, 1, 1, 1]
 
 
-def test_a_score_that_is_no_number_is_an_error() -> None:
-    huge = Trajectory(
-        video_embeddings=np.full((2, 12), MAX_EMBEDDING, np.float32), text_embedding=np.ones(6, np.float32)
-    )
-    network = build(SMALL)
-    network.video_proj.weight.data *= 1e14  # so that the largest embedding overflows
-    failed, good = engine_of(network).evaluate([ProgressSample(huge), ProgressSample(trajectory(0, 2))])
-    assert isinstance(failed, InferenceFailedError)
-    assert isinstance(good, ProgressResult)
-
-
 def test_prefixes_are_sampled_as_the_original_samples_them() -> None:
     assert prefix_indices(1, 4).tolist() == [[0, 0, 0, 0]]
     assert prefix_indices(6, 4).tolist() == [
         [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 2], [0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 3, 5]
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize("num_frames", [[9, 0], [1, 9]], ids=str)
-def test_more_frames_than_progress_tokens_are_refused(num_frames: list[int]) -> None:
-    frames = torch.zeros(sum(num_frames), 12)
-    with pytest.raises(ValueError, match="num_frames: expected at most 8, got 9"):
-        RewindBatch.of(SMALL, torch.zeros(1, 6), frames, np.array([num_frames]))
 
 
 def test_frames_that_many_rows_show_are_in_a_batch_once() -> None:

@@ -16,6 +16,7 @@ import pytest
 import torch
 from PIL import Image
 
+from engines import asked_engine
 from reward_models import Reference, references
 from rfm import families
 from rfm.engine import Engine, Execution
@@ -54,7 +55,7 @@ def samples_of(case: Reference) -> list[ProgressSample]:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_answers_are_those_of_the_original_code(case: Reference, dtype: torch.dtype) -> None:
-    engine = Engine.of(families.load(str(case.config / "checkpoint"), reward_model="roboreward"), dtype=dtype)
+    engine = asked_engine(case.config / "checkpoint", "roboreward", dtype)
     samples = samples_of(case)
     for sample, result, told in zip(samples, engine.evaluate(samples), case.content["generations"], strict=True):
         if told["parsed_score"] is None:
@@ -73,12 +74,13 @@ def test_answers_are_those_of_the_original_code(case: Reference, dtype: torch.dt
 @pytest.mark.reference
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_expected_value_is_that_of_the_digits_behind_answer(case: Reference) -> None:
-    engine = Engine.of(families.load(str(case.config / "checkpoint"), reward_model="roboreward-expected"))
+    engine = asked_engine(case.config / "checkpoint", "roboreward-expected")
     for result, told in zip(engine.evaluate(samples_of(case)), case.content["generations"], strict=True):
         assert isinstance(result, ProgressResult), result
         assert result.progress_logits is not None
         np.testing.assert_allclose(result.progress_logits[0], told["fp32_forced_digit_logits"], rtol=0, atol=EXACT)
         assert result.progress[-1] * 4 + 1 == pytest.approx(told["expected_score_fp32"], abs=1e-4)
+        assert result.unclear is None
 
 
 @pytest.mark.parametrize("shape", [(48, 64, 3), (33, 57, 3)])
@@ -155,6 +157,7 @@ def test_dense_mode_marks_the_frames_whose_prefix_has_an_unclear_answer(engine: 
         assert isinstance(alone, ProgressResult)
         assert alone.unclear is not None
         assert alone.unclear[-1] == mark
+        assert alone.progress[-1] == dense.progress[end]
     assert dense.unclear[-1]
 
 
@@ -175,41 +178,9 @@ def test_strict_answers_refuse_an_unclear_answer(tmp_path: Path, is_exported: bo
     assert execution.num_unclear == 1
 
 
-def test_an_expected_score_has_no_marks() -> None:
-    engine = Engine.of(families.load(str(CHECKPOINT), reward_model="roboreward-expected"))
-    (result,) = engine.evaluate(samples_named("fallback_digits_T2"))
-    assert isinstance(result, ProgressResult)
-    assert result.unclear is None
-
-
 @pytest.fixture(scope="module")
 def engine() -> Engine:
     return Engine.of(families.load(str(CHECKPOINT), reward_model="roboreward"), feature_cache_mib=16)
-
-
-def test_a_mixed_batch_gives_the_answers_of_single_samples(engine: Engine) -> None:
-    samples = [sample for case in CASES if case.config == CONFIGS[0] for sample in samples_of(case)]
-    together = engine.evaluate(samples)
-    for sample, result in zip(samples, together, strict=True):
-        (alone,) = engine.evaluate([sample])
-        if isinstance(alone, InvalidSampleError):
-            assert str(result) == str(alone)
-            continue
-        assert isinstance(alone, ProgressResult)
-        assert isinstance(result, ProgressResult)
-        np.testing.assert_array_equal(result.progress, alone.progress)
-
-
-def test_dense_mode_scores_each_prefix_alone(engine: Engine) -> None:
-    case = next(case for case in CASES if case.file.stem == "score4_T7")
-    frames, task = case.samples()[0].trajectory.positions, case.samples()[0].trajectory.task
-    (dense,) = engine.evaluate([ProgressSample(Trajectory(frames=frames[:4], task=task), frame_steps=2)])
-    assert isinstance(dense, ProgressResult)
-    for end in range(4):
-        pair = frames[[0, end]]
-        (alone,) = engine.evaluate([ProgressSample(Trajectory(frames=pair, task=task))])
-        assert isinstance(alone, ProgressResult)
-        assert dense.progress[end] == alone.progress[-1]
 
 
 PASSES = {"score4_T7": 2, "fallback_digits_T2": 8, "lower_T2": 8}  # 'ANSWER: 4', 'Score 2 of 5', 'answer: 3'
@@ -259,8 +230,11 @@ SETTINGS: dict[str, dict[str, Any]] = {
 MIXED = ("T1_single", "fallback_digits_T2", "odd_task_T3")
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
-@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+@pytest.mark.parametrize(
+    ("settings", "dtype"),
+    [*((each, torch.float32) for each in SETTINGS.values()), (SETTINGS["as published"], torch.bfloat16)],
+    ids=[*SETTINGS, "bfloat16"],
+)
 def test_a_draft_changes_no_answer(settings: dict[str, Any], dtype: torch.dtype) -> None:
     predictor = writer(dtype, **settings)
     rows = [row for name in MIXED for sample in samples_named(name) for row in predictor.rows(sample)]

@@ -50,6 +50,7 @@ def cold() -> dict[str, list[float]]:
     return dict(json.loads(done.stdout))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", BOUNDS)
 def test_a_clip_has_one_score_alone_in_a_batch_and_in_a_fresh_process(dtype: str, cold: dict[str, list[float]]) -> None:
     warm, bound = engine(dtype), BOUNDS[dtype]

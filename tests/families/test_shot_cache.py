@@ -103,18 +103,6 @@ def test_an_episode_has_the_scores_of_the_whole_and_each_shot_is_encoded_once(na
     assert execution.num_found == per_shot * (num_shown - len(shown))
 
 
-@pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
-def test_a_cache_that_holds_nothing_changes_no_score(name: str) -> None:
-    cache, frames = FeatureCache[Any](1), frames_of(1, 4)
-    cached, plain = of_both(name, cache)
-    for stop in range(1, 5):
-        assert_scored(ask(cached, frames[:stop], frames[:stop]), plain, frames[:stop])
-        assert len(cache) == 0
-    expected = "frame_digests: expected digests of frames that this model knows or has been sent, got 1 others"
-    with pytest.raises(InvalidSampleError, match=f"^{expected}$"):
-        named(cached, frames[:2], frames[1:])
-
-
 def test_a_video_has_frames_of_one_size() -> None:
     cached, kept, sent = engine(MODELS[0], FeatureCache(BYTES_PER_MIB)), frames_of(8, 1), frames_of(9, 1, (84, 56))
     ask(cached, kept, kept)

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 import torch
 
+from engines import asked_engine
 from reward_models import ROOT, Reference, references
 from rfm import families
-from rfm.engine import Engine, Execution
+from rfm.engine import Engine
 from rfm.families import CheckpointError
 from rfm_client import (
     ProgressResult,
@@ -46,9 +47,7 @@ def engine_of(case: Reference, num_prefixes: int | None) -> Engine:
     settings |= {} if num_prefixes is None else {"num_prefixes": num_prefixes}
     said = ",".join([name, *(f"{key}={value}" for key, value in settings.items())])
     dtype = torch.bfloat16 if summary["vlm_dtype"] == "torch.bfloat16" else None
-    return Engine.of(
-        families.load(str((case.config / summary["checkpoint"]).resolve()), reward_model=said), dtype=dtype
-    )
+    return asked_engine((case.config / summary["checkpoint"]).resolve(), said, dtype)
 
 
 def check(result: Any, expected: dict[str, Any], curve: list[float], *, is_rounded: bool) -> None:
@@ -104,31 +103,12 @@ def progress(frames: UInt8Array, task: str = TASK) -> ProgressSample:
 
 @pytest.fixture(scope="module")
 def lerobot() -> Engine:
-    return Engine.of(families.load(str(CHECKPOINT), reward_model="topreward"), feature_cache_mib=16)
+    return asked_engine(CHECKPOINT, "topreward")
 
 
 @pytest.fixture(scope="module")
 def robometer() -> Engine:
-    return Engine.of(families.load(str(CHECKPOINT), reward_model="topreward-robometer"))
-
-
-def test_a_mixed_batch_gives_the_answers_of_single_samples(lerobot: Engine) -> None:
-    samples = [progress(noise(n, h, w, n), f"task {n}") for n, h, w in ((1, 64, 96), (5, 48, 80), (8, 33, 300))]
-    for alone, together in zip(samples, lerobot.evaluate(samples), strict=True):
-        (expected,) = lerobot.evaluate([alone])
-        assert isinstance(expected, ProgressResult)
-        assert isinstance(together, ProgressResult)
-        assert together.log_prob is not None
-        np.testing.assert_allclose(together.log_prob, expected.log_prob, rtol=0, atol=2e-5)
-
-
-def test_prefixes_share_the_vision_tower_s_work(lerobot: Engine) -> None:
-    lerobot.predictor.cache.clear()
-    execution, again = Execution(), Execution()
-    lerobot.evaluate([progress(noise(8))], execution)
-    assert execution.num_encoded == 16  # 4 pairs, and 4 frames that make up a pair alone; not 72
-    lerobot.evaluate([progress(noise(8))], again)
-    assert again.num_encoded == 0
+    return asked_engine(CHECKPOINT, "topreward-robometer")
 
 
 def test_a_large_video_is_shrunk_by_the_length_of_the_prefix(lerobot: Engine) -> None:

@@ -248,13 +248,12 @@ def config(name: str) -> Config:
 
 
 # What the shared server serves: ReWiND, ReWiND with encoders; and on demand Qwen3-VL on images, Qwen2.5-VL on video. Each
-# reference case runs on the engine; through Triton one case of each model, and a refused one.
+# reference case runs on the engine; through Triton one case of each model.
 SERVED = [config(name) for name in ("c1_t1_disc10", "enc_c1_t1_disc10")]
 ON_DEMAND = [config(name) for name in ("q3_tok_disc10", "q25_video_avg_disc10")]
 SERVED_CASES = [
     next(case for case in each.cases() if case.file.stem.startswith("mixed")) for each in (*SERVED, *ON_DEMAND)
 ]
-REFUSED_CASE = next(case for each in SERVED for case in each.cases() if case.is_refused)
 
 
 def sample_type(sample: Sample) -> str:

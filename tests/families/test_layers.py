@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Linear layers: oneDNN's products equal those of ``nn.Linear``, and training keeps gradients."""
+"""Layers: oneDNN's products and the RMSNorm for GPUs equal PyTorch's and transformers' bit for bit; float32 stays float32."""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,7 +13,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from rfm.engine.layers import WORTH_ONEDNN, Linear, linear, speed_up
+import goldens
+from pretended import CUDA, pretended
+from rfm import families
+from rfm.engine import Engine
+from rfm.engine.layers import MKL_FUNCTIONS, WORTH_ONEDNN, Linear, RmsNorm, is_rms_norm, linear, speed_up
+from vlm import PLAIN, load
 
 LARGE, SMALL = (512, 256), (32, 16)  # [N, K] on either side of WORTH_ONEDNN
 
@@ -97,3 +104,46 @@ def test_speed_up_keeps_parameters_numbers_and_gradients() -> None:
         torch.testing.assert_close(network(x), expected, rtol=0, atol=1e-5)
     network(x).sum().backward()
     assert weight.grad is not None and weight.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 300.0], ids=str)
+def test_a_norm_of_gpus_gives_the_bits_of_transformers_norm(scale: float, dtype: torch.dtype) -> None:
+    """Return values from epsilon's root to the largest channels of trained networks."""
+    norm: Any = load(PLAIN).build(dtype).model.language_model.norm
+    torch.manual_seed(0)
+    norm.weight.normal_(1, 0.3)
+    x = (torch.randn(2, 33, len(norm.weight)) * scale).to(dtype)
+    with torch.inference_mode():
+        assert torch.equal(RmsNorm(norm.weight, norm.variance_epsilon)(x), norm(x))
+
+
+@pytest.mark.parametrize("name", [PLAIN, "q25_boundary_disc10"])
+def test_all_norms_are_replaced_on_a_device_and_none_on_the_cpu(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On CPUs, PyTorch's own RMSNorm is slower in bfloat16."""
+    network = load(name).build(torch.float32)
+    num_norms, names = sum(map(is_rms_norm, network.modules())), list(network.state_dict())
+    speed_up(network)
+    assert sum(map(is_rms_norm, network.modules())) == num_norms > 0
+    with pretended(monkeypatch):
+        network.to(CUDA)
+        speed_up(network)
+    assert sum(map(is_rms_norm, network.modules())) == 0
+    assert sum(isinstance(module, RmsNorm) for module in network.modules()) == num_norms
+    assert list(network.state_dict()) == names
+
+
+def test_the_first_calls_of_all_functions_of_mkl_are_made_by_one_thread() -> None:
+    """A wrong first call is rare, so this compares the list with PyTorch's header."""
+    header = Path(torch.__file__).parent / "include" / "ATen" / "cpu" / "vml.h"
+    named = re.findall(r"^ *IMPLEMENT_VML_MKL\((\w+),", header.read_text(), re.MULTILINE)
+    assert sorted(named) == sorted(function.__name__ for function in MKL_FUNCTIONS)
+    assert "cos" in named
+
+
+def test_an_engine_multiplies_float32_as_float32(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
+    monkeypatch.setattr(torch.backends.cuda.matmul, "allow_tf32", True)
+    Engine.of(families.load(goldens.REWIND[0].checkpoint))
+    assert not torch.backends.cudnn.allow_tf32
+    assert not torch.backends.cuda.matmul.allow_tf32
