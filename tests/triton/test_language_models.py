@@ -184,9 +184,9 @@ def test_the_gateway_answers_as_rynnvalue_s_server(asked: Served, tmp_path: Path
     assert "outputs_success" not in answer
 
 
-def test_lerobot_s_robometer_is_answered_as_by_lerobot(asked: Served, protocol: str) -> None:
+def test_lerobot_s_robometer_is_answered_as_by_lerobot(asked: Served) -> None:
     told = next(each for each in references("lerobot_robometer") if each.config == LEROBOT.parent)
-    with asked.client("lerobot", protocol) as client:
+    with asked.client("lerobot") as client:
         results = client.evaluate(told.samples(told.content.get("cropped_to_last")))
     for result, progress in zip(results, told.content["decoded"]["progress_pred"], strict=True):
         assert isinstance(result, ProgressResult)
@@ -206,9 +206,9 @@ def test_roboreward_is_answered_as_by_the_original(asked: Served, protocol: str)
         np.testing.assert_allclose(result.progress_logits[0], text["digit_logits_at_answer"], rtol=0, atol=0.3)
 
 
-def test_an_answer_without_a_score_fails_alone(asked: Served, protocol: str) -> None:
+def test_an_answer_without_a_score_fails_alone(asked: Served) -> None:
     samples = [*case("roboreward", "unparsable_T3").samples(), *case("roboreward", "score5_T4").samples()]
-    with asked.client("robo", protocol) as client:
+    with asked.client("robo") as client:
         failed, result = client.evaluate(samples, return_errors=True)
     assert isinstance(failed, InvalidSampleError)
     assert "answer: expected a score from 1 to 5 in the model's answer, got 'no idea'" in str(failed)
@@ -220,18 +220,14 @@ UNCLEAR, CLEAR = "fallback_digits_T2", "score5_T4"  # answers: 'Score 2 of 5', '
 SAID = "2 of 2 frames: the model's written answer states no single whole score"
 
 
-@pytest.mark.parametrize("is_old", [False, True], ids=["new server", "server of an older export"])
-def test_unclear_answers_are_marked(asked: Served, protocol: str, is_old: bool) -> None:
+def test_unclear_answers_are_marked(asked: Served) -> None:
     unclear, clear = (case("roboreward", name).samples()[0] for name in (UNCLEAR, CLEAR))
-    with asked.client("robo_old" if is_old else "robo", protocol) as client:
+    with asked.client("robo") as client:
         first = client.progress(unclear.trajectory)
         results = client.evaluate([unclear, clear])
         marks = [each.unclear if each.unclear is None else each.unclear.tolist() for each in (first, *results)]
-        if is_old:
-            assert marks == [None] * 3
-        else:
-            assert marks == [[True] * 2, [True] * 2, [False] * 4]
-        assert ("unclear" in client.model_info(frames=True).scores) is not is_old
+        assert marks == [[True] * 2, [True] * 2, [False] * 4]
+        assert "unclear" in client.model_info(frames=True).scores
     assert first.last_progress == 1.0
 
 
@@ -369,16 +365,16 @@ def test_the_description_tells_what_is_given(asked: Served) -> None:
     assert infos["top"].lacks == ("preference", "similarity", "success")
 
 
-def test_a_model_for_frames_alone_says_how_to_ask_for_its_description(asked: Served, protocol: str) -> None:
+def test_a_model_for_frames_alone_says_how_to_ask_for_its_description(asked: Served) -> None:
     remedy = r"give frames, and ask model_info\(frames=True\)$"
-    with asked.client("robo", protocol) as client, pytest.raises(ModelNotFoundError, match=remedy):
+    with asked.client("robo") as client, pytest.raises(ModelNotFoundError, match=remedy):
         client.model_info()
 
 
-def test_what_has_no_meaning_is_refused_by_name(asked: Served, protocol: str) -> None:
+def test_what_has_no_meaning_is_refused_by_name(asked: Served) -> None:
     frames = np.zeros((3, 64, 96, 3), np.uint8)
     trajectory = Trajectory(frames=frames, task=TASK)
-    with asked.client("top", protocol) as client:
+    with asked.client("top") as client:
         dense, preference = client.evaluate(
             [ProgressSample(trajectory, frame_steps=2), PreferenceSample(trajectory, trajectory)], return_errors=True
         )
@@ -399,25 +395,25 @@ def test_roboreward_scores_an_episode_step_by_step(asked: Served) -> None:
     assert steps == told.content["response"]["outputs_progress"]["progress_pred"][0]
 
 
-@pytest.mark.parametrize("name", ["batch_B3", "steps_T4_T1"])
-def test_the_gateway_answers_as_robometer_s_baseline_server(asked: Served, tmp_path: Path, name: str) -> None:
-    told = case("roboreward", name)
-    samples = [
-        {
-            "sample_type": "progress",
-            "trajectory": {
-                "task": sample.trajectory.task,
-                "frames": sample.trajectory.positions.tolist(),
-            },
-        }
-        for sample in told.samples()
-    ]
-    body = {"samples": samples, "use_frame_steps": told.content["use_frame_steps"]}
+def test_the_gateway_answers_as_robometer_s_baseline_server(asked: Served, tmp_path: Path) -> None:
     with running(asked.endpoints, tmp_path, "robo") as gateway:
-        answer = requests.post(f"{gateway.url}/evaluate_batch", json=body, timeout=60).json()
-    assert answer["outputs_progress"] == told.content["response"]["outputs_progress"]
-    assert answer["outputs_preference"] is None
-    assert "outputs_success" not in answer
+        for name in ("batch_B3", "steps_T4_T1"):
+            told = case("roboreward", name)
+            samples = [
+                {
+                    "sample_type": "progress",
+                    "trajectory": {
+                        "task": sample.trajectory.task,
+                        "frames": sample.trajectory.positions.tolist(),
+                    },
+                }
+                for sample in told.samples()
+            ]
+            body = {"samples": samples, "use_frame_steps": told.content["use_frame_steps"]}
+            answer = requests.post(f"{gateway.url}/evaluate_batch", json=body, timeout=60).json()
+            assert answer["outputs_progress"] == told.content["response"]["outputs_progress"]
+            assert answer["outputs_preference"] is None
+            assert "outputs_success" not in answer
 
 
 def test_the_page_shows_the_whole_episode_s_curve(asked: Served, tmp_path: Path) -> None:
@@ -436,27 +432,35 @@ def test_the_page_shows_the_whole_episode_s_curve(asked: Served, tmp_path: Path)
     assert "relative to the whole episode" in refused.text
 
 
-def test_tables_pictures_and_the_page_show_remaining_seconds(
-    asked: Served, tmp_path: Path, quiet_browser: Browser
-) -> None:
-    video, page = VIDEOS / "jaco_play_pick_up_green_cup.mp4", quiet_browser
-    words = [video, "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "rynn", "--fps", "0.5"]
-    scored = ["--sampling", "rint_pad", "--frames", "4", "--json", tmp_path / "scores.json"]
-    pictures = ["--plot", tmp_path / "plot.svg", "--strips", tmp_path / "strips.svg"]
-    done = rfm_client("score", *words, *scored, *pictures)
+ROBOT_VIDEO = VIDEOS / "jaco_play_pick_up_green_cup.mp4"
+
+
+def scored(asked: Served, folder: Path, *more: object) -> tuple[list[float], str]:
+    """The remaining seconds of a video by ``rfm-client score``, and what it printed."""
+    words = [ROBOT_VIDEO, "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "rynn", "--fps", "0.5"]
+    rule = ["--sampling", "rint_pad", "--frames", "4", "--json", folder / "scores.json"]
+    done = rfm_client("score", *words, *rule, *more)
     assert done.exit_code == 0, done.output
-    (told,) = json.loads((tmp_path / "scores.json").read_text())["videos"]
-    seconds = told["remaining_s"]
-    (row,) = (line for line in done.output.splitlines() if video.name[-10:] in line)
+    (told,) = json.loads((folder / "scores.json").read_text())["videos"]
+    return told["remaining_s"], done.output
+
+
+def test_tables_and_pictures_show_remaining_seconds(asked: Served, tmp_path: Path) -> None:
+    seconds, output = scored(asked, tmp_path, "--plot", tmp_path / "plot.svg", "--strips", tmp_path / "strips.svg")
+    (row,) = (line for line in output.splitlines() if ROBOT_VIDEO.name[-10:] in line)
     assert f"{seconds[-1]:.2f} s" in row
-    assert "In s, in place of progress: seconds that remain until the task is done." in " ".join(done.output.split())
+    assert "In s, in place of progress: seconds that remain until the task is done." in " ".join(output.split())
+
+
+def test_the_page_shows_remaining_seconds(asked: Served, tmp_path: Path, quiet_browser: Browser) -> None:
+    page, (seconds, _) = quiet_browser, scored(asked, tmp_path)
     with running(asked.endpoints, tmp_path, "rynn") as gateway:
         page.open(gateway.url)
         page.run("document.getElementById('advanced').open = true")
         Select(page["rule"]).select_by_visible_text("rint_pad")
         for name, text in {"tasks": TASK, "fps": "0.5", "frames": "4"}.items():
             page.write(name, text)
-        page.drop([video])
+        page.drop([ROBOT_VIDEO])
         page.until_text("scored", "1 of 1 scored")
         assert page.cells("#curves tr")[0][5:7] == [f"{seconds[-1]:.1f}", "-"]
         assert page.all("#numbers .leading")[0].text == "Final time remaining (s)"

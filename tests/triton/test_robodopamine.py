@@ -65,27 +65,27 @@ def test_samples_with_and_without_views_are_answered_as_by_the_engine(endpoints:
                 _ = result.progress_deltas
 
 
-def test_an_answer_without_a_score_is_an_error_and_counted(endpoints: Endpoints, protocol: str) -> None:
+def test_an_answer_without_a_score_is_an_error_and_counted(endpoints: Endpoints) -> None:
     def unreadable() -> float:
         return metric_at(endpoints.metrics_url, "rfm_unreadable_answers_total", model="steps_frames")
 
     before, case = unreadable(), case_named("incremental_T4_one_view")
-    with RewardClient(url_of(endpoints, protocol), model="steps") as client, pytest.raises(InvalidSampleError) as error:
+    with RewardClient(endpoints.grpc_url, model="steps") as client, pytest.raises(InvalidSampleError) as error:
         client.progress(case.sample.trajectory)
     assert error.value.got == "'no score'"
     poll(lambda: unreadable() == before + 1)
 
 
-def test_what_cannot_be_compared_is_refused_by_name(endpoints: Endpoints, protocol: str) -> None:
+def test_what_cannot_be_compared_is_refused_by_name(endpoints: Endpoints) -> None:
     frames = np.zeros((3, 32, 32, 3), np.uint8)
     views = Trajectory(frames=frames, task="t", views=(frames, frames), goal=frames[0])
     expected = "expected a model that reads views and a goal"
     with (
-        RewardClient(url_of(endpoints, protocol), model="robo") as client,
+        RewardClient(endpoints.grpc_url, model="robo") as client,
         pytest.raises(InvalidSampleError, match=expected),
     ):
         client.progress(views)
-    with RewardClient(url_of(endpoints, protocol), model="forward") as client:
+    with RewardClient(endpoints.grpc_url, model="forward") as client:
         with pytest.raises(InvalidSampleError, match="num_frames: expected at least 2"):
             client.progress(Trajectory(frames=frames[:1], task="t"))
         with pytest.raises(InvalidSampleError, match="frame_steps: expected 0"):
