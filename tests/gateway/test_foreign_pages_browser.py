@@ -7,30 +7,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 
 from browsers import REBOUND, Browser
 from gateway_requests import Json
-from gateways import Gateway, poll, running
-from rfm_client.episodes import StepScore
-from rfm_rl import LiveView
+from gateways import Gateway, running
 from servers import Endpoints, folder_server
 from shown_datasets import copied
 
 pytestmark = pytest.mark.slow
 
-DATASETS, VIDEO, LIVE = "/viewer/datasets", "/viewer/datasets/0/episodes/0/videos/0", "/viewer/live"
-REPORT = '{"episodes": [], "frames": {}}'
+DATASETS, VIDEO = "/viewer/datasets", "/viewer/datasets/0/episodes/0/videos/0"
+READS = [DATASETS, VIDEO, "/metrics"]
 TRY = """
-const [base, paths, video, report, done] = arguments;
+const [base, paths, video, done] = arguments;
 const told = async (request) => {
   try {
     const response = await request;
     return response.type === "opaque" ? null : [response.status, await response.text()];
   } catch { return null; }
 };
-const post = (path, options) => told(fetch(base + path, { method: "POST", body: report, ...options }));
+const post = (options) => told(fetch(base + "/evaluate_batch", { method: "POST", body: "[]", ...options }));
 const shown = (element) => new Promise((resolve) => {
   element.onloadedmetadata = () => resolve(true);
   element.onerror = () => resolve(false);
@@ -39,22 +36,22 @@ const shown = (element) => new Promise((resolve) => {
 (async () => done({
   read: await Promise.all(paths.map((path) => told(fetch(base + path)))),
   shown: await shown(document.createElement("video")),
-  json: await post("/live/reports", { headers: { "Content-Type": "application/json" } }),
-  plain: await post("/live/reports", {}),
-  unread: await post("/live/reports", { mode: "no-cors" }),
-  scored: await post("/evaluate_batch", { mode: "no-cors" }),
+  json: await post({ headers: { "Content-Type": "application/json" } }),
+  plain: await post({}),
+  unread: await post({ mode: "no-cors" }),
 }))();
 """
+POSTS = ("json", "plain", "unread")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     folder = tmp_path_factory.mktemp("gateway")
     with running(Endpoints.free(), folder, "rfm", "--dataset", str(copied("toy_v30_many", folder))) as started:
         yield started
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def other_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """The port of another local server, which serves a page."""
     folder = tmp_path_factory.mktemp("other")
@@ -74,23 +71,19 @@ def loud_browser(browser: Browser) -> Iterator[Browser]:
 
 def tried(browser: Browser, base: str) -> Json:
     """Return the results of a script in the open page."""
-    return dict(browser.driver.execute_async_script(TRY, base, [DATASETS, VIDEO, LIVE, "/metrics"], VIDEO, REPORT))
+    return dict(browser.driver.execute_async_script(TRY, base, READS, VIDEO))
 
 
 def passed_on(gateway: Gateway) -> float:
     """Return the number of accepted requests."""
-    return gateway.metric("requests_total") - sum(
-        gateway.metric("requests_total", code=code) for code in ("403", "421")
-    )
+    refused = sum(gateway.metric("requests_total", code=code) for code in ("403", "421"))
+    return gateway.metric("requests_total") - refused
 
 
 def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
     gateway: Gateway, loud_browser: Browser, other_port: int
 ) -> None:
     browser = loud_browser
-    with LiveView(gateway.url) as view:
-        view.episode("stack the cups").add(np.zeros((8, 8, 3), np.uint8), StepScore(0.5, 0.25, False, 0, 3.0))
-    poll(lambda: bool(gateway.get(LIVE).json()["episodes"]))
     port, answered = int(gateway.url.rpartition(":")[2]), passed_on(gateway)
     asked: Json = {}
     for host in ("127.0.0.1", REBOUND):
@@ -100,18 +93,15 @@ def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
     browser.driver.get(f"http://{REBOUND}:{port}/")
     rebound = tried(browser, "")
     for found in asked.values():
-        assert found == dict.fromkeys(("json", "plain", "unread", "scored"), None) | {
-            "read": [None] * 4,
-            "shown": False,
-        }
+        assert found == dict.fromkeys(POSTS, None) | {"read": [None] * len(READS), "shown": False}
     assert rebound.pop("shown") is False
     answers = [*rebound.pop("read"), *rebound.values()]
-    assert [status for status, _ in answers] == [421] * 8
+    assert [status for status, _ in answers] == [421] * (len(READS) + len(POSTS))
     assert not [text for _, text in answers if "expected localhost or an IP address" not in text]
     assert passed_on(gateway) == answered + 3  # reads of the metrics
 
     browser.driver.get(f"{gateway.url}/")
     own = tried(browser, "")
-    assert [status for status, _ in own["read"]] == [200] * 4
+    assert [status for status, _ in own["read"]] == [200] * len(READS)
     assert own["shown"]
-    assert [own[name][0] for name in ("json", "plain", "unread", "scored")] == [204, 204, 204, 422]
+    assert [own[name][0] for name in POSTS] == [422] * len(POSTS)

@@ -64,14 +64,8 @@ BODIES: dict[str, tuple[bytes, list[Any], str]] = {
     "an object of samples": (b'{"a": %b, "b": 6}' % SAMPLE.encode(), ["b"], "expected an object, got 6"),
     "no steps": (b'{"samples": [5], "use_frame_steps": 2}', ["use_frame_steps"], f"{NO_STEPS}2"),
 }
-
-
-@pytest.mark.parametrize(("body", "path", "message"), BODIES.values(), ids=BODIES)
-def test_a_body_without_samples(gateway: TestClient, body: bytes, path: list[Any], message: str) -> None:
-    check_refused(gateway.post("/evaluate_batch", content=body), (path, message))
-
-
 VIDEO_AT = ["sample_0", "trajectory", "video_embeddings"]
+OF_VIDEO = ("sample_0", (None, json.dumps(progress({"video_embeddings": {"__numpy_file__": "video"}}))))
 HUGE = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000, 2)}"
 NO_NPY = r"expected a \.npy file, got: .*"
 FILES = {
@@ -86,16 +80,7 @@ FILES = {
     "a type of nothing": (npy_of(HUGE.replace("'<f4'", "()")), NO_NPY),
     "an endless header": (npy_of("-" * 20_000), NO_NPY),
 }
-
-
-@pytest.mark.parametrize(("file", "message"), FILES.values(), ids=FILES)
-def test_a_bad_npy_file(gateway: TestClient, file: bytes, message: str) -> None:
-    form = {"sample_0": json.dumps(progress({"video_embeddings": {"__numpy_file__": "video"}}))}
-    check_refused(gateway.post(NPY, data=form, files={"video": ("video.npy", file)}), (VIDEO_AT, message))
-
-
 ZERO = ("sample_0", (None, SAMPLE))
-MISSING = dumped(progress({**FIRST, "video_embeddings": {"__numpy_file__": "other"}}))
 TWICE, NO_FILE = "expected one part of this name, got several", "expected a form field, got a file"
 FORMS: dict[str, tuple[list[tuple[str, Any]], list[Any], str]] = {
     "no sample": ([("use_frame_steps", (None, "true"))], ["samples"], NO_SAMPLE),
@@ -104,25 +89,32 @@ FORMS: dict[str, tuple[list[tuple[str, Any]], list[Any], str]] = {
     "other steps": ([ZERO, ("use_frame_steps", (None, "yes"))], ["use_frame_steps"], f"{NO_STEPS}'yes'"),
     "no JSON": ([("sample_0", (None, "{"))], ["sample_0"], "expected JSON, got: .*"),
     "JSON in JSON": ([("sample_0", (None, '"{}"'))], ["sample_0"], "expected an object, got '{}'"),
-    "no part": ([("sample_0", (None, MISSING))], VIDEO_AT, r"expected a \.npy part named 'other', got none"),
+    "no part": ([OF_VIDEO], VIDEO_AT, r"expected a \.npy part named 'video', got none"),
     "one field twice": ([ZERO] * 2, ["sample_0"], TWICE),
     "one file twice": ([ZERO, *[("a", ("a.npy", b""))] * 2], ["a"], TWICE),
     "a sample as a file": ([("sample_0", ("sample_0", b"{}"))], ["sample_0"], NO_FILE),
     "steps as a file": ([ZERO, ("use_frame_steps", ("steps", b"true"))], ["use_frame_steps"], NO_FILE),
 }
+UNREAD: dict[str, tuple[dict[str, Any], list[Any], str]] = {
+    **{f"a body: {name}": ({"content": body}, *told) for name, (body, *told) in BODIES.items()},
+    **{
+        f"a file: {name}": ({"files": [OF_VIDEO, ("video", ("video.npy", file))]}, VIDEO_AT, told)
+        for name, (file, told) in FILES.items()
+    },
+    **{f"a form: {name}": ({"files": parts}, *told) for name, (parts, *told) in FORMS.items()},
+}
 
 
-@pytest.mark.parametrize(("parts", "path", "message"), FORMS.values(), ids=FORMS)
-def test_a_form_whose_parts_are_not_all_read(
-    gateway: TestClient, parts: list[tuple[str, Any]], path: list[Any], message: str
+@pytest.mark.parametrize(("sent", "path", "message"), UNREAD.values(), ids=UNREAD)
+def test_a_body_whose_samples_cannot_be_read(
+    gateway: TestClient, sent: dict[str, Any], path: list[Any], message: str
 ) -> None:
-    check_refused(gateway.post(NPY, files=parts), (path, message))
+    check_refused(gateway.post(NPY if "files" in sent else "/evaluate_batch", **sent), (path, message))
 
 
 NAMELESS = b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n"
 NO_FORM = "content-type: expected multipart/form-data with a boundary, got"
 NO_PARTS, NO_END = "body: expected multipart/form-data, got: ", "body: expected its last boundary"
-NO_CHARSET = "content-type: expected the charset utf-8, got "
 WHOLE = NAMED + SAMPLE.encode() + b"\r\n"
 UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
     "JSON": (415, f"{NO_FORM} application/json", "application/json", b"[]"),
@@ -131,7 +123,12 @@ UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
     "no multipart": (400, NO_PARTS, MULTIPART, b"hello"),
     "no name": (400, NO_PARTS, MULTIPART, NAMELESS),
     **{
-        f"charset {name}": (415, f"{NO_CHARSET}'{name}'", f"{MULTIPART}; charset={name}", WHOLE + b"--b--\r\n")
+        f"charset {name}": (
+            415,
+            f"content-type: expected the charset utf-8, got '{name}'",
+            f"{MULTIPART}; charset={name}",
+            WHOLE + b"--b--\r\n",
+        )
         for name in ("undefined", "unicode_escape", "idna", "rot13", "latin-1")
     },
     "nothing": (400, NO_END, MULTIPART, b""),
@@ -148,34 +145,29 @@ def test_a_body_that_is_no_multipart(
 
 
 @pytest.mark.parametrize("path", ["/evaluate_batch", NPY, "/viewer/score"])
-@pytest.mark.parametrize("content", [b" " * (2**20 + 1), [b" " * 2**19] * 3], ids=["announced", "in chunks"])
-def test_too_large_a_body_is_a_413(gateway: TestClient, path: str, content: Any) -> None:
-    body = content if isinstance(content, bytes) else iter(content if path == "/evaluate_batch" else [NAMED, *content])
-    response = gateway.post(path, content=body, headers={"Content-Type": MULTIPART})
+def test_too_large_or_compressed_a_body_is_refused(gateway: TestClient, path: str) -> None:
     remedy = "send less in one request, or start the gateway with --max-body-mib (rfm serve: --gateway-max-body-mib)"
-    assert failure(response, 413) == f"body: expected at most 1048576 bytes, got more; {remedy}"
+    headers = {"Content-Type": MULTIPART}
+    chunks = [b" " * 2**19] * 3
+    for body in (b" " * (2**20 + 1), iter(chunks if path == "/evaluate_batch" else [NAMED, *chunks])):
+        response = gateway.post(path, content=body, headers=headers)
+        assert failure(response, 413) == f"body: expected at most 1048576 bytes, got more; {remedy}"
+    response = gateway.post(
+        path, content=gzip.compress(SAMPLE.encode()), headers=headers | {"Content-Encoding": "gzip"}
+    )
+    expected = "content-encoding: expected none, since the gateway unpacks no body, got 'gzip'; send the body as it is"
+    assert failure(response, 415) == expected
 
 
-def test_too_many_parts_are_a_413(gateway: TestClient) -> None:
-    files = [("sample_0", (None, "{")), *((f"array_{number}", (f"{number}.npy", b"")) for number in range(2000))]
-    expected = "body: expected at most 2000 parts, fields and files together, got more"
-    assert failure(gateway.post(NPY, files=files), 413) == f"{expected}; send the samples in several requests"
-    assert gateway.post(NPY, files=files[:-1]).status_code == 422
-
-
-def test_json_is_smaller_than_other_bodies() -> None:
+def test_json_is_smaller_than_other_bodies_and_a_form_has_a_number_of_parts(gateway: TestClient) -> None:
     with inside() as client:
         response = client.post("/evaluate_batch", content=b" " * (32 * 2**20 + 1))
         remedy = "send arrays as .npy files, to /evaluate_batch_npy"
         assert failure(response, 413) == f"body: expected at most 33554432 bytes, got more; {remedy}"
-
-
-@pytest.mark.parametrize("path", ["/evaluate_batch", NPY])
-def test_a_compressed_body_is_a_415(gateway: TestClient, path: str) -> None:
-    headers = {"Content-Type": MULTIPART, "Content-Encoding": "gzip"}
-    response = gateway.post(path, content=gzip.compress(SAMPLE.encode()), headers=headers)
-    expected = "content-encoding: expected none, since the gateway unpacks no body, got 'gzip'; send the body as it is"
-    assert failure(response, 415) == expected
+    files = [("sample_0", (None, "{")), *((f"array_{number}", (f"{number}.npy", b"")) for number in range(2000))]
+    expected = "body: expected at most 2000 parts, fields and files together, got more"
+    assert failure(gateway.post(NPY, files=files), 413) == f"{expected}; send the samples in several requests"
+    assert gateway.post(NPY, files=files[:-1]).status_code == 422
 
 
 def test_unknown_paths_and_methods_are_answered_in_json(gateway: TestClient) -> None:

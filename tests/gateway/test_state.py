@@ -39,7 +39,7 @@ from gateway_requests import (
     preference,
     progress,
 )
-from gateways import WITHIN_S, Gateway, answers, free_port, poll, running
+from gateways import WITHIN_S, Gateway, answers, free_port, inside, poll
 from rfm_client import InvalidSampleError, ModelNotFoundError, Trajectory
 from rfm_client.serving import ServerStatus
 from servers import Endpoints
@@ -73,21 +73,21 @@ def test_gpu_status_counts_each_request_once(encoders: Gateway, tiny: Gateway, t
     assert 0 < stats["memory_used_bytes"] < stats["memory_total_bytes"]
 
 
-def test_scoring_is_healthy_without_triton_s_metrics(triton: Triton, tmp_path: Path) -> None:
+def test_scoring_is_healthy_without_triton_s_metrics(triton: Triton) -> None:
     nowhere = f"http://127.0.0.1:{free_port()}/metrics"
-    with running(triton.endpoints, tmp_path, TINY, "--metrics-url", nowhere) as gateway:
+    with inside(triton=triton.endpoints.grpc_url, model=TINY, metrics_url=nowhere) as gateway:
         healthy = {"status": "healthy", "available_gpus": None, "total_gpus": None}
-        assert requests.get(f"{gateway.url}/health").json() == healthy
-        assert requests.get(f"{gateway.url}/model_info").json()["num_gpus"] is None
-        assert "metrics" in failure(requests.get(f"{gateway.url}/gpu_status"), 503)
+        assert gateway.get("/health").json() == healthy
+        assert gateway.get("/model_info").json()["num_gpus"] is None
+        assert "metrics" in failure(gateway.get("/gpu_status"), 503)
 
 
-def test_a_server_that_hangs_is_unhealthy_with_the_reason(triton: Triton, strict: Gateway) -> None:
-    assert requests.get(f"{strict.url}/health").ok
+def test_a_server_that_hangs_is_unhealthy_with_the_reason(triton: Triton, tiny: Gateway) -> None:
+    assert tiny.get("/health").ok
     with paused(triton):  # the earlier state is reported for another second
-        poll(lambda: requests.get(f"{strict.url}/health").status_code == 503)
-        assert "no answer within" in failure(requests.get(f"{strict.url}/health"), 503)
-    poll(lambda: requests.get(f"{strict.url}/health").ok)
+        poll(lambda: tiny.get("/health").status_code == 503)
+        assert "no answer within" in failure(tiny.get("/health"), 503)
+    poll(lambda: tiny.get("/health").ok)
 
 
 def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: torch.nn.Module) -> None:
@@ -170,7 +170,8 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_si
         poll(lambda: process.poll() is not None or answers(url))
         assert process.poll() is None, log_file.read_text()
         gateway = Gateway(url, TINY, endpoints.grpc_url, process, log_file)
-        assert answered(ask_json(gateway, [progress(FIRST)])) == expected(gateway, [progress(FIRST)])
+        answer = expected(gateway, [progress(FIRST)])
+        assert answered(ask_json(gateway, [progress(FIRST)])) == answer
         assert requests.get(f"{url}/health").json()["status"] == "healthy"
         started = psutil.Process(process.pid).children(recursive=True)
         (own,) = (child for child in started if "rfm_gateway" in child.cmdline())
@@ -179,14 +180,14 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_si
         own.kill()
         poll(lambda: not answers(url))
         poll(lambda: answers(url))
-        assert answered(ask_json(gateway, [progress(FIRST)])) == expected(gateway, [progress(FIRST)])
+        assert answered(ask_json(gateway, [progress(FIRST)])) == answer
         running = psutil.Process(process.pid).children(recursive=True)
         started += running
         (stopped,) = (child for child in running if "rfm_gateway" in child.cmdline())
         stopped.suspend()
         poll(lambda: not stopped.is_running())
         poll(lambda: answers(url))
-        assert answered(ask_json(gateway, [progress(FIRST)])) == expected(gateway, [progress(FIRST)])
+        assert answered(ask_json(gateway, [progress(FIRST)])) == answer
         started += psutil.Process(process.pid).children(recursive=True)
         process.terminate()
         assert process.wait(WITHIN_S) == 0
