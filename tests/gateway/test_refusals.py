@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
+import schemathesis
+from hypothesis import HealthCheck, given, settings
 
 from gateway_requests import (
     BLACK,
@@ -290,6 +293,55 @@ OF_MODEL: dict[str, tuple[str, Json, str, str]] = {
 def test_a_sample_that_the_served_model_does_not_read(only: str, sample: Json, field: str, message: str) -> None:
     with inside(triton=StandIn(served=[only])) as client:
         check_refused(ask_json(client, [sample]), (["samples", 0, "trajectory", field], message))
+
+
+CAST = (np.random.default_rng(0).random((6, 32, 32, 3)) * 1.2).clip(0, 1).astype(np.uint8)  # as some clients cast
+BLANK = "black pictures, no value above 1 (multiply floats in 0..1 by 255 before they become uint8)"
+PADDING = "frames of zeros at the end (send the real frames alone, without padding)"
+
+
+def test_frames_that_show_nothing_are_scored_with_a_warning_or_refused(
+    ask: Ask, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole, blank, triton = filmed(1, 6), filmed(1, 6, frames=CAST), StandIn(served=["rfm_frames"])
+    padded = filmed(1, 6, frames=np.concatenate([whole["frames"][:4], np.zeros_like(whole["frames"][:2])]))
+    samples = [progress(whole), progress(padded), progress(blank)]
+    triton.is_open.set()
+    with inside(triton=triton) as client:
+        response = ask(client, samples)
+        assert response.status_code == 200
+        warning = f"samples 2: {BLANK}: their scores mean nothing; samples 1: {PADDING}: they are scored as pictures"
+        assert response.headers["X-RFM-Warning"] == warning
+        assert warning in caplog.messages
+        assert "X-RFM-Warning" not in ask(client, samples[:1]).headers
+    with inside(triton=triton, refuse_blank=True) as client:
+        response = ask(client, [*samples, preference(filmed(2, 2), blank)])
+        faults = {1: ("trajectory", PADDING), 2: ("trajectory", BLANK), 3: ("rejected_trajectory", BLANK)}
+        sent = as_parts if ask is ask_npy else list
+        refused = [
+            (sent(["samples", index, name, "frames"]), re.escape(f"expected pictures that show something, got {fault}"))
+            for index, (name, fault) in faults.items()
+        ]
+        check_refused(response, *refused)
+
+
+@pytest.mark.parametrize("path", ["/evaluate_batch", NPY])
+def test_no_request_that_the_schemas_allow_breaks_the_gateway(path: str) -> None:
+    triton = StandIn()
+    triton.is_open.set()
+    with inside(triton=triton) as client:
+        ((_, operation),) = schemathesis.openapi.from_asgi("/openapi.json", client.app)[path].items()
+
+        @settings(
+            max_examples=25, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None
+        )
+        @given(case=operation.as_strategy())
+        def check(case: schemathesis.Case) -> None:
+            response = case.call(session=client)
+            assert response.status_code < 500, response.text
+            response.json()
+
+        check()
 
 
 NO_TOKEN = r"expected text without the model's special tokens, got '<\|prog_token\|>'"
