@@ -3,52 +3,26 @@
 
 from __future__ import annotations
 
-import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from gateway_requests import filmed, progress
-from rfm_client import AsyncRewardClient, InferenceFailedError, ModelInfo
-from rfm_gateway import GatewayConfig
-from rfm_gateway.body import Batch
-from rfm_gateway.config import MIB
-from rfm_gateway.mounting import BodyLimits
-from rfm_gateway.schema import SAMPLES
-from rfm_gateway.scoring import Evaluator
-from rfm_gateway.state import TritonState
-from shelves import V2, Shelf
+from gateway_requests import answered, ask_json, failure, filmed, progress
+from gateways import StandIn, TestClient, inside
+from rfm_client import ModelInfo
+from shelves import V2
 
-NUM_FRAMES = 4
+SAMPLE = progress(filmed(1, 4, size_px=8))
 
 
-class Rollout(Shelf):
+class Rollout(StandIn):
     """A server in whose second version two frames share a value."""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         info = await super().model_info(model, timeout_s)
         return replace(info, frames_per_value=1 + (info.versions == (V2.version,)))
-
-
-def test_values_are_those_of_the_version_that_answers() -> None:
-    async def ask() -> None:
-        async with AsyncRewardClient("", transports=[Rollout(after=1)], retry=False) as client:
-            config = GatewayConfig(triton="grpc://127.0.0.1:1", metrics_url="http://127.0.0.1:1/metrics")
-            state = TritonState(client, config)
-            batch = Batch(
-                SAMPLES.validate_python([progress(filmed(1, NUM_FRAMES, size_px=8))], context={}),
-                [("samples", 0)],
-                False,
-            )
-            evaluator = Evaluator(client, BodyLimits(MIB, 60.0))
-            first, second = [(await evaluator.evaluate(batch, "request"))[0] for _ in range(2)]
-            assert first.outputs_progress is not None and second.outputs_progress is not None
-            np.testing.assert_allclose(first.outputs_progress.progress_pred, [[0.1] * NUM_FRAMES], rtol=1e-6)
-            np.testing.assert_allclose(second.outputs_progress.progress_pred, [[0.9] * (NUM_FRAMES // 2)], rtol=1e-6)
-            assert (await state.model_info()).model_version == V2.version
-
-    asyncio.run(ask())
 
 
 class Baseline(Rollout):
@@ -58,18 +32,25 @@ class Baseline(Rollout):
         return replace(await super().model_info(model, timeout_s), scores_whole_prefixes=True, max_batch_size=1)
 
 
-def test_prefixes_that_several_versions_scored_are_no_curve() -> None:
-    async def ask() -> None:
-        async with AsyncRewardClient("", transports=[Baseline(after=1)], retry=False) as client:
-            batch = Batch(
-                SAMPLES.validate_python([progress(filmed(1, NUM_FRAMES, size_px=8))], context={}),
-                [("samples", 0)],
-                True,
-            )
-            with pytest.raises(InferenceFailedError, match="model_version: expected one for all frames, got "):
-                await Evaluator(client, BodyLimits(MIB, 60.0)).evaluate(batch, "request")
-            answer, _ = await Evaluator(client, BodyLimits(MIB, 60.0)).evaluate(batch, "request")
-            assert answer.outputs_progress is not None
-            assert len(answer.outputs_progress.progress_pred[0]) == NUM_FRAMES
+@contextmanager
+def replaced_after_one_request(kind: type[StandIn]) -> Iterator[TestClient]:
+    triton = kind(after=1)
+    triton.is_open.set()
+    with inside(triton=triton, metrics_url="http://127.0.0.1:1/metrics") as client:
+        yield client
 
-    asyncio.run(ask())
+
+def test_values_are_those_of_the_version_that_answers() -> None:
+    with replaced_after_one_request(Rollout) as client:
+        first, second = (answered(ask_json(client, [SAMPLE]))["outputs_progress"] for _ in range(2))
+        np.testing.assert_allclose(first["progress_pred"], [[0.1] * 4], rtol=1e-6)
+        np.testing.assert_allclose(second["progress_pred"], [[0.9] * 2], rtol=1e-6)
+        assert client.get("/model_info").json()["model_version"] == V2.version
+
+
+def test_prefixes_that_several_versions_scored_are_no_curve() -> None:
+    with replaced_after_one_request(Baseline) as client:
+        message = failure(ask_json(client, [SAMPLE], use_frame_steps=True), 502)
+        assert message.startswith("model_version: expected one for all frames, got ")
+        (values,) = answered(ask_json(client, [SAMPLE], use_frame_steps=True))["outputs_progress"]["progress_pred"]
+        assert len(values) == 4

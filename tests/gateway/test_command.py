@@ -6,18 +6,23 @@ from __future__ import annotations
 import logging
 import os
 import re
+import resource
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+import uvicorn
 
-from gateways import inside, running
+from gateways import NO_TRITON, free_port, inside, running
 from in_process import rfm
 from rfm_client import ServerError
+from rfm_client.contract.descriptors import MOST
 from rfm_client.contract.process_log import LogLines
 from rfm_client.contract.triton import denied, not_served, unreachable
-from rfm_gateway import GatewayConfig
+from rfm_gateway import GatewayConfig, mounting
 from rfm_gateway.command import page_link
 from rfm_gateway.state import TritonState
 from servers import Endpoints
@@ -25,25 +30,43 @@ from servers import Endpoints
 KEY = "open sesame"
 
 
-@pytest.mark.parametrize("has_key", [True, False])
-def test_an_open_address_without_a_key_is_warned_of(tmp_path: Path, has_key: bool) -> None:
-    (tmp_path / "key.txt").write_text(f"{KEY}\n")
-    options = ("--host", "0.0.0.0", *(["--api-key-file", str(tmp_path / "key.txt")] if has_key else []))
-    with running(Endpoints.free(), tmp_path, "rfm", *options) as gateway:
-        assert gateway.get("/viewer/datasets", headers={"X-API-Key": KEY}).ok
-        assert gateway.get("/viewer/datasets").ok is not has_key
-        warning = "]: 0.0.0.0 is no loopback address, and no key is required"
-        assert (warning in gateway.log) is not has_key
-        assert f"look at rewards in the browser: {gateway.url}/\n" in gateway.log
+@contextmanager
+def few_descriptors(free: int) -> Iterator[None]:
+    """Leave this process and those it starts ``free`` descriptors."""
+    count = sum(1 for _ in Path("/proc/self/fd").iterdir()) + free
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (count, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def test_a_gateway_opens_all_the_files_that_it_may_and_needs_the_key_of_its_variable(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        with few_descriptors(256):
+            gateway = stack.enter_context(running(Endpoints.free(), tmp_path, RFM_GATEWAY_API_KEY=KEY))
+        soft, hard = resource.prlimit(gateway.process.pid, resource.RLIMIT_NOFILE)
+        assert soft == min(hard, MOST)
+        assert gateway.get("/metrics", headers={"X-API-Key": KEY}).ok
+        assert gateway.get("/metrics").status_code == 401
         assert KEY not in gateway.log
 
 
-def test_the_key_is_that_of_the_file_or_else_of_the_variable(tmp_path: Path) -> None:
+@pytest.mark.parametrize("has_key", [True, False])
+def test_an_open_address_without_a_key_is_warned_of(
+    tmp_path: Path, has_key: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / "key.txt").write_text(f"{KEY}\n")
-    environment = {"RFM_GATEWAY_API_KEY": "another"}
-    assert GatewayConfig(api_key_file=tmp_path / "key.txt").api_key(environment) == KEY
-    assert GatewayConfig().api_key(environment) == "another"
-    assert GatewayConfig().api_key({}) is None
+    options = ["--api-key-file", str(tmp_path / "key.txt")] if has_key else []
+    port = free_port()
+    monkeypatch.setattr(uvicorn, "run", lambda *_arguments, **_options: None)
+    with caplog.at_level(logging.INFO, "rfm_gateway"):
+        rfm("gateway", "--triton", NO_TRITON, "--host", "0.0.0.0", "--port", str(port), *options)
+    warning = "0.0.0.0 is no loopback address, and no key is required: every host that reaches it can use it"
+    assert (warning in caplog.messages) is not has_key
+    assert f"look at rewards in the browser: http://127.0.0.1:{port}/" in caplog.messages
+    assert KEY not in caplog.text
 
 
 NO_KEY = "'--api-key-file': expected a key, here or in RFM_GATEWAY_API_KEY, got no character"
@@ -113,8 +136,7 @@ def test_a_fault_of_triton_tells_a_caller_who_can_mend_it_and_no_option_of_the_c
     monkeypatch.setattr(TritonState, "model_info", failing)
     with inside() as client:
         detail = client.get("/model_info").json()["detail"]
-    fault = str(error).removesuffix(error.remedy)
-    assert detail.startswith(f"{fault}whoever runs the gateway ")
+    assert detail.startswith(f"{error.fault}: whoever runs the gateway ")
     assert remedy in detail
     assert error.remedy not in detail
 
@@ -138,3 +160,38 @@ def test_every_line_about_a_failed_request_names_it(monkeypatch: pytest.MonkeyPa
         log.removeHandler(handler)
     assert lines[-1].endswith(": RuntimeError: made up")
     assert all(re.search(r" ERROR rfm-gateway\[\d+\] request=a/caller-s: ", line) for line in lines)
+
+
+GATEWAY, INSTALL = ("gateway", "--triton", NO_TRITON), "pip install ./client ./apps/gateway ./apps/page"
+
+
+@pytest.fixture
+def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No page is installed beside the gateway."""
+    monkeypatch.setattr(mounting, "entry_points", lambda group: ())
+
+
+@pytest.mark.usefixtures("no_page")
+def test_without_a_page_the_gateway_serves_its_endpoints_alone() -> None:
+    with inside() as gateway:
+        assert gateway.post("/evaluate_batch", json=[]).status_code == 422
+        for path in ("/metrics", "/docs", "/openapi.json"):
+            assert gateway.get(path).status_code == 200
+        for path in ("/", "/viewer/main.js", "/viewer/served", "/viewer/datasets"):
+            assert gateway.get(path).status_code == 404
+
+
+@pytest.mark.usefixtures("no_page")
+def test_the_log_says_that_there_is_no_page_if_one_is_wanted(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(uvicorn, "run", lambda *_arguments, **_options: None)
+    message = f"no page in the browser, since the package rfm-page is not installed: {INSTALL}"
+    with caplog.at_level(logging.INFO, "rfm_gateway"):
+        assert rfm(*GATEWAY, "--port", str(free_port()), "--no-viewer").exit_code == 0
+        assert message not in caplog.messages
+        assert rfm(*GATEWAY, "--port", str(free_port())).exit_code == 0
+        assert message in caplog.messages
+    result = rfm(*GATEWAY, "--dataset", "demonstrations", env={"COLUMNS": "300"})
+    assert result.exit_code == 2
+    assert f"'--dataset': expected the package rfm-page, which shows it, got none: {INSTALL}" in result.output

@@ -4,28 +4,17 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 
 import goldens
 from field_clients import CHECKPOINT, CLIENTS, EVALUATIONS, REPORTS, FieldRequest, Scores
 from gateway_requests import (
     FRAME_STEPS,
-    Ask,
     answered,
-    as_parts,
     ask_json,
-    ask_npy,
-    check_refused,
     expected,
-    filmed,
-    numbers,
-    of_frames,
-    preference,
-    progress,
 )
 from gateways import Gateway, running
 from paths import ROOT
@@ -46,9 +35,9 @@ def gateway(served: Served, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 
 @pytest.fixture(scope="module")
 def changed(served: Served, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
-    """A gateway that scores by prefixes unless a request says otherwise, and refuses frames that show nothing."""
-    options = ("--use-frame-steps", "--refuse-blank", "--no-viewer")
-    with running(served.endpoints, tmp_path_factory.mktemp("changed"), CHECKPOINT, *options) as started:
+    """A gateway that scores by prefixes unless a request says otherwise."""
+    folder = tmp_path_factory.mktemp("changed")
+    with running(served.endpoints, folder, CHECKPOINT, "--use-frame-steps", "--no-viewer") as started:
         yield started
 
 
@@ -96,42 +85,6 @@ def test_a_request_that_does_not_say_is_scored_by_prefixes_where_the_gateway_has
     assert scores.difference(steps) <= TOLERANCE
     scores = Scores.of(json.loads(saying_false.sent(changed.url)[2]))
     assert scores.difference(saying_false.original) <= PROBABILITY
-
-
-FLOATS = (np.random.default_rng(0).random((6, 32, 32, 3)) * 1.2).clip(0, 1)
-CAST = FLOATS.astype(np.uint8)  # 0, and 1 where a float is 1, as some clients cast before they send
-TOLD = "black pictures, no value above 1 (multiply floats in 0..1 by 255 before they become uint8)"
-
-
-def test_floats_that_became_uint8_are_scored_with_a_warning_in_a_header_and_the_log(gateway: Gateway) -> None:
-    assert set(np.unique(CAST)) == {0, 1}
-    response = ask_json(gateway, [of_frames(CAST)])
-    assert answered(response) == numbers(expected(gateway, [of_frames(CAST)]))
-    warning = f"samples 0: {TOLD}: their scores mean nothing"
-    assert response.headers["X-RFM-Warning"] == warning
-    assert re.search(
-        rf" WARNING .* request=\S+: {re.escape(warning)}", gateway.log
-    )  # of this request or one just before
-
-
-def test_frames_that_show_nothing_are_refused_where_the_gateway_is_told_so(changed: Gateway, ask: Ask) -> None:
-    blank = filmed(1, 6) | {"frames": CAST}
-    response = ask(changed, [progress(filmed(1, 6)), preference(filmed(2, 2), blank), progress(blank)])
-    told = f"expected pictures that show something, got {TOLD}"
-    paths = (["samples", 1, "rejected_trajectory", "frames"], ["samples", 2, "trajectory", "frames"])
-    sent = as_parts if ask is ask_npy else list
-    check_refused(response, *((sent(path), re.escape(told)) for path in paths))
-
-
-def test_zeros_that_pad_a_clip_are_scored_with_a_warning_or_refused(gateway: Gateway, changed: Gateway) -> None:
-    whole = filmed(1, 6)
-    padded = whole | {"frames": np.concatenate([whole["frames"][:4], np.zeros_like(whole["frames"][:2])])}
-    response = ask_json(gateway, [progress(whole), progress(padded), of_frames(CAST)])
-    told = "frames of zeros at the end (send the real frames alone, without padding)"
-    warning = f"samples 2: {TOLD}: their scores mean nothing; samples 1: {told}: they are scored as pictures"
-    assert response.headers["X-RFM-Warning"] == warning
-    refusal = re.escape(f"expected pictures that show something, got {told}")
-    check_refused(ask_json(changed, [progress(padded)]), (["samples", 0, "trajectory", "frames"], refusal))
 
 
 def test_the_guide_names_each_project_whose_requests_are_sent_and_the_longest_that_it_waits() -> None:

@@ -18,16 +18,16 @@ from shown_datasets import copied
 pytestmark = pytest.mark.slow
 
 DATASETS, VIDEO = "/viewer/datasets", "/viewer/datasets/0/episodes/0/videos/0"
-PAIR = "{}"
+READS = [DATASETS, VIDEO, "/metrics"]
 TRY = """
-const [base, paths, video, pair, done] = arguments;
+const [base, paths, video, done] = arguments;
 const told = async (request) => {
   try {
     const response = await request;
     return response.type === "opaque" ? null : [response.status, await response.text()];
   } catch { return null; }
 };
-const post = (path, options) => told(fetch(base + path, { method: "POST", body: pair, ...options }));
+const post = (options) => told(fetch(base + "/evaluate_batch", { method: "POST", body: "[]", ...options }));
 const shown = (element) => new Promise((resolve) => {
   element.onloadedmetadata = () => resolve(true);
   element.onerror = () => resolve(false);
@@ -36,22 +36,22 @@ const shown = (element) => new Promise((resolve) => {
 (async () => done({
   read: await Promise.all(paths.map((path) => told(fetch(base + path)))),
   shown: await shown(document.createElement("video")),
-  json: await post("/viewer/compare", { headers: { "Content-Type": "application/json" } }),
-  plain: await post("/viewer/compare", {}),
-  unread: await post("/viewer/compare", { mode: "no-cors" }),
-  scored: await post("/evaluate_batch", { mode: "no-cors" }),
+  json: await post({ headers: { "Content-Type": "application/json" } }),
+  plain: await post({}),
+  unread: await post({ mode: "no-cors" }),
 }))();
 """
+POSTS = ("json", "plain", "unread")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     folder = tmp_path_factory.mktemp("gateway")
     with running(Endpoints.free(), folder, "rfm", "--dataset", str(copied("toy_v30_many", folder))) as started:
         yield started
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def other_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """The port of another local server, which serves a page."""
     folder = tmp_path_factory.mktemp("other")
@@ -71,14 +71,13 @@ def loud_browser(browser: Browser) -> Iterator[Browser]:
 
 def tried(browser: Browser, base: str) -> Json:
     """Return the results of a script in the open page."""
-    return dict(browser.driver.execute_async_script(TRY, base, [DATASETS, VIDEO, "/metrics"], VIDEO, PAIR))
+    return dict(browser.driver.execute_async_script(TRY, base, READS, VIDEO))
 
 
 def passed_on(gateway: Gateway) -> float:
     """Return the number of accepted requests."""
-    return gateway.metric("requests_total") - sum(
-        gateway.metric("requests_total", code=code) for code in ("403", "421")
-    )
+    refused = sum(gateway.metric("requests_total", code=code) for code in ("403", "421"))
+    return gateway.metric("requests_total") - refused
 
 
 def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
@@ -94,18 +93,15 @@ def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
     browser.driver.get(f"http://{REBOUND}:{port}/")
     rebound = tried(browser, "")
     for found in asked.values():
-        assert found == dict.fromkeys(("json", "plain", "unread", "scored"), None) | {
-            "read": [None] * 3,
-            "shown": False,
-        }
+        assert found == dict.fromkeys(POSTS, None) | {"read": [None] * len(READS), "shown": False}
     assert rebound.pop("shown") is False
     answers = [*rebound.pop("read"), *rebound.values()]
-    assert [status for status, _ in answers] == [421] * 7
+    assert [status for status, _ in answers] == [421] * (len(READS) + len(POSTS))
     assert not [text for _, text in answers if "expected localhost or an IP address" not in text]
     assert passed_on(gateway) == answered + 3  # reads of the metrics
 
     browser.driver.get(f"{gateway.url}/")
     own = tried(browser, "")
-    assert [status for status, _ in own["read"]] == [200] * 3
+    assert [status for status, _ in own["read"]] == [200] * len(READS)
     assert own["shown"]
-    assert [own[name][0] for name in ("json", "plain", "unread", "scored")] == [422] * 4
+    assert [own[name][0] for name in POSTS] == [422] * len(POSTS)

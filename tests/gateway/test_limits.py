@@ -3,45 +3,28 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import pytest
-import requests
 
-import rfm_export
 from gateway_requests import (
     FIRST,
     MULTIPART,
     NAMED,
     NO_KEY,
-    SECOND,
-    TINY,
-    TINY_CONFIG,
     answered,
     ask_json,
     begun,
     dumped,
-    expected,
     failure,
-    numbers,
     post_body,
-    preference,
     progress,
 )
-from gateways import Address, StandIn, inside, listening, metric_at, poll, running
-from rfm.config import ExportConfig
-from rfm.rewind.checkpoint import RewindCheckpoint
-from rfm.rewind.network import RewindTransformer
-from rfm_client import AsyncRewardClient, ServerUnavailableError
-from rfm_gateway import GatewayConfig
-from rfm_gateway.state import STALL_S, TritonState
-from servers import start_triton
+from gateways import Address, StandIn, inside, listening, poll
 
 KEY = "open sesame"
 SCORED = {"outputs_progress": {"progress_pred": [[pytest.approx(0.1)] * 3]}}  # of FIRST, by the stand-in
@@ -85,6 +68,18 @@ def test_a_caller_who_leaves_in_the_middle_of_a_body_is_a_400(strict: Address) -
     for path, half in HALVES.items():
         begun(strict, *half, path=path).close()
         poll(lambda path=path: strict.metric("requests_total", endpoint=path, code="400") >= 1)  # type: ignore[misc]
+
+
+def test_a_caller_who_hangs_up_cancels_the_call_of_triton() -> None:
+    triton = StandIn(served=["rfm"])
+    with listening(triton) as gateway:
+        leaving = [post_body(gateway, progress(FIRST)) for _ in range(3)]
+        poll(lambda: gateway.metric("requests_in_flight") == len(leaving))
+        for caller in leaving:
+            caller.close()
+        poll(lambda: gateway.metric("requests_total", code="499") == len(leaving))
+        assert triton.num_cancelled == len(leaving)
+        assert gateway.metric("requests_in_flight") == 0
 
 
 def test_more_evaluations_than_allowed_are_a_503_and_no_score_in_time_is_a_504(
@@ -167,83 +162,3 @@ def test_a_program_that_names_no_host_is_answered(strict: Address) -> None:
     with strict.dial() as caller:
         caller.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
         assert caller.makefile("rb").readline().split()[1] == b"200"
-
-
-CLOSED_GATE = """
-
-_load = TritonPythonModel.load
-
-
-def load(self, version, device, settings):
-    _load(self, version, device, settings)
-    score = self.engine.predictor.score
-
-    def gated(rows, batch, execution):
-        import time
-
-        while Path({gate!r}).exists():
-            Path({gate!r} + ".at_work").touch()
-            time.sleep(0.01)
-        return score(rows, batch, execution)
-
-    self.engine.predictor.score = gated
-
-
-TritonPythonModel.load = load
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.triton
-def test_while_a_model_works_health_is_told_and_callers_who_hang_up_cost_no_forward(
-    tiny_network: RewindTransformer, tmp_path: Path
-) -> None:
-    """The preference is asked last: once it is counted, so is whatever was scored before it."""
-    repository, checkpoint, gate = tmp_path / "model_repository", tmp_path / "two_wide", tmp_path / "gate"
-    RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
-    rfm_export.export(checkpoint, repository, ExportConfig(name=TINY, num_gpus=0, torch_threads=1))
-    model = repository / TINY / "1" / "model.py"
-    model.write_text(model.read_text() + CLOSED_GATE.format(gate=str(gate)))
-    samples, now_s = [progress(FIRST), preference(FIRST, SECOND)], [0.0]
-
-    async def ask_health() -> None:
-        async with AsyncRewardClient(endpoints.grpc_url) as client:
-            config = GatewayConfig(triton=endpoints.grpc_url, metrics_url=endpoints.metrics_url)
-            state = TritonState(client, config, clock_s=lambda: now_s[0])
-            assert (await state.health()).status == "healthy"
-            now_s[0] += STALL_S
-            await state.health()
-
-    def metric(name: str, **labels: str) -> float:
-        return metric_at(endpoints.metrics_url, name, **labels)
-
-    def scored(sample_type: str) -> float:
-        return metric("rfm_samples_total", outcome="scored", sample_type=sample_type)
-
-    with start_triton(repository) as server, running(server.endpoints, tmp_path) as gateway:
-        endpoints = server.endpoints
-        answers = [expected(gateway, [sample]) for sample in samples]
-        poll(lambda: scored("preference") == 1)
-        progress_before = scored("progress")
-        gate.touch()
-        first = post_body(gateway, samples[0])
-        poll(gate.with_name("gate.at_work").exists)
-        leaving = [post_body(gateway, samples[0]) for _ in range(12)]
-        poll(lambda: metric("nv_inference_pending_request_count") == len(leaving))
-        for caller in leaving:
-            caller.close()
-        poll(lambda: gateway.metric("requests_total", code="499") == len(leaving))
-        last = post_body(gateway, samples[1])
-        poll(lambda: metric("nv_inference_pending_request_count") >= 1)
-        health = {"status": "healthy", "available_gpus": 0, "total_gpus": 1}
-        assert answered(requests.get(f"{gateway.url}/health")) == health
-        hangs = r"rfm: no answer within 1\.5 s, and nothing finished for 30 s"
-        with pytest.raises(ServerUnavailableError, match=hangs):
-            asyncio.run(ask_health())
-        gate.unlink()
-        for caller, answer in zip((first, last), answers, strict=True):
-            assert json.loads(caller.getresponse().read()) == numbers(answer)
-            caller.close()
-        poll(lambda: scored("preference") == 2)
-        assert scored("progress") == progress_before + 1
-        assert gateway.metric("requests_in_flight") == 0

@@ -12,14 +12,7 @@ import pytest
 
 from gateway_requests import FIRST, SECOND, TINY, Json, Triton, dumped, filmed, preference, progress
 from gateways import inside, poll
-from rfm_client import (
-    PreferenceSample,
-    ProgressSample,
-    RewardClient,
-    RewardError,
-    Sample,
-    Trajectory,
-)
+from rfm_client import PreferenceSample, ProgressSample, RewardClient, RewardError, Sample, Trajectory
 from rfm_gateway.schema import TrajectoryInput
 from servers import Endpoints
 
@@ -49,25 +42,20 @@ REFUSED: dict[str, tuple[list[Json], int]] = {
     "at a field": ([progress(FIRST), progress({**FIRST, "text_embedding": [[1.0]]})], 422),
     "by the model": ([progress(TOO_LONG), progress(FIRST), preference(TOO_LONG, SECOND)], 422),
     "by the model, alone": ([progress(TOO_LONG)], 422),
+    "by no Triton": ([progress(FIRST)], 503),
 }
 
 
 @pytest.mark.parametrize(("samples", "code"), REFUSED.values(), ids=REFUSED)
 def test_a_refused_request_is_freed_at_once(triton: Triton, samples: list[Json], code: int) -> None:
     body = dumped(samples)
-    with inside(triton=triton.endpoints.grpc_url, model=TINY) as client:
+    url = triton.endpoints.grpc_url if code == 422 else Endpoints.free().grpc_url
+    with inside(triton=url, model=TINY) as client:
         client.post("/evaluate_batch", content=dumped([progress(FIRST)]))
         with without_collector() as before:
             for _ in range(3):
                 assert client.post("/evaluate_batch", content=body).status_code == code
             poll(lambda: held() == before)
-
-
-def test_a_request_that_no_triton_answers_is_freed_at_once() -> None:
-    with inside() as client, without_collector() as before:
-        for _ in range(3):
-            assert client.post("/evaluate_batch", content=dumped([progress(FIRST)])).status_code == 503
-        poll(lambda: held() == before)
 
 
 def questions() -> list[Sample]:
@@ -91,17 +79,16 @@ CALLS: dict[str, Callable[[RewardClient], object]] = {
 }
 
 
-@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
 @pytest.mark.parametrize("is_there", [True, False], ids=["refused", "no Triton"])
-def test_an_error_of_the_client_is_freed_with_its_arrays(
-    triton: Triton, call: Callable[[RewardClient], object], is_there: bool
-) -> None:
+def test_an_error_of_the_client_is_freed_with_its_arrays(triton: Triton, is_there: bool) -> None:
     url = triton.endpoints.grpc_url if is_there else Endpoints.free().grpc_url
-    with RewardClient(url, model=TINY, retry=False, timeout_s=30) as client, without_collector() as before:
-        for _ in range(3):
-            with pytest.raises(RewardError):
-                call(client)
-        poll(lambda: held() == before)
+    with RewardClient(url, model=TINY, retry=False, timeout_s=30) as client:
+        for call in CALLS.values():
+            with without_collector() as before:
+                for _ in range(3):
+                    with pytest.raises(RewardError):
+                        call(client)
+                poll(lambda before=before: held() == before)  # type: ignore[misc]
 
 
 def test_errors_that_are_returned_keep_no_arrays(triton: Triton) -> None:

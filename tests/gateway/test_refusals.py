@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
+import schemathesis
+from hypothesis import HealthCheck, given, settings
 
 from gateway_requests import (
     BLACK,
@@ -64,14 +67,8 @@ BODIES: dict[str, tuple[bytes, list[Any], str]] = {
     "an object of samples": (b'{"a": %b, "b": 6}' % SAMPLE.encode(), ["b"], "expected an object, got 6"),
     "no steps": (b'{"samples": [5], "use_frame_steps": 2}', ["use_frame_steps"], f"{NO_STEPS}2"),
 }
-
-
-@pytest.mark.parametrize(("body", "path", "message"), BODIES.values(), ids=BODIES)
-def test_a_body_without_samples(gateway: TestClient, body: bytes, path: list[Any], message: str) -> None:
-    check_refused(gateway.post("/evaluate_batch", content=body), (path, message))
-
-
 VIDEO_AT = ["sample_0", "trajectory", "video_embeddings"]
+OF_VIDEO = ("sample_0", (None, json.dumps(progress({"video_embeddings": {"__numpy_file__": "video"}}))))
 HUGE = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000, 2)}"
 NO_NPY = r"expected a \.npy file, got: .*"
 FILES = {
@@ -86,16 +83,7 @@ FILES = {
     "a type of nothing": (npy_of(HUGE.replace("'<f4'", "()")), NO_NPY),
     "an endless header": (npy_of("-" * 20_000), NO_NPY),
 }
-
-
-@pytest.mark.parametrize(("file", "message"), FILES.values(), ids=FILES)
-def test_a_bad_npy_file(gateway: TestClient, file: bytes, message: str) -> None:
-    form = {"sample_0": json.dumps(progress({"video_embeddings": {"__numpy_file__": "video"}}))}
-    check_refused(gateway.post(NPY, data=form, files={"video": ("video.npy", file)}), (VIDEO_AT, message))
-
-
 ZERO = ("sample_0", (None, SAMPLE))
-MISSING = dumped(progress({**FIRST, "video_embeddings": {"__numpy_file__": "other"}}))
 TWICE, NO_FILE = "expected one part of this name, got several", "expected a form field, got a file"
 FORMS: dict[str, tuple[list[tuple[str, Any]], list[Any], str]] = {
     "no sample": ([("use_frame_steps", (None, "true"))], ["samples"], NO_SAMPLE),
@@ -104,25 +92,32 @@ FORMS: dict[str, tuple[list[tuple[str, Any]], list[Any], str]] = {
     "other steps": ([ZERO, ("use_frame_steps", (None, "yes"))], ["use_frame_steps"], f"{NO_STEPS}'yes'"),
     "no JSON": ([("sample_0", (None, "{"))], ["sample_0"], "expected JSON, got: .*"),
     "JSON in JSON": ([("sample_0", (None, '"{}"'))], ["sample_0"], "expected an object, got '{}'"),
-    "no part": ([("sample_0", (None, MISSING))], VIDEO_AT, r"expected a \.npy part named 'other', got none"),
+    "no part": ([OF_VIDEO], VIDEO_AT, r"expected a \.npy part named 'video', got none"),
     "one field twice": ([ZERO] * 2, ["sample_0"], TWICE),
     "one file twice": ([ZERO, *[("a", ("a.npy", b""))] * 2], ["a"], TWICE),
     "a sample as a file": ([("sample_0", ("sample_0", b"{}"))], ["sample_0"], NO_FILE),
     "steps as a file": ([ZERO, ("use_frame_steps", ("steps", b"true"))], ["use_frame_steps"], NO_FILE),
 }
+UNREAD: dict[str, tuple[dict[str, Any], list[Any], str]] = {
+    **{f"a body: {name}": ({"content": body}, *told) for name, (body, *told) in BODIES.items()},
+    **{
+        f"a file: {name}": ({"files": [OF_VIDEO, ("video", ("video.npy", file))]}, VIDEO_AT, told)
+        for name, (file, told) in FILES.items()
+    },
+    **{f"a form: {name}": ({"files": parts}, *told) for name, (parts, *told) in FORMS.items()},
+}
 
 
-@pytest.mark.parametrize(("parts", "path", "message"), FORMS.values(), ids=FORMS)
-def test_a_form_whose_parts_are_not_all_read(
-    gateway: TestClient, parts: list[tuple[str, Any]], path: list[Any], message: str
+@pytest.mark.parametrize(("sent", "path", "message"), UNREAD.values(), ids=UNREAD)
+def test_a_body_whose_samples_cannot_be_read(
+    gateway: TestClient, sent: dict[str, Any], path: list[Any], message: str
 ) -> None:
-    check_refused(gateway.post(NPY, files=parts), (path, message))
+    check_refused(gateway.post(NPY if "files" in sent else "/evaluate_batch", **sent), (path, message))
 
 
 NAMELESS = b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n"
 NO_FORM = "content-type: expected multipart/form-data with a boundary, got"
 NO_PARTS, NO_END = "body: expected multipart/form-data, got: ", "body: expected its last boundary"
-NO_CHARSET = "content-type: expected the charset utf-8, got "
 WHOLE = NAMED + SAMPLE.encode() + b"\r\n"
 UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
     "JSON": (415, f"{NO_FORM} application/json", "application/json", b"[]"),
@@ -131,7 +126,12 @@ UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
     "no multipart": (400, NO_PARTS, MULTIPART, b"hello"),
     "no name": (400, NO_PARTS, MULTIPART, NAMELESS),
     **{
-        f"charset {name}": (415, f"{NO_CHARSET}'{name}'", f"{MULTIPART}; charset={name}", WHOLE + b"--b--\r\n")
+        f"charset {name}": (
+            415,
+            f"content-type: expected the charset utf-8, got '{name}'",
+            f"{MULTIPART}; charset={name}",
+            WHOLE + b"--b--\r\n",
+        )
         for name in ("undefined", "unicode_escape", "idna", "rot13", "latin-1")
     },
     "nothing": (400, NO_END, MULTIPART, b""),
@@ -148,34 +148,29 @@ def test_a_body_that_is_no_multipart(
 
 
 @pytest.mark.parametrize("path", ["/evaluate_batch", NPY, "/viewer/score"])
-@pytest.mark.parametrize("content", [b" " * (2**20 + 1), [b" " * 2**19] * 3], ids=["announced", "in chunks"])
-def test_too_large_a_body_is_a_413(gateway: TestClient, path: str, content: Any) -> None:
-    body = content if isinstance(content, bytes) else iter(content if path == "/evaluate_batch" else [NAMED, *content])
-    response = gateway.post(path, content=body, headers={"Content-Type": MULTIPART})
+def test_too_large_or_compressed_a_body_is_refused(gateway: TestClient, path: str) -> None:
     remedy = "send less in one request, or start the gateway with --max-body-mib (rfm serve: --gateway-max-body-mib)"
-    assert failure(response, 413) == f"body: expected at most 1048576 bytes, got more; {remedy}"
+    headers = {"Content-Type": MULTIPART}
+    chunks = [b" " * 2**19] * 3
+    for body in (b" " * (2**20 + 1), iter(chunks if path == "/evaluate_batch" else [NAMED, *chunks])):
+        response = gateway.post(path, content=body, headers=headers)
+        assert failure(response, 413) == f"body: expected at most 1048576 bytes, got more; {remedy}"
+    response = gateway.post(
+        path, content=gzip.compress(SAMPLE.encode()), headers=headers | {"Content-Encoding": "gzip"}
+    )
+    expected = "content-encoding: expected none, since the gateway unpacks no body, got 'gzip'; send the body as it is"
+    assert failure(response, 415) == expected
 
 
-def test_too_many_parts_are_a_413(gateway: TestClient) -> None:
-    files = [("sample_0", (None, "{")), *((f"array_{number}", (f"{number}.npy", b"")) for number in range(2000))]
-    expected = "body: expected at most 2000 parts, fields and files together, got more"
-    assert failure(gateway.post(NPY, files=files), 413) == f"{expected}; send the samples in several requests"
-    assert gateway.post(NPY, files=files[:-1]).status_code == 422
-
-
-def test_json_is_smaller_than_other_bodies() -> None:
+def test_json_is_smaller_than_other_bodies_and_a_form_has_a_number_of_parts(gateway: TestClient) -> None:
     with inside() as client:
         response = client.post("/evaluate_batch", content=b" " * (32 * 2**20 + 1))
         remedy = "send arrays as .npy files, to /evaluate_batch_npy"
         assert failure(response, 413) == f"body: expected at most 33554432 bytes, got more; {remedy}"
-
-
-@pytest.mark.parametrize("path", ["/evaluate_batch", NPY])
-def test_a_compressed_body_is_a_415(gateway: TestClient, path: str) -> None:
-    headers = {"Content-Type": MULTIPART, "Content-Encoding": "gzip"}
-    response = gateway.post(path, content=gzip.compress(SAMPLE.encode()), headers=headers)
-    expected = "content-encoding: expected none, since the gateway unpacks no body, got 'gzip'; send the body as it is"
-    assert failure(response, 415) == expected
+    files = [("sample_0", (None, "{")), *((f"array_{number}", (f"{number}.npy", b"")) for number in range(2000))]
+    expected = "body: expected at most 2000 parts, fields and files together, got more"
+    assert failure(gateway.post(NPY, files=files), 413) == f"{expected}; send the samples in several requests"
+    assert gateway.post(NPY, files=files[:-1]).status_code == 422
 
 
 def test_unknown_paths_and_methods_are_answered_in_json(gateway: TestClient) -> None:
@@ -298,6 +293,55 @@ OF_MODEL: dict[str, tuple[str, Json, str, str]] = {
 def test_a_sample_that_the_served_model_does_not_read(only: str, sample: Json, field: str, message: str) -> None:
     with inside(triton=StandIn(served=[only])) as client:
         check_refused(ask_json(client, [sample]), (["samples", 0, "trajectory", field], message))
+
+
+CAST = (np.random.default_rng(0).random((6, 32, 32, 3)) * 1.2).clip(0, 1).astype(np.uint8)  # as some clients cast
+BLANK = "black pictures, no value above 1 (multiply floats in 0..1 by 255 before they become uint8)"
+PADDING = "frames of zeros at the end (send the real frames alone, without padding)"
+
+
+def test_frames_that_show_nothing_are_scored_with_a_warning_or_refused(
+    ask: Ask, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole, blank, triton = filmed(1, 6), filmed(1, 6, frames=CAST), StandIn(served=["rfm_frames"])
+    padded = filmed(1, 6, frames=np.concatenate([whole["frames"][:4], np.zeros_like(whole["frames"][:2])]))
+    samples = [progress(whole), progress(padded), progress(blank)]
+    triton.is_open.set()
+    with inside(triton=triton) as client:
+        response = ask(client, samples)
+        assert response.status_code == 200
+        warning = f"samples 2: {BLANK}: their scores mean nothing; samples 1: {PADDING}: they are scored as pictures"
+        assert response.headers["X-RFM-Warning"] == warning
+        assert warning in caplog.messages
+        assert "X-RFM-Warning" not in ask(client, samples[:1]).headers
+    with inside(triton=triton, refuse_blank=True) as client:
+        response = ask(client, [*samples, preference(filmed(2, 2), blank)])
+        faults = {1: ("trajectory", PADDING), 2: ("trajectory", BLANK), 3: ("rejected_trajectory", BLANK)}
+        sent = as_parts if ask is ask_npy else list
+        refused = [
+            (sent(["samples", index, name, "frames"]), re.escape(f"expected pictures that show something, got {fault}"))
+            for index, (name, fault) in faults.items()
+        ]
+        check_refused(response, *refused)
+
+
+@pytest.mark.parametrize("path", ["/evaluate_batch", NPY])
+def test_no_request_that_the_schemas_allow_breaks_the_gateway(path: str) -> None:
+    triton = StandIn()
+    triton.is_open.set()
+    with inside(triton=triton) as client:
+        ((_, operation),) = schemathesis.openapi.from_asgi("/openapi.json", client.app)[path].items()
+
+        @settings(
+            max_examples=25, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None
+        )
+        @given(case=operation.as_strategy())
+        def check(case: schemathesis.Case) -> None:
+            response = case.call(session=client)
+            assert response.status_code < 500, response.text
+            response.json()
+
+        check()
 
 
 NO_TOKEN = r"expected text without the model's special tokens, got '<\|prog_token\|>'"

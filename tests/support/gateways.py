@@ -131,6 +131,7 @@ class StandIn(Shelf):
     served: Collection[str] = ("rfm", "rfm_encoder", "rfm_frames")
     dims: tuple[int, int] = (2, 2)  # widths D and Dt
     is_open: threading.Event = field(default_factory=threading.Event)
+    num_cancelled: int = 0
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         if model not in self.served:
@@ -139,8 +140,12 @@ class StandIn(Shelf):
         return info if info.video_dim is None else replace(info, video_dim=self.dims[0], text_dim=self.dims[1])
 
     async def infer(self, *arguments: Any, **options: Any) -> Answer:
-        while not self.is_open.is_set():
-            await asyncio.sleep(0.01)
+        try:
+            while not self.is_open.is_set():
+                await asyncio.sleep(0.01)
+        except asyncio.CancelledError:
+            self.num_cancelled += 1
+            raise
         return await super().infer(*arguments, **options)
 
 

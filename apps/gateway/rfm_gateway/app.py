@@ -45,7 +45,7 @@ from rfm_gateway.observe import (
 )
 from rfm_gateway.refusals import Refusals, asked
 from rfm_gateway.scoring import Evaluator
-from rfm_gateway.state import TritonState, told
+from rfm_gateway.state import TritonState, message_of
 
 _REFERENCE = "#/components/schemas/{model}"
 _MODELS = (schema.EvaluateBatchRequest, schema.InvalidRequest, schema.Failure)
@@ -220,7 +220,7 @@ def _handlers(refusals: Refusals) -> dict[Any, Any]:
 
     async def failed(request: Request, error: RewardError) -> JSONResponse:
         code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
-        return refusals.answer(request.scope, code, told(error), RETRY_AFTER if code == 503 else None)
+        return refusals.answer(request.scope, code, message_of(error), RETRY_AFTER if code == 503 else None)
 
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
         logger.error("500 %s: unexpected", asked(request.scope), exc_info=error)

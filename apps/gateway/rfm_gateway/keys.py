@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import base64
 import secrets
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Annotated
 
 from fastapi import Depends, HTTPException
@@ -27,11 +27,11 @@ _EXPECTED = (
 _CHALLENGE = "Bearer"  # not Basic, for which a browser would ask its user for a password
 
 
-def key_check(key: str) -> Callable[..., None]:
+def key_check(key: str) -> Callable[..., Awaitable[None]]:
     """Return a dependency that refuses requests without the key."""
     expected = key.encode()
 
-    def check(
+    async def check(  # not in a thread, as FastAPI would run a plain function
         in_header: Annotated[str | None, Depends(_HEADER)],
         in_bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)],
         in_basic: Annotated[HTTPAuthorizationCredentials | None, Depends(_BASIC)],

@@ -38,11 +38,13 @@ _REMEDIES = {  # for callers over HTTP, who have no option of the client
 }
 
 
-def told(error: RewardError) -> str:
+def message_of(error: RewardError) -> str:
     """Return an error's message, with a remedy for callers over HTTP instead of one for users of the client."""
     if not isinstance(error, ServerError) or not error.remedy:
         return str(error)
-    return str(error).replace(error.remedy, _REMEDIES[type(error)])
+    for_callers = type(error)(f"{error.fault}: {_REMEDIES[type(error)]}")
+    for_callers.request_id = error.request_id
+    return str(for_callers)
 
 
 class TritonState:
@@ -128,7 +130,7 @@ class TritonState:
         try:
             stall = await within(HEALTH_TIMEOUT_S, self._stall())
         except RewardError as error:
-            return told(error)
+            return message_of(error)
         if stall is not None:
             return stall
         devices = await self._devices(ends_s - time.monotonic())

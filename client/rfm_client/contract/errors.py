@@ -118,10 +118,10 @@ class ClientClosedError(RewardError, RuntimeError):
 class ServerError(RewardError):
     """A failure of the server or of the connection to it; the sample may be valid.
 
-    remedy: end of the message, for users of this library; empty: none
+    fault, remedy: parts of a message with a remedy for users of this library; empty: there is none
     """
 
-    remedy = ""
+    fault = remedy = ""
 
 
 class ServerUnavailableError(ServerError):

@@ -217,5 +217,6 @@ def not_served(model: str, message: str, served: Collection[str]) -> errors.Mode
 
 def _with_remedy(kind: type[_ServerError], fault: str, remedy: str) -> _ServerError:
     error = kind(f"{fault}: {remedy}" if remedy else fault)
-    error.remedy = remedy
+    if remedy:
+        error.fault, error.remedy = fault, remedy
     return error
