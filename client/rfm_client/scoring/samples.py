@@ -32,6 +32,7 @@ Outcome: TypeAlias = Result | RewardError
 
 logger = logging.getLogger("rfm_client")
 
+_PROBED_FRAMES = 8
 _EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
 
 
@@ -106,7 +107,8 @@ class SampleScorer:
 
     def tell_of_blank(self, frames: Sequence[UInt8Array] | UInt8Array) -> None:
         """Log a line about the first video that shows nothing. Its scores mean nothing."""
-        if self._checks_blank and len(frames) > 1 and all(map(is_blank, frames)):
+        few = frames[:: max(len(frames) // _PROBED_FRAMES, 1)]  # of a video that is black at first, not all are read
+        if self._checks_blank and len(frames) > 1 and all(map(is_blank, few)) and all(map(is_blank, frames)):
             self._checks_blank = False
             expected = "frames: expected pictures that show something, got %d frames: %s (logged once)"
             logger.warning(expected, len(frames), BlankFrames(frames).told)
