@@ -133,6 +133,17 @@ def test_a_future_keeps_its_client_and_its_arrays(engines: EngineServer) -> None
     assert engines.client().submit(ProgressSample(random_trajectory(0, 2))).result().last_progress > 0
 
 
+def test_a_client_that_is_not_closed_does_not_keep_the_interpreter(engines: EngineServer) -> None:
+    code = f"""
+from rfm_client import RewardClient
+client = RewardClient({engines.url!r}, model="c1_t1_disc10")
+client.wait_ready(60)  # in a worker thread, too
+assert not RewardClient("http://127.0.0.1:1").is_ready()
+"""
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("url", ["localhost:8001", "grpc://localhost", "grpc://", "", "ftp://b:2", "grpc://a:70000"])
 def test_a_wrong_url_is_refused_when_the_client_is_made(url: str) -> None:
     with pytest.raises(ValueError, match="url") as raised:

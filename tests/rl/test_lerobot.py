@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import copy
-import logging
 import pickle
 import sys
 from pathlib import Path
@@ -203,15 +202,6 @@ def test_an_answer_without_a_clear_score_is_an_error() -> None:
         InferenceFailedError, match=r"^sample 3 of the batch: the model's written answer states no single"
     ):
         check_clear(result, 1, "sample 3 of the batch")
-
-
-def test_black_pictures_log_one_warning(recorder: Recorder, caplog: pytest.LogCaptureFixture) -> None:
-    model = RfmRewardModel(RfmRewardConfig(sampling="all"), client=recorder)
-    with caplog.at_level(logging.WARNING, "rfm_client"):
-        for _ in range(2):
-            model.compute_reward({KEY: PIXELS // 255, "task": TASK})  # floats that someone cast to uint8
-    (record,) = caplog.records
-    assert record.getMessage().startswith(f"{KEY} of sample 0 of the batch: ")
 
 
 def test_a_copy_of_a_model_asks_with_a_client_of_its_own(served: Served) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,11 +16,8 @@ from torch import Tensor
 from lerobot_reward_rfm.batches import padding_of, trajectories_of
 from lerobot_reward_rfm.configuration_rfm import OUTPUTS, RfmRewardConfig
 from lerobot_reward_rfm.prefixes import newest_scores, scores_of_all_frames
-from rfm_client import Float32Array, RewardClient, Trajectory
-from rfm_client.frames import BlankFrames
+from rfm_client import Float32Array, RewardClient
 from rfm_client.options import require
-
-logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True)
@@ -55,7 +51,6 @@ class RfmRewardModel(PreTrainedRewardModel):
         super().__init__(config)
         self._given = client
         self._made: RewardClient | None = None
-        self._has_told = False
 
     @property
     def client(self) -> RewardClient:
@@ -87,7 +82,8 @@ class RfmRewardModel(PreTrainedRewardModel):
         It is the reward of the Gymnasium wrappers and of labels for the same frames. Raises RewardError, never a
         number instead; ValueError for a ``reward_output`` that the checkpoint does not predict.
         """
-        newest, output = newest_scores(self.client, self._trajectories(batch), self.config), self.config.reward_output
+        newest = newest_scores(self.client, trajectories_of(batch, self.config), self.config)
+        output = self.config.reward_output
         columns = {name: [each.arrays.get(name, [np.nan])[0] for each in newest] for name in OUTPUTS}
         predicted = [name for name, scores in columns.items() if not np.isnan(scores).any()]
         got = f"{output}, which the checkpoint does not predict"
@@ -102,26 +98,13 @@ class RfmRewardModel(PreTrainedRewardModel):
 
         The server scores B times T samples. Raises RewardError.
         """
-        trajectories = self._trajectories(batch)
+        trajectories = trajectories_of(batch, self.config)
         results = scores_of_all_frames(self.client, trajectories, self.config)
         pads = padding_of(batch, self.config.image_key)
         progress = spread([result.progress for result in results], pads)
         success = spread([result.success for result in results], pads)
         knows = not np.isnan(success).any()
         return RfmPrediction(self._tensor(batch, progress), self._tensor(batch, success) if knows else None)
-
-    def tell_blank(self, trajectory: Trajectory, where: str) -> None:
-        """Log a warning, once, for frames that are black or of one colour: the scores mean nothing."""
-        told = "" if self._has_told or trajectory.frames is None else BlankFrames(trajectory.frames).told
-        if told:
-            self._has_told = True
-            logger.warning("%s of %s: %s", self.config.image_key, where, told)
-
-    def _trajectories(self, batch: Mapping[str, Any]) -> list[Trajectory]:
-        trajectories = trajectories_of(batch, self.config)
-        for index, trajectory in enumerate(trajectories):
-            self.tell_blank(trajectory, f"sample {index} of the batch")
-        return trajectories
 
     def _tensor(self, batch: Mapping[str, Any], values: Sequence[float] | npt.NDArray[Any]) -> Tensor:
         device = getattr(batch[self.config.image_key], "device", None)

@@ -63,7 +63,6 @@ class RfmFrameScorer:
         first = next(steps_of(dataset, episode_index))
         task = config.default_task if config.default_task and is_blank(first.get("task")) else ""
         trajectory = as_trajectory(steps_of(dataset, episode_index), task=task, camera=config.camera)
-        self.model.tell_blank(trajectory, f"episode {episode_index}")
         return as_configured(trajectory, config)
 
 

@@ -32,6 +32,7 @@ Outcome: TypeAlias = Result | RewardError
 
 logger = logging.getLogger("rfm_client")
 
+_PROBED_FRAMES = 8
 _EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
 
 
@@ -104,9 +105,10 @@ class SampleScorer:
         expected = "trajectory: expected at most %d frames, as in the training of %s, got %d: %s (logged once)"
         logger.warning(expected, limit, info.source or info.name, num_frames, remedy)
 
-    def tell_of_blank(self, frames: Sequence[UInt8Array]) -> None:
+    def tell_of_blank(self, frames: Sequence[UInt8Array] | UInt8Array) -> None:
         """Log a line about the first video that shows nothing. Its scores mean nothing."""
-        if self._checks_blank and len(frames) > 1 and all(map(is_blank, frames)):
+        few = frames[:: max(len(frames) // _PROBED_FRAMES, 1)]  # of a video that is black at first, not all are read
+        if self._checks_blank and len(frames) > 1 and all(map(is_blank, few)) and all(map(is_blank, frames)):
             self._checks_blank = False
             expected = "frames: expected pictures that show something, got %d frames: %s (logged once)"
             logger.warning(expected, len(frames), BlankFrames(frames).told)
@@ -135,7 +137,8 @@ class SampleScorer:
         """The sample as the call sends it. Raises RewardError."""
         fit = whole(sample)
         for trajectory in fit.sample.trajectories if self._checks_blank else ():
-            self.tell_of_blank(() if trajectory.frames is None else trajectory.frames)
+            if trajectory.frames is not None:
+                self.tell_of_blank(trajectory.frames)
         if not (call.subsample or call.resize):
             return fit
         call.deadline.remaining_s()
