@@ -18,6 +18,5 @@ FEATURE_CACHE_PARAMETER = "feature_cache_mib"  # 0: no cache
 PYTHON_PARAMETERS = (THREADS_PARAMETER, BUDGET_PARAMETER, SAMPLE_TOKENS_PARAMETER, DTYPE_PARAMETER, FAMILY_PARAMETER)
 GRAPHS_PARAMETER = "cuda_graphs"  # present only if it is on
 
-INSIDE_VARIABLE = "RFM_REQUESTS_INSIDE"  # beginning of the path where a process notes the requests inside it
 HANG_VARIABLE = "RFM_HANG_S"  # seconds without progress of a batch after which the process ends
 DEFAULT_HANG_S = 120

@@ -7,11 +7,9 @@ import fcntl
 import os
 import secrets
 import shutil
-from contextlib import suppress
 from pathlib import Path
 
 from rfm.launch.installation import ServerStartError
-from rfm.launch.model_processes import has_ended
 
 SHARED_MEMORY = Path("/dev/shm")
 # Beginning of the names of the Python backend's regions. Newer Tritons let no client map a region with this name.
@@ -33,7 +31,6 @@ class Claim:
         name = f"{os.getpid()}_{secrets.token_hex(4)}"
         self.region_prefix = f"{REGION_PREFIX}_{name}_"
         self.backends = SHARED_MEMORY / f"{self.region_prefix}backends"
-        self.requests = self.backends / "requests_"  # and the id of a model process: its notes
         self._lock = SHARED_MEMORY / f"{self.region_prefix}{_LOCK}"
         new_lock = SHARED_MEMORY / f"rfm-new-{name}"
         try:
@@ -45,15 +42,6 @@ class Claim:
             raise ServerStartError.at(
                 error.filename, "room for a server's files", error.strerror, NEEDS_ROOM
             ) from error
-
-    def requests_inside(self) -> list[str]:
-        """Return the requests that model processes which have ended had noted; if none has ended, those of all."""
-        inside: dict[bool, list[str]] = {True: [], False: []}  # by whether the process has ended
-        for file in self.backends.glob(f"{self.requests.name}*"):
-            with suppress(FileNotFoundError):  # its process has unloaded the model meanwhile
-                noted = file.read_text(errors="replace").partition("\0\0")[0]
-                inside[has_ended(int(file.name.rpartition("_")[2]))] += filter(None, noted.split("\0"))
-        return inside[True] or inside[False]
 
     def release(self) -> None:
         """Remove the regions, the folder and the lock."""

@@ -30,7 +30,7 @@ from rfm.launch.repository_api import INDEX_PATH, versions_of
 from rfm.launch.repository_check import check_models
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm.launch.triton_options import check_arguments, size_limits
-from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE, INSIDE_VARIABLE
+from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE
 
 POLL_S = 0.1
 LOAD_S = 1800.0
@@ -128,10 +128,6 @@ class TritonServer:
         if self._group is not None:
             self._group.process.send_signal(number)
 
-    def requests_inside(self) -> list[str]:
-        """Return the ids of requests inside model processes that have ended; if none has, inside all."""
-        return [] if self._claim is None else self._claim.requests_inside()
-
     def kill(self) -> None:
         """Kill the process and its children."""
         assert self._group is not None  # started
@@ -220,7 +216,7 @@ class TritonServer:
         try:
             self._group = ProcessGroup(
                 [program, *arguments],
-                env=self._environment(self._claim),
+                env=self._environment(),
                 stdout=self._log,
                 stderr=self._log,
                 pass_fds=[self._claim.lock_file],
@@ -292,9 +288,9 @@ class TritonServer:
             *restrictions(self.admin_key),
         ]
 
-    def _environment(self, claim: Claim) -> dict[str, str]:
+    def _environment(self) -> dict[str, str]:
         own = {name: value for name, value in os.environ.items() if not SECRET.fullmatch(name)}
-        of_models = {HANG_VARIABLE: str(self._hang_s), INSIDE_VARIABLE: str(claim.requests)}
+        of_models = {HANG_VARIABLE: str(self._hang_s)}
         return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE, **of_models}
 
 

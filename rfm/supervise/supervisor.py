@@ -19,7 +19,6 @@ from rfm.launch.installation import ServerStartError
 from rfm.launch.triton_server import POLL_S, Config, SpoiltStartError, TritonServer
 from rfm.supervise.status import Status, StatusServer
 from rfm.supervise.watch import TRITON, TritonWatch, parts_of
-from rfm_client.contract.process_log import about
 
 GATEWAY = "gateway"
 STEADY_S = 60.0  # after a longer run, a process is not in a crash loop
@@ -240,9 +239,6 @@ class Supervisor:
         counts: False: the fault is not part of a crash loop
         """
         began_s = time.monotonic()
-        if inside := self._server.requests_inside():
-            with about(inside):
-                logger.warning("%s: these requests were inside when it failed", what)
         while not self._is_to_stop.is_set():
             self._close_watch()
             reason = why if what == TRITON else f"{what}: {why}"

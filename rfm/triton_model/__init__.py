@@ -4,6 +4,5 @@
 ``batch_model`` is the base of every model.py. It decodes and prepares each ``request``, answers a batch together, and
 encodes each answer. A ``pipeline`` serves models whose frames take long to prepare. ``placement`` sets device and
 threads. ``watchdog`` ends a hung or broken process. ``metrics`` and ``request_log`` report outcomes.
-``requests_inside`` notes requests for the case that the process dies. ``weights`` checks the weights before they are
-loaded.
+``weights`` checks the weights before they are loaded.
 """

@@ -17,14 +17,13 @@ import torch
 
 from rfm.engine.computation import is_by_this_torch
 from rfm.engine.execution import Execution
-from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, INSIDE_VARIABLE
+from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE
 from rfm.probe_request import probe_request
 from rfm.triton_model import request_log
 from rfm.triton_model.metrics import InstanceMetrics
 from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.placement import Placement
 from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Request
-from rfm.triton_model.requests_inside import RequestsInside
 from rfm.triton_model.shared_memory import close_to_other_users
 from rfm.triton_model.watchdog import Watchdog
 from rfm.triton_model.weights import check_digest
@@ -69,7 +68,6 @@ class BatchModel(Generic[Question, Answer]):
         self._watchdog = Watchdog(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), self._is_working)
         check_digest(version, description.weights_digest)
         placement.run(lambda: self.load(version, placement.device, settings))
-        self._inside = RequestsInside(os.environ.get(INSIDE_VARIABLE, ""))
         model = {"model": args["model_name"], "version": args["model_version"]}
         labels = {**model, "device": str(placement.device), "instance": args["model_instance_name"]}
         sample_types = _sample_types([spec["name"] for spec in config["input"]])
@@ -97,7 +95,6 @@ class BatchModel(Generic[Question, Answer]):
             self._pipeline.close()
         self._metrics.close()
         self._watchdog.close()
-        self._inside.close()
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         """Load the weights in the folder ``version`` onto ``device``."""
@@ -133,7 +130,6 @@ class BatchModel(Generic[Question, Answer]):
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
         """Take requests from Triton. Return their responses; None: the pipeline sends them later."""
         batch: list[Request[Question]] = [Request.of(inference) for inference in requests]
-        self._inside.add(batch)
         pipeline = self._pipeline
         if pipeline is None:
             return self._responses(batch, self._score)
@@ -159,7 +155,6 @@ class BatchModel(Generic[Question, Answer]):
             responses = [self._response(request) for request in batch]
         finally:
             self._is_executing = False
-            self._inside.remove(batch)
         self._count(scored)
         return responses
 
@@ -239,7 +234,6 @@ class BatchModel(Generic[Question, Answer]):
         batch = [request for part, _ in scored for request in part]
         for request in batch:
             request.send(self._response(request))
-        self._inside.remove(batch)
         self._count(scored)
 
     def _response(self, request: Request[Question]) -> Any:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -20,18 +21,28 @@ from rfm_client.contract import wire
 from rfm_export import ExportError
 from rfm_export.layout import Version, generated_models
 from rfm_export.pbtxt import render
-from rfm_export.source import read_for_export, saturating_samples, with_batch_size
+from rfm_export.source import Source, read_for_export, read_source, saturating_samples, with_batch_size
 from vlm import BFLOAT16, load
 
 EMBEDDINGS, FRAMES, VLM = (goldens.config(name) for name in ("c1_t1_disc10", "enc_c1_t1_disc10", "q3_tok_disc10"))
 CACHE = "feature_cache_mib"
 
 
+def ignore(line: str) -> None:
+    pass
+
+
+@functools.cache
+def source(name: str) -> Source:
+    config = goldens.config(name)
+    return read_source(config.checkpoint, serve_config(config), None, ignore)
+
+
 def models(config: goldens.Config, **changes: Any) -> dict[str, pb.ModelConfig]:
     """The configurations of an export, as Triton parses them."""
-    settings = replace(serve_config(config), **changes)
-    read = read_for_export(config.checkpoint, settings, None, "cpu", lambda _: None, other_machine=True)
-    version = Version(1, read.settings, read.num_gpus, read.family.name)
+    read = source(config.name)
+    settings = with_batch_size(replace(serve_config(config), **changes), read.checkpoint, ignore)
+    version = Version(1, settings, settings.num_gpus or 0, read.family.name)
     made = generated_models(read.description, read.of_encoders, version)
     return {each.name: text_format.Parse(render(each.config), pb.ModelConfig()) for each in made}
 
@@ -129,10 +140,14 @@ def test_a_configuration_names_graphs_only_if_they_are_on() -> None:
         assert (
             "cuda_graphs" in models(VLM, num_gpus=1, cuda_graphs=cuda_graphs)["rfm_frames"].parameters
         ) is cuda_graphs
-    with pytest.raises(ExportError, match="cuda_graphs: expected an export for GPUs, got one for the CPU"):
-        models(VLM, cuda_graphs=True)
-    with pytest.raises(ExportError, match=r"cuda_graphs: expected an RFM, .*leave out --cuda-graphs$"):
-        models(EMBEDDINGS, cuda_graphs=True)
+    refused = {
+        VLM: "cuda_graphs: expected an export for GPUs, got one for the CPU",
+        EMBEDDINGS: r"cuda_graphs: expected an RFM, .*leave out --cuda-graphs$",
+    }
+    for config, message in refused.items():
+        settings = replace(serve_config(config), cuda_graphs=True)
+        with pytest.raises(ExportError, match=message):
+            read_for_export(config.checkpoint, settings, None, None, ignore, other_machine=True)
 
 
 # The batch that saturates a GPU, from the work of a typical sample.

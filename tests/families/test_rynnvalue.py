@@ -224,17 +224,9 @@ def copied(tmp_path: Path) -> Path:
 
 
 REFUSED: dict[str, tuple[Path, dict[str, Any], str]] = {
-    "needed": (
-        CAUSAL,
-        {},
-        "expected robot_description, camera_description or both, .* got neither; for example --robot",
-    ),
+    "needed": (CAUSAL, {}, "expected robot_description, camera_description or both, .* got neither; for example --"),
     "unused": (NO_META, said(USUAL), "--robot-description: expected a RynnValue whose prompt names robot and camera"),
-    "special": (
-        CAUSAL,
-        said((None, "the <value> camera")),
-        "camera_description: expected text without the model's spec",
-    ),
+    "special": (CAUSAL, said((None, "a <value>")), "camera_description: expected text without the model's special"),
 }
 
 

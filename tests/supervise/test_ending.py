@@ -7,13 +7,11 @@ import os
 import subprocess
 import sys
 from contextlib import suppress
-from pathlib import Path
 
 import psutil
 import pytest
 
 from commands import is_alive
-from rfm.launch import cleanup
 from rfm.launch.ending import ProcessGroup, how_it_ended
 from servers import PATIENCE_S, children, wait_for
 
@@ -69,16 +67,3 @@ def test_a_process_that_cannot_start_leaves_no_sentinel() -> None:
 
 def test_a_signal_is_called_by_its_name() -> None:
     assert [how_it_ended(status) for status in (-9, 1)] == ["killed by SIGKILL", "exit status 1"]
-
-
-def test_notes_of_requests_in_dead_processes_come_first_and_empty_notes_hide_none() -> None:
-    claim = cleanup.Claim()
-    try:
-        for pid, notes in {os.getpid(): b"alive\0too\0\0left over", 2**22 + 1: b"\0\0"}.items():  # the second never ran
-            Path(f"{claim.requests}{pid}").write_bytes(notes)
-        assert claim.requests_inside() == ["alive", "too"]
-        Path(f"{claim.requests}{2**22 + 2}").write_bytes(b"dead\0\0")
-        assert claim.requests_inside() == ["dead"]
-        assert claim.requests.parent.stat().st_mode & 0o077 == 0  # only the owner can write notes
-    finally:
-        claim.release()
