@@ -5,15 +5,14 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 
 from client_commands import invoke
+from hdf5_writers import write_robomimic
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, command
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 from rfm_labels.datasets.cameras import word_of_no_colours
@@ -38,22 +37,14 @@ def lines_of(source: Path, output: Path, **options: Any) -> list[str]:
     return [line for line in notes.lines if "pictures" in line]
 
 
-def hdf5(file: Path, cameras: Sequence[dict[str, Any]]) -> Path:
-    with h5py.File(file, "w") as opened:
-        for index, of_demo in enumerate(cameras):
-            for camera, frames in of_demo.items():
-                opened[f"data/demo_{index}/obs/{camera}"] = frames
-    return file
-
-
 def of_hdf5(folder: Path) -> Path:
     shown = [{"front": noise(), "video": black() if index in (0, 2) else noise()} for index in range(3)]
-    return hdf5(folder / "demos.hdf5", shown)
+    return write_robomimic(folder / "demos.hdf5", shown, None)
 
 
 def test_many_episodes_are_abbreviated(tmp_path: Path) -> None:
     shown = [{"front": noise(3) if index % 2 else black(3)} for index in range(40)]
-    (told,) = lines_of(hdf5(tmp_path / "demos.hdf5", shown), tmp_path / "labels")
+    (told,) = lines_of(write_robomimic(tmp_path / "demos.hdf5", shown, None), tmp_path / "labels")
     assert "in 20 of 40 episodes (0,2,4,6,8,10,12,14,16,18,20,22,...): " in told
 
 
@@ -78,7 +69,7 @@ COLOURS = ("deep_camera", "segway", "masked_rgb", "overflow", "abnormal")
 
 def test_words_in_names_tell_cameras_without_colours(tmp_path: Path) -> None:
     assert [camera for camera in (*NO_COLOURS, *COLOURS) if word_of_no_colours(camera)] == list(NO_COLOURS)
-    file, notes = hdf5(tmp_path / "demos.hdf5", [{"front": noise(), "depth_head": noise()}]), Notes()
+    file, notes = write_robomimic(tmp_path / "demos.hdf5", [{"front": noise(), "depth_head": noise()}], None), Notes()
     dataset = open_dataset(file, task=TASK)
     report = label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path / "labels", frames=2), notes)
     assert report.plan.recipe.cameras == ("front",)

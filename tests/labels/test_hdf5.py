@@ -19,6 +19,7 @@ from PIL import Image
 from pyarrow import parquet
 
 from client_commands import invoke
+from hdf5_writers import write_robomimic
 from labelling import BrightnessScorer, Notes, brightness
 from paths import ROOT
 from rfm_client import FrameSize, InvalidSampleError, ProgressResult, ProgressSample, RewardError, UInt8Array
@@ -440,15 +441,8 @@ NUM_FRAMES = 5
 @pytest.fixture
 def three(tmp_path: Path) -> Path:
     """Three demonstrations as robomimic writes them."""
-    file = tmp_path / "three.hdf5"
-    with h5py.File(file, "w") as opened:
-        for index in range(3):
-            demo = opened.create_group(f"data/demo_{index}")
-            demo.attrs["num_samples"] = NUM_FRAMES
-            demo["actions"] = np.zeros((NUM_FRAMES, 7))
-            demo["obs/front"] = np.random.default_rng(index).integers(0, 256, (NUM_FRAMES, 16, 16, 3), np.uint8)
-        opened["data"].attrs["env_args"] = json.dumps({"env_name": "Lift", "lang": TASK_OF_THREE})
-    return file
+    shown = [np.random.default_rng(index).integers(0, 256, (NUM_FRAMES, 16, 16, 3), np.uint8) for index in range(3)]
+    return write_robomimic(tmp_path / "demos.hdf5", [{"front": frames} for frames in shown], TASK_OF_THREE)
 
 
 def changed(file: Path, change: Callable[[Any], object]) -> Path:
