@@ -107,8 +107,8 @@ def test_a_model_that_works_is_healthy_until_it_finishes_nothing_for_long(triton
                 await state.health()
             status = await config.status(WITHIN_S)
             waiting = replace(status, models=[replace(model, requests_pending=1) for model in status.models])
-            told = state._gpu_status(waiting)
-            assert (told.available_gpus, told.total_gpus, told.gpu_stats["0"].status) == (0, 1, "processing")
+            answer = state._gpu_status(waiting)
+            assert (answer.available_gpus, answer.total_gpus, answer.gpu_stats["0"].status) == (0, 1, "processing")
 
     asyncio.run(ask())
 
