@@ -144,7 +144,7 @@ def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> N
         del weights[HEAD]
 
 
-def dtype_of(config: Mapping[str, Any], file: Path) -> tuple[str, tuple[Assumption, ...]]:
+def dtype_of(config: Mapping[str, Any], file: Path) -> tuple[Dtype, tuple[Assumption, ...]]:
     """Return the number type of the network, and the type as an assumption if config.json states none.
 
     Raises CheckpointError.

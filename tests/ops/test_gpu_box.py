@@ -140,8 +140,8 @@ def test_nginx_passes_on_what_scoring_needs_with_a_key_and_nothing_else(nginx: s
             with http(**shown) as caller:
                 for path in ("repository/models/rfm/unload", "systemsharedmemory/region/a/register", "../v2/logging"):
                     assert caller.post(f"/v2/{path}", json={}).status_code == 403
-            origin = {"host": "gpu-box.lan:8443", "origin": "https://gpu-box.lan:8443", "X-API-Key": bob}
-            with http(**origin) as page:
+            origin = {"host": "gpu-box.lan:8443", "origin": "https://gpu-box.lan:8443", "Sec-Fetch-Site": "same-origin"}
+            with http(**origin, **{"X-API-Key": bob}) as page:
                 assert page.post("/evaluate_batch", content=b"").status_code == 422  # like a wrong body
     log = (papers / "access.log").read_text()
     assert '"alice" "POST /inference.GRPCInferenceService/ModelInfer' in log

@@ -90,7 +90,9 @@ def scraping(prometheus: str, folder: Path, targets: dict[str, str]) -> Iterator
 
     def get(path: str, **parameters: str) -> Any:
         with suppress(httpx.TransportError):  # it does not listen yet
-            return httpx.get(f"http://127.0.0.1:{port}/api/v1/{path}", params=parameters).json()["data"]
+            answer = httpx.get(f"http://127.0.0.1:{port}/api/v1/{path}", params=parameters)
+            if answer.status_code != 503:  # it starts
+                return answer.json()["data"]
         return {"result": []}
 
     with (folder / "log").open("wb") as log:

@@ -107,17 +107,6 @@ def test_a_link_shows_a_colleague_the_same_episode_and_settings(page: Page) -> N
     page.has(link)
 
 
-def test_tasks_and_settings_are_in_the_address_and_come_back_with_it(page: Page) -> None:
-    browser = page.browser
-    browser.write("tasks", "stack the cups\npour & stir")
-    browser.all("#question summary")[0].click()
-    browser.write("fps", "5")
-    page.has("#task=stack+the+cups&task=pour+%26+stir")
-    browser.driver.refresh()
-    browser.until("document.getElementById('tasks').value")
-    assert browser["tasks"].get_attribute("value") == "stack the cups\npour & stir"
-
-
 @pytest.mark.parametrize(
     ("dead", "title"),
     [

@@ -144,30 +144,3 @@ def test_nothing_to_show_says_what_to_do(browser: Browser, tmp_path: Path) -> No
         browser.all("#episodes button")[0].click()
         check("episode-errors", "No videos", "-dataset my_dataset")
         without_violations(browser)
-
-
-def test_a_wrong_key_is_told_from_none(browser: Browser, tmp_path: Path) -> None:
-    with running(NOWHERE, tmp_path, RFM_GATEWAY_API_KEY="open sesame") as gateway:
-        browser.driver.get(gateway.url)
-        browser.until("!document.getElementById('key-form').hidden")
-        assert browser["key-wrong"].text == ""
-        assert not browser["question"].is_displayed()
-        without_violations(browser)
-        browser.write("key", "sesame")
-        browser.all("#key-form button")[0].click()
-        browser.until_text("key-wrong", "This is not the key. Type it again.")
-        browser.write("key", "open sesame")
-        browser.all("#key-form button")[0].click()
-        browser.until("document.getElementById('key-form').hidden")
-        assert browser["question"].is_displayed()
-
-
-@pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
-def test_no_state_is_wider_than_the_window(browser: Browser, tmp_path: Path, size: tuple[int, int]) -> None:
-    with browser.window(*size), running(NOWHERE, tmp_path) as gateway:
-        browser.driver.get(gateway.url)
-        for tab, place in (("score", "served-state"), ("dataset", "no-datasets")):
-            browser[f"{tab}-tab"].click()
-            wait_for_state(browser, place)
-            browser.draw()
-            assert browser.run("return document.documentElement.scrollWidth - innerWidth") <= 0

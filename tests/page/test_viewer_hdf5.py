@@ -18,7 +18,6 @@ import pytest
 
 from gateway_requests import failure
 from gateways import inside
-from hdf5_writers import decoded, jpeg, video, write_robomind
 from labelling import LEROBOT, BrightnessScorer
 from rfm_client.options import ConfigError
 from rfm_labels import LabelOptions, label, open_dataset, read_episode_labels
@@ -123,25 +122,6 @@ def test_a_file_that_changes_to_show_another_file_is_not_read(demos: Path, tmp_p
         assert "an HDF5 file, got a folder, a pipe, a socket or a device" in failure(gateway.get(path), 500)
 
 
-def test_labels_in_another_folder_are_not_read(demos: Path, tmp_path: Path) -> None:
-    with inside(dataset=(str(demos),)) as gateway:
-        label(open_dataset(demos), BrightnessScorer(), LabelOptions())
-        assert gateway.get("/viewer/datasets/0").json()["labels"] == "demos.rfm_progress.parquet"
-        labels = demos.with_name("demos.rfm_progress.parquet")
-        labels.symlink_to(labels.rename(tmp_path / labels.name))
-        assert "got a link that leaves it" in failure(gateway.get("/viewer/datasets/0"), 500)
-
-
-def test_a_demonstration_without_a_task_is_shown(demos: Path) -> None:
-    with h5py.File(demos, "r+") as opened:
-        del opened["data"].attrs["env_args"]
-        opened["data/demo_3"].attrs["language"] = TASK
-    with inside(dataset=(str(demos),)) as gateway:
-        table = gateway.get("/viewer/datasets/0").json()
-    assert [row["task"] for row in table["episodes"]] == [TASK, ""]
-    assert table["fps"] == 20
-
-
 def test_the_faults_are_those_that_labelling_refuses(tmp_path: Path) -> None:
     root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "toy_v21")
     with inside(dataset=(str(root),)) as gateway:
@@ -151,32 +131,3 @@ def test_the_faults_are_those_that_labelling_refuses(tmp_path: Path) -> None:
     assert list(faults) == ["2"]
     assert "episode_000002.mp4: expected a whole video file, got " in faults["2"]
     assert str(tmp_path) not in faults["2"]
-
-
-def test_cameras_that_are_not_labelled_have_no_faults(tmp_path: Path) -> None:
-    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "toy_v21")
-    info = root / "meta" / "info.json"
-    info.write_text(info.read_text().replace("observation.images.wrist", "observation.images.depth_head"))
-    for folder in root.rglob("observation.images.wrist"):
-        moved = folder.rename(folder.with_name("observation.images.depth_head"))
-        for film in moved.iterdir():
-            film.write_bytes(b"no video")
-    with inside(dataset=(str(root),)) as gateway:
-        assert gateway.get("/viewer/datasets/0").json()["unused"] == [None, "depth"]
-        assert gateway.get("/viewer/datasets/0/faults").json() == {}
-
-
-def test_the_page_shows_an_episode_of_jpeg_files_with_its_labels(tmp_path: Path) -> None:
-    files = [jpeg(frame) for frame in video(LENGTH)]
-    file = write_robomind(tmp_path / "trajectory.hdf5", {"camera_top": files})
-    label(open_dataset(file), BrightnessScorer(), LabelOptions())
-    with inside(dataset=(str(file),)) as gateway:
-        (about,) = gateway.get("/viewer/datasets").json()["datasets"]
-        table = gateway.get("/viewer/datasets/0").json()
-        shown = gateway.get("/viewer/datasets/0/episodes/0/videos/0")
-    assert about["kind"] == "HDF5 (RoboMIND)"
-    assert about["labels"] == ["trajectory.rfm_progress.parquet"]
-    assert (table["cameras"], table["fps"]) == (["camera_top"], 30)
-    with av.open(io.BytesIO(shown.content)) as container:
-        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    assert np.abs(np.stack(frames).astype(int) - np.stack([decoded(each) for each in files])).mean() < 6
