@@ -18,6 +18,7 @@ from rfm.family import Options, VideoPrompt, Weights
 from rfm.vlm.backbone import QWEN_2_5, QWEN_NAMES, Renames, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
 from rfm.vlm.language import EMBEDDING, HEAD, REWARD_MODEL, LanguageConfig
+from rfm.vlm.network import Dtype
 from rfm.vlm.processor import PROCESSOR_FOLDER
 from rfm.vlm.qwen_checkpoint import SETTINGS
 from rfm.vlm.rounding import kind_of, read_published, read_unrounded_config, round_layers

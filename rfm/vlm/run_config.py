@@ -10,7 +10,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from rfm.checkpoint.content import (
     ADAPTER_CONFIG,
@@ -25,11 +25,11 @@ from rfm.checkpoint.provenance import OF_UPSTREAM, Assumption, file_name, source
 from rfm.checkpoint.run_config import find_run_config, frame_count
 from rfm.vlm.backbone import DEQUANTIZED, QWEN_2_5
 from rfm.vlm.lora import MERGE
-from rfm.vlm.network import VlmConfig
+from rfm.vlm.network import Dtype, VlmConfig
 from rfm_client.contract.checks import require
 
 HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, generated text
-DTYPES = ("float32", "bfloat16", "float16")
+DTYPES: tuple[Dtype, ...] = get_args(Dtype)
 POOLINGS = ("mean", "boundary", "attention")
 _SECTIONS = ("model", "data", "training", "peft")
 # The keys of a run's configuration that decide fields of VlmConfig; two keys must agree.

@@ -156,7 +156,7 @@ def test_the_tab_opens_and_the_arrow_keys_change_tabs(page: Page) -> None:
     assert page.browser["score-panel"].is_displayed()
     assert not page.browser["dataset-panel"].is_displayed()
     page.browser["score-tab"].send_keys(Keys.ARROW_LEFT)
-    assert page.browser.run("return document.activeElement.id") == "live-tab"
+    assert page.browser.run("return document.activeElement.id") == "dataset-tab"
     names = page.browser.run("return [...document.getElementById('dataset').options].map((option) => option.text)")
     assert names[:3] == ["toy_v30_many (v3.0)", *["toy_v21 (v2.1)"] * 2]
 
