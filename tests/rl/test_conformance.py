@@ -26,6 +26,7 @@ from reward_doors import (
     Door,
     InProcesses,
     Sb3InProcesses,
+    Vector,
     go_on,
     makers_of,
     played,
@@ -400,6 +401,61 @@ def test_an_observation_without_the_frame_is_refused(
         door.reset()
 
 
+class ResettingEnv(CodedEnv):
+    """Resets in the step that ends an episode, and returns the observation from before, as LeRobot's environments do."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = super().step(action)
+        if terminated:
+            info = {"final_info": {"is_success": True}}
+            self.reset()
+        return observation, reward, terminated, truncated, info
+
+
+@at_each_door
+def test_an_environment_that_resets_in_its_last_step_is_paid_by_its_observation(
+    judge: Recorder, kind: type[Door]
+) -> None:
+    with opened(kind, judge, [ResettingEnv(TERMINATES, (2,))], options()) as door:
+        ended = [episode for episode in played(door, 8)[0] if episode.terminated]
+    assert len(ended) >= 2
+    for episode in ended:
+        assert episode.rewards == pytest.approx(PROGRESS[1:3])
+
+
+@pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if kind is not VECTORS["SAME_STEP"]])
+def test_an_environment_that_resets_in_its_last_step_is_not_rendered(recorder: Recorder, kind: type[Door]) -> None:
+    expected = r"^(info|infos\[0\]): expected no final_info with frames from render\(\), .*frames_from='pixels'$"
+    with opened(kind, recorder, [ResettingEnv(TERMINATES, (2,))], options(frames_from=None)) as door:
+        door.reset()
+        door.step()
+        with pytest.raises(InvalidSampleError, match=expected):
+            door.step()
+    assert [codes[-1] for call in recorder.calls for codes, _ in call] == [(0, 0, 0), (0, 0, 1)]
+
+
+class ReturningEnv(CodedEnv):
+    """Every episode begins in one pose; from the second on, it also ends there."""
+
+    @property
+    def code(self) -> Code:
+        return self.number, 0, 0 if self.episode and self.has_ended else self.t
+
+
+@at_each_door
+def test_an_episode_that_ends_where_the_next_begins_is_paid(judge: Recorder, kind: type[Door]) -> None:
+    with opened(kind, judge, [ReturningEnv(TERMINATES, (2,))], options()) as door:
+        first, second, *_ = (episode for episode in played(door, 8)[0] if episode.terminated)
+    assert first.rewards == pytest.approx(PROGRESS[1:3])
+    assert second.rewards == pytest.approx([PROGRESS[1], PROGRESS[0]])
+
+
+@pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if issubclass(kind, Vector)])
+def test_a_vector_tells_its_autoreset_mode(recorder: Recorder, kind: type[Vector]) -> None:
+    """TorchRL reads it."""
+    assert kind(makers_of([CodedEnv()]), recorder, options()).env.autoreset_mode is kind.mode
+
+
 # Early resets, after which a reward is never paid.
 
 FINAL: dict[str, Any] = {"mode": "final"}
@@ -556,7 +612,7 @@ def test_a_vector_needs_a_task_for_each_environment(recorder: Recorder, kind: ty
         door.wrap(makers_of([CodedEnv(), CodedEnv()]), recorder, ["task 0"], options())
 
 
-INSTEAD = "; wrap each environment in RewardModelWrapper instead$"
+INSTEAD = "wrap each environment in RewardModelWrapper instead$"
 REFUSED_DOORS: dict[str, tuple[Sequence[str], dict[str, Any], str]] = {
     "an unknown key": (
         list(DOORS),
@@ -571,12 +627,12 @@ REFUSED_DOORS: dict[str, tuple[Sequence[str], dict[str, Any], str]] = {
     "frames that a vector never renders": (
         ["SAME_STEP"],
         {"frames_from": None},
-        rf"^autoreset_mode: expected NEXT_STEP or DISABLED with frames from render\(\), .* got SAME_STEP{INSTEAD}",
+        rf"^autoreset_mode: expected NEXT_STEP or DISABLED with frames from render\(\), .* got SAME_STEP; make the vector with .*NEXT_STEP, or {INSTEAD}",
     ),
     "an end that a vector does not learn of": (
         ["NEXT_STEP", "SAME_STEP"],
         {"terminate_on_success": ENDS},
-        f"^autoreset_mode: expected DISABLED with terminate_on_success, got [NS].*{INSTEAD}",
+        f"^autoreset_mode: expected DISABLED with terminate_on_success, got [NS].*; make the vector with .*DISABLED, or {INSTEAD}",
     ),
     "an end that a VecEnv does not learn of": (
         ["VecEnv"],

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
-from gymnasium.wrappers import RecordEpisodeStatistics
+from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
 
 from coded_env import Code, CodedEnv, CodeReader, Recorder
@@ -156,8 +156,10 @@ def test_a_monitor_outside_counts_episodes_that_end_by_success() -> None:
 @pytest.mark.parametrize("inside", [Monitor, RecordEpisodeStatistics])
 def test_statistics_that_would_miss_an_end_by_success_are_refused(recorder: Recorder, inside: Any) -> None:
     """With them, ``evaluate_policy`` would wait for ever for an episode's end."""
-    with pytest.raises(ValueError, match=r"^terminate_on_success: expected None with a Monitor .*; wrap in the other"):
+    remedy = r"; wrap in the other order: Monitor\(.*RewardModelWrapper\(TimeLimit\(env.unwrapped, steps\), ...\)$"
+    with pytest.raises(ValueError, match=rf"^terminate_on_success: expected None with a Monitor .*{remedy}"):
         single(recorder, inside(Reach()), terminate_on_success=SuccessRule())
+    single(recorder, TimeLimit(inside(Reach()).unwrapped, 5), terminate_on_success=SuccessRule())
 
 
 @pytest.mark.parametrize(

@@ -36,10 +36,11 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium
-from gymnasium.error import ResetNeeded
+import numpy as np
 
 from rfm_client import InvalidSampleError
 from rfm_client.options import InvalidValueError, require
+from rfm_rl.envs import INFO, ClientSource, RewardedEnvs
 from rfm_rl.own_rewards import (
     RETURNS,
     WritingMonitor,
@@ -48,22 +49,17 @@ from rfm_rl.own_rewards import (
     warn_of_file,
     with_statistics,
 )
-from rfm_rl.rewards import ClientSource, Info, RewardedEpisode, Rewarder, RewardOptions
-
-INFO = "reward_model"  # key in info
-
-_ENDS = (
-    "final_obs",
-    "final_observation",
-    "terminal_observation",
-)  # in info, if the step that ended an episode also reset
+from rfm_rl.rewards import Info, RewardOptions
 
 DEFAULTS = RewardOptions()
+_ENDS = "final_obs", "final_observation", "terminal_observation"  # in info, if the last step also reset
+_RESETS = "final_info"  # in info, if the last step of LeRobot's environments reset; the observation is from before
+_ALL = np.ones(1, np.bool_)
+_REMEDY = "call reset, or wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
 _UNBATCH = (
     "ManiSkill: RewardModelVectorWrapper(ManiSkillVectorEnv(env), ...), or CPUGymWrapper(env) if there is one; "
     "Isaac Lab never shows an episode's last frame: score its frames with client.episodes(num_envs, task)"
 )
-LOST = "an earlier call failed before its frame was kept"
 
 
 class RewardModelWrapper(gymnasium.Wrapper):
@@ -94,69 +90,44 @@ class RewardModelWrapper(gymnasium.Wrapper):
         check_frame_source(options, env.render_mode, env.observation_space)
         _check_statistics(env, options)
         super().__init__(env)
-        self._rewarder = Rewarder(client, options)
+        self._envs = RewardedEnvs(client, options, [""], remedy=_REMEDY, is_only=True)
         self._options = options
         self._task = task
         self._autoresets = [layer for layer in _layers(env) if isinstance(layer, gymnasium.wrappers.Autoreset)]
-        self._episode: RewardedEpisode | None = None
-        self._is_whole = False  # all frames of the episode are kept
-        self._has_ended = False
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and score its first frame. Cancel open requests. Raises RewardError, ValueError."""
-        if self._episode is not None and self._is_whole:
-            self._rewarder.check_reset([self._episode])
-        self._is_whole = False
+        self._envs.check_reset(_ALL)
         observation, info = self.env.reset(seed=seed, options=options)
-        self._has_ended = False
-        return observation, self._begin(observation, info)
+        self._set_task(info)
+        self._envs.begin(lambda _: self._frame(observation))
+        return observation, {**info, INFO: self._envs.episodes[0].info()}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
         """Step the environment; return the reward model's reward. Raises RewardError, ResetNeeded."""
         resets = any(wrapper.autoreset for wrapper in self._autoresets)
-        episode = None if resets else self._checked_episode()
-        self._is_whole = False  # until the frame is kept
+        self._envs.check_step(_ALL & resets)
         observation, env_reward, terminated, truncated, info = self.env.step(action)
-        self._has_ended = bool(terminated or truncated)
-        if episode is None:
-            return observation, 0.0, terminated, truncated, self._begin(observation, info)
-        if self._has_ended:
+        if resets:
+            self._set_task(info)
+        elif terminated or truncated:
             _check_shows_its_end(info)
-        episode.steps.keep(self._frame(observation))
-        self._is_whole = True
-        self._rewarder.score({episode: self._has_ended})
-        reward = episode.reward(float(env_reward), bool(terminated))
-        ends = bool(terminated or episode.succeeded)
-        return observation, reward, ends, truncated, {**with_statistics(info, episode), INFO: episode.info()}
+            check_renders_its_end(self._options, info)
+        said = [float(env_reward)], [bool(terminated)], [bool(truncated)]
+        (reward,), _ = self._envs.keep(lambda _: self._frame(observation), *said)
+        episode = self._envs.episodes[0]
+        info = {**with_statistics(info, episode), INFO: episode.info()}
+        return observation, float(reward), bool(terminated or episode.succeeded), truncated, info
 
     compute_reward = refuse_relabelling
 
     def close(self) -> None:
         """Cancel open requests; close the environment, and the client if it was made here."""
-        if self._episode is not None:
-            self._episode.end()
-        self._rewarder.close()
+        self._envs.close()
         super().close()
 
-    def _begin(self, observation: Any, info: Info) -> Info:
-        if self._episode is not None:
-            self._episode.end()
-        task = self._task if isinstance(self._task, str) else self._task(info)
-        self._episode = self._rewarder.begin(task, self._frame(observation))
-        self._is_whole = True
-        self._rewarder.score({self._episode: False})
-        return {**info, INFO: self._episode.info()}
-
-    def _checked_episode(self) -> RewardedEpisode:
-        """The episode that the next step continues. Raises ResetNeeded if there is none."""
-        if self._episode is None:
-            raise ResetNeeded("step: expected a reset before it")
-        if self._has_ended or self._episode.succeeded:
-            remedy = "call reset, or wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
-            raise ResetNeeded(f"step: expected a reset, since the episode has ended, got another step; {remedy}")
-        if not self._is_whole:
-            raise ResetNeeded(f"step: expected a reset, since {LOST}, got another step; call reset")
-        return self._episode
+    def _set_task(self, info: Info) -> None:
+        self._envs.tasks[0] = self._task if isinstance(self._task, str) else self._task(info)
 
     def _frame(self, observation: Any) -> Any:
         return self.env.render() if self._options.renders else self._options.frames_of(observation)
@@ -196,11 +167,20 @@ def _check_shows_its_end(info: Info) -> None:
         raise InvalidSampleError.at("info", expected, f"{', '.join(found)}; {remedy}")
 
 
+def check_renders_its_end(options: RewardOptions, info: Info, where: str = "info") -> None:
+    """Raise InvalidSampleError if ``render()`` already shows the next episode. info: of an episode's last step."""
+    if options.renders and _RESETS in info:
+        expected = f"no {_RESETS} with frames from render(), which must show the last frame of the episode"
+        remedy = "it has reset in this step: take frames from the observation, frames_from='pixels'"
+        raise InvalidSampleError.at(where, expected, f"{_RESETS}; {remedy}")
+
+
 def _check_statistics(env: gymnasium.Env[Any, Any], options: RewardOptions) -> None:
     """Raise ValueError for statistics that would miss episodes; warn of a file with the environment's rewards."""
     if options.terminate_on_success is not None and env.has_wrapper_attr(RETURNS):
         make = "call make_vec_env with a function that makes RewardModelWrapper(...)"
-        refuse_statistics(options.terminate_on_success, f"Monitor(RewardModelWrapper(...)); {make}")
+        inside = "if gymnasium.make puts them inside, RewardModelWrapper(TimeLimit(env.unwrapped, steps), ...)"
+        refuse_statistics(options.terminate_on_success, f"Monitor(RewardModelWrapper(...)); {make}; {inside}")
     if any(isinstance(layer, WritingMonitor) for layer in _layers(env)):
         warn_of_file("env", "Monitor(RewardModelWrapper(...), filename)")
 

@@ -6,25 +6,24 @@ A vector may return torch tensors on a GPU, as ManiSkillVectorEnv does. Nothing 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.error import ResetNeeded
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 
 from rfm_client import InvalidSampleError, as_array
 from rfm_client.options import InvalidValueError, require
-from rfm_rl.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind, tasks_of
+from rfm_rl.envs import INFO, ClientSource, Mask, RewardedEnvs
+from rfm_rl.gym import DEFAULTS, check_frame_source, check_kind, check_renders_its_end, tasks_of
 from rfm_rl.own_rewards import RETURNS, correct_statistics, refuse_statistics
-from rfm_rl.rewards import ClientSource, Info, RewardedEpisode, Rewarder, RewardOptions
-
-OfEnvs: TypeAlias = dict[int, RewardedEpisode]  # by number of the environment
-Mask: TypeAlias = npt.NDArray[np.bool_]
+from rfm_rl.rewards import Info, RewardOptions
 
 _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
+_REMEDY = 'call reset, for some environments with options={"reset_mask": mask}'
 _MANI_SKILL_MASK = "env_idx"  # ManiSkill's key in the options of a reset
 _RESET_MASK = "reset_mask"  # key in the options of a reset, which Gymnasium's vectors remove
 
@@ -67,13 +66,16 @@ class RewardModelVectorWrapper(VectorWrapper):
             refuse_statistics(options.terminate_on_success, "RecordEpisodeStatistics(RewardModelVectorWrapper(...))")
         tasks = tasks_of(task, env.num_envs)
         super().__init__(env)  # after the checks: a refused wrapper must not close the environments when collected
-        self._rewarder = Rewarder(client, options)
+        self._envs = RewardedEnvs(
+            client, options, tasks, remedy=_REMEDY, final="final_obs[{}]", instead=_INSTEAD_OF_SAME_STEP
+        )
         self._options = options
         self._autoreset_mode = autoreset_mode
-        self._tasks = tasks
-        self._episodes: OfEnvs = {}
-        self._whole: Mask = np.zeros(env.num_envs, np.bool_)  # all frames of the episode are kept
-        self._ended: Mask = np.zeros(env.num_envs, np.bool_)
+
+    @property
+    def autoreset_mode(self) -> AutoresetMode:
+        """The vector's autoreset mode, as TorchRL reads it."""
+        return self._autoreset_mode
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environments, or those in ``reset_mask``, and score their first frames.
@@ -84,48 +86,36 @@ class RewardModelVectorWrapper(VectorWrapper):
         """
         reset_mask, options = self._masked(options)
         self._check_can_reset(self._resetting & reset_mask)
-        indices = np.flatnonzero(reset_mask).tolist()
-        before = [self._episodes[index] for index in indices if index in self._episodes]
-        self._rewarder.check_reset(self._episodes[index] for index in np.flatnonzero(reset_mask & self._whole).tolist())
-        whole, self._whole = self._whole, np.zeros_like(self._whole)
+        self._envs.check_reset(reset_mask)
         observations, infos = self.env.reset(seed=seed, options=options)
         self._check_was_masked(options)
-        self._whole, self._ended = whole & ~reset_mask, self._ended & ~reset_mask
-        for episode in before:
-            episode.end()
-        shown = self._shown(observations)
-        fresh = {index: self._begin(index, self._frame(shown[index])) for index in indices}
-        self._rewarder.score(dict.fromkeys(fresh.values(), False))
-        return observations, self._with_scores(infos, fresh)
+        self._envs.begin(partial(self._frame, self._shown(observations)))
+        return observations, self._with_scores(infos, reset_mask)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Info]:
         """Step the environments; return the model's rewards, [num_envs]. Raises RewardError, ResetNeeded."""
-        self._check_can_step()
         resetting = self._resetting
-        self._whole = np.zeros_like(self._whole)  # until each frame is kept
+        self._envs.check_step(resetting)
         observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
         terminated, truncated = (as_array(each).astype(np.bool_) for each in (terminations, truncations))
-        paid = as_array(env_rewards)
-        self._ended = ended = terminated | truncated
-        stepped, fresh, final = self._added(self._shown(observations), infos, resetting)
-        self._rewarder.score(
-            {episode: bool(ended[index]) for index, episode in stepped.items()} | dict.fromkeys(fresh.values(), False)
-        )
-        rewards = np.zeros(self.num_envs)
+        ended, resets_at_once = terminated | truncated, self._autoreset_mode is AutoresetMode.SAME_STEP
+        for index in np.flatnonzero(ended & as_array(infos.get("_final_info", False))).tolist():
+            check_renders_its_end(self._options, infos, f"infos[{index}]")
+        final = partial(self._frame, self._final_observations(infos, ended)) if resets_at_once else None
+        shown = partial(self._frame, self._shown(observations))
+        rewards, stepped = self._envs.keep(shown, as_array(env_rewards), terminated, truncated, final=final)
         for index, episode in stepped.items():
-            rewards[index] = episode.reward(float(paid[index]), bool(terminated[index]))
             correct_statistics(infos, index, episode)
             scores: Info = {INFO: episode.info()}
-            infos = self._add_info(infos, {"final_info": scores} if index in final else scores, index)
-        terminated = terminated | self._succeeded()
-        infos = self._with_scores(infos, fresh)
+            has_reset = resets_at_once and ended[index]
+            infos = self._add_info(infos, {"final_info": scores} if has_reset else scores, index)
+        infos = self._with_scores(infos, resetting | (ended & resets_at_once))
+        terminated = terminated | self._envs.succeeded
         return observations, _like(env_rewards, rewards), _like(terminations, terminated), truncations, infos
 
     def close(self, **kwargs: Any) -> None:
         """Cancel open requests; close the environments, and the client if it was made here."""
-        for episode in self._episodes.values():
-            episode.end()
-        self._rewarder.close()
+        self._envs.close()
         super().close(**kwargs)
 
     def _masked(self, options: Info | None) -> tuple[Mask, Info | None]:
@@ -156,53 +146,10 @@ class RewardModelVectorWrapper(VectorWrapper):
             remedy = "take a step before it, or make the AsyncVectorEnv with shared_memory=True"
             raise InvalidValueError.at("reset", "none whose episode has ended", got, remedy)
 
-    def _check_can_step(self) -> None:
-        if len(self._episodes) != self.num_envs:
-            raise ResetNeeded("step: expected a reset of every environment before it")
-        is_caller_s = self._autoreset_mode is AutoresetMode.DISABLED  # the caller resets
-        over = (self._ended | self._succeeded()) & is_caller_s
-        for indices, reason in ((over, "their episodes have ended"), (~self._whole & ~self._resetting, LOST)):
-            if indices.any():
-                expected = f"expected a reset of the environments {np.flatnonzero(indices).tolist()}, since {reason}"
-                remedy = 'call reset, for some environments with options={"reset_mask": mask}'
-                raise ResetNeeded(f"step: {expected}, got another step; {remedy}")
-
     @property
     def _resetting(self) -> Mask:
         """Environments that only reset in the next step."""
-        return self._ended & (self._autoreset_mode is AutoresetMode.NEXT_STEP)
-
-    def _succeeded(self) -> Mask:
-        return np.array([episode.succeeded for _, episode in sorted(self._episodes.items())], np.bool_)
-
-    def _added(self, shown: Sequence[Any], infos: Info, resetting: Mask) -> tuple[OfEnvs, OfEnvs, Collection[int]]:
-        """Add the frames of a step, each as soon as it is made: it may reuse the array of the frame before.
-
-        Returns the continued episodes, the new episodes, and the environments with both (SAME_STEP).
-        """
-        final = self._final_observations(infos) if self._autoreset_mode is AutoresetMode.SAME_STEP else {}
-        stepped = {index: self._episodes[index] for index in np.flatnonzero(~resetting).tolist()}
-        last = {}
-        for index, episode in stepped.items():
-            frame = self._frame(final.get(index, shown[index]))
-            if index in final:
-                last[index] = frame = copied(frame)
-            episode.steps.keep(frame)
-            self._whole[index] = index not in final
-        fresh = {}
-        for index in (*np.flatnonzero(resetting).tolist(), *final):
-            if index not in final:
-                self._episodes[index].end()
-            frame = self._frame(shown[index])
-            fresh[index] = self._begin(index, frame)
-            if index in final:
-                check_differ(f"final_obs[{index}]", last[index], copied(frame), _INSTEAD_OF_SAME_STEP)
-        return stepped, fresh, final
-
-    def _begin(self, index: int, frame: Any) -> RewardedEpisode:
-        self._episodes[index] = self._rewarder.begin(self._tasks[index], frame, index)
-        self._whole[index] = True
-        return self._episodes[index]
+        return self._envs.ended & (self._autoreset_mode is AutoresetMode.NEXT_STEP)
 
     def _shown(self, observations: Any) -> Sequence[Any]:
         if self._options.renders:
@@ -214,15 +161,15 @@ class RewardModelVectorWrapper(VectorWrapper):
         require("frames", len(shown) == self.num_envs, expected, len(shown), InvalidSampleError)
         return shown
 
-    def _frame(self, shown: Any) -> Any:
-        return shown if self._options.renders else self._options.frames_of(shown)
+    def _frame(self, shown: Sequence[Any] | dict[int, Any], index: int) -> Any:
+        return shown[index] if self._options.renders else self._options.frames_of(shown[index])
 
-    def _final_observations(self, infos: Info) -> dict[int, Any]:
+    def _final_observations(self, infos: Info, ended: Mask) -> dict[int, Any]:
         """Last observations of ended episodes, whose environments already show the next episode."""
         observations = infos.get("final_obs", [None] * self.num_envs)
         if "final_obs" not in infos and "final_observation" in infos:  # ManiSkill's, a batch like the observations
             observations = list(iterate(self.env.observation_space, infos["final_observation"]))
-        final = {index: observations[index] for index in np.flatnonzero(self._ended).tolist()}
+        final = {index: observations[index] for index in np.flatnonzero(ended).tolist()}
         missing = [index for index, observation in final.items() if observation is None]
         if missing:
             expected = f"final_obs of the environments {missing}, whose episodes ended in this step"
@@ -230,9 +177,9 @@ class RewardModelVectorWrapper(VectorWrapper):
             raise InvalidSampleError.at("infos", expected, f"none in {list(infos)}; {remedy}")
         return final
 
-    def _with_scores(self, infos: Info, fresh: OfEnvs) -> Info:
-        for index, episode in fresh.items():
-            infos = self._add_info(infos, {INFO: episode.info()}, index)
+    def _with_scores(self, infos: Info, fresh: Mask) -> Info:
+        for index in np.flatnonzero(fresh).tolist():
+            infos = self._add_info(infos, {INFO: self._envs.episodes[index].info()}, index)
         return infos
 
 
@@ -244,25 +191,6 @@ def _like(given: Any, values: npt.NDArray[Any]) -> Any:
     return typed.new_tensor(values)
 
 
-def copied(frame: Any) -> Any:
-    """Return a copy of a frame, or of a dict of frames by camera."""
-    if isinstance(frame, Mapping):
-        return {camera: np.array(as_array(each)) for camera, each in frame.items()}
-    return np.array(as_array(frame))
-
-
-def check_differ(where: str, last: Any, first: Any, instead: str) -> None:
-    """Raise InvalidSampleError if a reset has drawn over the last frame of the episode before.
-
-    instead: remedy where the environment cannot return a copy
-    """
-    of_cameras = [(last[camera], first[camera]) for camera in last] if isinstance(last, Mapping) else [(last, first)]
-    if any(np.array_equal(*pair) for pair in of_cameras):
-        got = "the first frame of the next one: the environment seems to draw into the array that it has returned"
-        remedy = f"let it return a copy of its observation, or {instead}"
-        raise InvalidSampleError.at(where, "the last frame of the ended episode", f"{got}; {remedy}")
-
-
 def _has_statistics(env: VectorEnv) -> bool:
     """True with a RecordEpisodeStatistics around the vector or around environments in it."""
     if isinstance(env, VectorWrapper):
@@ -272,12 +200,15 @@ def _has_statistics(env: VectorEnv) -> bool:
 
 def _checked_autoreset_mode(env: VectorEnv, options: RewardOptions) -> AutoresetMode:
     mode = env.metadata.get("autoreset_mode")
-    instead = "wrap each environment in RewardModelWrapper instead"
+    instead = (
+        "make the vector with autoreset_mode=AutoresetMode.{}, or wrap each environment in RewardModelWrapper instead"
+    )
     if not isinstance(mode, AutoresetMode):
         raise InvalidValueError.at("metadata['autoreset_mode']", "an AutoresetMode", repr(mode))
     if mode is AutoresetMode.SAME_STEP and options.renders:
         expected = "NEXT_STEP or DISABLED with frames from render(), which never shows an episode's last frame"
-        raise InvalidValueError.at("autoreset_mode", expected, mode.name, instead)
+        raise InvalidValueError.at("autoreset_mode", expected, mode.name, instead.format("NEXT_STEP"))
     if mode is not AutoresetMode.DISABLED and options.terminate_on_success is not None:
-        raise InvalidValueError.at("autoreset_mode", "DISABLED with terminate_on_success", mode.name, instead)
+        expected = "DISABLED with terminate_on_success"
+        raise InvalidValueError.at("autoreset_mode", expected, mode.name, instead.format("DISABLED"))
     return mode

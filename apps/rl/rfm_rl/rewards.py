@@ -3,21 +3,19 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from rfm_client import InvalidSampleError, RewardClient, UInt8Array
+from rfm_client import InvalidSampleError, UInt8Array
 from rfm_client.episodes import Episode, EpisodeOptions, FrameOptions, StepScore, SuccessRule
 from rfm_client.options import InvalidValueError, checked_count, checked_finite, require
 
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
-ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
 
 _PAID: dict[Mode, Callable[[float, float, float, bool], float]] = {  # of progress now and before, gamma, the end
     "absolute": lambda now, before, gamma, is_end: now,
@@ -25,13 +23,6 @@ _PAID: dict[Mode, Callable[[float, float, float, bool], float]] = {  # of progre
     "shaping": lambda now, before, gamma, is_end: gamma * now - before,
     "final": lambda now, before, gamma, is_end: now if is_end else 0.0,
 }
-
-_INSIDE = (
-    "put the time limit inside the wrapper: RewardModelWrapper(TimeLimit(env, steps), ...), "
-    "or gymnasium.make(..., max_episode_steps=steps)"
-)
-
-logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,95 +234,3 @@ class RewardedEpisode:
         told: Info = {**self._paid, "progress": known.progress, "success": known.success, "step": known.step}
         told |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped, **known.more_scores}
         return told if self._options.success_rule is None else told | {"succeeded": self._has_succeeded}
-
-
-class Rewarder:
-    """Scores the episodes of environments through one client. Connects at the first request."""
-
-    def __init__(self, client: ClientSource, options: RewardOptions) -> None:
-        if not (isinstance(client, RewardClient) or callable(client)):
-            raise TypeError(
-                f"client: expected a RewardClient or a function that makes one, got {type(client).__name__}"
-            )
-        self._source = client
-        self._options = options
-        self._made: RewardClient | None = None
-        self._has_dropped = False  # the last reset has, and no episode has ended since
-        self._has_warned = False
-
-    def check_reset(self, episodes: Iterable[RewardedEpisode]) -> None:
-        """Warn once of a reset that drops the reward of unended episodes. Call it before the reset.
-
-        Raises ValueError in mode ``final`` for the second such reset in a row: episodes that end outside the wrapper
-        would never be paid. An end or an error between the resets allows the second.
-        """
-        unpaid = next((episode for episode in episodes if episode.is_unpaid), None)
-        if unpaid is None:
-            return
-        where = "reset" if unpaid.index is None else f"envs[{unpaid.index}]: reset"
-        got = f"one after {unpaid.steps.step} steps, whose reward is lost"
-        self._has_dropped = not self._has_dropped  # a third reset may go on
-        if not self._has_dropped and self._options.mode == "final":
-            expected = "the end of an episode before it, where mode 'final' pays"
-            raise InvalidValueError.at(where, expected, f"{got}, for the second time in a row", _INSIDE)
-        if not self._has_warned:
-            self._has_warned = True
-            logger.warning("%s: expected the end of the episode before it, got %s; %s", where, got, _INSIDE)
-
-    def begin(self, task: str, frame: Any, index: int | None = None) -> RewardedEpisode:
-        """Return a new episode with its first frame. Raises RewardError.
-
-        frame: uint8 [H, W, 3]; with cameras, a dict of these
-        index: number of its environment; None: the only environment
-        """
-        episode = self._client.episode(task, env=index, **self._options.scoring)
-        episode.keep(frame)
-        return RewardedEpisode(self._options, episode, index)
-
-    def score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
-        """Collect known scores, and request those of newest frames that are due. Raises RewardError.
-
-        episodes: to each, True if its newest frame is its last
-        """
-        has_dropped, self._has_dropped = self._has_dropped, False  # after an error, a reset may drop a reward
-        try:
-            self._score(episodes)
-            self._has_dropped = has_dropped
-        finally:
-            for episode in (episode for episode, ends in episodes.items() if ends or episode.succeeded):
-                episode.end()
-                self._has_dropped = False
-
-    def close(self) -> None:
-        """Close the client if it was made here."""
-        if self._made is not None:
-            self._made.close()
-
-    def _score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
-        awaited = []
-        for episode, ends in episodes.items():
-            episode.collect()
-            ends = ends or episode.succeeded
-            is_first = episode.known is None
-            due = ends or is_first or self._options.is_due(episode.steps.step)
-            waits = self._options.blocking or is_first or (ends and self._options.await_last)
-            if ends:
-                episode.cancel()
-            if due and waits:
-                awaited.append(episode)
-            elif due and not ends and len(episode.pending) >= self._options.max_pending:
-                episode.num_skipped += 1
-            elif due and not ends:
-                episode.pending.append(self._client.submit_episodes([episode.steps]))
-        if awaited:
-            scores = self._client.score_episodes([episode.steps for episode in awaited])
-            for episode, score in zip(awaited, scores, strict=True):
-                episode.learn(score)
-
-    @property
-    def _client(self) -> RewardClient:
-        if isinstance(self._source, RewardClient):
-            return self._source
-        if self._made is None:
-            self._made = self._source()
-        return self._made

@@ -15,12 +15,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.error import ResetNeeded
 
 from rfm_client import InvalidSampleError
 from rfm_client.options import require
-from rfm_rl.gym import DEFAULTS, INFO, LOST, check_frame_source, tasks_of
-from rfm_rl.gym_vector import check_differ, copied
+from rfm_rl.envs import INFO, ClientSource, RewardedEnvs
+from rfm_rl.gym import DEFAULTS, check_frame_source, check_renders_its_end, tasks_of
 from rfm_rl.own_rewards import (
     RELABELS,
     WritingMonitor,
@@ -28,7 +27,7 @@ from rfm_rl.own_rewards import (
     warn_of_file,
     with_statistics,
 )
-from rfm_rl.rewards import ClientSource, Info, RewardedEpisode, Rewarder, RewardOptions
+from rfm_rl.rewards import Info, RewardOptions
 
 try:
     from stable_baselines3.common.vec_env import (
@@ -99,35 +98,23 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         require("terminate_on_success", options.terminate_on_success is None, "None, since a VecEnv resets", instead)
         _check_own_rewards(venv)
         tasks = tasks_of(task, venv.num_envs)
-        self._rewarder = Rewarder(client, options)  # before super, which reads the attributes
-        self._reward_options, self._tasks = options, tasks
-        self._episodes: list[RewardedEpisode] = []
-        self._is_whole = False  # all frames of the episodes are kept
-        super().__init__(venv)
+        final, instead = "infos[{}]['terminal_observation']", "use RenderedFrame"
+        self._envs = RewardedEnvs(client, options, tasks, remedy="call reset", final=final, instead=instead)
+        self._reward_options = options
+        super().__init__(venv)  # which reads attributes
 
     def reset(self) -> Any:
         """Reset the environments and score their first frames. Cancel open requests. Raises RewardError."""
-        if self._is_whole:
-            self._rewarder.check_reset(self._episodes)
-        self._is_whole = False
+        self._envs.check_reset(np.ones(self.num_envs, np.bool_))
         observations = self.venv.reset()
-        for episode in self._episodes:
-            episode.end()
         self._take_reset_infos(range(self.num_envs))
-        self._episodes = [self._begin(index, observations) for index in range(self.num_envs)]
-        self._is_whole = True
-        self._rewarder.score(dict.fromkeys(self._episodes, False))
-        for index, episode in enumerate(self._episodes):
-            self.reset_infos[index] |= {INFO: episode.info()}
+        self._envs.begin(lambda index: self._first(index, observations))
+        self._tell_resets(range(self.num_envs))
         return observations
 
     def step_async(self, actions: Any) -> None:
         """Begin a step. Raises ResetNeeded before a reset, and after a step whose frames were lost."""
-        if not self._episodes:
-            raise ResetNeeded("step: expected a reset before it")
-        if not self._is_whole:
-            raise ResetNeeded(f"step: expected a reset, since {LOST}, got another step; call reset")
-        self._is_whole = False  # until each frame is kept
+        self._envs.check_step(np.zeros(self.num_envs, np.bool_))
         self.venv.step_async(actions)
 
     def step_wait(self) -> tuple[Any, Any, Any, list[Info]]:
@@ -135,32 +122,25 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         observations, env_rewards, dones, told = self.venv.step_wait()
         infos = [dict(info) for info in told]  # a list in one ``VecEnv``, a tuple in another
         ended = np.flatnonzero(dones).tolist()
+        for index in ended:
+            check_renders_its_end(self._reward_options, infos[index], f"infos[{index}]")
         self._take_reset_infos(ended)
-        frames = [info.pop(_FRAME, None) for info in infos]
-        stepped = list(self._episodes)
-        for index, episode in enumerate(stepped):
-            if index in ended and not self._reward_options.renders:
-                frames[index] = copied(self._final_frame(index, infos[index]))
-            elif not self._reward_options.renders:
-                frames[index] = self._reward_options.frames_of(_of_env(observations, index))
-            episode.steps.keep(frames[index])
-        for index in ended:
-            self._episodes[index] = self._begin(index, observations)
-            if not self._reward_options.renders:  # a rendered frame is a copy
-                first = copied(self._reward_options.frames_of(_of_env(observations, index)))
-                check_differ(f"infos[{index}]['terminal_observation']", frames[index], first, "use RenderedFrame")
-        self._is_whole = True
-        fresh = [self._episodes[index] for index in ended]
-        questions = {episode: bool(dones[index]) for index, episode in enumerate(stepped)}
-        self._rewarder.score(questions | dict.fromkeys(fresh, False))
-        rewards = np.zeros(self.num_envs, np.float32)
-        for index, episode in enumerate(stepped):
-            terminated = bool(dones[index]) and not infos[index].get("TimeLimit.truncated", False)
-            rewards[index] = episode.reward(float(env_rewards[index]), terminated)
+        rendered = [info.pop(_FRAME, None) for info in infos]
+        truncated = dones & np.array([info.get("TimeLimit.truncated", False) for info in infos], np.bool_)
+
+        is_rendered = self._reward_options.renders
+
+        def shown(index: int) -> Any:
+            return rendered[index] if is_rendered and not dones[index] else self._first(index, observations)
+
+        def final(index: int) -> Any:
+            return rendered[index] if is_rendered else self._final_frame(index, infos[index])
+
+        rewards, stepped = self._envs.keep(shown, env_rewards, dones & ~truncated, truncated, final=final)
+        for index, episode in stepped.items():
             infos[index] = {**with_statistics(infos[index], episode), INFO: episode.info()}
-        for index in ended:
-            self.reset_infos[index] |= {INFO: self._episodes[index].info()}
-        return observations, rewards, dones, infos
+        self._tell_resets(ended)
+        return observations, rewards.astype(np.float32), dones, infos
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
         """Call a method of the environments. Raises NotImplementedError for ``compute_reward``, which HER calls."""
@@ -178,25 +158,25 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
 
     def close(self) -> None:
         """Cancel open requests; close the environments, and the client if it was made here."""
-        for episode in self._episodes:
-            episode.end()
-        self._rewarder.close()
+        self._envs.close()
         self.venv.close()
 
-    def _begin(self, index: int, observations: Any) -> RewardedEpisode:
-        """The new episode of an environment, whose reset has just been."""
-        if self._reward_options.renders:
-            frame = self.reset_infos[index].pop(_FRAME, None)
-            require(
-                f"reset_infos[{index}]", frame is not None, "the frame of RenderedFrame", "none", InvalidSampleError
-            )
-        else:
-            frame = self._reward_options.frames_of(_of_env(observations, index))
-        return self._rewarder.begin(self._tasks[index], frame, index)
+    def _first(self, index: int, observations: Any) -> Any:
+        """The first frame of an environment's new episode."""
+        if not self._reward_options.renders:
+            return self._reward_options.frames_of(_of_env(observations, index))
+        frame = self.reset_infos[index].pop(_FRAME, None)
+        where = f"reset_infos[{index}]"
+        require(where, frame is not None, "the frame of RenderedFrame", "none", InvalidSampleError)
+        return frame
 
     def _take_reset_infos(self, indices: Sequence[int]) -> None:
         for index in indices:
             self.reset_infos[index] = dict(self.venv.unwrapped.reset_infos[index])
+
+    def _tell_resets(self, indices: Sequence[int]) -> None:
+        for index in indices:
+            self.reset_infos[index] |= {INFO: self._envs.episodes[index].info()}
 
     def _final_frame(self, index: int, info: Mapping[str, Any]) -> Any:
         where, expected = f"infos[{index}]", "the terminal_observation of the episode that ended in this step"
