@@ -37,7 +37,7 @@ from gateway_requests import (
     preference,
     progress,
 )
-from gateways import StandIn, TestClient, inside
+from gateways import StandIn, TestClient, inside, listening
 
 NPY = "/evaluate_batch_npy"
 SAMPLE = dumped(progress(FIRST))
@@ -291,7 +291,7 @@ OF_MODEL: dict[str, tuple[str, Json, str, str]] = {
 
 @pytest.mark.parametrize(("only", "sample", "field", "message"), OF_MODEL.values(), ids=OF_MODEL)
 def test_a_sample_that_the_served_model_does_not_read(only: str, sample: Json, field: str, message: str) -> None:
-    with inside(triton=StandIn(served=[only])) as client:
+    with inside(triton=StandIn(served=[only]), timeout_s=10) as client:
         check_refused(ask_json(client, [sample]), (["samples", 0, "trajectory", field], message))
 
 
@@ -329,15 +329,15 @@ def test_frames_that_show_nothing_are_scored_with_a_warning_or_refused(
 def test_no_request_that_the_schemas_allow_breaks_the_gateway(path: str) -> None:
     triton = StandIn()
     triton.is_open.set()
-    with inside(triton=triton) as client:
-        ((_, operation),) = schemathesis.openapi.from_asgi("/openapi.json", client.app)[path].items()
+    with listening(triton) as gateway:
+        ((_, operation),) = schemathesis.openapi.from_url(f"{gateway.url}/openapi.json")[path].items()
 
         @settings(
             max_examples=25, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None
         )
         @given(case=operation.as_strategy())
         def check(case: schemathesis.Case) -> None:
-            response = case.call(session=client)
+            response = case.call()
             assert response.status_code < 500, response.text
             response.json()
 

@@ -139,14 +139,16 @@ class StandIn(Shelf):
         info = await super().model_info(model, timeout_s)
         return info if info.video_dim is None else replace(info, video_dim=self.dims[0], text_dim=self.dims[1])
 
-    async def infer(self, *arguments: Any, **options: Any) -> Answer:
+    async def infer(self, model: str, *arguments: Any, **options: Any) -> Answer:
+        if model not in self.served:
+            raise ModelNotFoundError(model)
         try:
             while not self.is_open.is_set():
                 await asyncio.sleep(0.01)
         except asyncio.CancelledError:
             self.num_cancelled += 1
             raise
-        return await super().infer(*arguments, **options)
+        return await super().infer(model, *arguments, **options)
 
 
 def _app(triton: StandIn | str, api_key: str | None, settings: Mapping[str, Any]) -> tuple[FastAPI, GatewayConfig]:
