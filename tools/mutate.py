@@ -25,10 +25,12 @@ CAUGHT = 0.95
 # Mutated files, and their tests: at least one test must fail.
 PARTS = {
     "client/rfm_client/contract/wire/*.py": "contract/test_*.py families/test_properties.py",
-    "rfm/engine/layers.py": "families/test_linear.py families/test_precision.py families/test_rewind.py",
+    "rfm/engine/layers.py": "families/test_layers.py families/test_rewind.py",
     "rfm/rewind/*.py": "families/test_rewind.py families/test_*encoders.py families/test_checkpoint.py"
-    " families/test_missing_heads.py families/test_forms.py export/test_provenance.py",
-    "rfm/vlm/*.py": "families/test_vlm*.py families/test_nf4.py families/test_rounded.py families/test_forms.py families/test_shot_cache.py"
+    " families/test_missing_heads.py families/test_adapters.py families/test_refused_checkpoints.py"
+    " families/test_wrong_inputs.py export/test_provenance.py",
+    "rfm/vlm/*.py": "families/test_vlm*.py families/test_nf4.py families/test_rounded.py families/test_adapters.py"
+    " families/test_refused_checkpoints.py families/test_wrong_inputs.py families/test_tree.py families/test_shot_cache.py"
     " export/test_provenance.py",
     "rfm/triton_model/batch_model.py": "triton/test_batch_model.py triton/test_pipeline.py",
     "rfm/triton_model/pipeline.py": "triton/test_pipeline.py",

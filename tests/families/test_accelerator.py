@@ -47,7 +47,7 @@ WAITS = {
 
 
 DIFFERENT = (  # each has operators of its own
-    "c1_t1_disc10", "legacy_keys_l2", "enc_c1_t1_disc10", PLAIN, "q25_attention_disc10", "q25_video_last_l2", "q25_peft_adapter_disc10",
+    "c1_t1_disc10", "legacy_keys_l2", "enc_c1_t1_disc10", PLAIN, "q25_attention_disc10", "q25_video_last_l2",
 )  # fmt: skip
 
 

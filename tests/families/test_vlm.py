@@ -138,7 +138,6 @@ def mixture(step: int = 1) -> list[Sample]:
     ("name", "token_budget", "step"),
     [
         ("q25_peft_adapter_disc10", 4096, 1),
-        ("q25_peft_adapter_disc10", 65_536, 2),
         ("q25_attention_disc10", 65_536, 2),
         ("q25_video_last_l2", 65_536, 2),
     ],
