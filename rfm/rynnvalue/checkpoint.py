@@ -139,11 +139,10 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnC
     if fields["use_meta"] and not meta:
         expected = "robot_description, camera_description or both, which the prompt of this checkpoint names"
         raise CheckpointError.at(folder, expected, "neither", f"for example {_EXAMPLE}")
-    dtype, of_dtype = dtype_of(backbone, file)
+    fields["dtype"], of_dtype = dtype_of(backbone, file)
     limits = pixel_limits(preprocessor, f"base model {processor}")
     config = RynnConfig(
         backbone=backbone,
-        dtype=dtype,
         base_model_id=source_name(processor),
         **{**fields, **limits, **(meta if fields["use_meta"] else {})},
     )
