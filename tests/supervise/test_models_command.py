@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -26,7 +24,6 @@ from in_process import rfm
 from reward_models import ROOT
 from rfm.config import ExportConfig
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
-from rfm.supervise.status import NO_REASON
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_commands import rollout as rfm_rollout
 from rfm_commands.rollout import Rollout, RolloutError
@@ -251,34 +248,6 @@ def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(
         assert each.asked == each.answered > CALLERS
         assert each.by_version.keys() == {"1", "2"}
     assert running.served.said == []  # nothing was healed
-
-
-@pytest.mark.nightly  # a minute and a half
-def test_what_was_served_is_served_again_and_not_what_was_exported_since(running: Running, other: Path) -> None:
-    """Newly loaded models, too, but no unloaded ones."""
-    served, samples = running.served, rollout.questions()
-    running.export_plain("since")
-    running.models("load", "since")
-    version = rollout.export(other, running.repository)
-    parts = dict.fromkeys(PARTS, NO_REASON)
-    wait_for(lambda: served.reasons() == parts | {"since": NO_REASON})
-    os.kill(served.model_processes("since")[0], signal.SIGKILL)
-    wait_for(lambda: served.restarts("since") == 1)
-    served.wait_ready()
-    assert served.reasons() == parts | {"since": NO_REASON}
-    assert [running.ready(part) for part in PARTS] == [["1"]] * 3
-    with served.client() as client:
-        expected = rollout.answers(WITH_ENCODERS.checkpoint, samples)
-        for got, wanted in zip(client.evaluate(samples), expected, strict=True):
-            assert difference(got, wanted) <= rollout.TOLERANCE
-    running.models("rollout", NAME, str(version))
-    running.models("unload", "since")
-    wait_for(lambda: served.reasons() == parts)
-    os.kill(served.triton, signal.SIGKILL)
-    wait_for(lambda: served.restarts("triton") == 1)
-    served.wait_ready()
-    assert served.reasons() == parts
-    assert [running.ready(part) for part in PARTS] == [[str(version)]] * 3
 
 
 def break_settings(checkpoint: Path) -> None:
