@@ -7,7 +7,7 @@ import json
 import socket
 import sys
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -28,7 +28,6 @@ class Status:
 
     def __init__(self) -> None:
         self._reasons: Mapping[str, str] = {}
-        self._left_out: Collection[str] = ()
         self._registry = CollectorRegistry()
         gauge = partial(Gauge, registry=self._registry)
         self._ready = gauge("rfm_serve_ready", "1: the model is ready.", ["model"])
@@ -40,13 +39,8 @@ class Status:
         told = "Why Triton was started again: a model by name, or triton itself; gateway: the gateway was."
         self.restarts = Counter("rfm_serve_restarts", told, ["what"], registry=self._registry)
 
-    def record(self, reasons: Mapping[str, str], left_out: Collection[str] = ()) -> None:
-        """Record the state of all models.
-
-        reasons: why each model is not ready, or NO_REASON
-        left_out: models that are not to be served
-        """
-        self._left_out = tuple(left_out)
+    def record(self, reasons: Mapping[str, str]) -> None:
+        """Record the state of all models. reasons: why each model is not ready, or NO_REASON"""
         gone, before, self._reasons = self._reasons.keys() - reasons.keys(), self._reasons, dict(reasons)
         for model, reason in before.items():
             if reason not in (NO_REASON, reasons.get(model)):
@@ -60,14 +54,13 @@ class Status:
 
     def record_down(self, reason: str) -> None:
         """Record a reason why no model is ready."""
-        self.record(dict.fromkeys(self._reasons, reason), self._left_out)
+        self.record(dict.fromkeys(self._reasons, reason))
 
     @property
     def ready(self) -> tuple[bool, dict[str, Any]]:
-        """True if all models are ready, except those left out, and the body of ``/ready``."""
+        """True if all models are ready, and the body of ``/ready``."""
         reasons = self._reasons
-        to_serve = reasons.keys() - self._left_out
-        is_ready = bool(to_serve) and all(reasons[model] == NO_REASON for model in to_serve)
+        is_ready = bool(reasons) and all(reason == NO_REASON for reason in reasons.values())
         models = {model: {"ready": reason == NO_REASON, "reason": reason} for model, reason in reasons.items()}
         return is_ready, {"ready": is_ready, "models": models}
 
@@ -77,7 +70,7 @@ class Status:
 
 
 class StatusServer(ThreadingHTTPServer):
-    """HTTP server with ``/live``, ``/ready``, ``/ready?strict`` and ``/metrics``.
+    """HTTP server with ``/live``, ``/ready`` and ``/metrics``.
 
     Raises ServerStartError for a taken port.
     """
@@ -108,10 +101,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         code, body, content_type = HTTPStatus.OK, b"{}", "application/json"
-        if self.path in ("/ready", "/ready?strict"):
+        if self.path == "/ready":
             is_ready, told = self.server.status.ready
-            if self.path.endswith("?strict"):  # a model that is left out counts, too
-                is_ready = is_ready and all(model["ready"] for model in told["models"].values())
             code = HTTPStatus.OK if is_ready else HTTPStatus.SERVICE_UNAVAILABLE
             body = json.dumps(told).encode()
         elif self.path == "/metrics":

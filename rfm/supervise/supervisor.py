@@ -9,7 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing, nullcontext
 from functools import partial
 from types import FrameType
 
@@ -18,12 +18,11 @@ from rfm.launch.ending import ProcessGroup, how_it_ended, stop_signals_to
 from rfm.launch.installation import ServerStartError
 from rfm.launch.triton_server import POLL_S, Config, SpoiltStartError, TritonServer
 from rfm.supervise.status import Status, StatusServer
-from rfm.supervise.watch import TRITON, TritonWatch, parts_of
+from rfm.supervise.watch import TRITON, TritonWatch
 
 GATEWAY = "gateway"
 STEADY_S = 60.0  # after a longer run, a process is not in a crash loop
-MOST = 5  # restarts in a row
-MOST_OF_A_MODEL = 3  # of them; a call ends a process twice at most, so one call alone costs no model
+MOST = 5  # restarts in a row; a call ends a process twice at most
 ASK_S = 1.0  # between the requests to the gateway
 TRIES = 2  # requests in a row without an answer; one alone may be due to a machine that stood still
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
@@ -44,27 +43,26 @@ class BackOff:
 
     def __init__(self, steady_s: float = STEADY_S) -> None:
         self._steady_s = steady_s
-        self.row: list[str] = []
+        self._num_faults = 0  # in a row
         self._running_since_s: float | None = None  # None: not running
 
     def started(self) -> None:
         """Record a successful start."""
         self._running_since_s = time.monotonic()
 
-    def failed(self, cause: str) -> int:
-        """Record a fault of ``cause``, or a failed start. Return its number of faults in this row."""
+    def failed(self) -> None:
+        """Record a fault or a failed start."""
         if self._running_since_s is not None and time.monotonic() - self._running_since_s >= self._steady_s:
-            self.row = []
+            self._num_faults = 0
         self._running_since_s = None  # a failed start does not count as running
-        self.row.append(cause)
-        return self.row.count(cause)
+        self._num_faults += 1
 
     def pause_s(self, reason: str) -> float:
         """Return the seconds to wait before the next start. Raises CrashLoopError. reason: that of the last fault"""
-        if len(self.row) > MOST:
-            got = f"{len(self.row)} faults in a row; the last: {reason}"
+        if self._num_faults > MOST:
+            got = f"{self._num_faults} faults in a row; the last: {reason}"
             raise CrashLoopError(f"{TRITON}: expected to run, got {got}")
-        return 0.0 if len(self.row) == 1 else min(FIRST_PAUSE_S * 2.0 ** (len(self.row) - 2), LONGEST_PAUSE_S)
+        return 0.0 if self._num_faults == 1 else min(FIRST_PAUSE_S * 2.0 ** (self._num_faults - 2), LONGEST_PAUSE_S)
 
 
 class GatewayProcess:
@@ -157,11 +155,9 @@ class Supervisor:
             TritonWatch, server, self._status, probe_s=probe_s, hang_s=hang_s, silent_s=triton_silent_s
         )
         self._is_to_stop = threading.Event()
-        self._new_back_off = partial(BackOff, STEADY_S + hang_s)
-        self._back_off = self._new_back_off()
+        self._back_off = BackOff(STEADY_S + hang_s)
         self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
-        self._left_out: dict[str, str] = {}  # reasons by model: left out after too many faults in a row
 
     def run(self) -> None:
         """Serve until a stop signal. Raises ServerStartError for a failed start or a crash loop."""
@@ -225,12 +221,7 @@ class Supervisor:
         if self._gateway is not None and (why := self._gateway.look()):
             self._count(GATEWAY, why)
         if self._watch is not None and self._watch.reasons:
-            reasons = self._watch.reasons
-            if self._left_out:
-                with suppress(OSError):  # the folder may be readable again at the next look
-                    lasting = set(self._server.models) - reasons.keys()  # neither deleted nor loaded again
-                    self._left_out = {model: why for model, why in self._left_out.items() if model in lasting}
-            self._status.record({**self._left_out, **reasons}, self._left_out)
+            self._status.record(self._watch.reasons)
 
     def _start_again(self, what: str, why: str, *, counts: bool = True) -> None:
         """Restart Triton; return when it is ready, or after a stop signal. Raises CrashLoopError.
@@ -246,10 +237,8 @@ class Supervisor:
             self._server.kill()
             self._server.stop()
             if counts:
-                num_faults, row = self._back_off.failed(what), self._back_off.row
-                is_too_often = num_faults > MOST_OF_A_MODEL or len(row) > MOST
-                is_left_out = is_too_often and self._leaves_out(what, why)
-                if not is_left_out and self._is_to_stop.wait(self._back_off.pause_s(reason)):
+                self._back_off.failed()
+                if self._is_to_stop.wait(self._back_off.pause_s(reason)):
                     return
             counts = True
             self._count(what, why)
@@ -262,23 +251,6 @@ class Supervisor:
                 # A crash of Triton itself is the fault of the model before; a kill from outside is not.
                 was_killed = self._server.exit_status == -signal.SIGKILL and not isinstance(error, SpoiltStartError)
                 what, why = error.model or (TRITON if was_killed else what), str(error)
-
-    def _leaves_out(self, what: str, why: str) -> bool:
-        """Leave out the model ``what`` and its ensembles. False if it is no served model, or no other is left."""
-        served = self._served or {}
-        left_out = [what, *(name for name, config in served.items() if what in parts_of(config))]
-        others = {name: config for name, config in served.items() if name not in left_out}
-        if what not in served or not others:
-            return False
-        row = self._back_off.row
-        fault = f"had {row.count(what)} of {len(row)} faults in a row; the last: {why}"
-        logger.error("%s is left out, since it %s", what, fault)
-        remedy = "`rfm models load`, or a restart of `rfm serve`, serves it again; without its folder it is forgotten"
-        reason = f"it is left out, since {what} {fault}; {remedy}"
-        self._left_out |= dict.fromkeys(left_out, reason)
-        self._served = others
-        self._back_off = self._new_back_off()
-        return True
 
     def _count(self, what: str, why: str) -> None:
         self._status.restarts.labels(what).inc()

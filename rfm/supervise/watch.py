@@ -160,8 +160,8 @@ class TritonWatch:
                 self._probes[model].has_answered = known  # a reloaded model stays ready
         (self._going.add if is_going else self._going.discard)(model)
         self._wanted.pop(model, None)
-        if model in self.served and not any(entry.state == LOADING for entry in versions):
-            self._wanted[model] = len(ready) * num_instances(self.served[model])
+        if not any(entry.state == LOADING for entry in versions) and (model in self.served or not ready):
+            self._wanted[model] = len(ready) * num_instances(self.served.get(model, {}))
         if is_settled:
             self._ready[model] = ready
         elif not ready:

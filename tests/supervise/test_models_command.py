@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -15,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.torch
-from tritonclient.grpc import model_config_pb2 as pb
 from typer.testing import Result
 
 import goldens
@@ -25,13 +22,12 @@ from engines import load_engine, serve_config
 from in_process import rfm
 from reward_models import ROOT
 from rfm.config import ExportConfig
-from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
-from rfm.supervise.status import NO_REASON
+from rfm.launch.repository_api import RepositoryApiError
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_commands import rollout as rfm_rollout
 from rfm_commands.rollout import Rollout, RolloutError
 from rfm_export.publish import read_config
-from rollout import CALLERS, NAME, WITH_ENCODERS, callers, difference
+from rollout import NAME, WITH_ENCODERS, callers
 from servers import Serving, administered, wait_for
 from trajectories import random_trajectory
 
@@ -99,12 +95,6 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     rollout.export(WITH_ENCODERS.checkpoint, repository)
     with administered(repository) as served:
         yield Running(served, repository)
-
-
-@pytest.fixture(scope="module")
-def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The checkpoint with encoders, with other weights."""
-    return rollout.other_checkpoint(tmp_path_factory.mktemp("both") / "other")
 
 
 def test_a_name_is_loaded_listed_and_unloaded_beside_the_others(running: Running) -> None:
@@ -203,82 +193,6 @@ def test_another_url_than_a_server_s_for_grpc_is_refused(url: str, message: str)
         done = rfm("models", "list", *words, env={"COLUMNS": "300", **variables})
         assert done.exit_code == 2
         assert message in done.stderr.splitlines()[-1]
-
-
-@pytest.mark.nightly  # minutes; make chaos also does it
-def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(
-    running: Running, other: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A rollout fails after the ensemble's change; another succeeds and is rolled back."""
-    samples = rollout.questions()
-    expected = {"1": rollout.answers(WITH_ENCODERS.checkpoint, samples), "2": rollout.answers(other, samples)}
-    assert min(difference(*pair) for pair in zip(expected["1"], expected["2"], strict=True)) > rollout.CLEARLY
-    rollout.export(other, running.repository)
-    probe, endpoints = rfm_rollout.probe, running.served.endpoints
-
-    def failing(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
-        if config.name == "rfm_frames":
-            raise RepositoryApiError("made up")
-        probe(server, config, version)
-
-    def is_served(version: int) -> None:
-        assert [running.served_by_restart(part) for part in PARTS] == [[version]] * 3
-        assert [running.ready(part) for part in PARTS] == [[str(version)]] * 3
-
-    with (
-        callers(endpoints.http_url, samples, expected, count=CALLERS // 2) as over_http,
-        callers(endpoints.grpc_url, samples, expected, count=CALLERS // 2) as tally,
-    ):
-        assert tally.by_version.keys() == over_http.by_version.keys() == {"1"}  # an export alone changes nothing
-        with monkeypatch.context() as patched:
-            patched.setattr(rfm_rollout, "probe", failing)
-            told = running.ask("rollout", NAME, "2")
-        assert (told.exit_code, "made up (served as before: rfm_encoder: version 1; rfm: " in told.stderr) == (1, True)
-        is_served(1)
-        assert running.models("rollout", NAME, "2").endswith("rfm: version 2 is served\n")
-        is_served(2)
-        by_first = tally.by_version["1"]
-        assert tally.by_version["2"] > 0
-        with running.client(NAME) as client:
-            assert client.model_info().source == f"{other.parent.name}/other"
-        assert running.models("rollback", NAME).endswith("rfm: version 1 is served\n")
-        is_served(1)
-        assert tally.by_version["1"] > by_first
-        with running.client(NAME) as client:
-            assert client.model_info().source == "enc_c1_t1_disc10/checkpoint"
-    for each in (tally, over_http):
-        assert (each.failed, each.unlike) == ([], [])
-        assert each.asked == each.answered > CALLERS
-        assert each.by_version.keys() == {"1", "2"}
-    assert running.served.said == []  # nothing was healed
-
-
-@pytest.mark.nightly  # a minute and a half
-def test_what_was_served_is_served_again_and_not_what_was_exported_since(running: Running, other: Path) -> None:
-    """Newly loaded models, too, but no unloaded ones."""
-    served, samples = running.served, rollout.questions()
-    running.export_plain("since")
-    running.models("load", "since")
-    version = rollout.export(other, running.repository)
-    parts = dict.fromkeys(PARTS, NO_REASON)
-    wait_for(lambda: served.reasons() == parts | {"since": NO_REASON})
-    os.kill(served.model_processes("since")[0], signal.SIGKILL)
-    wait_for(lambda: served.restarts("since") == 1)
-    served.wait_ready()
-    assert served.reasons() == parts | {"since": NO_REASON}
-    assert [running.ready(part) for part in PARTS] == [["1"]] * 3
-    with served.client() as client:
-        expected = rollout.answers(WITH_ENCODERS.checkpoint, samples)
-        for got, wanted in zip(client.evaluate(samples), expected, strict=True):
-            assert difference(got, wanted) <= rollout.TOLERANCE
-    running.models("rollout", NAME, str(version))
-    running.models("unload", "since")
-    wait_for(lambda: served.reasons() == parts)
-    os.kill(served.triton, signal.SIGKILL)
-    wait_for(lambda: served.restarts("triton") == 1)
-    served.wait_ready()
-    assert served.reasons() == parts
-    assert [running.ready(part) for part in PARTS] == [[str(version)]] * 3
 
 
 def break_settings(checkpoint: Path) -> None:

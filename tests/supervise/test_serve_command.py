@@ -274,16 +274,15 @@ def test_triton_may_have_as_many_files_and_connections_open_as_its_user(tmp_path
     ],
     ids=["missing", "no program", "fails at once", "ends without serving"],
 )
-def test_a_program_that_does_not_serve_is_told_and_is_no_crash_loop(
-    tmp_path: Path, program: str | None, told: str
-) -> None:
+def test_a_program_that_does_not_serve_is_told(tmp_path: Path, program: str | None, told: str) -> None:
     file = tmp_path / "tritonserver"
     if program is not None:
         executable(file, program)
-    words = [*command(REPOSITORY, Endpoints.free()), f"--status-port={free_ports(1)[0]}", f"--tritonserver={file}"]
-    done = subprocess.run(words, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert re.search(rf"^rfm: tritonserver: {told}", done.stderr.splitlines()[-1])
+    with (
+        pytest.raises(ServerStartError, match=f"^tritonserver: {told}"),
+        TritonServer(REPOSITORY, Endpoints.free(), find_installation(file)),
+    ):
+        raise AssertionError("it serves")
 
 
 @pytest.mark.parametrize(

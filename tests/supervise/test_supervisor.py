@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+import json
 import os
-import shutil
 import signal
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -26,7 +27,7 @@ from rfm.launch.model_processes import LOADING_DEAD_S, UNKNOWN, ModelProcesses
 from rfm.launch.triton_server import TritonServer
 from rfm.supervise import probe, status, supervisor, watch
 from rfm.supervise.status import NO_REASON, Status, StatusServer
-from rfm.supervise.supervisor import MOST, STEADY_S, BackOff, CrashLoopError, Supervisor
+from rfm.supervise.supervisor import MOST, STEADY_S, BackOff, CrashLoopError, GatewayProcess, Supervisor
 from servers import Endpoints, Serving, wait_for
 
 SILENT_S, HANG_S = 1.5, 1.5
@@ -138,34 +139,12 @@ def test_faults_in_a_row_end_the_supervisor(tmp_path: Path, monkeypatch: pytest.
         stage.signal(signal.SIGKILL)
         wait_for(lambda: stage.serving.restarts("triton") == 1)
         stage.serving.wait_ready()
-        stage.signal(signal.SIGKILL)
-        wanted = r"^triton: expected to run, got 2 faults in a row; the last: killed by SIGKILL$"
+        assert httpx.get(f"{stage.serving.status_url}/live").status_code == 200
+        assert httpx.get(f"{stage.serving.status_url}/other").status_code == 404
+        stage.file("deadly-a").touch()
+        wanted = r"^triton: expected to run, got 2 faults in a row; the last: a: a process of it is dead$"
         with pytest.raises(CrashLoopError, match=wanted):
             stage.ended.result()
-
-
-def test_a_model_that_keeps_ending_is_left_out_until_it_is_loaded_again(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(supervisor, "MOST_OF_A_MODEL", 1)
-    with supervised(tmp_path, "a", "b") as stage:
-        serving = stage.serving
-        assert httpx.get(f"{serving.status_url}/live").status_code == 200
-        assert httpx.get(f"{serving.status_url}/other").status_code == 404
-        stage.file("deadly-b").touch()
-        wait_for(lambda: serving.reasons().get("b", "").startswith("it is left out"))
-        wait_for(serving.is_ready)
-        assert serving.reasons()["a"] == NO_REASON
-        assert httpx.get(f"{serving.status_url}/ready?strict").status_code == 503
-        assert serving.metric("rfm_serve_ready", model="b") == 0
-        stage.file("deadly-b").unlink()
-        away = (stage.repository / "b").rename(tmp_path / "b")
-        wait_for(lambda: serving.reasons() == {"a": NO_REASON})  # without the folder it is forgotten
-        shutil.copytree(away, stage.repository / "b")
-        httpx.post(f"{serving.endpoints.http_url}/v2/repository/models/b/load")
-        wait_for(lambda: serving.reasons() == {"a": NO_REASON, "b": NO_REASON})
-    told = "b is left out, since it had 2 of 2 faults in a row; the last: a process of it is dead"
-    assert told in caplog.messages
 
 
 class Stubs(ModelProcesses):
@@ -190,6 +169,7 @@ PROCESSES: dict[str, tuple[list[tuple[str, str]], dict[str, int] | None, bool, f
     "one of two is stopped": ([ALIVE, STOPPED], {"a": 2}, True, 0),
     "replaced": ([DEAD, ALIVE], {"a": 1}, True, NEVER),
     "replaced while another model loads": ([DEAD, ALIVE], {"a": 1}, False, NEVER),
+    "dead after a failed load": ([DEAD], {"a": 0}, True, NEVER),
     "dead while another model loads": ([DEAD], {"a": 1}, False, LOADING_DEAD_S),
     "dead while its model loads": ([ALIVE, DEAD], {}, False, LOADING_DEAD_S),
     "dead in a start": ([DEAD], None, False, LOADING_DEAD_S),
@@ -227,38 +207,67 @@ def test_a_fault_of_a_load_counts_for_the_model_that_loads_and_is_part_of_no_cra
         assert stage.serving.restarts("a", "triton") == 0
 
 
+def test_what_was_served_is_served_again_and_not_what_was_exported_since(tmp_path: Path) -> None:
+    """Also what was loaded, and not what was unloaded."""
+    with supervised(tmp_path, "a", "b") as stage:
+        stand_in_triton.repository(tmp_path, "c")
+        httpx.post(f"{stage.serving.endpoints.http_url}/v2/repository/models/c/load")
+        httpx.post(f"{stage.serving.endpoints.http_url}/v2/repository/models/b/unload")
+        wait_for(lambda: stage.serving.reasons() == {"a": NO_REASON, "c": NO_REASON})
+        config = stage.repository / "a" / "config.pbtxt"
+        config.write_text(config.read_text() + "version_policy { specific { versions: 2 } }\n")
+        stage.signal(signal.SIGKILL)
+        wait_for(lambda: stage.serving.restarts("triton") == 1)
+        stage.serving.wait_ready()
+        assert stage.serving.reasons() == {"a": NO_REASON, "c": NO_REASON}
+        loaded = {model: json.loads(stage.file(f"loaded-{model}").read_text()) for model in ("a", "c")}
+    for model, body in loaded.items():
+        told = json.loads(body["parameters"]["config"])
+        assert (told["name"], told["version_policy"]) == (model, {"specific": {"versions": [1]}})
+
+
+def test_a_silent_gateway_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("ASK_S", "GATEWAY_PAUSE_S"):
+        monkeypatch.setattr(supervisor, name, 0.01)
+    port = Endpoints.free().http_port
+    listens = f"import socket, time; s = socket.create_server(('127.0.0.1', {port})); time.sleep(600)"
+    gateway = GatewayProcess([sys.executable, "-c", listens], ("127.0.0.1", port), silent_s=0.2)
+    gateway.start()
+    try:
+        told: list[str] = []
+        wait_for(lambda: told.extend(filter(None, [gateway.look()])) or told)
+        assert told == ["no answer for 0.2 s"]
+    finally:
+        gateway.stop()
+
+
 def test_a_crash_loop_is_many_faults_each_soon_after_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """A long run resets the count; failed starts do not, however long they take."""
     now_s = 0.0
     monkeypatch.undo()
     monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic=lambda: now_s))
 
-    def run_for(duration_s: float) -> float:
+    def run_for(duration_s: float, starts: bool = True) -> float:
         nonlocal now_s
-        ends.started()
+        if starts:
+            ends.started()
         now_s += duration_s
-        ends.failed("triton")
+        ends.failed()
         return ends.pause_s("why")
 
-    ends = BackOff()
-    assert [ends.failed(cause) for cause in ("rfm", "triton", "rfm")] == [1, 1, 2]
-    assert ends.row == ["rfm", "triton", "rfm"]
     ends = BackOff()
     assert [run_for(1.0) for _ in range(MOST)] == [0, 0.5, 1, 2, 4]
     assert run_for(STEADY_S) == 0
     assert [run_for(1.0) for _ in range(MOST - 1)] == [0.5, 1, 2, 4]
-    wanted = r"^triton: expected to run, got 6 faults in a row; the last: why$"
-    with pytest.raises(CrashLoopError, match=wanted):
+    in_a_row = r"^triton: expected to run, got 6 faults in a row; the last: why$"
+    with pytest.raises(CrashLoopError, match=in_a_row):
         run_for(1.0)
     ends = BackOff()
     run_for(5 * STEADY_S)
     for _ in range(MOST - 1):
-        now_s += 2 * STEADY_S
-        ends.failed("triton")
-        ends.pause_s("it does not start")
-    ends.failed("triton")
-    with pytest.raises(CrashLoopError, match="the last: it does not start"):
-        ends.pause_s("it does not start")
+        run_for(2 * STEADY_S, starts=False)
+    with pytest.raises(CrashLoopError, match=in_a_row):
+        run_for(2 * STEADY_S, starts=False)
 
 
 def test_a_silent_connection_to_the_status_port_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,20 +299,3 @@ def test_the_status_tells_nothing_of_what_there_was() -> None:
     }
     about.record_down("restarted")
     assert about.ready[1]["models"]["a_frames"] == {"ready": False, "reason": "restarted"}
-
-
-def test_a_server_without_a_model_that_is_left_out_is_ready_and_names_it() -> None:
-    about = Status()
-    about.record({"a": NO_REASON, "b": "it is left out"}, left_out=["b"])
-    is_ready, body = about.ready
-    assert is_ready
-    assert body["models"]["b"] == {"ready": False, "reason": "it is left out"}
-    assert told(about)['rfm_serve_ready{model="b"}'] == 0
-    port = Endpoints.free().http_port
-    with closing(StatusServer("127.0.0.1", port, about)):
-        codes = [httpx.get(f"http://127.0.0.1:{port}/ready{query}").status_code for query in ("", "?strict")]
-    assert codes == [200, 503]
-    about.record({"a": "it is loading", "b": "it is left out"}, left_out=["b"])
-    assert not about.ready[0]
-    about.record({"b": "it is left out"}, left_out=["b"])
-    assert not about.ready[0]

@@ -2,7 +2,8 @@
 """A Triton that starts at once, has real model processes, and answers what ``rfm serve`` asks.
 
 Empty files in the folder above the repository change it: ``hangs`` and ``fails`` say what becomes of probes, ``busy``
-lets the count of requests grow. A model with the file ``loading-MODEL`` also loads a version 2.
+lets the count of requests grow. A model with the file ``loading-MODEL`` also loads a version 2. What a load asked for
+is in ``loaded-MODEL``.
 """
 
 from __future__ import annotations
@@ -40,14 +41,22 @@ class Answer(BaseHTTPRequestHandler):
             lines = [f'nv_inference_request_success{{model="{model}"}} {Answer.count}' for model in self.processes]
             self._reply(200, "\n".join(lines))
         else:
-            self._reply(200, {"version": "2.51.0"} if self.path == "/v2" else CONFIG)
+            told = {"version": "2.51.0"} if self.path == "/v2" else {**CONFIG, "name": self.path.split("/")[3]}
+            self._reply(200, told)
 
     def do_POST(self) -> None:
-        self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         if self.path == "/v2/repository/index":
             self._reply(200, [entry for folder in self.repository.iterdir() for entry in self._versions(folder.name)])
-        elif self.path.endswith("/load"):
-            self.load(self.path.split("/")[-2])
+        elif self.path.endswith(("/load", "/unload")):
+            *_, model, what = self.path.split("/")
+            if what == "load":
+                (self.repository.parent / f"loaded-{model}").write_bytes(body)
+                self.load(model)
+            else:
+                process = self.processes.pop(model)
+                process.kill()
+                process.wait()
             self._reply(200, {})
         else:
             while self._is("hangs"):
@@ -56,7 +65,7 @@ class Answer(BaseHTTPRequestHandler):
 
     def _versions(self, model: str) -> list[dict[str, str]]:
         if model not in self.processes:
-            return [{"name": model}]
+            return [{"name": model, "version": "1", "state": "UNAVAILABLE", "reason": "unloaded"}]
         loading = [{"name": model, "version": "2", "state": "LOADING"}] if self._is(f"loading-{model}") else []
         return [{"name": model, "version": "1", "state": "READY"}, *loading]
 
