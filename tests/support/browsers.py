@@ -22,7 +22,6 @@ from rfm_client import UInt8Array
 
 AXE = Path(__file__).parents[1] / "page" / "vendored" / "axe-core" / "axe.min.js"
 WINDOW_PX = (1280, 1400)
-PICTURE_PX = (1440, 900)
 REBOUND = "rebound.example"  # a foreign name that leads here, as with DNS rebinding
 QUIET = (  # nothing but the page asks for anything
     "--disable-background-networking", "--disable-component-update", "--disable-default-apps", "--disable-sync",
@@ -150,15 +149,6 @@ class Browser:
             yield
         finally:
             self.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-
-    def picture(self, file: Path) -> None:
-        """Save a picture of the page for the documents."""
-        self.run("document.activeElement.blur()")
-        with self.window(*PICTURE_PX):
-            self.run("for (const each of document.querySelectorAll('.work')) each.scrollTo(0, 0)")
-            self.draw()
-            assert self.driver.save_screenshot(str(file))
-        assert file.read_bytes().startswith(b"\x89PNG\r\n")
 
     def complaints(self) -> list[str]:
         """Return new errors in the console, also violations of the page's policy."""

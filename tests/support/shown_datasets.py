@@ -35,12 +35,10 @@ def columns_of(root: Path, episode: int, name: str = "rfm_progress.parquet") -> 
     return {column: table[column].to_numpy()[own] for column in table.column_names}
 
 
-def encoded_anew(video: Path, codec: str, options: dict[str, str], noise: np.random.Generator | None = None) -> None:
-    """Encode a video, or noise, in another way."""
+def encoded_anew(video: Path, codec: str, options: dict[str, str]) -> None:
+    """Encode a video in another way."""
     with av.open(str(video)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    if noise is not None:
-        frames = [noise.integers(0, 256, frame.shape, np.uint8) for frame in frames]
     encode(video, frames, codec, options)
 
 
