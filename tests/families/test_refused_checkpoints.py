@@ -24,8 +24,7 @@ from safetensors.torch import load_file, save_file
 import goldens
 from reward_models import ROOT
 from rfm import families
-from rfm.checkpoint.content import MAX_HEADER_BYTES, MAX_JSON_BYTES, CheckpointError
-from rfm.plain_yaml import MAX_YAML_BYTES
+from rfm.families import CheckpointError
 from spoilt import (
     REWARD_MODELS,
     WEIGHTS,
@@ -53,6 +52,8 @@ IMAGES, VIDEOS, BOTH = "preprocessor_config.json", "video_preprocessor_config.js
 FIRST = "first_embedding_A"  # tensor in a ReWiND's file
 HEAD, EMBEDDING, TIED = "lm_head.weight", "model.language_model.embed_tokens.weight", "tie_word_embeddings"
 
+MAX_HEADER_BYTES = MAX_JSON_BYTES = 2**24  # of what is read
+MAX_YAML_BYTES = 2**18
 LONGEST_S = 30
 MOST_MEMORY_BYTES = 512 * 2**20  # above the process's peak
 Change = Callable[[dict[str, Any]], object]
