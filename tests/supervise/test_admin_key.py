@@ -9,14 +9,46 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tritonclient.grpc
+import tritonclient.http
+from tritonclient.utils import InferenceServerException
 
 from commands import REPOSITORY
+from in_process import rfm
 from rfm.launch.admin_key import VARIABLE, take_key
 from rfm.launch.installation import Installation, ServerStartError, find_installation
 from rfm.launch.triton_options import MAX_HTTP_BYTES, size_limits
 from rfm.launch.triton_server import TritonServer
 from rfm_client.options import InvalidValueError
-from servers import KEY, Endpoints
+from servers import KEY, Endpoints, Served
+
+ADMINISTRATION: dict[str, tuple[Any, ...]] = {
+    "get_model_repository_index": (),
+    "load_model": ("rfm",),
+    "unload_model": ("rfm",),
+    "update_log_settings": ({"log_verbose_level": 1},),
+    "update_trace_settings": (None, {"trace_rate": "1"}),
+}
+
+
+@pytest.mark.parametrize("shown", [None, "another-key-of-16-or-more"], ids=["none", "another"])
+def test_the_server_changes_nothing_without_its_key(served: Served, tmp_path: Path, shown: str | None) -> None:
+    for module, protocol, prefix in (
+        (tritonclient.http, "http", ""),
+        (tritonclient.grpc, "grpc", "triton-grpc-protocol-"),
+    ):
+        headers = {} if shown is None else {f"{prefix}rfm-admin-key": shown}
+        with module.InferenceServerClient(served.url(protocol).partition("://")[2]) as client:
+            for call, arguments in ADMINISTRATION.items():
+                with pytest.raises(InferenceServerException, match="restricted, expecting header"):
+                    getattr(client, call)(*arguments, headers=headers)
+    key_file, url = tmp_path / "key", served.url("grpc")
+    key_file.touch(0o600)
+    key_file.write_text(shown or "")
+    words = ["--url", url, *(["--admin-key-file", str(key_file)] if shown else [])]
+    done = rfm("models", "list", *words)
+    hint = f"(--admin-key-file or {VARIABLE}), got {'another' if shown else 'none'}"
+    assert (done.exit_code, done.stderr) == (1, f"rfm: admin key: expected that of the server at {url} {hint}\n")
 
 
 @pytest.mark.parametrize(

@@ -3,19 +3,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import socket
 import ssl
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
-from http.server import BaseHTTPRequestHandler
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import aiohttp
+import aiohttp.web
 import httpx
 import numpy as np
 import pytest
@@ -27,7 +30,7 @@ from repositories import kill_model
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
 from rfm_client.serving import Credentials, ServerStatus
 from secured import PUBLIC_HOST, Papers, other_program
-from servers import KEY, PATIENCE_S, Endpoints, GrpcTls, Serving, serving, start_triton, wait_for, web_server
+from servers import KEY, PATIENCE_S, Endpoints, GrpcTls, Serving, serving, start_triton, wait_for
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
@@ -139,32 +142,6 @@ def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, key_f
         assert refused.stderr.startswith(f"rfm: {mutual.grpc_url}: failed to connect")
 
 
-class Forward(BaseHTTPRequestHandler):
-    """Passes a request with the key on to Triton."""
-
-    triton = ""  # URL
-    protocol_version = "HTTP/1.1"
-
-    def do_POST(self) -> None:
-        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-        status, content, headers = 401, b'{"error": "no key"}', {}
-        if self.headers.get("Authorization") == f"Bearer {KEY}":
-            passed_on = {name: value for name, value in self.headers.items() if name.startswith("Inference")}
-            answer = httpx.request(self.command, f"{self.triton}{self.path}", content=body, headers=passed_on)
-            status, content, headers = answer.status_code, answer.content, dict(answer.headers)
-        self.send_response(status)
-        for name, value in {**headers, "content-length": str(len(content))}.items():
-            self.send_header(name, value)
-        self.end_headers()
-        self.wfile.write(content)
-
-    def do_GET(self) -> None:
-        self.do_POST()
-
-    def log_message(self, format: str, *args: object) -> None:
-        pass
-
-
 @pytest.fixture(scope="module")
 def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
     """An HTTPS proxy like nginx or an ingress that asks for a certificate and a key."""
@@ -172,63 +149,100 @@ def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
     context.load_cert_chain(papers.certificate, papers.key)
     context.verify_mode = ssl.CERT_REQUIRED
     context.load_verify_locations(papers.ca)
-    with web_server(type("Forwarding", (Forward,), {"triton": mutual.http_url}), context) as url:
-        yield url
+
+    async def forward(request: aiohttp.web.Request) -> aiohttp.web.Response:
+        if request.headers.get("Authorization") != f"Bearer {KEY}":
+            return aiohttp.web.json_response({"error": "no key"}, status=401)
+        url = f"{mutual.http_url}{request.path_qs}"
+        headers = {name: value for name, value in request.headers.items() if name.startswith("Inference")}
+        async with (
+            aiohttp.ClientSession(auto_decompress=False) as session,
+            session.request(request.method, url, data=await request.read(), headers=headers) as answer,
+        ):
+            kept = {name: value for name, value in answer.headers.items() if name != "Content-Length"}
+            return aiohttp.web.Response(status=answer.status, body=await answer.read(), headers=kept)
+
+    application = aiohttp.web.Application(client_max_size=2**28)
+    application.router.add_route("*", "/{tail:.*}", forward)
+    runner = aiohttp.web.AppRunner(application, access_log=None)
+    bound = socket.create_server(("127.0.0.1", 0))
+
+    async def start() -> None:
+        await runner.setup()
+        await aiohttp.web.SockSite(runner, bound, ssl_context=context).start()
+
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    try:
+        asyncio.run_coroutine_threadsafe(start(), loop).result()
+        yield f"https://127.0.0.1:{bound.getsockname()[1]}"
+    finally:
+        asyncio.run_coroutine_threadsafe(runner.cleanup(), loop).result()
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
 
 
-DOORS: dict[str, tuple[Callable[[Papers], dict[str, Any]], list[tuple[Callable[[Papers], dict[str, Any]], str]]]] = {
-    # options of a client that may enter, and of others, with what they hear
-    "gRPC with a key": (
-        lambda p: {"ca_file": p.ca, "headers": {TRITON_GATE.title(): KEY}},
-        [
-            (lambda p: {"ca_file": p.ca}, ".*is restricted"),
-            (lambda p: {"ca_file": p.ca, "headers": {TRITON_GATE: "another"}}, ".*is restricted"),
-            (lambda p: {"ca_file": p.other_ca}, ".*CERTIFICATE_VERIFY_FAILED"),
-            (lambda p: {}, r".*CERTIFICATE_VERIFY_FAILED.*with ca_file \(--ca-file\)"),
-        ],
-    ),
-    "gRPC with certificates": (
-        lambda p: p.client,
-        [(lambda p: {**p.client, "ca_file": p.other_ca}, ".*CERTIFICATE_VERIFY_FAILED")],
-    ),
-    "HTTP through a proxy": (
-        lambda p: {**p.client, "api_key": KEY},
-        [
-            (lambda p: p.client, "no key"),
-            (lambda p: {**p.client, "api_key": "another"}, "no key"),
-            (lambda p: {**p.client, "ca_file": p.other_ca, "api_key": KEY}, ".*certificate verify failed"),
-        ],
-    ),
-}
+@dataclass(frozen=True)
+class Door:
+    """A way to a server: options of a client that may enter, and of others, with what they hear."""
+
+    url: str
+    good: dict[str, Any]
+    denied: list[tuple[dict[str, Any], str]]
 
 
-@pytest.mark.parametrize("name", DOORS)
-def test_a_door_answers_who_may_enter_and_denies_others_at_once(
-    secure: Endpoints, mutual: Endpoints, proxied: str, papers: Papers, name: str
-) -> None:
-    url = dict(zip(DOORS, (secure.grpc_url, mutual.grpc_url, proxied), strict=True))[name]
-    good, denied = DOORS[name]
-    with client(url, **good(papers)) as asked:
-        scores_right(asked)
-    status = ServerStatus.read(url, credentials=Credentials(**good(papers)))
-    assert [model.name for model in status.models] == ["rfm"]
-    for options, told in denied:
-        is_denied = pytest.raises(AccessDeniedError, match=f"access denied: {told}")
-        with client(url, **options(papers)) as asked:
+@pytest.fixture(scope="module")
+def doors(secure: Endpoints, mutual: Endpoints, proxied: str, papers: Papers) -> dict[str, Door]:
+    stranger = {**papers.client, "ca_file": papers.other_ca}
+    shown = {"ca_file": papers.ca, "headers": {TRITON_GATE.title(): KEY}}
+    return {
+        "gRPC with a key": Door(
+            secure.grpc_url,
+            shown,
+            [
+                ({"ca_file": papers.ca}, ".*is restricted"),
+                ({"ca_file": papers.ca, "headers": {TRITON_GATE: "another"}}, ".*is restricted"),
+                ({"ca_file": papers.other_ca}, ".*CERTIFICATE_VERIFY_FAILED"),
+                ({}, r".*CERTIFICATE_VERIFY_FAILED.*with ca_file \(--ca-file\)"),
+            ],
+        ),
+        "gRPC under another name": Door(
+            secure.grpc_url.replace("127.0.0.1", "localhost"), {}, [({"ca_file": papers.ca}, "")]
+        ),
+        "gRPC with certificates": Door(mutual.grpc_url, papers.client, [(stranger, ".*CERTIFICATE_VERIFY_FAILED")]),
+        "HTTP through a proxy": Door(
+            proxied,
+            {**papers.client, "api_key": KEY},
+            [
+                (papers.client, "no key"),
+                ({**papers.client, "api_key": "another"}, "no key"),
+                ({**stranger, "api_key": KEY}, ".*certificate verify failed"),
+            ],
+        ),
+    }
+
+
+@pytest.mark.parametrize(
+    "name", ["gRPC with a key", "gRPC under another name", "gRPC with certificates", "HTTP through a proxy"]
+)
+def test_a_door_answers_who_may_enter_and_denies_others_at_once(doors: dict[str, Door], name: str) -> None:
+    door = doors[name]
+    if door.good:
+        with client(door.url, **door.good) as asked:
+            scores_right(asked)
+        status = ServerStatus.read(door.url, credentials=Credentials(**door.good))
+        assert [model.name for model in status.models] == ["rfm"]
+    for options, told in door.denied:
+        with client(door.url, **options) as asked:
             started_s = time.monotonic()
             assert not asked.is_ready()
-            with is_denied:
+            with pytest.raises(AccessDeniedError, match=f"access denied: {told}"):
                 asked.progress(TRAJECTORY)
             assert time.monotonic() - started_s < AT_ONCE_S
-        with is_denied:
-            ServerStatus.read(url, credentials=Credentials(**options(papers)))
-
-
-def test_a_server_under_another_name_is_not_trusted(secure: Endpoints, papers: Papers) -> None:
-    with client(secure.grpc_url.replace("127.0.0.1", "localhost"), ca_file=papers.ca) as asked:
-        assert not asked.is_ready()
-        with pytest.raises(AccessDeniedError, match="access"):
-            asked.progress(TRAJECTORY)
+        with pytest.raises(AccessDeniedError, match=f"access denied: {told}"):
+            ServerStatus.read(door.url, credentials=Credentials(**options))
 
 
 def test_a_closed_client_leaves_no_connection_to_a_server_that_hangs(papers: Papers) -> None:

@@ -16,15 +16,13 @@ from typing import Any
 
 import pytest
 import requests
-import tritonclient.grpc
 import tritonclient.http
-from tritonclient.utils import InferenceServerException, np_to_triton_dtype
+from tritonclient.utils import np_to_triton_dtype
 
 import goldens
 import rfm_export
 from engines import serve_config
 from gateways import answers, poll
-from in_process import rfm
 from paths import ROOT
 from rfm_client import (
     DeadlineExceededError,
@@ -35,7 +33,6 @@ from rfm_client import (
     RewardError,
     ServerUnavailableError,
 )
-from rfm_client.contract.names import ADMIN_KEY_VARIABLE
 from servers import Endpoints, Serving, children, serving, wait_for, web_server
 from tensors import encode_samples
 from trajectories import random_trajectory
@@ -217,37 +214,6 @@ def test_the_admin_key_is_among_triton_s_arguments_alone(running: Running) -> No
             assert KEY not in Path(f"/proc/{child}/environ").read_text()
     assert f"={KEY}" in Path(f"/proc/{running.served.triton}/cmdline").read_text()
     assert KEY not in running.served.log.read_text()
-
-
-ADMINISTRATION: dict[str, tuple[Any, ...]] = {
-    "get_model_repository_index": (),
-    "load_model": ("rfm",),
-    "unload_model": ("rfm",),
-    "update_log_settings": ({"log_verbose_level": 1},),
-    "update_trace_settings": (None, {"trace_rate": "1"}),
-}
-
-
-@pytest.mark.triton
-@pytest.mark.parametrize("shown", [None, "another-key-of-16-or-more"], ids=["none", "another"])
-def test_the_server_changes_nothing_without_its_key(running: Running, tmp_path: Path, shown: str | None) -> None:
-    ends = running.served.endpoints
-    for module, url, prefix in (
-        (tritonclient.http, ends.http_url, ""),
-        (tritonclient.grpc, ends.grpc_url, "triton-grpc-protocol-"),
-    ):
-        headers = {} if shown is None else {f"{prefix}rfm-admin-key": shown}
-        with module.InferenceServerClient(url.partition("://")[2]) as client:
-            for call, arguments in ADMINISTRATION.items():
-                with pytest.raises(InferenceServerException, match="restricted, expecting header"):
-                    getattr(client, call)(*arguments, headers=headers)
-    key_file, url = tmp_path / "key", ends.grpc_url
-    key_file.touch(0o600)
-    key_file.write_text(shown or "")
-    words = ["--url", url, *(["--admin-key-file", str(key_file)] if shown else [])]
-    done = rfm("models", "list", *words)
-    hint = f"(--admin-key-file or {ADMIN_KEY_VARIABLE}), got {'another' if shown else 'none'}"
-    assert (done.exit_code, done.stderr) == (1, f"rfm: admin key: expected that of the server at {url} {hint}\n")
 
 
 def asked(running: Running, request_id: str, **content: Any) -> requests.Response:
