@@ -118,7 +118,7 @@ class EngineServer(service_pb2_grpc.GRPCInferenceServiceServicer):
         if name == "rfm":
             configs = [parse((folder / CONFIG_FILE).read_text()) for folder in sorted(DEMO.glob("rfm*"))]
             self._models |= {each.name: Model(each, DEMO / each.name / "1") for each in configs}
-        elif name in {config.name for config in goldens.SERVED}:
+        elif name in {config.name for config in (*goldens.SERVED, *goldens.ON_DEMAND)}:
             config = goldens.config(name)
             source = read_for_export(
                 config.checkpoint, serve_config(config, name), None, None, lambda _: None, other_machine=True
