@@ -91,6 +91,7 @@ def test_a_server_that_hangs_is_unhealthy_with_the_reason(triton: Triton, tiny: 
     poll(lambda: tiny.get("/health").ok)
 
 
+@pytest.mark.slow
 def test_a_model_that_works_is_healthy_until_it_finishes_nothing_for_long(triton: Triton) -> None:
     """A stand-in is late with its probes, beside the real Triton's statistics."""
     config, now_s = GatewayConfig(triton=triton.endpoints.grpc_url, metrics_url=triton.endpoints.metrics_url), 0.0

@@ -24,13 +24,13 @@ from fastapi import FastAPI
 from prometheus_client.parser import text_string_to_metric_families
 
 from rfm.launch.endpoints import free_ports
-from rfm_client import AsyncRewardClient, ModelInfo, ModelNotFoundError, RewardClient
+from rfm_client import AsyncRewardClient, DeadlineExceededError, ModelInfo, ModelNotFoundError, RewardClient
 from rfm_gateway import GatewayConfig
 from rfm_gateway.app import create_app
 from rfm_gateway.command import server_options
 from servers import Endpoints
 from shelves import Shelf
-from transports import Answer
+from transports import Answer, Tensors
 
 with warnings.catch_warnings():  # it would rather have httpx2
     warnings.simplefilter("ignore")
@@ -139,16 +139,21 @@ class StandIn(Shelf):
         info = await super().model_info(model, timeout_s)
         return info if info.video_dim is None else replace(info, video_dim=self.dims[0], text_dim=self.dims[1])
 
-    async def infer(self, model: str, *arguments: Any, **options: Any) -> Answer:
+    async def infer(
+        self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+    ) -> Answer:
         if model not in self.served:
             raise ModelNotFoundError(model)
+        ends_s = time.monotonic() + timeout_s
         try:
             while not self.is_open.is_set():
                 await asyncio.sleep(0.01)
+                if time.monotonic() > ends_s:
+                    raise DeadlineExceededError("no answer in time")
         except asyncio.CancelledError:
             self.num_cancelled += 1
             raise
-        return await super().infer(model, *arguments, **options)
+        return await super().infer(model, inputs, outputs, timeout_s, request_id=request_id)
 
 
 def _app(triton: StandIn | str, api_key: str | None, settings: Mapping[str, Any]) -> tuple[FastAPI, GatewayConfig]:
