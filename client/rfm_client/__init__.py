@@ -8,8 +8,8 @@ with RewardClient("grpc://localhost:8001") as client:
     result.progress, result.success  # float32 [T] each
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+import importlib
+import typing
 
 from rfm_client.contract import (
     FRAME_SCORES,
@@ -39,7 +39,7 @@ from rfm_client.contract import (
 )
 from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
 
-if TYPE_CHECKING:
+if typing.TYPE_CHECKING:
     from rfm_client.async_client import AsyncRewardClient
     from rfm_client.client import RewardClient
     from rfm_client.frames.inputs import as_trajectory, load_trajectory
@@ -86,7 +86,7 @@ _LATER = {  # imported at first use, since servers need the contract alone
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> typing.Any:
     if name not in _LATER:
         raise AttributeError(f"module 'rfm_client' has no attribute {name!r}")
-    return getattr(import_module(f"rfm_client.{_LATER[name]}"), name)
+    return getattr(importlib.import_module(f"rfm_client.{_LATER[name]}"), name)
