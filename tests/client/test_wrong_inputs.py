@@ -126,7 +126,7 @@ USAGE = {
     "rfm-client label dataset --episodes 5:2": bad(
         "--episodes", "expected numbers and ranges such as 0:100,205, got '5:2'"
     ),
-    "rfm-client label dataset --format csv": bad("--format", "expected one of progress, signals, hdf5, got 'csv'"),
+    "rfm-client label dataset --format csv": bad("--format", "expected some of progress, signals, got csv"),
     "rfm-client label dataset --shard 3": bad("--shard", "expected i/n, for example 0/8, got '3'"),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
     "rfm-client label dataset --name a/b": bad("--name", "expected 1 to 64 letters, digits, _ or -, got 'a/b'"),
@@ -160,7 +160,7 @@ FAILURES = {
     "rfm-client evaluate nope": (1, "nope: expected a labelled dataset, got no file or folder of this name"),
     "rfm-client evaluate dataset": (
         1,
-        "dataset: expected label files, NAME_progress.parquet or in HDF5 (rfm-client label), or --labels, got none",
+        "dataset: expected label files, NAME_progress.parquet (rfm-client label), or --labels, got none",
     ),
     "rfm-client label nope": (1, f"nope: {DATASET} none"),
     "rfm-client label file.txt": (1, f"file.txt: {DATASET} another file"),
@@ -226,10 +226,6 @@ AT_SERVER = {
     "label dataset --cameras top": (
         1,
         "--cameras: expected some of observation.images.front, observation.images.wrist, got 'top'",
-    ),
-    "label dataset --format hdf5": (
-        1,
-        "--format: expected progress or signals for a dataset that is no HDF5 file, got hdf5",
     ),
     "label dataset --mode whole --frames 4": (1, "frames: expected none with the rule all, got 4: leave --frames out"),
 }

@@ -348,7 +348,7 @@ def test_labels_of_seconds_name_the_rule_that_makes_progress(asked: Served, tmp_
 
 def test_the_description_tells_what_is_given(asked: Served) -> None:
     infos = {}
-    for name in NAMES:
+    for name in (*NAMES, "rynn"):
         with asked.client(name) as client:
             infos[name] = client.model_info(frames=True)
     assert infos["rynn"].kind == "RynnValue"
