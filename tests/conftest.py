@@ -103,7 +103,7 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests with a shared server ``triton``, and keep those of a folder in one of the test processes.
+    """Mark tests with a shared server ``triton``, those with a server of their own ``slow``, too, and keep those of a folder in one of the test processes.
 
     The folders in ``ALONE_WITH_IT`` have a server each, the others one together: with one for all, most tests would
     wait in one process. The tests of a file also stay together, since they share servers.
@@ -114,5 +114,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("triton")
             folder = item.path.parent.name
             shared += folder if folder in ALONE_WITH_IT else ""
+        elif item.get_closest_marker("triton"):
+            item.add_marker("slow")  # it starts a server of its own
         item.add_marker(pytest.mark.xdist_group(shared or str(item.path)))
     items.sort(key=lambda item: item.path.parent.name not in LONGEST)

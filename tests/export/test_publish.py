@@ -204,6 +204,7 @@ def test_triton_does_not_see_what_is_staged(served: Served) -> None:
 
 
 @pytest.mark.triton
+@pytest.mark.slow
 def test_weights_that_have_changed_since_their_export_are_not_served(served: Served) -> None:
     """Each version is compared with its own configuration; the shared one describes the newest."""
     export(served.repository, "changed")

@@ -265,6 +265,7 @@ def test_a_plain_tritonserver_serves_the_repository_too(tmp_path: Path) -> None:
             process.wait(EXIT_S)
 
 
+@pytest.mark.slow
 def test_triton_may_have_as_many_files_and_connections_open_as_its_user(tmp_path: Path) -> None:
     program = executable(tmp_path / "tritonserver", "#!/bin/sh\nulimit -Sn\nulimit -Hn\nexit 3\n")
     words = [*command(REPOSITORY, Endpoints.free()), f"--tritonserver={program}"]
@@ -283,6 +284,7 @@ def test_triton_may_have_as_many_files_and_connections_open_as_its_user(tmp_path
     ],
     ids=["missing", "no program", "fails at once", "ends without serving"],
 )
+@pytest.mark.slow
 def test_a_program_that_does_not_serve_is_told_and_is_no_crash_loop(
     tmp_path: Path, program: str | None, told: str
 ) -> None:

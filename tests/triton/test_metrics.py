@@ -136,6 +136,7 @@ def test_samples_are_counted_by_type_and_by_what_became_of_them(served: Served) 
     assert counted(scrape(served), before, MODEL) == expected
 
 
+@pytest.mark.slow
 def test_two_instances_count_apart_and_add_up(served_too: Served) -> None:
     """Failures are counted, too: in a batch, then alone, as the client asks again."""
     samples = mixed_samples(60)
@@ -182,6 +183,7 @@ def test_histograms_add_up_to_what_each_execution_took(served: Served) -> None:
     assert change("forward_seconds_sum") == pytest.approx(sum(t.forward_ms for t in timings) / 1e3, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_metrics_have_their_kinds_buckets_and_labels(served_too: Served) -> None:
     scraped = scrape(served_too, 0)
     counters = ("samples", "frames", "out_of_memory_retries", "forward_passes")
@@ -248,6 +250,7 @@ def test_the_served_checkpoint_is_told(served: Served) -> None:
     assert {sample.labels["network"] for sample in told} == {"RewindTransformer", "Encoders"}
 
 
+@pytest.mark.slow
 def test_a_model_that_is_loaded_again_counts_on(served_too: Served) -> None:
     """An unloaded checkpoint is served no more; one loaded in place is."""
     sample = ProgressSample(random_trajectory(0, 3))

@@ -40,11 +40,15 @@ from trajectories import random_trajectory
 pytestmark = pytest.mark.triton
 
 VLM = "q3_tok_disc10"
+CASES = [
+    pytest.param(case, marks=[pytest.mark.slow] if case.config in goldens.ON_DEMAND else [])
+    for case in goldens.SERVED_CASES
+]
 LEAST_REGION_BYTES = 2**20  # of the Python backend, per model process
 
 
 @pytest.mark.reference
-@pytest.mark.parametrize("case", goldens.SERVED_CASES, ids=str)  # each of the others runs on the engine
+@pytest.mark.parametrize("case", CASES, ids=str)  # each of the others runs on the engine
 def test_a_reference_answer_of_each_kind_of_checkpoint_comes_back(
     served: Served, protocol: str, case: goldens.Case
 ) -> None:
@@ -246,9 +250,12 @@ def test_what_cannot_be_scored_is_refused_with_what_was_expected(served: Served,
         infer(served.url("grpc"), model, question | changes, ["progress"])
 
 
-@pytest.mark.parametrize("model", [MODEL, f"{FRAMES_MODEL}_encoder", f"{VLM}_frames"])
+@pytest.mark.parametrize(
+    "model", [MODEL, f"{FRAMES_MODEL}_encoder", pytest.param(f"{VLM}_frames", marks=pytest.mark.slow)]
+)
 def test_a_batch_of_no_samples_is_refused(served: Served, model: str) -> None:
     """Triton lets the request pass if the bytes fit a single sample, which an ensemble then scores."""
+    served.has(VLM if model.startswith(VLM) else model)
     question = embedded() if model == MODEL else {**QUESTION, "task": np.array([[4, 0, 0, 0, *b"lift"]], np.uint8)}
     if model.endswith("_encoder"):
         question = {name: question[name] for name in ("num_frames", "frames", "task")}
@@ -305,7 +312,7 @@ def test_no_other_user_can_read_the_shared_memory_of_a_server() -> None:
     assert {stat.S_IMODE(each.st_mode) & 0o077 for each in found} == {0}
 
 
-@pytest.mark.parametrize("model", [FRAMES_MODEL, VLM])
+@pytest.mark.parametrize("model", [FRAMES_MODEL, pytest.param(VLM, marks=pytest.mark.slow)])
 def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) -> None:
     """Tensors may use the optional input for any pair, and for a sample without a second trajectory."""
     frames = [np.random.default_rng(seed).integers(0, 256, (2, 56, 56, 3), np.uint8) for seed in (1, 2)]
@@ -316,6 +323,7 @@ def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) 
         "second_frames": np.stack([frames[1], np.zeros_like(frames[1])]),
     }
     outputs = ["progress", "success", "preference"]
+    served.has(model)
     url = served.url("http")
     expected, got = (infer(url, f"{model}_frames", t, outputs) for t in (tensors, tensors | apart))
     for name in outputs:
@@ -323,6 +331,7 @@ def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) 
         np.testing.assert_allclose(got[name], expected[name], rtol=0, atol=TOLERANCE)
 
 
+@pytest.mark.slow
 def test_a_model_from_before_pairs_of_two_frame_sizes_says_so(served: Served) -> None:
     config = goldens.config(VLM)
     rfm_export.export(config.checkpoint, served.repository, serve_config(config, "before"))
