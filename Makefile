@@ -84,7 +84,7 @@ SPACE := $(EMPTY) $(EMPTY)
 GPU_PATH = $(subst $(SPACE),:,$(addprefix $(CURDIR)/,. client apps/gateway apps/labels export commands build/gpu/site))
 
 # Measure on a GPU: GPU tests, the bare engine, served checkpoints. Ten minutes.
-# Writes benchmarks/results/gpu.md. ARGUMENTS="--checkout build/gpu/before" measures the commit of make gpu-packages.
+# Writes build/benchmarks/gpu.md. ARGUMENTS="--checkout build/gpu/before" measures the commit of make gpu-packages.
 gpu:
 	test ! -f build/gpu.tar.xz || $(PYTHON) -c "import tarfile; tarfile.open('build/gpu.tar.xz').extractall('build/gpu')"
 	PYTHONPATH=$(GPU_PATH) $(GPU_PYTHON) benchmarks/gpu.py $(ARGUMENTS)

@@ -173,8 +173,8 @@ def roboreward(run: Run) -> Iterator[Row]:
 
 
 def rynnvalue(run: Run) -> Iterator[Row]:
-    """Serve RynnValue, where the checkout has it."""
-    if (run.checkout / "rfm" / "rynnvalue").exists():
+    """Serve RynnValue, where the checkout describes robots at export."""
+    if "robot_description" in (run.checkout / "rfm" / "config.py").read_text():
         asked = [(n, FRAMES, run.scale.small_px, False) for n in run.scale.callers]
         yield from served(run, "rynnvalue", run.checkpoint(RYNNVALUE), DESCRIBED, asked)
 

@@ -15,7 +15,6 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +113,7 @@ def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
         ("roboreward", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
         ("roboreward-expected", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
     ]
-    if find_spec("rfm.rynnvalue"):
+    if "robot_description" in inspect.signature(families.load).parameters:
         plans += [("rynnvalue", RYNNVALUE, [(n, FRAMES, small) for n in (one, some, many)])]
     knows_graphs = "cuda_graphs" in inspect.signature(Engine.of).parameters
     for what, kind, sizes in plans:

@@ -40,7 +40,10 @@ class ModelProcesses:
         states, now_s = self._states(), time.monotonic()
         living = Counter(self._models[pid] for pid, state in states.items() if state not in _STATES)
         enough = {model for model, number in (wanted or {}).items() if living[model] >= number}
-        ill = [pid for pid, state in states.items() if state in _STATES and self._models[pid] not in enough]
+        replaced = [
+            pid for pid, state in states.items() if state == psutil.STATUS_ZOMBIE and self._models[pid] in enough
+        ]
+        ill = [pid for pid, state in states.items() if state in _STATES and pid not in replaced]
         before, self._since_s = self._since_s, {pid: self._since_s.get(pid, now_s) for pid in ill}
         for pid in sorted(before.keys() & self._since_s.keys()):
             if is_settled or now_s - before[pid] >= LOADING_DEAD_S:

@@ -101,7 +101,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         code, body, content_type = HTTPStatus.OK, b"{}", "application/json"
-        if self.path == "/ready":
+        if self.path.partition("?")[0] == "/ready":  # 0.4.0 had /ready?strict
             is_ready, told = self.server.status.ready
             code = HTTPStatus.OK if is_ready else HTTPStatus.SERVICE_UNAVAILABLE
             body = json.dumps(told).encode()

@@ -66,12 +66,12 @@ def mixed(make: Callable[..., Json], *dims: Any) -> list[Json]:
     ]
 
 
-def test_the_documented_payload_is_answered_to_curl_and_to_requests(tiny: Gateway, tmp_path: Path) -> None:
+def test_the_documented_payload_is_answered_to_curl_and_to_requests(tiny: Gateway, curl: str, tmp_path: Path) -> None:
     (tmp_path / "sample_request.json").write_text(json.dumps(SEED_PAYLOAD))
     url = f"{tiny.url}/evaluate_batch"
-    curl = ["curl", "-sS", "-X", "POST", url, "-H", "Content-Type: application/json", "-d", "@sample_request.json"]
+    words = [curl, "-sS", "-X", "POST", url, "-H", "Content-Type: application/json", "-d", "@sample_request.json"]
     by_curl, by_curls_http2 = (
-        json.loads(subprocess.run([*curl, *more], cwd=tmp_path, capture_output=True, check=True).stdout)
+        json.loads(subprocess.run([*words, *more], cwd=tmp_path, capture_output=True, check=True).stdout)
         for more in ([], ["--http2"])
     )
     assert by_curls_http2 == by_curl

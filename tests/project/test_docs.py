@@ -285,10 +285,10 @@ def test_the_request_of_the_contract_runs(demo_server: Endpoints) -> None:
     assert outputs["progress"]["shape"] == [2, 3]
 
 
-def test_the_answer_to_the_curl_of_the_contract_is_strict_json(demo_server: Endpoints) -> None:
+def test_the_answer_to_the_curl_of_the_contract_is_strict_json(demo_server: Endpoints, curl: str) -> None:
     (command,) = re.findall(r"^```bash\n(curl .*?)^```", CONTRACT.read_text(), re.MULTILINE | re.DOTALL)
-    words = shlex.split(command.replace("localhost:8000", f"{demo_server.http_url}"))
-    done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60)
+    _, *words = shlex.split(command.replace("localhost:8000", f"{demo_server.http_url}"))
+    done = subprocess.run([curl, *words], capture_output=True, text=True, check=True, timeout=60)
     answer = json.loads(done.stdout, parse_constant=pytest.fail)
     assert {output["name"]: output["shape"] for output in answer["outputs"]} == {"progress": [1, 2], "success": [1, 2]}
 

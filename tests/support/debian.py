@@ -26,7 +26,9 @@ PACKAGES = {  # fixture -> packages of Debian and Ubuntu
     "promtool": "prometheus",
 }
 WAITING = pytest.StashKey[Counter[str]]()  # tests of this run that were left out, by packages
-PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"], "/usr/sbin"])
+PATH = os.pathsep.join(
+    [str(Path(sys.executable).parent), os.environ["PATH"], "/usr/sbin", "/usr/libexec/docker/cli-plugins"]
+)
 
 
 def find(name: str) -> str:

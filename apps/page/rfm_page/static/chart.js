@@ -72,7 +72,6 @@ export class Chart {
   #curves = [];
   #panes = panesOf([]);
   #shape = "";
-  #begin = 0;
   #end = 1;
   #threshold = 0.5;
   #time = 0;
@@ -95,15 +94,14 @@ export class Chart {
   /**
    * Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`; one with a `leading`
    * has the array of this name in place of progress.
-   * Some have a `begin`, a `colour`, or a `dash`: lengths of strokes and gaps.
+   * Some have a `colour` or a `dash`: lengths of strokes and gaps.
    * One that `skipsFrames` has a dot at each point.
    */
   show(curves) {
     this.#curves = curves.filter(({ times }) => times.length);
     this.#panes = panesOf(this.#curves, this.#isLow);
-    this.#begin = Math.min(...this.#curves.map(({ begin }) => begin ?? 0), Infinity);
     this.#end = Math.max(0, ...this.#curves.map(({ allTimes }) => allTimes.at(-1))); // so that the axis does not grow
-    if (this.#end <= this.#begin) this.#end = this.#begin + 1; // uPlot divides an axis of no length for ever
+    if (this.#end <= 0) this.#end = 1; // uPlot divides an axis of no length for ever
     const signals = Object.keys(this.#panes);
     const tables = this.#drawn.map((curve) => [
       curve.times, ...signals.map((signal) => curve.times.map((_, index) => heightOf(this.#panes, signal, curve[signal]?.[index]))),
@@ -244,7 +242,7 @@ export class Chart {
       padding: [4, this.#rightPx, 4, 0],
       legend: { show: false },
       cursor: { x: false, y: false, points: { show: false }, drag: { x: false, y: false } },
-      scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [0, 1] } },
+      scales: { x: { time: false, range: () => [0, this.#end] }, y: { range: [0, 1] } },
       axes: [{ ...axis, size: 24, space: MARK_PX, label: "time (s)" }, left],
       series: [{}, ...series],
       hooks: { drawAxes: [(plot) => clearBetween(plot, panes)], draw: [(plot) => drawNames(plot, panes, letterPx)], setSize: [() => this.#placeAgain()] },
@@ -266,7 +264,7 @@ export class Chart {
       const bounds = plot.over.getBoundingClientRect();
       const seconds = plot.posToVal(event.clientX - bounds.left, "x");
       this.#pointedTop = event.clientY - bounds.top;
-      this.#onTime(Math.min(Math.max(seconds, this.#begin), this.#end), event.buttons > 0);
+      this.#onTime(Math.min(Math.max(seconds, 0), this.#end), event.buttons > 0);
     };
     plot.over.addEventListener("pointerdown", (event) => {
       plot.over.setPointerCapture(event.pointerId);
