@@ -43,7 +43,7 @@ class ModelProcesses:
         replaced = [
             pid for pid, state in states.items() if state == psutil.STATUS_ZOMBIE and self._models[pid] in enough
         ]
-        ill = [pid for pid, state in states.items() if state in _STATES and pid not in replaced]
+        ill = [pid for pid in states.keys() - replaced if states[pid] in _STATES]
         before, self._since_s = self._since_s, {pid: self._since_s.get(pid, now_s) for pid in ill}
         for pid in sorted(before.keys() & self._since_s.keys()):
             if is_settled or now_s - before[pid] >= LOADING_DEAD_S:

@@ -21,7 +21,7 @@ from paths import ROOT
 from servers import Served
 from tolerances import TOLERANCE
 
-pytestmark = pytest.mark.triton
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 QWEN3 = {"name": "model", "type": "Qwen3VLModel"}  # as a client of the original server looks for it
 PROBABILITY = goldens.config(CHECKPOINT).tolerances[1]
@@ -29,6 +29,7 @@ PROBABILITY = goldens.config(CHECKPOINT).tolerances[1]
 
 @pytest.fixture(scope="module")
 def gateway(served: Served, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    served.has(CHECKPOINT)
     with running(served.endpoints, tmp_path_factory.mktemp("gateway"), CHECKPOINT) as started:
         yield started
 
@@ -36,6 +37,7 @@ def gateway(served: Served, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 @pytest.fixture(scope="module")
 def changed(served: Served, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     """A gateway that scores by prefixes unless a request says otherwise."""
+    served.has(CHECKPOINT)
     folder = tmp_path_factory.mktemp("changed")
     with running(served.endpoints, folder, CHECKPOINT, "--use-frame-steps", "--no-viewer") as started:
         yield started

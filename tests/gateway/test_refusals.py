@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import schemathesis
 from hypothesis import HealthCheck, given, settings
 
 from gateway_requests import (
@@ -328,6 +327,8 @@ def test_frames_that_show_nothing_are_scored_with_a_warning_or_refused(
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ["/evaluate_batch", NPY])
 def test_no_request_that_the_schemas_allow_breaks_the_gateway(path: str) -> None:
+    import schemathesis  # here, since it takes a second to import
+
     triton = StandIn()
     triton.is_open.set()
     with listening(triton) as gateway:

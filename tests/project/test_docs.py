@@ -150,6 +150,7 @@ def test_every_example_runs(demo_server: Endpoints, folder: Path, code: str) -> 
             environment.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", found(COMMAND))
 def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: str) -> None:
     if command.startswith("rfm-client gateway"):
