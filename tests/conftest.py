@@ -24,7 +24,6 @@ from servers import CRASHES, Endpoints, Served, start_triton
 
 pytest_plugins = ("debian", "gateway_fixtures")
 SHARED = ("served", "triton")  # fixtures that start a server for the tests of many files
-ALONE_WITH_IT = {"client"}
 LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the others run meanwhile
 
 torch.set_num_threads(1)
@@ -103,18 +102,15 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests with a shared server ``triton``, those with a server of their own ``slow``, too, and keep those of a folder in one of the test processes.
+    """Mark tests with a shared server ``triton``, and keep them in one of the test processes.
 
-    The folders in ``ALONE_WITH_IT`` have a server each, the others one together: with one for all, most tests would
-    wait in one process. The tests of a file also stay together, since they share servers.
+    Tests with another server than ``served`` are ``slow``. The tests of a file stay together, since they share servers.
     """
     for item in items:
         shared = next((name for name in SHARED if name in getattr(item, "fixturenames", ())), None)
         if shared:
             item.add_marker("triton")
-            folder = item.path.parent.name
-            shared += folder if folder in ALONE_WITH_IT else ""
-        elif item.get_closest_marker("triton"):
-            item.add_marker("slow")  # it starts a server of its own
+        if shared != "served" and item.get_closest_marker("triton"):
+            item.add_marker("slow")  # a server of its own, or the gateway's
         item.add_marker(pytest.mark.xdist_group(shared or str(item.path)))
     items.sort(key=lambda item: item.path.parent.name not in LONGEST)

@@ -54,6 +54,7 @@ def test_every_style_of_call_gives_the_engine_s_answers(served: Served, protocol
         assert answer.model_version == "1"
 
 
+@pytest.mark.slow
 def test_an_episode_step_by_step_has_the_scores_of_the_whole(served: Served, protocol: str) -> None:
     frames = np.random.default_rng(1).integers(0, 256, (6, 56, 84, 3), np.uint8)
     with served.client(protocol, IMAGES) as client, client.episode("stack the cups", frames=4) as episode:

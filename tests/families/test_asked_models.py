@@ -118,6 +118,7 @@ def test_a_file_without_a_dtype_gets_a_line(tmp_path: Path) -> None:
     assert "assumed, and not shown by the checkpoint: dtype bfloat16 (default, as config.json has no dtype);" in line
 
 
+@pytest.mark.slow
 def test_a_model_of_before_marks_may_gain_them(tmp_path: Path) -> None:
     settings = ExportConfig(name="robo", num_gpus=0, reward_model="roboreward")
     assert rfm_export.export(ROBO, tmp_path, settings) == 1

@@ -83,6 +83,7 @@ def test_scoring_is_healthy_without_triton_s_metrics(triton: Triton) -> None:
         assert "metrics" in failure(gateway.get("/gpu_status"), 503)
 
 
+@pytest.mark.slow
 def test_a_server_that_hangs_is_unhealthy_with_the_reason(triton: Triton, tiny: Gateway) -> None:
     assert tiny.get("/health").ok
     with paused(triton):  # the earlier state is reported for another second

@@ -84,6 +84,7 @@ BOUNDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("max_bytes", "scorer"), BOUNDS.values(), ids=BOUNDS)
 def test_all_workers_together_hold_no_more_than_fits_or_one_video(
     output: Path, max_bytes: int, scorer: BrightnessScorer, monkeypatch: pytest.MonkeyPatch

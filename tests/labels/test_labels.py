@@ -74,6 +74,7 @@ def area_under_curve(scores: Any, is_success: Any) -> float:
     return float(np.mean((good[:, None] > bad) + 0.5 * (good[:, None] == bad)))
 
 
+@pytest.mark.slow
 @pytest.mark.triton
 @pytest.mark.parametrize("root", DATASETS)
 def test_triton_and_the_engine_score_each_frame_on_its_prefix_and_tell_successes_from_failures(

@@ -95,6 +95,7 @@ except ValueError as error:
 """
 
 
+@pytest.mark.slow
 def test_without_the_package_of_datasets_the_page_shows_none_and_says_what_to_install() -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests" / "support")}
     told = subprocess.check_output([sys.executable, "-c", WITHOUT_LABELS], env=environment, text=True)

@@ -103,6 +103,7 @@ def test_a_preview_has_the_first_frame_as_for_the_labels_and_a_few_points(get: G
     assert "expected one from 0 to" in failure(get("/0/episodes/99/preview"), 404)
 
 
+@pytest.mark.slow
 def test_the_table_tells_how_pictures_became_upright_rgb_for_the_labels(tmp_path: Path) -> None:
     root = copied("toy_v21", tmp_path)
     corrected = open_dataset(root, orient={"wrist": "rotate180"}, channels="bgr")
@@ -197,6 +198,7 @@ def test_a_video_has_the_frames_of_its_episode(get: Get, folders: list[Path], nu
         check_frames(get, folders[number], episode, number, camera)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coding", CODINGS.values(), ids=CODINGS)
 def test_a_cut_is_exact_however_the_video_is_coded(tmp_path: Path, coding: tuple[str, dict[str, str]]) -> None:
     root = copied("toy_v30_many", tmp_path)

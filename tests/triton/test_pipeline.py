@@ -201,6 +201,7 @@ pipeline.close()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["score", "reply"])
 def test_a_pipeline_that_breaks_ends_the_process(stage: str) -> None:
     """Nothing would be answered any more."""

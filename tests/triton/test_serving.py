@@ -99,6 +99,7 @@ def test_any_mixture_equals_its_samples_alone(served: Served, protocol: str, mod
 BAD = 11  # index of the refused sample
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("protocol", "model"), [("grpc", MODEL), ("http", MODEL), ("http", FRAMES_MODEL)])
 def test_callers_share_batches_and_a_bad_sample_fails_alone(served: Served, protocol: str, model: str) -> None:
     samples = mixed_samples(100) if model == MODEL else filmed_samples(32)

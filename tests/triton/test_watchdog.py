@@ -41,6 +41,7 @@ def test_a_batch_that_hangs_ends_the_process_and_the_log_says_where(hang: str) -
     assert "Timeout" in ended.stderr and "in hanging" in ended.stderr
 
 
+@pytest.mark.slow
 def test_a_batch_that_gets_on_and_a_model_that_waits_go_on() -> None:
     ended = run("""
         WORKS.set()
