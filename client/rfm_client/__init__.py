@@ -86,7 +86,14 @@ _LATER = {  # imported at first use, since servers need the contract alone
 }
 
 
-def __getattr__(name: str) -> typing.Any:
-    if name not in _LATER:
-        raise AttributeError(f"module 'rfm_client' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"rfm_client.{_LATER[name]}"), name)
+if not typing.TYPE_CHECKING:  # a type checker would take any name
+
+    def __getattr__(name: str) -> object:
+        if name in ("episodes", "frames", "options"):
+            return importlib.import_module(f"rfm_client.{name}")
+        if name not in _LATER:
+            raise AttributeError(f"module 'rfm_client' has no attribute {name!r}")
+        return getattr(importlib.import_module(f"rfm_client.{_LATER[name]}"), name)
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *_LATER})

@@ -11,6 +11,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 from rfm_client.client_options import ClientOptions
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import (
     ClientClosedError,
     DeadlineExceededError,
@@ -102,14 +103,21 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         sampling: the frames that the model sees of each prefix; None: as in the checkpoint's training
         options: of each of several calls, since the prefixes of a long trajectory do not fit in memory together
 
-        Raises RewardError; ValueError if neither ``sampling`` nor the checkpoint says how many frames to show.
+        Raises RewardError; ValueError if neither ``sampling`` nor the checkpoint says how many frames to show, and for
+        ``subsample``.
         """
+        require("subsample", not options.get("subsample"), "False: the sampling rule chooses the frames", True)
         info = await self.model_info(frames=trajectory.frames is not None, timeout_s=options.get("timeout_s"))
         info.check_scores_prefixes()
         rule = sampling or Sampling.of(None, None, info.max_frames, trained_padding=info.trained_padding)
         samples, results = rule.samples(trajectory), list[Result]()
-        while part := list(itertools.islice(samples, PREFIXES_AT_A_TIME)):
-            results += await self.evaluate(part, **options)
+        if trajectory.frames is not None:
+            self._scorer.tell_of_blank(trajectory.frames)
+        # in a thread, since copies of many frames would block the event loop
+        while part := await asyncio.to_thread(lambda: list(itertools.islice(samples, PREFIXES_AT_A_TIME))):
+            call = self._call(options)
+            call.checks_blank = False  # a prefix may be the first frame many times
+            results += results_of(await self._scorer.outcomes(part, call), "samples[{}]")
         return rule.joined(cast("list[ProgressResult]", results))
 
     async def score(self, sample: Sample, **options: Unpack[CallOptions]) -> Result:

@@ -93,7 +93,8 @@ def check(plan: Plan, dataset: Dataset, outputs: Outputs, watch: Watch = QUIET) 
             if not options.overwrite:
                 told = f"{error.problem}: choose another {file.option}, or --overwrite"
                 raise DatasetError(told, error.where) from error
-            watch.note(f"--overwrite: {error}; its labels of {len(file.digests)} episodes are replaced")
+            labels = f"its labels of {len(file.digests)} episodes are" if file.digests else "it is"
+            watch.note(f"--overwrite: {error}; {labels} replaced")
     watch.checking(len(plan.items))
     num_bytes = 0
     with all_faults(dataset, options):

@@ -144,7 +144,9 @@ class LabelOptions(Settings):
         None, "Folder for finished episodes. Default: .NAME_parts in the output.", metavar="FOLDER|URL"
     )
     workers: int = setting(DEFAULT_WORKERS, "Episodes to score at a time.", least=1)
-    overwrite: bool = setting(False, "Replace labels made by another recipe.")
+    overwrite: bool = setting(
+        False, "Replace label files that this run does not give again in full, by the same recipe."
+    )
     verify: bool = setting(False, "Detect changed videos by SHA-256 instead of size and mtime.")
 
     def __post_init__(self) -> None:

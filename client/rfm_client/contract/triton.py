@@ -65,7 +65,7 @@ _OF_VIEWS = (
     "leave out views and goal",
 )
 _OLD = "one that was exported before there was this input"
-# By optional input, and by the output that comes with one: a model that has it, one that has not, and the remedy.
+# By optional input: a model that has it, one that has not, and the remedy.
 _WITHOUT = {
     SECOND_FRAMES: ("a model that takes pairs of two frame sizes", _OLD, "export it again, or resize a trajectory"),
     **dict.fromkeys((*VIEWS, GOAL), _OF_VIEWS),

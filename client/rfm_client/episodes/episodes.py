@@ -82,14 +82,12 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
             tasks = [task] * len(indices) if task is None or isinstance(task, str) else list(task)
             require("task", len(tasks) == len(indices), f"one for each of {len(indices)} episodes", len(tasks))
             for index, new in zip(indices, tasks, strict=True):
-                self.steps[index].end()
                 self.steps[index] = self.steps[index].anew(new)
 
     async def close(self) -> None:
         """End the episodes, once no step is open."""
         async with self._adding:
-            for steps in self.steps:
-                steps.end()
+            pass
 
     async def frame_size(self, call: Call | None = None) -> FrameSize | None:
         """Return the target size for frames; None: no change. Raises RewardError."""
@@ -277,8 +275,6 @@ class Episode(Closing, OneProcess):
         """End the episode, as ``AsyncEpisode.close``."""
         if self._is_queued:
             self._loop.wait(self._episode.close())
-        else:
-            self.asked[0].end()
 
 
 def _indices(mask: npt.ArrayLike | None, count: int) -> list[int]:

@@ -25,6 +25,7 @@ from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.episodes.options import StepScore
 from rfm_client.episodes.steps import Steps, Window
+from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW
 from rfm_client.scoring.call import Call
 from rfm_client.scoring.samples import SampleScorer, for_each
 from rfm_client.transport.off_loop import off_loop
@@ -90,8 +91,10 @@ class StepScorer:
 
     async def _all_outcomes(self, windows: Sequence[Window], info: ModelInfo, call: Call) -> list[Result | RewardError]:
         self._scorer.tell_of_length(max((len(window.frames) for window in windows), default=0), info)
-        for window in windows:
-            self._scorer.tell_of_blank([frame.pixels for frame in dict.fromkeys(window.frames)])
+        enough = min(info.max_frames or FRAMES_IN_A_ROW, FRAMES_IN_A_ROW)  # a camera may begin with a black frame
+        for frames in (dict.fromkeys(window.frames) for window in windows):
+            if len(frames) >= enough:
+                self._scorer.tell_of_blank([frame.pixels for frame in frames])
         if not info.by_digest:
             return await self._whole(windows, call)
         num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame of each window is new

@@ -79,7 +79,6 @@ class Steps:
         self._where = where
         self._corrections = options.corrections
         self._frames: list[tuple[Frame, ...]] = []  # by step and camera
-        self._has_ended = False
 
     @property
     def newest(self) -> int:
@@ -161,10 +160,6 @@ class Steps:
         remedy = f"; score={predicted[0]!r} takes what it predicts" if predicted else ""
         got = f"NaN: this checkpoint does not predict it{remedy}"
         require(name, name in predicted, "a score of each frame", got)
-
-    def end(self) -> None:
-        """No step will follow."""
-        self._has_ended = True
 
     def _located(self, error: RewardError) -> RewardError:
         """Return the error, with the episode's name if a sample is at fault."""

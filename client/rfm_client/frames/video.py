@@ -25,7 +25,7 @@ from rfm_client.contract.samples import UInt8Array
 from rfm_client.frames.pictures import FrameFileError, decoded_picture, opened_picture
 from rfm_client.frames.video_decoding import (
     DAMAGED,
-    REENCODE,
+    DOWNLOAD,
     UNDAMAGED,
     Packets,
     Upright,
@@ -42,7 +42,7 @@ Take: TypeAlias = Callable[[int], object]
 
 _EXPECTED = "a file with a video stream"
 _LOST = (
-    f"the decoder loses the others, as without a key frame before them: {REENCODE}; or name a part: start_s of "
+    f"the decoder loses the others, as without a key frame before them: {DOWNLOAD}; or name a part: start_s of "
     "load_trajectory"
 )
 _REMUX = "extract the stream and encode it: ffmpeg -i IN -c copy RAW.h264; ffmpeg -framerate FPS -i RAW.h264 OUT.mp4"
@@ -301,4 +301,4 @@ def _judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
             yield each
             num_given += 1
     except import_av().FFmpegError as error:
-        raise FrameFileError.of(f"frame {num_given} to be decoded ({REENCODE})", str(error.strerror)) from error
+        raise FrameFileError.of(f"frame {num_given} to be decoded ({DOWNLOAD})", str(error.strerror)) from error

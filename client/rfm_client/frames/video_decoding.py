@@ -24,7 +24,7 @@ from rfm_client.frames.pictures import FrameFileError
 
 UNDAMAGED = "an undamaged frame"
 DAMAGED = "one that the decoder marks, or is made from such a one"
-REENCODE = "download it again"
+DOWNLOAD = "download it again"
 _HEADLESS = ("an HEVC video that begins with a key frame (cut it there: ffmpeg -ss SECONDS -i IN OUT)", "another frame")
 
 _NO_MATRIX, _BT601, _BT2020 = 0, 5, 9  # from YUV to RGB, as ITU-T H.273 numbers them
@@ -128,7 +128,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
                 num_hidden += bool(packet.size)
                 continue
             if packet.is_corrupt:
-                raise FrameFileError.of("a whole video file", f"one whose packet {count} is broken ({REENCODE})")
+                raise FrameFileError.of("a whole video file", f"one whose packet {count} is broken ({DOWNLOAD})")
             if packet.pts is not None:
                 timed.append((float(packet.pts * packet.time_base), packet.size))
             count += 1

@@ -46,9 +46,11 @@ class Call:
     outputs: outputs requested by name
     request_ids: an id for each request
     server: index of the server to ask first; None: the least busy
+    checks_blank: True: tell of videos that show nothing
     """
 
     server: int | None = None
+    checks_blank = True
 
     def __init__(
         self,

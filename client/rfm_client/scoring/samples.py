@@ -136,7 +136,7 @@ class SampleScorer:
     async def _fitted(self, sample: Sample, call: Call) -> FittedSample:
         """The sample as the call sends it. Raises RewardError."""
         fit = whole(sample)
-        for trajectory in fit.sample.trajectories if self._checks_blank else ():
+        for trajectory in fit.sample.trajectories if self._checks_blank and call.checks_blank else ():
             if trajectory.frames is not None:
                 self.tell_of_blank(trajectory.frames)
         if not (call.subsample or call.resize):

@@ -170,7 +170,7 @@ def has_numbers(file: Path, types: Mapping[str, str], column: str) -> bool:
     """
     usable = {name: kind for name, kind in types.items() if _is_usable(kind) and name not in _IDENTITY}
     candidates = [name for name, kind in usable.items() if not _WHOLE_OR_NOT.fullmatch(kind)]
-    require(f"{file}: task_column", column in usable, f"one of {', '.join(candidates)}", repr(column))
+    require("task_column", column in usable, f"one of {', '.join(candidates)}", f"{column!r} in {file}")
     return bool(_NUMBERS.fullmatch(usable[column]) or _WHOLE_OR_NOT.fullmatch(usable[column]))
 
 
