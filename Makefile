@@ -9,7 +9,7 @@ WORKERS := --numprocesses 3 --dist loadgroup --no-loadscope-reorder
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
-.PHONY: help demo install test fast test-more test-all nightly test-newest check parity bench bench-full gpu gpu-packages perf chaos soak format model_repository \
+.PHONY: help demo install test fast test-more test-all nightly test-newest check parity bench gpu gpu-packages perf chaos soak format model_repository \
   clean ops-check ops-tools audit lock mutate docs reference version
 
 # What can be made: this list.
@@ -71,11 +71,6 @@ parity: $(INSTALLED)
 bench: $(INSTALLED)
 	$(INSTALL) --editable ".[bench]"
 	$(BIN)/python benchmarks/bench.py
-
-# The same with all loads, half an hour.
-bench-full: $(INSTALLED)
-	$(INSTALL) --editable ".[bench]"
-	$(BIN)/python benchmarks/bench.py --full
 
 # The packages from build/gpu.tar.xz if it exists, else those of $(VENV).
 GPU_PYTHON = $(if $(wildcard build/gpu.tar.xz),$(PYTHON),$(BIN)/python)
