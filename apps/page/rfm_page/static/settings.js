@@ -2,7 +2,7 @@
 // The tasks and settings of the tab of videos, as an address has them: those that differ from the usual ones.
 
 const TASK = "task";
-const NAMES = ["model", "rule", "frames", "fps", "orient", "channels", "threshold", "robot", "camera"]; // a rule after its model
+const NAMES = ["model", "rule", "frames", "fps", "orient", "channels", "threshold"]; // a rule after its model
 const RESIZE = "resize";
 
 export class Settings {
