@@ -16,7 +16,7 @@ from rfm_client import PreferenceSample, ProgressSample, RewardClient, RewardErr
 from rfm_gateway.schema import TrajectoryInput
 from servers import Endpoints
 
-pytestmark = [pytest.mark.triton, pytest.mark.slow]
+pytestmark = [pytest.mark.triton, pytest.mark.nightly]
 
 
 def held() -> int:

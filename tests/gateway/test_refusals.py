@@ -324,6 +324,7 @@ def test_frames_that_show_nothing_are_scored_with_a_warning_or_refused(
         check_refused(response, *refused)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ["/evaluate_batch", NPY])
 def test_no_request_that_the_schemas_allow_breaks_the_gateway(path: str) -> None:

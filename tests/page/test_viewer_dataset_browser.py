@@ -79,7 +79,10 @@ class Page:
         """Shows a dataset."""
         dataset = LeRobotDataset(self.folders[number])
         Select(self.browser["dataset"]).select_by_value(str(number))
-        self.browser.until(f"document.querySelectorAll('#episodes tr').length === {len(dataset.episodes)}")
+        self.browser.until(
+            f"document.querySelector('#episode-list table').ariaRowCount === '{len(dataset.episodes) + 1}'"
+        )
+        self.browser.until("document.querySelector('#episodes tr')")
         self.browser.until(f"document.getElementById('ends').hidden === {str(number >= PLAIN).lower()}")
         return dataset
 

@@ -112,7 +112,7 @@ def test_a_name_is_loaded_listed_and_unloaded_beside_the_others(running: Running
     running.models("unload", "listed")
 
 
-@pytest.mark.parametrize("family", ["rynnvalue", "robodopamine"])
+@pytest.mark.parametrize("family", ["rynnvalue", pytest.param("robodopamine", marks=pytest.mark.nightly)])
 def test_a_model_whose_progress_may_be_missing_is_rolled_out(running: Running, family: str) -> None:
     """The small Robo-Dopamine also writes answers without a score."""
     checkpoint = {"rynnvalue": "bro_symlog_bf16_tied", "robodopamine": "grm_qwen3vl_bf16_tied"}[family]

@@ -245,6 +245,7 @@ def test_a_folder_without_models_is_refused_with_the_one_that_was_meant(folders:
     assert str(refused.value) == got.format(folder=folder, root=folders)
 
 
+@pytest.mark.nightly
 @pytest.mark.triton
 @pytest.mark.slow
 def test_a_plain_tritonserver_serves_the_repository_too(tmp_path: Path) -> None:

@@ -156,11 +156,11 @@ class Served:
             self.server.start_ready()
 
 
-def wait_for(is_so: Callable[[], Any], within_s: float = PATIENCE_S) -> float:
-    """Seconds until it was so."""
+def wait_for(is_so: Callable[[], Any], within_s: float = PATIENCE_S, told: object = None) -> float:
+    """Seconds until it was so. told: is shown if it never is"""
     started_s = time.monotonic()
     while not is_so():
-        assert time.monotonic() - started_s < within_s
+        assert time.monotonic() - started_s < within_s, told
         time.sleep(0.02)
     return time.monotonic() - started_s
 

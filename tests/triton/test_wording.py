@@ -122,6 +122,7 @@ def test_a_restricted_api_wants_its_key(asker: Asker) -> None:
     assert triton.is_denied(status, message)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_dead_process_and_an_unloaded_model_are_told_apart(served: Served) -> None:
     config, model = goldens.config(MODEL), "mortal"

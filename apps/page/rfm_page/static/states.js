@@ -58,7 +58,7 @@ function commandLine(command) {
   text.textContent = command;
   text.tabIndex = 0;
   text.setAttribute("role", "region");
-  text.setAttribute("aria-label", "Command line");
+  text.setAttribute("aria-label", `Command line: ${command}`); // two regions need two names
   button.type = "button";
   button.textContent = "Copy";
   button.addEventListener("click", async () => {
