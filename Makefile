@@ -9,7 +9,7 @@ WORKERS := --numprocesses 3 --dist loadgroup --no-loadscope-reorder
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
-.PHONY: help demo install test fast test-more test-all nightly test-newest check parity bench gpu gpu-packages perf chaos soak format model_repository \
+.PHONY: help demo install test fast test-more test-all nightly test-newest lint check parity bench gpu gpu-packages perf chaos soak format model_repository \
   clean ops-check ops-tools audit lock mutate docs reference version
 
 # What can be made: this list.
@@ -24,17 +24,17 @@ demo: $(RUNS)
 # Install everything into .venv, for tests, labels and RL, too. make test does it as well.
 install: $(INSTALLED)
 
-# Lint, types, generated files, and tests against a real Triton: four minutes.
+# Lint, generated files, and tests against a real Triton: four minutes.
 test: $(INSTALLED)
-	+$(MAKE) --jobs 2 check fast
+	+$(MAKE) --jobs 2 lint fast
 
-# The tests of make test, without lint and types.
+# The tests of make test, without lint.
 fast: $(INSTALLED)
-	$(BIN)/pytest $(WORKERS) --durations 10 --durations-min 1 -m "not gpu and not alone and not slow and not debian and not nightly"
+	$(BIN)/pytest $(WORKERS) --numprocesses 2 --durations 10 --durations-min 1 -m "not gpu and not alone and not slow and not debian and not nightly"
 
-# The other tests of CI: they kill, wait or restart, or need programs of Debian. Builds the documents, too.
+# The rest of CI: types, the documents, and the tests that are slow or need programs of Debian.
 test-more: $(INSTALLED)
-	+$(MAKE) --jobs 2 docs ops-tools
+	+$(MAKE) --jobs 3 check docs ops-tools
 	$(BIN)/pytest $(WORKERS) --durations 10 -m "(slow or debian) and not gpu and not alone and not nightly"
 	$(BIN)/pytest -m "alone and not nightly" $$(grep --recursive --files-with-matches mark.alone tests)
 
@@ -56,12 +56,15 @@ test-newest: $(INSTALLED)
 	PYTHONPATH=$(CURDIR)/$(VENV)/newest $(BIN)/python -m pytest $(WORKERS) -m "not gpu and not slow and not triton" \
 	  tests/families
 
-# Lint, format, types, generated files; no tests.
-check: $(INSTALLED)
+# Lint, format, generated files.
+lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/rfm export --check --repository model_repository --config model_repository/serve.yaml
+
+# Lint and types; no tests.
+check: lint
+	$(BIN)/mypy
 
 # How far the scores are from the original's: every reference case, through Triton.
 parity: $(INSTALLED)
@@ -128,10 +131,10 @@ ops-check: ops-tools
 	$(BIN)/pytest tests/ops
 
 AS_ROOT = $(shell if [ "$$(id -u)" = 0 ]; then :; elif sudo -n true 2>/dev/null; then echo sudo -n; else echo false; fi)
-PROGRAMS := chromium/chromium chromedriver/chromium-driver curl/curl docker-compose/docker-compose ffmpeg/ffmpeg nginx/nginx \
+PROGRAMS := chromium/chromium chromedriver/chromium-driver curl/curl docker-compose/docker-compose ffmpeg/ffmpeg nginx/nginx openssl/openssl \
   prometheus/prometheus promtool/prometheus
 
-# Get the programs of Debian and Ubuntu that tests run: Chromium, curl, docker-compose, ffmpeg, nginx, Prometheus.
+# Get the programs of Debian and Ubuntu that tests run: Chromium, curl, docker-compose, ffmpeg, nginx, openssl, Prometheus.
 # nginx and Prometheus are unpacked into $(VENV), since their packages start a service when they are installed.
 ops-tools: $(INSTALLED)
 	@missing=$$(for each in $(PROGRAMS); do PATH=$(CURDIR)/$(BIN):$$PATH:/usr/sbin command -v $${each%/*} >/dev/null || \

@@ -41,6 +41,7 @@ def shown(url: str, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[s
     return {word for line in lines for word in line.split()}, lines
 
 
+@pytest.mark.slow
 def test_the_state_of_a_server_fits_a_terminal_and_ends_with_what_to_try_next(demo_server: Endpoints) -> None:
     url, asked = demo_server.grpc_url, ("status", "--metrics-url", demo_server.metrics_url)
     words, lines = shown(url, *asked)
@@ -55,6 +56,7 @@ def test_the_state_of_a_server_fits_a_terminal_and_ends_with_what_to_try_next(de
     assert wide[0][-4:-1] == ["requests since load", "failed since load", "refused since start"]
 
 
+@pytest.mark.slow
 def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(engines: EngineServer, videos: list[Path]) -> None:
     words, _ = shown(engines.url, "score", *videos, "missing.mp4", "--task", TASK, code=ExitCode.FAILED)
     assert {"video", "progress", "success", "frames", "version"} <= words

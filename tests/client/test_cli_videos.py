@@ -30,6 +30,7 @@ FILE_OF_SEVERAL = "data/videos/observation.images.top/chunk-000/file-000.mp4"
 EVENLY = np.rint(np.linspace(0, clip.NUM_FRAMES - 1, MAX_FRAMES)).astype(int)
 
 
+@pytest.mark.slow
 def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_others(
     engines: EngineServer, video: Path, tmp_path: Path
 ) -> None:

@@ -134,6 +134,7 @@ def test_memory_of_a_call_at_work_is_given_back_when_the_client_closes(served: S
             future.cancel()
 
 
+@pytest.mark.slow
 def test_a_server_that_hangs_does_not_hold_what_shares_memory_with_it(demo_server: Endpoints) -> None:
     before = ours_in_dev_shm()
     with Proxy(demo_server.grpc_port) as proxy:

@@ -202,6 +202,7 @@ def test_a_model_is_not_served_only_if_every_server_says_so(others: list[RewardE
         assert [stand.asked["infer"] for stand in stands] == [1, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("down_s", "kind"), [(0.1, DeadlineExceededError), (1.3, ServerUnavailableError)])
 def test_a_call_ends_with_what_took_most_of_its_time(down_s: float, kind: type[RewardError]) -> None:
     """The server takes no connection at first, and is silent afterwards."""

@@ -84,6 +84,7 @@ def test_a_bad_sample_fails_alone_or_is_raised_with_its_place_in_our_words(serve
     assert str(outcomes[6]) == "sample: expected ProgressSample, PreferenceSample or SimilaritySample, got str"
 
 
+@pytest.mark.slow
 def test_a_deadline_or_a_cancelled_future_ends_a_call_and_no_other(served: Served, protocol: str) -> None:
     full = [ProgressSample(random_trajectory(0, 40), frame_steps=16) for _ in range(64)]
     with served.client(protocol) as client, ThreadPoolExecutor(3) as pool:

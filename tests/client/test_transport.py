@@ -86,6 +86,7 @@ MISBEHAVING: dict[str, tuple[str, Misbehaviour, type[RewardError], bool]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("protocol", "answer", "kind", "may_have_ended"), MISBEHAVING.values(), ids=MISBEHAVING)
 def test_whatever_answers_the_error_is_ours(
     protocol: str, answer: Misbehaviour, kind: type[RewardError], may_have_ended: bool

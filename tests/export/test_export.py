@@ -105,6 +105,7 @@ def test_a_model_keeps_its_inputs_and_outputs(tmp_path: Path) -> None:
     assert list(read(tmp_path, "rfm").version_policy.specific.versions) == [1]
 
 
+@pytest.mark.slow
 def test_a_model_may_gain_an_optional_input_and_lose_none(tmp_path: Path) -> None:
     export(FRAMES, tmp_path)
     for name in ("rfm_encoder", "rfm_frames"):

@@ -152,6 +152,7 @@ def test_the_hub_gives_all_files_that_are_read_in_a_folder(tmp_path: Path) -> No
     assert "older" not in families.load(fetched, **options).collator.example()
 
 
+@pytest.mark.slow
 def test_a_hub_that_does_not_answer_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as silent, socket.create_server(("127.0.0.1", 0)) as closed:

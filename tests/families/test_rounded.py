@@ -61,6 +61,7 @@ def layers_of(engine: Engine) -> dict[str, RoundedLinear]:
     return {name: each for name, each in network_of(engine).named_modules() if isinstance(each, RoundedLinear)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind", "dtype"),
     [
@@ -135,6 +136,7 @@ def test_nf4_rounds_and_decodes_as_bitsandbytes(shape: tuple[int, int]) -> None:
     assert not nf4.quantize(torch.zeros(2, 32))[1].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind"), [(PLAIN, "nf4"), (LORA_INSIDE, "int8"), ("q25_peft_adapter_disc10", "nf4")])
 def test_an_export_holds_the_rounded_weights_and_says_how_far_scores_are(tmp_path: Path, kind: Any, name: str) -> None:
     config, said = goldens.config(name), list[str]()

@@ -100,6 +100,7 @@ def test_more_evaluations_than_allowed_are_a_503_and_no_score_in_time_is_a_504(
     assert answered(ask_json(strict, [progress(FIRST)]))
 
 
+@pytest.mark.slow
 def test_callers_who_wait_too_long_are_a_503_and_those_without_the_key_do_not_wait() -> None:
     triton, sent = StandIn(served=["rfm"]), {"content": dumped(progress(FIRST)), "headers": {"X-API-Key": KEY}}
     with inside(KEY, triton, timeout_s=1, max_in_flight=1) as client, ThreadPoolExecutor() as pool:

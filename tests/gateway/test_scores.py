@@ -237,6 +237,7 @@ def test_a_model_that_sees_a_video_gives_a_value_for_two_frames(video: Gateway) 
     assert len(steps["outputs_progress"]["progress_pred"][0]) == 5
 
 
+@pytest.mark.slow
 def test_concurrent_callers_each_get_their_own_answer(encoders: Gateway) -> None:
     asked = [[mixed(embedded, ENCODER_DIMS)[k % 6], progress(embedded(k, 1 + k % 9, ENCODER_DIMS))] for k in range(32)]
     alone = [expected(encoders, samples) for samples in asked]

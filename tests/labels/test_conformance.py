@@ -185,6 +185,7 @@ def test_episodes_have_their_numbers_tasks_and_frames(tmp_path: Path, write: Cal
     assert {episode.task for episode in overridden.episodes} == {"wave"}
 
 
+@pytest.mark.slow
 @every_format
 def test_each_frame_gets_its_label_and_a_second_run_scores_what_is_missing(
     tmp_path: Path, output: Path, write: Callable[[Path], Written]

@@ -198,6 +198,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, ask: Callable[[Path]
         ask(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
     root = copied("toy_v30_many", tmp_path)
     for name, frames in (("short", 2), ("long", 8)):

@@ -68,6 +68,7 @@ def peak_videos(dataset: LongVideos, options: LabelOptions, scorer: BrightnessSc
 MODES: dict[str, dict[str, Any]] = {"prefixes": {"frames": 2}, "one pass": {"mode": "whole"}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES.values(), ids=MODES)
 def test_each_frame_of_a_video_is_held_once(output: Path, mode: dict[str, Any]) -> None:
     options = LabelOptions(output=output, workers=1, formats=("progress",), **mode)

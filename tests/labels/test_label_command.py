@@ -46,6 +46,7 @@ def cells(output: str) -> dict[str, str]:
     return {row[0]: row[1] for row in rows if len(row) == 2}
 
 
+@pytest.mark.slow
 @pytest.mark.triton
 def test_both_commands_write_the_same_labels_and_tell_what_they_did(demo_server: Endpoints, output: Path) -> None:
     words = ("--episodes", "2,3,9", "--frames", 8, "--cameras", "front", "--alias", "sarm_progress")
@@ -107,6 +108,7 @@ def test_a_second_run_scores_nothing_and_a_report_needs_no_server(demo_server: E
         assert cells(report.stdout) == cells(first.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.triton
 def test_labelled_episodes_are_recorded_with_the_frames_and_scores_of_each_camera(
     demo_server: Endpoints, output: Path

@@ -115,6 +115,7 @@ def test_triton_and_the_engine_score_each_frame_on_its_prefix_and_tell_successes
     np.testing.assert_allclose(served["progress_sparse"][: episode.num_frames], fused, rtol=0, atol=TOLERANCE)
 
 
+@pytest.mark.slow
 @pytest.mark.triton
 def test_all_of_a_causal_network_in_one_pass_is_what_its_prefixes_give(client: RewardClient, output: Path) -> None:
     dataset = open_dataset(LEROBOT / "toy_v21")

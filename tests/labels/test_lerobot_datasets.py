@@ -52,6 +52,7 @@ def videos(root: Path, camera: str) -> list[Path]:
     return sorted(found, key=lambda file: (file.parent.name if "chunk" in file.parent.name else "", file.name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("root", DATASETS)
 def test_every_frame_is_that_of_the_video_in_order_and_every_episode_that_of_the_rows(root: Path) -> None:
     """LeRobot writes episodes one after another, so a camera's whole videos hold all frames."""
@@ -434,6 +435,7 @@ def test_a_hub_that_cannot_be_reached_is_told_in_words(tmp_path: Path) -> None:
     assert done.stdout.strip() == f"{HUB_ID}: expected a local dataset or one of the Hub, got {got}"
 
 
+@pytest.mark.slow
 def test_a_dataset_of_the_hub_is_fetched_at_its_revision(tmp_path: Path) -> None:
     """In a separate process, since the Hub's library reads settings at import."""
     old = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "old")

@@ -50,8 +50,8 @@ def shell(script: str, box: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture
-def papers(tmp_path: Path) -> Path:
-    """The folder after steps 5 and 6, for two callers."""
+def papers(openssl: str, tmp_path: Path) -> Path:
+    """The folder after steps 5 and 6, which run openssl, for two callers."""
     (tmp_path / "docker").symlink_to(ROOT / "docker")
     (tmp_path / "etc" / "nginx" / "conf.d").mkdir(parents=True)
     begin, _, step = commands("5. A key").partition("\n")

@@ -139,6 +139,7 @@ def test_a_missing_video_a_missing_model_and_a_refused_task_are_named(encoders: 
     assert re.fullmatch(r"[\w.]+: expected .*, got .*", documents[-1]["detail"]), documents[-1]
 
 
+@pytest.mark.slow
 def test_a_video_that_needs_too_much_memory_is_refused(triton: Triton, videos: Path, tmp_path: Path) -> None:
     with running(triton.endpoints, tmp_path, ENCODERS, "--max-body-mib", "1") as gateway:
         response = post(gateway.url, SCORE, {"video": videos / "long.mp4"}, **QUESTION)

@@ -126,6 +126,7 @@ def test_the_curves_are_those_of_the_labels(get: Get, folders: list[Path], numbe
         np.testing.assert_array_equal(np.float32(curve["success"]), columns[success])
 
 
+@pytest.mark.slow
 def test_the_curves_tell_which_frames_the_model_skipped(tmp_path: Path) -> None:
     root = copied("toy_v21", tmp_path)
     label(open_dataset(root), BrightnessScorer(), LabelOptions())

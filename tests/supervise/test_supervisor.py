@@ -104,6 +104,7 @@ FAULTS: dict[str, tuple[Act, str, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_triton_is_started_again_after_each_fault(tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str) -> None:
     act, what, why = FAULTS[name]
@@ -123,6 +124,7 @@ def test_triton_is_started_again_after_each_fault(tmp_path: Path, caplog: pytest
     assert [message.startswith("ready again after ") for message in caplog.messages].count(True) == 1
 
 
+@pytest.mark.slow
 def test_a_model_that_works_on_long_requests_is_not_started_again(tmp_path: Path) -> None:
     with supervised(tmp_path, "a") as stage:
         stage.file("busy").touch()
@@ -191,6 +193,7 @@ def test_a_dead_process_counts_unless_it_was_replaced(name: str, monkeypatch: py
     assert stubs.fault(wanted, is_settled=is_settled) is None
 
 
+@pytest.mark.slow
 def test_a_fault_of_a_load_counts_for_the_model_that_loads_and_is_part_of_no_crash_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -207,6 +210,7 @@ def test_a_fault_of_a_load_counts_for_the_model_that_loads_and_is_part_of_no_cra
         assert stage.serving.restarts("a", "triton") == 0
 
 
+@pytest.mark.slow
 def test_what_was_served_is_served_again_and_not_what_was_exported_since(tmp_path: Path) -> None:
     """Also what was loaded, and not what was unloaded."""
     with supervised(tmp_path, "a", "b") as stage:

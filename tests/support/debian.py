@@ -22,6 +22,7 @@ PACKAGES = {  # fixture -> packages of Debian and Ubuntu
     "docker_compose": "docker-compose",
     "ffmpeg": "ffmpeg",
     "nginx": "nginx",
+    "openssl": "openssl",
     "prometheus": "prometheus",
     "promtool": "prometheus",
 }
@@ -47,7 +48,7 @@ def _program(fixture: str) -> Any:
     return path
 
 
-curl, docker_compose, ffmpeg, nginx, prometheus, promtool = (
+curl, docker_compose, ffmpeg, nginx, openssl, prometheus, promtool = (
     _program(name) for name in sorted(PACKAGES) if name != "browser"
 )
 

@@ -119,6 +119,7 @@ def num_frames(samples: list[Sample]) -> int:
     return sum(trajectory.num_frames for sample in samples for trajectory in sample.trajectories)
 
 
+@pytest.mark.slow
 def test_samples_are_counted_by_type_and_by_what_became_of_them(served: Served) -> None:
     good = mixed_samples(12)
     before = scrape(served)
@@ -154,6 +155,7 @@ def test_two_instances_count_apart_and_add_up(served_too: Served) -> None:
     assert min(each) > 0
 
 
+@pytest.mark.slow
 def test_histograms_add_up_to_what_each_execution_took(served: Served) -> None:
     """Sequential requests are separate executions with times in the results."""
     engine = load_engine(MODEL)
@@ -201,6 +203,7 @@ def test_metrics_have_their_kinds_buckets_and_labels(served_too: Served) -> None
     }  # before the first, which must count as an increase
 
 
+@pytest.mark.slow
 def test_raw_frames_are_counted_where_they_are_encoded_and_where_they_are_scored(served: Served) -> None:
     def video(count: int) -> Trajectory:
         random = np.random.default_rng(count)
