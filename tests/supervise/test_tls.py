@@ -127,7 +127,8 @@ def test_tls_on_one_side_alone_gives_no_connection(mutual: Endpoints, papers: Pa
 def test_the_gateway_beside_tls_listens_on_loopback_alone(mutual: Endpoints, gateway_port: int) -> None:
     """Otherwise it would serve callers without a certificate, in the clear."""
     with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as caller:  # it starts after Triton
-        assert caller.get(f"http://127.0.0.1:{gateway_port}/health", timeout=AT_ONCE_S).json()["status"] == "healthy"
+        url = f"http://127.0.0.1:{gateway_port}/health"
+        wait_for(lambda: caller.get(url, timeout=AT_ONCE_S).json().get("status") == "healthy")
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((PUBLIC_HOST, gateway_port), AT_ONCE_S)
 
