@@ -5,7 +5,7 @@ UV := 0.13.9
 # Stamp files: what make demo runs is installed; everything is installed, which tests and tools need.
 RUNS := $(VENV)/runs
 INSTALLED := $(VENV)/installed
-WORKERS := --numprocesses 3 --dist loadgroup --no-loadscope-reorder
+WORKERS := --dist loadgroup --no-loadscope-reorder
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
@@ -30,12 +30,12 @@ test: $(INSTALLED)
 
 # The tests of make test, without lint.
 fast: $(INSTALLED)
-	$(BIN)/pytest $(WORKERS) --numprocesses 2 --durations 10 --durations-min 1 -m "not gpu and not alone and not slow and not debian and not nightly"
+	$(BIN)/pytest --numprocesses 2 $(WORKERS) --durations 10 --durations-min 1 -m "not gpu and not alone and not slow and not debian and not nightly"
 
 # The rest of CI: types, the documents, and the tests that are slow or need programs of Debian.
 test-more: $(INSTALLED)
 	+$(MAKE) --jobs 3 check docs ops-tools
-	$(BIN)/pytest $(WORKERS) --durations 10 -m "(slow or debian) and not gpu and not alone and not nightly"
+	$(BIN)/pytest --numprocesses 3 $(WORKERS) --durations 10 -m "(slow or debian) and not gpu and not alone and not nightly"
 	$(BIN)/pytest -m "alone and not nightly" $$(grep --recursive --files-with-matches mark.alone tests)
 
 # All tests of CI.
@@ -44,7 +44,7 @@ test-all: test test-more
 # What takes too long for CI: chaos, a cold install, every snippet of the documents, more reference cases.
 # RFM_GOLDENS names a folder with more reference cases.
 nightly: check ops-tools
-	$(BIN)/pytest $(WORKERS) -m nightly
+	$(BIN)/pytest --numprocesses 3 $(WORKERS) -m nightly
 	$(if $(RFM_GOLDENS),$(BIN)/pytest -m reference)
 	$(TOOL) tools/chaos.py
 
@@ -53,7 +53,7 @@ nightly: check ops-tools
 test-newest: $(INSTALLED)
 	$(BIN)/pip install --quiet --disable-pip-version-check --upgrade --target $(VENV)/newest --no-deps \
 	  "transformers<6" "huggingface_hub<2" tokenizers
-	PYTHONPATH=$(CURDIR)/$(VENV)/newest $(BIN)/python -m pytest $(WORKERS) -m "not gpu and not slow and not triton" \
+	PYTHONPATH=$(CURDIR)/$(VENV)/newest $(BIN)/python -m pytest --numprocesses 3 $(WORKERS) -m "not gpu and not slow and not triton" \
 	  tests/families
 
 # Lint, format, generated files.
@@ -131,14 +131,11 @@ ops-check: ops-tools
 	$(BIN)/pytest tests/ops
 
 AS_ROOT = $(shell if [ "$$(id -u)" = 0 ]; then :; elif sudo -n true 2>/dev/null; then echo sudo -n; else echo false; fi)
-PROGRAMS := chromium/chromium chromedriver/chromium-driver curl/curl docker-compose/docker-compose ffmpeg/ffmpeg nginx/nginx openssl/openssl \
-  prometheus/prometheus promtool/prometheus
 
-# Get the programs of Debian and Ubuntu that tests run: Chromium, curl, docker-compose, ffmpeg, nginx, openssl, Prometheus.
+# Get the programs of Debian and Ubuntu that tests run, by the table in tests/support/debian.py.
 # nginx and Prometheus are unpacked into $(VENV), since their packages start a service when they are installed.
 ops-tools: $(INSTALLED)
-	@missing=$$(for each in $(PROGRAMS); do PATH=$(CURDIR)/$(BIN):$$PATH:/usr/sbin command -v $${each%/*} >/dev/null || \
-	  echo $${each#*/}; done | sort -u); \
+	@missing=$$($(BIN)/python tests/support/debian.py); \
 	test -z "$$missing" || $(AS_ROOT) apt-get update -qq; \
 	for package in $$missing; do case $$package in \
 	  nginx|prometheus) cd $(VENV) && apt-get -qq -o APT::Sandbox::User=root download $$package && \

@@ -116,7 +116,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         # in a thread, since copies of many frames would block the event loop
         while part := await asyncio.to_thread(lambda: list(itertools.islice(samples, PREFIXES_AT_A_TIME))):
             call = self._call(options)
-            call.checks_blank = False  # a prefix may be the first frame many times
+            call.checks_blank = False  # a prefix may repeat the first frame
             results += results_of(await self._scorer.outcomes(part, call), "samples[{}]")
         return rule.joined(cast("list[ProgressResult]", results))
 

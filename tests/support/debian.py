@@ -16,47 +16,54 @@ from typing import Any
 
 import pytest
 
-PACKAGES = {  # fixture -> packages of Debian and Ubuntu
-    "browser": "chromium chromium-driver",
+PACKAGES = {  # by program
+    "chromedriver": "chromium-driver",
+    "chromium": "chromium",
     "curl": "curl",
-    "docker_compose": "docker-compose",
+    "docker-compose": "docker-compose",
     "ffmpeg": "ffmpeg",
     "nginx": "nginx",
     "openssl": "openssl",
     "prometheus": "prometheus",
     "promtool": "prometheus",
 }
+BROWSER = ("chromium", "chromedriver")
 WAITING = pytest.StashKey[Counter[str]]()  # tests of this run that were left out, by packages
 PATH = os.pathsep.join(
     [str(Path(sys.executable).parent), os.environ["PATH"], "/usr/sbin", "/usr/libexec/docker/cli-plugins"]
 )
 
 
-def find(name: str) -> str:
-    """Return the path of a program. Fails the test if there is none."""
-    found = shutil.which(name, path=PATH)
-    if found is None:
-        pytest.fail(f"{name}: expected in PATH, got nothing (make ops-tools)")
-    return found
+def find(name: str) -> str | None:
+    """Return the path of a program; None: it is not installed."""
+    return shutil.which(name, path=PATH)
 
 
-def _program(fixture: str) -> Any:
-    @pytest.fixture(scope="session", name=fixture)
+def _program(name: str) -> Any:
+    @pytest.fixture(scope="session", name=_fixture(name))
     def path() -> str:
-        return find(fixture.replace("_", "-"))
+        found = find(name)
+        if found is None:
+            pytest.fail(f"{name}: expected in PATH, got nothing (make ops-tools)")
+        return found
 
     return path
 
 
+def _fixture(program: str) -> str:
+    return program.replace("-", "_")
+
+
 curl, docker_compose, ffmpeg, nginx, openssl, prometheus, promtool = (
-    _program(name) for name in sorted(PACKAGES) if name != "browser"
+    _program(name) for name in sorted(PACKAGES.keys() - set(BROWSER))
 )
+PROGRAMS = {"browser": BROWSER, **{_fixture(name): (name,) for name in PACKAGES if name not in BROWSER}}  # by fixture
 
 
 def _packages(item: pytest.Item) -> str:
     """Return the packages that a test needs."""
-    asked = [PACKAGES[name] for name in getattr(item, "fixturenames", ()) if name in PACKAGES]
-    return " ".join(sorted(set(asked)))
+    asked = [PROGRAMS[name] for name in getattr(item, "fixturenames", ()) if name in PROGRAMS]
+    return " ".join(sorted({PACKAGES[name] for names in asked for name in names}))
 
 
 @pytest.hookimpl(tryfirst=True)  # before marks are selected
@@ -86,3 +93,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
     for packages, count in sorted(config.stash.get(WAITING, Counter()).items()):
         terminalreporter.write_line(f"not run: {count} tests that need {packages} (make test-more)")
+
+
+if __name__ == "__main__":  # for make ops-tools
+    print(*sorted({package for name, package in PACKAGES.items() if find(name) is None}))

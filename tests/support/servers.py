@@ -157,7 +157,7 @@ class Served:
 
 
 def wait_for(is_so: Callable[[], Any], within_s: float = PATIENCE_S, told: object = None) -> float:
-    """Seconds until it was so. told: is shown if it never is"""
+    """Seconds until it was so. told: shown in the failure"""
     started_s = time.monotonic()
     while not is_so():
         assert time.monotonic() - started_s < within_s, told

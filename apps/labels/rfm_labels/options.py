@@ -145,7 +145,7 @@ class LabelOptions(Settings):
     )
     workers: int = setting(DEFAULT_WORKERS, "Episodes to score at a time.", least=1)
     overwrite: bool = setting(
-        False, "Replace label files that this run does not give again in full, by the same recipe."
+        False, "Replace label files even if this run does not reproduce all their labels by the same recipe."
     )
     verify: bool = setting(False, "Detect changed videos by SHA-256 instead of size and mtime.")
 

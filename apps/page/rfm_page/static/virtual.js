@@ -55,7 +55,7 @@ export class VirtualRows {
   #draw() {
     const height = this.#height;
     const { top, bottom } = this.#scroller.getBoundingClientRect();
-    if (!this.#scroller.getClientRects().length) return; // nobody sees it; without rows it may be visible and have no height
+    if (!this.#scroller.getClientRects().length) return; // hidden; a visible list without rows has no height either
     const begin = this.#body.closest("table").getBoundingClientRect().top;
     const [from, to] = [Math.max(top, 0), Math.min(bottom, innerHeight)].map((edge) => Math.max(Math.round((edge - begin) / height), 0));
     const first = Math.max(Math.min(from, this.#items.length) - BEYOND, 0);
