@@ -162,25 +162,14 @@ class Checkpoint(Protocol):
     def parts(self) -> Mapping[str, Mapping[str, Tensor]]:
         """All weights by part and name. The part NETWORK always exists."""
 
-    @property
-    def notes(self) -> Sequence[str]:
-        """A line for the user about each contradiction to the known facts of training."""
-
     def skeleton(self) -> nn.Module:
         """Return the network without weights, on PyTorch's device ``meta``."""
-
-    @property
-    def assumptions(self) -> Sequence[Assumption]:
-        """The settings that neither weights nor files prove. Raises CheckpointError for missing files."""
 
     def flop(self, sample: Sample) -> float:
         """Return the floating-point operations to score a sample: about two for each parameter that a token passes.
 
         Raises CheckpointError, and InvalidSampleError if this checkpoint cannot score the sample.
         """
-
-    def encoders(self) -> FrameEncoders | None:
-        """Return the checkpoint's encoders, or None. Raises CheckpointError if they are missing or do not fit."""
 
     def predictor(
         self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
@@ -192,22 +181,49 @@ class Checkpoint(Protocol):
         """
 
     def save(self, folder: Path) -> None:
-        """Write all but the encoders into a new folder, which the family loads without options or internet."""
+        """Write all but the encoders into a new folder, which ``Family.restore`` reads."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """The functions that recognise and load the checkpoints of a family.
+    """A family of checkpoints, as it is served.
 
     name: the package with this object as its ``FAMILY``
-    reads: returns True if a folder may hold a checkpoint of the family; used if the caller names no family
-    load: loads the checkpoint of a local folder; raises CheckpointError
+    restore: loads what ``Checkpoint.save`` wrote into a folder; raises CheckpointError
+    reader: the module whose ``READER`` reads checkpoints as they were published, which serving never imports
     encoders: the class of the family's encoders; None: its checkpoints score raw frames
-    reward_models: names that ``--as`` takes, for ordinary models that the family asks in its own way
     """
 
     name: str
-    reads: Callable[[Path], bool]
-    load: Callable[[Path, Options], Checkpoint]
+    restore: Callable[[Path], Checkpoint]
+    reader: str
     encoders: type[FrameEncoders] | None = None
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A checkpoint as it was published, and what a user must know about it.
+
+    assumptions: the settings that neither weights nor files prove
+    notes: returns a line for the user about each contradiction to the known facts of training; raises CheckpointError
+    encoders: returns the checkpoint's encoders, or None; raises CheckpointError if they are missing or do not fit
+    """
+
+    checkpoint: Checkpoint
+    assumptions: Sequence[Assumption] = ()
+    notes: Callable[[], Sequence[str]] = list
+    encoders: Callable[[], FrameEncoders | None] = lambda: None
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Reads the checkpoints of a family as they were published, or as they were exported.
+
+    reads: returns True if a folder may hold a checkpoint of the family; used if the caller names no family
+    load: loads the checkpoint of a local folder; raises CheckpointError
+    reward_models: names that ``--as`` takes, for ordinary models that the family asks in its own way
+    """
+
+    reads: Callable[[Path], bool]
+    load: Callable[[Path, Options], Loaded]
     reward_models: tuple[str, ...] = ()

@@ -6,7 +6,6 @@ Where configuration and weights disagree, the weights decide.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from rfm.checkpoint.content import (
@@ -23,17 +21,20 @@ from rfm.checkpoint.content import (
     WEIGHTS,
     CheckpointError,
     cut,
+    expecting,
     is_there,
     misfits,
     read_json,
     read_run_config,
+    read_tensors,
     shown,
 )
 from rfm.checkpoint.provenance import OF_UPSTREAM, Assumption, source_name
 from rfm.checkpoint.run_config import MAX_COUNT, check_progress, find_run_config, frame_count, trained_frames
 from rfm.checkpoint.weights import check_shapes, has_head, read_weights, take_prefix
 from rfm.engine.feature_cache import FeatureCache
-from rfm.family import NETWORK, Options, config_fields
+from rfm.family import NETWORK, Loaded, Options, Reader, config_fields
+from rfm.saved import write_network
 from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
@@ -67,17 +68,12 @@ class RewindCheckpoint:
 
     network: weights of RewindTransformer
     image_encoder, text_encoder: weights of encoders without their prefix; empty if the checkpoint has none
-    image_source, text_source: image_encoder and text_encoder of ``rfm.family.Options``
-    assumed: settings of the configuration that nothing proves
     """
 
     config: RewindConfig
     network: dict[str, Tensor]
     image_encoder: dict[str, Tensor] = field(default_factory=dict)
     text_encoder: dict[str, Tensor] = field(default_factory=dict)
-    image_source: str | None = None
-    text_source: str | None = None
-    assumed: tuple[Assumption, ...] = ()
 
     @property
     def description(self) -> Description:
@@ -101,75 +97,11 @@ class RewindCheckpoint:
         """All weights by part and name."""
         return {NETWORK: self.network, "image_encoder": self.image_encoder, "text_encoder": self.text_encoder}
 
-    @property
-    def notes(self) -> list[str]:
-        """A line for each encoder that differs from upstream's of the same width."""
-        if not self._has_encoders:
-            return []
-        compared = zip((IMAGE_ENCODER, TEXT_ENCODER), self._sources, map(differences, self._facts()), strict=True)
-        return [
-            f"{source}: differs from upstream's {known} in {'; '.join(found)}: scores are right only if the run's "
-            "embeddings were made with it"
-            for known, source, found in compared
-            if found
-        ]
-
-    @property
-    def assumptions(self) -> list[Assumption]:
-        """The settings that nothing proves, and the encoders, which no file of a training run names."""
-        found = [*self.assumed]
-        named, weights = (self.image_source, self.text_source), (self.image_encoder, self.text_encoder)
-        encoders = zip(("image", "text"), self._sources, named, weights, strict=True) if self._has_encoders else ()
-        for kind, source, option, own in encoders:
-            given = f"--{kind}-encoder" if option else OF_UPSTREAM
-            whose = "weights of the checkpoint" if own else "only its width agrees"
-            found.append(Assumption(f"{kind}_encoder", source_name(source), f"{given}; {whose}"))
-        return found
-
-    @property
-    def _has_encoders(self) -> bool:
-        return any((self.image_encoder, self.text_encoder, self.image_source, self.text_source))
-
-    @property
-    def _sources(self) -> tuple[str, str]:
-        return self.image_source or IMAGE_ENCODER, self.text_source or TEXT_ENCODER
-
-    def _facts(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        image_source, text_source = self._sources
-        with self._having_encoders():
-            return image_facts(image_source), text_facts(text_source)
-
     def flop(self, sample: Sample) -> float:
         """Return the operations of a sample's products: two for each parameter and token."""
         counts = [trajectory.num_frames for trajectory in sample.trajectories]
         num_tokens = self.config.num_tokens(counts[0], sum(counts[1:]))
         return 2.0 * num_tokens * sum(tensor.numel() for tensor in self.network.values())
-
-    def encoders(self) -> Encoders | None:
-        """Return the encoders if the checkpoint has their weights or the user names them; else None.
-
-        Raises CheckpointError if they are missing or do not fit the network.
-        """
-        if not self._has_encoders:
-            return None
-        with self._having_encoders():
-            encoders = Encoders.from_pretrained(
-                *self._sources, image_weights=self.image_encoder or None, text_weights=self.text_encoder or None
-            )
-        widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), self.description.widths
-        if widths != expected:
-            raise CheckpointError.at(f"encoders {' and '.join(self._sources)}", f"widths {expected}", widths)
-        return encoders
-
-    @contextmanager
-    def _having_encoders(self) -> Iterator[None]:
-        try:
-            yield
-        except misfits(ImportError, OSError) as error:
-            absent = [source for source in self._sources if not Path(source).is_dir()]
-            here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
-            hint = f"name local folders with --image-encoder and --text-encoder{here}"
-            raise CheckpointError(f"encoders {' and '.join(self._sources)}: {cut(str(error))} ({hint})") from error
 
     def predictor(
         self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
@@ -182,11 +114,7 @@ class RewindCheckpoint:
 
     def save(self, folder: Path) -> None:
         """Write network and configuration for ``load``, without encoders."""
-        folder.mkdir(parents=True)
-        config = {"model_type": MODEL_TYPE, **config_fields(self.config)}
-        (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
-        tensors = {name: tensor.contiguous() for name, tensor in self.network.items()}
-        save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
+        write_network(folder, {"model_type": MODEL_TYPE, **config_fields(self.config)}, self.network)
 
     def build(self) -> RewindTransformer:
         """Return the network with these weights, on the CPU, ready to score. Raises CheckpointError."""
@@ -205,12 +133,110 @@ class RewindCheckpoint:
             return RewindTransformer(self.config)
 
 
+def restore(folder: Path) -> RewindCheckpoint:
+    """Load what ``RewindCheckpoint.save`` wrote. Raises CheckpointError."""
+    file = folder / NETWORK_CONFIG
+    with expecting("the settings of an exported ReWiND network", file):
+        settings = {name: value for name, value in read_json(file).items() if name != "model_type"}
+        config = RewindConfig(**settings)
+    checkpoint = RewindCheckpoint(config, read_tensors(folder / WEIGHTS))
+    checkpoint.check()
+    return checkpoint
+
+
+@dataclass(frozen=True)
+class PretrainedEncoders:
+    """The encoders of a published checkpoint, which no file of a training run names.
+
+    image_source, text_source: folders or ids that the user named; None: upstream's
+    """
+
+    checkpoint: RewindCheckpoint
+    image_source: str | None = None
+    text_source: str | None = None
+
+    @property
+    def _are_used(self) -> bool:
+        """True if the checkpoint has weights of encoders, or the user named one."""
+        own = self.checkpoint
+        return any((own.image_encoder, own.text_encoder, self.image_source, self.text_source))
+
+    @property
+    def _sources(self) -> tuple[str, str]:
+        return self.image_source or IMAGE_ENCODER, self.text_source or TEXT_ENCODER
+
+    def notes(self) -> list[str]:
+        """Return a line for each encoder that differs from upstream's of the same width."""
+        if not self._are_used:
+            return []
+        compared = zip((IMAGE_ENCODER, TEXT_ENCODER), self._sources, map(differences, self._facts()), strict=True)
+        return [
+            f"{source}: differs from upstream's {known} in {'; '.join(found)}: scores are right only if the run's "
+            "embeddings were made with it"
+            for known, source, found in compared
+            if found
+        ]
+
+    @property
+    def assumptions(self) -> list[Assumption]:
+        """The encoders."""
+        found = []
+        own = (self.checkpoint.image_encoder, self.checkpoint.text_encoder)
+        named = (self.image_source, self.text_source)
+        encoders = zip(("image", "text"), self._sources, named, own, strict=True) if self._are_used else ()
+        for kind, source, option, weights in encoders:
+            given = f"--{kind}-encoder" if option else OF_UPSTREAM
+            whose = "weights of the checkpoint" if weights else "only its width agrees"
+            found.append(Assumption(f"{kind}_encoder", source_name(source), f"{given}; {whose}"))
+        return found
+
+    def _facts(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        image_source, text_source = self._sources
+        with self._having_encoders():
+            return image_facts(image_source), text_facts(text_source)
+
+    def load(self) -> Encoders | None:
+        """Return the encoders if the checkpoint has their weights or the user names them; else None.
+
+        Raises CheckpointError if they are missing or do not fit the network.
+        """
+        if not self._are_used:
+            return None
+        own = self.checkpoint
+        with self._having_encoders():
+            encoders = Encoders.from_pretrained(
+                *self._sources, image_weights=own.image_encoder or None, text_weights=own.text_encoder or None
+            )
+        widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), own.description.widths
+        if widths != expected:
+            raise CheckpointError.at(f"encoders {' and '.join(self._sources)}", f"widths {expected}", widths)
+        return encoders
+
+    @contextmanager
+    def _having_encoders(self) -> Iterator[None]:
+        try:
+            yield
+        except misfits(ImportError, OSError) as error:
+            absent = [source for source in self._sources if not Path(source).is_dir()]
+            here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
+            hint = f"name local folders with --image-encoder and --text-encoder{here}"
+            raise CheckpointError(f"encoders {' and '.join(self._sources)}: {cut(str(error))} ({hint})") from error
+
+
+def _loaded(
+    checkpoint: RewindCheckpoint, assumed: tuple[Assumption, ...], sources: tuple[str | None, str | None] = (None, None)
+) -> Loaded:
+    checkpoint.check()
+    encoders = PretrainedEncoders(checkpoint, *sources)
+    return Loaded(checkpoint, (*assumed, *encoders.assumptions), encoders.notes, encoders.load)
+
+
 def reads(folder: Path) -> bool:
     """True unless config.json names another network; the first ReWiND checkpoints have no config.json."""
     return _saved(folder).get("model_type", MODEL_TYPE) == MODEL_TYPE
 
 
-def load(folder: Path, options: Options) -> RewindCheckpoint:
+def load(folder: Path, options: Options) -> Loaded:
     """Load the checkpoint of a local folder. Raises CheckpointError."""
     network = read_weights(folder)
     if _FIRST_CODES_FRAME in network:
@@ -223,13 +249,11 @@ def load(folder: Path, options: Options) -> RewindCheckpoint:
         network.pop("preference_token", None)
     if not config.has_pairs:
         network.pop("first_embedding_B", None)
-    sources = options.image_encoder, options.text_encoder
-    checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder, *sources, assumed)
-    checkpoint.check()
-    return checkpoint
+    checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder)
+    return _loaded(checkpoint, assumed, (options.image_encoder, options.text_encoder))
 
 
-def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -> RewindCheckpoint:
+def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -> Loaded:
     """Return the checkpoint, with its weights renamed to upstream's names."""
     first = weights.pop(_FIRST_CODES_FRAME)
     require(_FIRST_CODES_FRAME, first.dim() == 2, "2 axes", list(first.shape), CheckpointError)
@@ -246,9 +270,7 @@ def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -
     config = _config(folder, weights, {**stated, "trained_frames": stated["max_len"]})
     defaults = {name: value for name, value in _FIRST_CODES_SETTINGS.items() if name not in read}
     assumed = (Assumption(name, value, "default of the first ReWiND code") for name, value in defaults.items())
-    checkpoint = RewindCheckpoint(config, weights, assumed=tuple(assumed))
-    checkpoint.check()
-    return checkpoint
+    return _loaded(RewindCheckpoint(config, weights), tuple(assumed))
 
 
 def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, Any]) -> RewindConfig:
@@ -342,3 +364,6 @@ def _stated(folder: Path) -> tuple[dict[str, Any], tuple[Assumption, ...]]:
         where = f"{folder / NETWORK_CONFIG}: trained_padding"
         raise CheckpointError.at(where, "true or false", shown(padding))
     return {**stated, "trained_frames": frames, "trained_padding": padding}, assumed
+
+
+READER = Reader(reads, load)

@@ -10,22 +10,27 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, ClassVar
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar, TypeAlias
+from rfm_client.contract.samples import UInt8Array
 
 import numpy as np
 
 from rfm.checkpoint.content import CheckpointError
 from rfm.engine.predictor import check_type
 from rfm.robodopamine.answers import BEGIN, QUESTIONS, Mode, Question, sampled_frames
-from rfm.vlm.asked_images import ImagesCollator, ImagesConfig, each_alone
-from rfm.vlm.collator import video_of
-from rfm.vlm.images import BoundedImages
+from rfm.vlm.written import WritingCollator, WritingConfig
+from rfm.vlm.collator import IMAGE_PAD, VISION_END, VISION_START, expanded, video_of
+from rfm.vlm.images import MERGE, BoundedImages
 from rfm.vlm.prompts import KEPT_TEXTS
-from rfm.vlm.qwen import Indices
+from rfm.vlm.qwen import Box, Indices, positions
 from rfm.vlm.row import VlmRow
 from rfm.vlm.video import VlmVideo
 from rfm_client.contract import InvalidSampleError, Sample, Trajectory
 
+IMAGE = VISION_START + IMAGE_PAD + VISION_END
+PLACEHOLDER = "<image>"  # of an image in the originals' prompts
+Images: TypeAlias = Sequence[tuple[VlmVideo, int]]  # video and index of each image, in the prompt's order
 GOAL_SIDE_PX, GOAL_GREY = 224, 128  # of a sample without a goal
 NUM_WRISTS = 2
 PARTS = (
@@ -78,10 +83,11 @@ Return ONLY one line containing the score wrapped in <score> tags, as an integer
 <score>+NN%</score>  or  <score>-NN%</score>  or  <score>0%</score>
 """,  # noqa: E501
 )
+NUM_IMAGES = len(PARTS) - 1  # of a question
 
 
 @dataclass(frozen=True)
-class RoboDopamineConfig(ImagesConfig):
+class RoboDopamineConfig(WritingConfig):
     """The configuration of Robo-Dopamine.
 
     least_px, most_px: of an image
@@ -96,21 +102,32 @@ class RoboDopamineConfig(ImagesConfig):
     interval: int = 1
 
     reward_model: ClassVar[str] = "robodopamine"
+    multi_image: ClassVar[bool] = True
 
     def check(self) -> None:
         """Raise CheckpointError for a setting of the user that makes no sense."""
-        super().check()
         if self.mode not in QUESTIONS:
             raise CheckpointError.at("--as: mode", f"one of {', '.join(QUESTIONS)}", repr(self.mode))
         if self.interval < 1:
             raise CheckpointError.at("--as: interval", "at least 1 frame", self.interval)
 
 
-class RoboDopamineCollator(ImagesCollator):
+@dataclass(frozen=True, eq=False)
+class ImagesRow(VlmRow):
+    """A question about images."""
+
+    images: Images = field(kw_only=True)
+
+    @property
+    def shown(self) -> Iterator[tuple[VlmVideo, Indices]]:
+        """Each image's video, and its index there."""
+        return ((video, np.array([frame])) for video, frame in self.images)
+
+
+class RoboDopamineCollator(WritingCollator):
     """The collator of Robo-Dopamine: a conversation for each pair of frames and mode."""
 
     images: BoundedImages
-    num_images = len(PARTS) - 1
 
     def __init__(self, config: RoboDopamineConfig, tokenizer: Any, images: BoundedImages) -> None:
         super().__init__(config, tokenizer, images, BEGIN)
@@ -119,6 +136,39 @@ class RoboDopamineCollator(ImagesCollator):
     def example(self) -> str:
         """Return the prompt of an example task."""
         return self._text("TASK")
+
+    def check_template(self) -> None:
+        """Raise CheckpointError unless a prompt has its images."""
+        got = self.example().count(IMAGE)
+        if got != NUM_IMAGES:
+            raise CheckpointError.at("chat template", f"{NUM_IMAGES} images in a prompt", got)
+
+    def num_patches(self, video: VlmVideo) -> int:
+        """Return the number of patches of a video's frames that are shown."""
+        return super().num_patches(video) * len(video.conversations)
+
+    def _questions(self, text: str, asked: Sequence[Images]) -> list[VlmRow]:
+        """Return the rows of questions whose images have equal sizes, so that they have equal tokens.
+
+        text: the chat template's
+        """
+        grids = [self.grid(video) for video, _ in asked[0]]
+        ids = expanded(self._chat.tokens(text), self.visual_pad, [grid.tokens_per_group for grid in grids])
+        starts = self._positions(ids, VISION_START) + 1
+        boxes = [
+            Box(int(start), 1, grid.rows // MERGE, grid.columns // MERGE)
+            for start, grid in zip(starts, grids, strict=True)
+        ]
+        at = positions(len(ids), boxes)
+        return [
+            ImagesRow(ids, _different(images), ([],), len(ids) - 1, False, position_ids=at, images=images)
+            for images in asked
+        ]
+
+    def _check_task(self, task: str) -> None:
+        super()._check_task(task)
+        if PLACEHOLDER in task:
+            raise InvalidSampleError.at("task", f"text without {PLACEHOLDER}", repr(task))
 
     def rows(self, sample: Sample) -> list[VlmRow]:
         """Return the conversations of a progress sample, those of each mode in the order of frames.
@@ -132,7 +182,7 @@ class RoboDopamineCollator(ImagesCollator):
         videos, rows = Videos.of(trajectory, frames), list[VlmRow]()
         for question in QUESTIONS[self.config.mode]:
             asked = [videos.images(question, before, after) for before, after in pairwise(frames.tolist())]
-            rows += self.questions(self._text(trajectory.task), asked)
+            rows += self._questions(self._text(trajectory.task), asked)
         return rows
 
     def _check(self, sample: Sample, trajectory: Trajectory) -> None:
@@ -147,12 +197,22 @@ class RoboDopamineCollator(ImagesCollator):
             raise InvalidSampleError.at("views", expected, str(len(trajectory.views)))
 
     def _task_text(self, task: str) -> str:
-        """Return the chat template's text of a question."""
-        parts: list[str | None] = []
+        """Return the chat template's text of a question, with an image between each two of PARTS."""
+        content: list[dict[str, str]] = []
         for part in PARTS:
-            parts += [None] * bool(parts)
-            parts.append(part.replace("{task}", task))
-        return self.rendered(parts)
+            content += [{"type": "image"}] * bool(content)
+            content.append({"type": "text", "text": part.replace("{task}", task)})
+        conversation = [{"role": "user", "content": content}]
+        return str(self.tokenizer.apply_chat_template(conversation, tokenize=False, add_generation_prompt=True))
+
+
+def _different(images: Images) -> tuple[VlmVideo, ...]:
+    return tuple(dict.fromkeys(video for video, _ in images))
+
+
+def each_alone(frames: Sequence[UInt8Array] | UInt8Array, shown: Indices, named: Any = None) -> VlmVideo:
+    """Return a video of which each frame in ``shown``, int64 [N], is an image. named: as in ``VlmVideo``"""
+    return VlmVideo(frames, 1, [np.array([frame]) for frame in shown], named)
 
 
 @dataclass(frozen=True, eq=False)

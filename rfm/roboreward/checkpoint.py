@@ -13,13 +13,15 @@ from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, re
 from rfm.checkpoint.run_config import find_run_config
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.pixels import Normalisation
-from rfm.family import Options
+from rfm.family import Loaded, Options, Reader
+from rfm.checkpoint.provenance import Assumption
+from rfm.saved import is_saved, reward_model_of
 from rfm.roboreward.predictor import RoboRewardPredictor
 from rfm.roboreward.prompts import SCORES, RoboRewardCollator, RoboRewardConfig
 from rfm.vlm.collator import QWEN3
 from rfm.vlm.images import QwenImages
 from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork
-from rfm.vlm.language_folder import LanguageFolder, reward_model_of
+from rfm.vlm.language_folder import LanguageFolder, reopened
 from rfm.vlm.written import is_named, stops_of
 from rfm_client.contract.description import Description
 
@@ -30,6 +32,8 @@ REWARD_MODELS = (WRITTEN, EXPECTED)
 @dataclass(frozen=True)
 class RoboRewardCheckpoint(LanguageCheckpoint):
     """A checkpoint of RoboReward in memory."""
+
+    made_of = RoboRewardConfig
 
     @property
     def description(self) -> Description:
@@ -72,19 +76,26 @@ def reads(folder: Path) -> bool:
     return has_name and content.get("model_type") == QWEN3 and find_run_config(folder) is None
 
 
-def load(folder: Path, options: Options) -> RoboRewardCheckpoint:
+def load(folder: Path, options: Options) -> Loaded:
     """Load the model of a local folder: a Qwen3-VL's, or an export. Raises CheckpointError."""
     name, _ = options.named()
     options.settings({})
-    files = LanguageFolder.read(folder, options)
-    config = files.saved(RoboRewardConfig)
-    if config is None:
-        files = replace(files, dtype="bfloat16", assumed=tuple(each for each in files.assumed if each.name != "dtype"))
-        config = RoboRewardConfig(**files.made_of, stops=stops_of(folder), is_expected=name == EXPECTED)
-    elif name is not None and config.is_expected != (name == EXPECTED):
-        raise CheckpointError.at("--as", "the reward model of this export", name, "export the checkpoint again")
-    if options.strict_answers and not config.is_expected:
-        config = replace(config, strict_answers=True)
-    checkpoint = RoboRewardCheckpoint(config, files.weights, files.processor, files.assumptions(config))
+    assumptions: tuple[Assumption, ...] = ()
+    if is_saved(folder):
+        checkpoint = reopened(RoboRewardCheckpoint, folder, options)
+        if name is not None and checkpoint.config.is_expected != (name == EXPECTED):
+            remedy = "export the checkpoint again"
+            raise CheckpointError.at("--as", "the reward model of this export", name, remedy)
+    else:
+        files = LanguageFolder.read(folder, options)
+        made_of = {**files.made_of, "dtype": "bfloat16"}  # as the original loads it, whatever config.json says
+        config = RoboRewardConfig(**made_of, stops=stops_of(folder), is_expected=name == EXPECTED)
+        assumptions = tuple(each for each in files.assumptions(config) if each.name != "dtype")
+        checkpoint = RoboRewardCheckpoint(config, files.weights, files.processor)
+    if options.strict_answers and not checkpoint.config.is_expected:
+        checkpoint = replace(checkpoint, config=replace(checkpoint.config, strict_answers=True))
     checkpoint.check()
-    return checkpoint
+    return Loaded(checkpoint, assumptions)
+
+
+READER = Reader(reads, load, REWARD_MODELS)

@@ -13,23 +13,23 @@ from torch import Tensor
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
 from rfm.checkpoint.provenance import source_name
-from rfm.checkpoint.weights import read_weights
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.pixels import Normalisation
-from rfm.family import Options
-from rfm.rynnvalue.network import Bins, HeadConfig, RynnConfig, RynnNetwork
+from rfm.family import Loaded, Options, Reader
+from rfm.saved import is_saved, reward_model_of
+from rfm.rynnvalue.network import RynnConfig, RynnNetwork
 from rfm.rynnvalue.predictor import RynnPredictor
 from rfm.rynnvalue.prompts import META, RELATIVE_TOKEN, VALUE_TOKEN, RynnCollator
 from rfm.rynnvalue.settings import PUBLISHED, Settings
 from rfm.vlm.backbone import QWEN_NAMES, UNUSED, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
 from rfm.vlm.images import BoundedImages
-from rfm.vlm.language import EMBEDDING, REWARD_MODEL, LanguageCheckpoint
-from rfm.vlm.language_folder import dtype_of, reward_model_of
+from rfm.vlm.language import EMBEDDING, LanguageCheckpoint
+from rfm.vlm.language_folder import dtype_of
 from rfm.vlm.network import build_backbone
 from rfm.vlm.preprocessor import pixel_limits
-from rfm.vlm.processor import PROCESSOR_FOLDER, read_processor
-from rfm.vlm.qwen_checkpoint import SETTINGS, QwenCheckpoint
+from rfm.vlm.processor import read_processor
+from rfm.vlm.qwen_checkpoint import QwenCheckpoint
 from rfm.vlm.rounding import read_published, read_unrounded_config, round_layers
 from rfm_client.contract.description import Description
 
@@ -41,13 +41,9 @@ _OF_BACKBONE = "model."  # begins the names of the backbone's weights
 
 @dataclass(frozen=True)
 class RynnCheckpoint(LanguageCheckpoint):
-    """A RynnValue in memory.
+    """A RynnValue in memory."""
 
-    unexpected: lines for the user about keys that no known checkpoint has
-    """
-
-    unexpected: tuple[str, ...] = ()
-
+    made_of = RynnConfig
     reads_videos: ClassVar[bool] = False
 
     @property
@@ -65,13 +61,6 @@ class RynnCheckpoint(LanguageCheckpoint):
             uses_graphs=self.config.attention == "causal",  # else the groups need a mask
             is_large=True,
         )
-
-    @property
-    def notes(self) -> list[str]:
-        """A line for each sign that the files differ from the published checkpoints."""
-        return [
-            f"{name}: not expected, and not used: scores may differ from the original's" for name in self.unexpected
-        ]
 
     @property
     def own_tokens(self) -> dict[str, int]:
@@ -110,18 +99,18 @@ def reads(folder: Path) -> bool:
     return content.get("model_type") == MODEL_TYPE or reward_model_of(folder) == RynnConfig.reward_model
 
 
-def load(folder: Path, options: Options) -> RynnCheckpoint:
+def load(folder: Path, options: Options) -> Loaded:
     """Load the checkpoint of a local folder. Raises CheckpointError."""
+    if is_saved(folder):
+        return _exported(folder, options)
     content = read_json(folder / NETWORK_CONFIG)
-    if SETTINGS in content:
-        return _exported(folder, content, options)
     if content.get("model_type") != MODEL_TYPE:
         got = shown(content.get("model_type"))
         raise CheckpointError.at(f"{folder / NETWORK_CONFIG}: model_type", f"{MODEL_TYPE}, of a RynnValue", got)
     return _published(folder, content, options)
 
 
-def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnCheckpoint:
+def _published(folder: Path, content: dict[str, Any], options: Options) -> Loaded:
     """Load a checkpoint as it was published."""
     file = folder / NETWORK_CONFIG
     read = Settings.read(folder, content)
@@ -146,24 +135,17 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> RynnC
         base_model_id=source_name(processor),
         **{**fields, **limits, **(meta if fields["use_meta"] else {})},
     )
-    assumptions = (*of_dtype, *read.assumptions)
-    return _rounded(RynnCheckpoint(config, weights, processor, assumptions, tuple(read.unexpected)), options)
+    notes = [f"{name}: not expected, and not used: scores may differ from the original's" for name in read.unexpected]
+    checkpoint = _rounded(RynnCheckpoint(config, weights, processor), options)
+    return Loaded(checkpoint, (*of_dtype, *read.assumptions), lambda: notes)
 
 
-def _exported(folder: Path, content: dict[str, Any], options: Options) -> RynnCheckpoint:
-    """Load what ``LanguageCheckpoint.save`` wrote."""
-    saved = {name: value for name, value in content.pop(SETTINGS).items() if name != REWARD_MODEL}
-    parts = {"value_head": HeadConfig, "relative_head": HeadConfig, "value_bins": Bins, "relative_bins": Bins}
-    for name, made in parts.items():
-        told = {key: tuple(each) if isinstance(each, list) else each for key, each in saved[name].items()}
-        saved[name] = made(**told)
-    for name in ("robot", "camera"):  # in exports of 0.4
-        if name in saved:
-            saved[f"{name}_description"] = saved.pop(name)
-    changed = _descriptions(options) if saved["use_meta"] else {}
-    config = RynnConfig(backbone=backbone_config(content, folder / NETWORK_CONFIG), **{**saved, **changed})
-    own = folder / PROCESSOR_FOLDER
-    return _rounded(RynnCheckpoint(config, read_weights(folder), options.base_model or own), options)
+def _exported(folder: Path, options: Options) -> Loaded:
+    """Load an export, with the processor, descriptions and form of weights that the user asks for."""
+    checkpoint = RynnCheckpoint.restore(folder)
+    changed = _descriptions(options) if checkpoint.config.use_meta else {}
+    config, processor = replace(checkpoint.config, **changed), options.base_model or checkpoint.processor
+    return Loaded(_rounded(replace(checkpoint, config=config, processor=processor), options))
 
 
 def _rounded(checkpoint: RynnCheckpoint, options: Options) -> RynnCheckpoint:
@@ -173,11 +155,8 @@ def _rounded(checkpoint: RynnCheckpoint, options: Options) -> RynnCheckpoint:
         ours = {name: each for name, each in checkpoint.weights.items() if name.startswith(_OF_BACKBONE)}
         rounded, _ = round_layers(ours, {}, options.weights, config.torch_dtype)
         heads = {name: each for name, each in checkpoint.weights.items() if name not in ours}
-        checkpoint = replace(
-            checkpoint,
-            config=replace(config, weights=options.weights),
-            weights={**rounded, **heads},
-        )
+        config = replace(config, weights=options.weights)
+        checkpoint = replace(checkpoint, config=config, weights={**rounded, **heads})
     checkpoint.check()
     return checkpoint
 
@@ -192,3 +171,6 @@ def _set_rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Pat
 def _descriptions(options: Options) -> dict[str, str]:
     """Return the user's descriptions of robot and camera, by setting."""
     return {name: words for name in META if (words := getattr(options, name))}
+
+
+READER = Reader(reads, load)

@@ -117,6 +117,19 @@ class RynnConfig(LanguageConfig):
     reward_model: ClassVar[str] = "rynnvalue"
     multi_image: ClassVar[bool] = True
 
+    @classmethod
+    def fields_of(cls, settings: dict[str, Any]) -> dict[str, Any]:
+        """Return the fields of this class from an export's settings."""
+        fields = {**settings}
+        parts = {"value_head": HeadConfig, "relative_head": HeadConfig, "value_bins": Bins, "relative_bins": Bins}
+        for name, made in parts.items():
+            values = {key: tuple(each) if isinstance(each, list) else each for key, each in fields[name].items()}
+            fields[name] = made(**values)
+        for name in ("robot", "camera"):  # in exports of 0.4
+            if name in fields:
+                fields[f"{name}_description"] = fields.pop(name)
+        return fields
+
 
 class BroBlock(nn.Module):
     """A residual block of a ``bro`` head."""

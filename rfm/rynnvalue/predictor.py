@@ -13,13 +13,13 @@ from rfm.engine.execution import Execution
 from rfm.engine.predictor import RowScores, no_success
 from rfm.rynnvalue.network import RynnConfig, RynnOutput, entropy
 from rfm.rynnvalue.prompts import RynnCollator
-from rfm.vlm.predictor import VlmPredictor
+from rfm.vlm.predictor import QwenPredictor
 from rfm.vlm.row import VlmRow
 from rfm_client.contract import FrameScores, RewardError
 from rfm_client.contract.samples import Float32Array
 
 
-class RynnPredictor(VlmPredictor):
+class RynnPredictor(QwenPredictor):
     """A RynnValue on a device."""
 
     collator: RynnCollator

@@ -17,7 +17,7 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.engine.predictor import check_type
 from rfm.rynnvalue.batch import RynnBatch
 from rfm.rynnvalue.network import RynnConfig
-from rfm.vlm.collator import IMAGE_PAD, VISION_END, VISION_START, VlmCollator, video_of
+from rfm.vlm.collator import IMAGE_PAD, VISION_END, VISION_START, QwenCollator, video_of
 from rfm.vlm.images import BoundedImages
 from rfm.vlm.leaves import Leaf, fits
 from rfm.vlm.prompts import KEPT_TEXTS
@@ -66,7 +66,7 @@ class Conversation:
         return slots
 
 
-class RynnCollator(VlmCollator):
+class RynnCollator(QwenCollator):
     """The collator of RynnValue: a conversation about all frames, in dense mode one for each prefix.
 
     A row ends with the last value token: nothing behind it changes a value. With isolated attention, it has no value
@@ -132,7 +132,7 @@ class RynnCollator(VlmCollator):
         return Conversation(ids, self._position_ids(ids, (video,)), groups)
 
     def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> RynnBatch:
-        """Return the batch of conversations. length: as in ``VlmCollator.collate``"""
+        """Return the batch of conversations. length: as in ``QwenCollator.collate``"""
         return RynnBatch.of(super().collate(rows, length), self.config.relative_token, self.config.relative_copies)
 
     def num_groups(self, row: VlmRow) -> tuple[int, int]:

@@ -14,11 +14,12 @@ from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, re
 from rfm.checkpoint.hub import find
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.pixels import Normalisation
-from rfm.family import Options
+from rfm.family import Loaded, Options, Reader
+from rfm.saved import is_saved, reward_model_of
 from rfm.topreward.predictor import TopRewardPredictor
 from rfm.topreward.prompts import PROMPT_PREFIX, PROMPT_SUFFIX, TopRewardCollator, TopRewardConfig, TopRewardImages
 from rfm.vlm.language import LanguageCheckpoint, LanguageNetwork
-from rfm.vlm.language_folder import LanguageFolder, reward_model_of
+from rfm.vlm.language_folder import LanguageFolder, reopened
 from rfm.vlm.preprocessor import (
     OF_VIDEOS,
     SIZED_BY_PROCESSOR,
@@ -54,6 +55,8 @@ _OF_USER = {"num_prefixes": int, "fps": float, "chat_template": bool, "max_frame
 class TopRewardCheckpoint(LanguageCheckpoint):
     """A model of TOPReward in memory."""
 
+    made_of = TopRewardConfig
+
     @property
     def description(self) -> Description:
         """The model's inputs and outputs."""
@@ -86,9 +89,15 @@ def reads(folder: Path) -> bool:
     return content.get("type") == _TYPE or reward_model_of(folder) == TopRewardConfig.reward_model
 
 
-def load(folder: Path, options: Options) -> TopRewardCheckpoint:
+def load(folder: Path, options: Options) -> Loaded:
     """Load the model of a local folder: a Qwen3-VL's, LeRobot's settings, or an export. Raises CheckpointError."""
     name, given = options.named()
+    if is_saved(folder):
+        checkpoint = reopened(TopRewardCheckpoint, folder, options)
+        if given or name not in (None, LEROBOT if checkpoint.config.variant == "lerobot" else ROBOMETER):
+            raise CheckpointError("--as: expected none for an export, which has its own; export the checkpoint again")
+        checkpoint.check()
+        return Loaded(checkpoint)
     content = read_json(folder / NETWORK_CONFIG)
     of_lerobot: dict[str, Any] = {}
     if content.get("type") == _TYPE:
@@ -98,14 +107,10 @@ def load(folder: Path, options: Options) -> TopRewardCheckpoint:
         files = _named_by_lerobot(content, options)
     else:
         files = LanguageFolder.read(folder, options)
-    config = files.saved(TopRewardConfig)
-    if config is None:
-        config = TopRewardConfig(**files.made_of, **_settings(files, of_lerobot, options))
-    elif given or name not in (None, LEROBOT if config.variant == "lerobot" else ROBOMETER):
-        raise CheckpointError("--as: expected none for an export, which has its own; export the checkpoint again")
-    checkpoint = TopRewardCheckpoint(config, files.weights, files.processor, files.assumptions(config))
+    config = TopRewardConfig(**files.made_of, **_settings(files, of_lerobot, options))
+    checkpoint = TopRewardCheckpoint(config, files.weights, files.processor)
     checkpoint.check()
-    return checkpoint
+    return Loaded(checkpoint, files.assumptions(config))
 
 
 def _named_by_lerobot(content: Mapping[str, Any], options: Options) -> LanguageFolder:
@@ -174,3 +179,6 @@ def _check(settings: Mapping[str, Any]) -> None:
     except (AttributeError, IndexError, LookupError, ValueError):
         is_good = False
     require("prompt_suffix", is_good, "text with {instruction}", shown(suffix), CheckpointError)
+
+
+READER = Reader(reads, load, REWARD_MODELS)

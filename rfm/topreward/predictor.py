@@ -14,13 +14,13 @@ from rfm.engine.predictor import RowScores, no_success
 from rfm.topreward.prompts import TopRewardConfig
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.images import FRAMES_PER_GROUP
-from rfm.vlm.predictor import VlmPredictor
+from rfm.vlm.predictor import QwenPredictor
 from rfm.vlm.row import VlmRow
 from rfm_client.contract import FrameScores, RewardError, Sample
 from rfm_client.contract.samples import Float32Array
 
 
-class TopRewardPredictor(VlmPredictor):
+class TopRewardPredictor(QwenPredictor):
     """A Qwen3-VL on a device, which is asked whether a video completes the task."""
 
     @torch.inference_mode()

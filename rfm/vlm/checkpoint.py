@@ -7,8 +7,7 @@ A table of renames for each form turns the names of weights into those of VlmRew
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -28,7 +27,7 @@ from rfm.checkpoint.provenance import Assumption
 from rfm.checkpoint.run_config import check_progress
 from rfm.checkpoint.weights import has_head, read_weights
 from rfm.engine.feature_cache import FeatureCache
-from rfm.family import NETWORK, Options
+from rfm.family import NETWORK, Loaded, Options, Reader
 from rfm.vlm.backbone import (
     BACKBONES,
     LORA_INSIDE,
@@ -54,7 +53,6 @@ from rfm.vlm.lora import (
 from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import (
-    PROCESSOR_FOLDER,
     check_published,
     differences,
     frame_size,
@@ -62,7 +60,8 @@ from rfm.vlm.processor import (
     load_collator,
 )
 from rfm.vlm.prompts import OF_AN_OLD_RUN
-from rfm.vlm.qwen_checkpoint import LORA, SETTINGS, QwenCheckpoint
+from rfm.vlm.qwen_checkpoint import LORA, QwenCheckpoint
+from rfm.saved import PROCESSOR_FOLDER, Saved, is_saved
 from rfm.vlm.rounding import kind_of, read_published, read_unrounded_config, round_layers
 from rfm.vlm.run_config import RunConfig, assumptions_of, base_of_adapter
 from rfm.vlm.video_prompt import decided
@@ -75,16 +74,10 @@ class VlmCheckpoint(QwenCheckpoint):
 
     weights: of VlmRewardModel, without LoRA
     factors: of LoRA, with the names of ``rfm.vlm.lora.split``; empty without LoRA
-    processor: the checkpoint's own folder of tokenizer and image preprocessing; None: the base model's are used
-    base_model: folder or id from the caller; None: as the checkpoint names it
-    assumptions: settings that neither weights nor files prove
     """
 
     config: VlmConfig
-    factors: dict[str, Tensor]
-    processor: Path | None = None
-    base_model: str | None = None
-    assumptions: tuple[Assumption, ...] = ()
+    factors: dict[str, Tensor] = field(default_factory=dict)
 
     @property
     def description(self) -> Description:
@@ -109,41 +102,10 @@ class VlmCheckpoint(QwenCheckpoint):
         """All weights: the network's, and the LoRA factors that change them."""
         return {NETWORK: self.weights, LORA: self.factors}
 
-    @property
-    def notes(self) -> list[str]:
-        """A line for each sign that prompts, images or positions differ from those in training."""
-        lines = []
-        if not self._is_own and (found := differences(self.collator)):
-            known = f"the published processors of {self.config.family}"
-            lines.append(f"base model {self._source}: differs from {known} in {'; '.join(found)}")
-        version = str(self.config.backbone.get("transformers_version"))
-        major = version.partition(".")[0]
-        reads_videos = self.config.family == QWEN_2_5 and not self.config.multi_image
-        if reads_videos and major.isdigit() and int(major) >= 5:
-            lines.append(
-                f"{NETWORK_CONFIG}: transformers_version is {version}: text behind a video stands where transformers 4 "
-                "puts it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the "
-                "run's"
-            )
-        return lines
-
-    @property
-    def _source(self) -> str | Path:
-        return self.base_model or self.processor or self.config.base_model_id
-
-    @property
-    def _is_own(self) -> bool:
-        """True if the checkpoint's own processor is used, which an export has."""
-        return self._source == self.processor
-
-    @cached_property
-    def collator(self) -> VlmCollator:
-        """The collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+    def load_collator(self) -> VlmCollator:
+        """Return the collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
         embedding = next(t for name, t in self.weights.items() if name.endswith("embed_tokens.weight"))
-        collator = load_collator(self.config, len(embedding), self._source)
-        if self.base_model is not None and is_published(self.config.base_model_id, self.config.family):
-            check_published(collator, self.base_model)
-        return collator
+        return load_collator(self.config, len(embedding), self.processor)
 
     def network(self, dtype: torch.dtype) -> VlmRewardModel:
         """Return the network, with weights of no use."""
@@ -156,6 +118,55 @@ class VlmCheckpoint(QwenCheckpoint):
         return VlmPredictor(network, self.collator, device, cache)
 
 
+def restore(folder: Path) -> VlmCheckpoint:
+    """Load what ``VlmCheckpoint.save`` wrote. Raises CheckpointError."""
+    saved = Saved.read(folder)
+    with expecting("the settings of an exported RFM or Robometer", folder / NETWORK_CONFIG):
+        settings = {**saved.settings}
+        size = settings.pop("size_px")
+        config = VlmConfig(backbone=saved.backbone, size_px=tuple(size) if size else None, **settings)
+    weights, factors = split(saved.weights)
+    checkpoint = VlmCheckpoint(config, weights, saved.processor, factors)
+    checkpoint.check()
+    return checkpoint
+
+
+@dataclass(frozen=True)
+class PublishedVlm(VlmCheckpoint):
+    """A checkpoint as it was published.
+
+    base_model: folder or id from the caller; None: as the checkpoint names it
+    has_processor: the processor is the checkpoint's own
+    """
+
+    base_model: str | None = None
+    has_processor: bool = False
+
+    def load_collator(self) -> VlmCollator:
+        """Return the collator. Raises CheckpointError if the caller's base model is not like the one of the run."""
+        collator = super().load_collator()
+        if self.base_model is not None and is_published(self.config.base_model_id, self.config.family):
+            check_published(collator, self.base_model)
+        return collator
+
+    def notes(self) -> list[str]:
+        """Return a line for each sign that prompts, images or positions differ from those in training."""
+        lines = []
+        if not self.has_processor and (found := differences(self.collator)):
+            known = f"the published processors of {self.config.family}"
+            lines.append(f"base model {self.processor}: differs from {known} in {'; '.join(found)}")
+        version = str(self.config.backbone.get("transformers_version"))
+        major = version.partition(".")[0]
+        reads_videos = self.config.family == QWEN_2_5 and not self.config.multi_image
+        if reads_videos and major.isdigit() and int(major) >= 5:
+            lines.append(
+                f"{NETWORK_CONFIG}: transformers_version is {version}: text behind a video stands where transformers 4 "
+                "puts it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the "
+                "run's"
+            )
+        return lines
+
+
 def reads(folder: Path) -> bool:
     """True if the folder holds an adapter, a network on a known backbone, or a Robometer of LeRobot."""
     if is_there(folder / ADAPTER_CONFIG):
@@ -165,23 +176,43 @@ def reads(folder: Path) -> bool:
     return is_lerobot(content) or (isinstance(model_type, str) and model_type in BACKBONES)
 
 
-def load(folder: Path, options: Options) -> VlmCheckpoint:
+def load(folder: Path, options: Options) -> Loaded:
     """Load the checkpoint of a local folder. Raises CheckpointError."""
-    own = folder / PROCESSOR_FOLDER
-    processor = own if own.is_dir() else None
+    if is_saved(folder):
+        parts, assumptions = _exported(folder), ()
+    else:
+        parts, assumptions = _published(folder, options)
+    config, weights, factors, processor = parts
+    if options.weights is not None and config.weights is None:
+        weights, factors = round_layers(weights, factors, options.weights, config.torch_dtype)
+        config = replace(config, weights=options.weights)
+    base = options.base_model
+    has_processor = base is None and isinstance(processor, Path)
+    checkpoint = PublishedVlm(config, weights, base or processor, factors, base, has_processor)
+    checkpoint.check()
+    return Loaded(checkpoint, assumptions, checkpoint.notes)
+
+
+_Parts: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], str | Path]
+_Read: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], tuple[Assumption, ...]]
+
+
+def _exported(folder: Path) -> _Parts:
+    """Return the parts of an export, whose processor and form of weights the caller may change."""
+    restored = restore(folder)
+    return restored.config, restored.weights, restored.factors, restored.processor
+
+
+def _published(folder: Path, options: Options) -> tuple[_Parts, tuple[Assumption, ...]]:
     with expecting("a vision-language checkpoint", folder):
         content = {} if has_adapter(folder) else read_json(folder / NETWORK_CONFIG)
-        read = _exported if SETTINGS in content else _by_lerobot if is_lerobot(content) else _trained
+        read = _by_lerobot if is_lerobot(content) else _trained
         config, weights, factors, assumptions = read(folder, content, options.base_model)
         if config.family == QWEN3 and not config.multi_image:
             config, form = _with_video_prompt(config, content, options)
             assumptions = (*assumptions, *form)
-        if options.weights is not None and config.weights is None:
-            weights, factors = round_layers(weights, factors, options.weights, config.torch_dtype)
-            config = replace(config, weights=options.weights)
-    checkpoint = VlmCheckpoint(config, weights, factors, processor, options.base_model, assumptions)
-    checkpoint.check()
-    return checkpoint
+    own = folder / PROCESSOR_FOLDER
+    return (config, weights, factors, own if own.is_dir() else config.base_model_id), assumptions
 
 
 def _with_video_prompt(
@@ -191,27 +222,12 @@ def _with_video_prompt(
 
     content: config.json of the run; empty for an adapter, whose base model may be saved by another transformers
     """
-    if SETTINGS in content:
-        return config, ()
     file = f"{NETWORK_CONFIG}: {LEROBOT_BACKBONE}" if is_lerobot(content) else NETWORK_CONFIG
     form, assumed = decided(options.video_prompt, config.backbone if content else {}, file)
     return replace(config, video_prompt=form), assumed
 
 
-_Parts: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], tuple[Assumption, ...]]
-
-
-def _exported(folder: Path, content: Mapping[str, Any], _: str | None) -> _Parts:
-    """Read a checkpoint that ``VlmCheckpoint.save`` wrote, with every setting in config.json."""
-    file = folder / NETWORK_CONFIG
-    backbone = backbone_config(content, file)
-    check_not_quantized(backbone, file, UNQUANTIZED)
-    config = _saved_config(backbone)
-    weights, factors = _used(renamed(read_weights(folder), QWEN_NAMES))
-    return config, weights, factors, ()
-
-
-def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Parts:
+def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Read:
     """Read a Robometer that LeRobot saved, with every setting in config.json."""
     file = folder / NETWORK_CONFIG
     run = lerobot_run(content, file)
@@ -223,7 +239,7 @@ def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None
     return config, weights, factors, assumptions_of(config, run, base_model)
 
 
-def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Parts:
+def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Read:
     """Read the checkpoint of a training run, with the run's config.yaml. content: {} for an adapter."""
     file = folder / NETWORK_CONFIG
     backbone = backbone_config(content, file) if content else {}
@@ -240,13 +256,6 @@ def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -
     weights, factors = _used(tensors, scaling)
     config = _config(folder, backbone, run, weights)
     return config, weights, factors, assumptions_of(config, run, base_model, num_nf4)
-
-
-def _saved_config(content: Mapping[str, Any]) -> VlmConfig:
-    settings = {**content[SETTINGS]}
-    size = settings.pop("size_px")
-    rest = {name: value for name, value in content.items() if name != SETTINGS}
-    return VlmConfig(backbone=rest, size_px=tuple(size) if size else None, **settings)
 
 
 def _config(
@@ -290,6 +299,10 @@ def _whole(
 
 def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Return the weights that scores depend on, and their LoRA factors; ``scaling``: of these."""
-    weights, factors = split(tensors, scaling)
+    weights, factors = split(tensors)
+    factors = factors if scaling is None else scaling.scaled(factors)
     weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
+
+
+READER = Reader(reads, load)

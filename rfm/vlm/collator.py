@@ -2,7 +2,7 @@
 """Turn samples of raw frames into rows, and rows into padded batches for a vision-language backbone.
 
 T frames, L tokens. A row is a conversation: its tokens, and the tokens whose hidden states are read for each frame and
-for the query. Token ids equal those of upstream's inference collator.
+for the query.
 Making a row is cheap. Resizing its frames is not, and may be done before its batch is collated.
 """
 
@@ -40,8 +40,8 @@ VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
 IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
 
 
-class VlmCollator:
-    """Turns samples into rows, and rows into batches, for Qwen2.5-VL and Qwen3-VL.
+class QwenCollator:
+    """Turns samples into rows, and rows into batches, for Qwen2.5-VL and Qwen3-VL. A family gives its ``rows``.
 
     Images and videos are pad tokens between vision start and end.
 
@@ -51,7 +51,7 @@ class VlmCollator:
 
     makes_trees: ClassVar[bool] = True  # of prefixes, whose common beginnings are computed once
 
-    def __init__(self, config: VlmConfig, tokenizer: Any, images: QwenImages) -> None:
+    def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
         self.config = config
         self.tokenizer = tokenizer
         self.images = images
@@ -65,15 +65,7 @@ class VlmCollator:
 
     def rows(self, sample: Sample) -> list[VlmRow]:
         """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
-        check_type(sample, self.config)
-        frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
-        videos = tuple(video_of(trajectory, frame_steps) for trajectory in sample.trajectories)
-        self._check_task(sample.trajectories[0].task)
-        row = self._row(sample, videos)
-        if frame_steps:
-            # All prefixes show equally many frames of equal size, so all conversations have the same tokens.
-            return [replace(row, picked=picked) for picked in videos[0].conversations]
-        return [row]
+        raise NotImplementedError
 
     def _uncached_to_size(self, video: VlmVideo, threads: FrameThreads) -> SizedFrames:
         keys = {shot: (id(video), shot) for shot in video.shots(are_images=self.config.multi_image)}
@@ -113,38 +105,6 @@ class VlmCollator:
             num_span_tokens=sum(stop - start for _, start, stop in spans),
         )
         return self._with_pixels(batch, rows)
-
-    def _row(self, sample: Sample, videos: tuple[VlmVideo, ...]) -> VlmRow:
-        parts: list[str | Visual] = []
-        for part in question(sample, progress_in_preference=self.config.progress_in_preference):
-            parts += self._frame_parts(videos[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
-        text, pad, lengths = self._placed(self._chat.text(tuple(parts)), videos)
-        ids = expanded(self._chat.tokens(text), self.tokenizer.convert_tokens_to_ids(pad), lengths)
-        is_similarity = isinstance(sample, SimilaritySample)
-        query_token = SIMILARITY_TOKEN if is_similarity else PREFERENCE_TOKEN
-        query = int(self._positions(ids, query_token)[-1]) if len(videos) > 1 else None
-        return VlmRow(
-            ids, videos, self._spans(ids, videos), query, is_similarity, position_ids=self._position_ids(ids, videos)
-        )
-
-    def _frame_parts(self, num_frames: int) -> list[str | Visual]:
-        if not self.config.multi_image:
-            return [Visual.VIDEO]
-        each: list[str | Visual] = [Visual.IMAGE]
-        if self.config.per_frame_progress_token:
-            each.append(PROGRESS_TOKEN)
-        return each * num_frames
-
-    def _image_spans(self, ids: Indices, videos: tuple[VlmVideo, ...], ends: Spans) -> tuple[Spans, ...]:
-        """Return the spans of frames that are separate images; ``ends``: the tokens around each image."""
-        if self.config.per_frame_progress_token:
-            spans = [(int(token), int(token) + 1) for token in self._positions(ids, PROGRESS_TOKEN)]
-        elif self.config.frame_pooling == "boundary":
-            spans = [(end - 1, end) for _, end in ends]
-        else:
-            spans = [(start + 1, end) for start, end in ends]
-        bounds = np.cumsum([0, *(video.num_shown for video in videos)])
-        return tuple(spans[bounds[i] : bounds[i + 1]] for i in range(len(videos)))
 
     def _positions(self, ids: Indices, token: str) -> Indices:
         return np.flatnonzero(ids == self.tokenizer.convert_tokens_to_ids(token))
@@ -210,37 +170,9 @@ class VlmCollator:
         grid = self.grid(video)
         return grid.groups * grid.rows * grid.columns
 
-    def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
-        """Return the text with a pad token for each image, video or temporal patch, this token, and its repetitions."""
-        grids = [self.grid(video) for video in videos]
-        of_shots = [grid.tokens_per_group for grid in grids for _ in range(grid.groups)]
-        if self.config.multi_image:
-            return text, IMAGE_PAD, of_shots
-        if self.config.family != QWEN3:
-            return text, VIDEO_PAD, [grid.groups * grid.tokens_per_group for grid in grids]
-        timed = ["".join(self._around(timed_groups(group_times(grid.groups)))) for grid in grids]
-        return _replaced(text, VISION_START + VIDEO_PAD + VISION_END, timed), VIDEO_PAD, of_shots
-
     def _around(self, *texts: str) -> tuple[str, ...]:
         """Return the texts of a Qwen3-VL's video in its prompt's form, wrapped as a whole or bare."""
         return (VISION_START, *texts, VISION_END) if self.config.video_prompt == WRAPPED else texts
-
-    def _spans(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> tuple[Spans, ...]:
-        """Return the tokens at which each frame's state is read."""
-        starts = self._positions(ids, VISION_START)
-        if self.config.multi_image:
-            ends = list(zip(starts.tolist(), self._positions(ids, VISION_END).tolist(), strict=True))
-            return self._image_spans(ids, videos, ends)
-        # As upstream: strides from the row's n-th vision start for the n-th trajectory. Upstream ignores, in training
-        # and inference, that Qwen3-VL writes a time and a vision start before each temporal patch.
-        grids = map(self.grid, videos)
-        return tuple(self._video_spans(int(start), grid) for start, grid in zip(starts, grids, strict=False))
-
-    def _video_spans(self, start: int, grid: Grid) -> Spans:
-        bounds = [start + group * grid.tokens_per_group for group in range(grid.groups + 1)]
-        if self.config.average_temporal_patches:
-            return list(pairwise(bounds))
-        return [(bound, bound + 1) for bound in bounds[1:]]
 
     def _position_ids(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> Indices:
         """Return position ids: a box for each image or temporal patch of Qwen3-VL, or for a video of Qwen2.5-VL."""
@@ -306,6 +238,82 @@ class VlmCollator:
             query_rows=torch.zeros(len(queries), dtype=torch.int64),
             query_tokens=torch.tensor(queries, dtype=torch.int64),
         )
+
+
+class VlmCollator(QwenCollator):
+    """The collator of RFM and Robometer, whose tokens equal those of upstream's inference collator."""
+
+    def rows(self, sample: Sample) -> list[VlmRow]:
+        """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
+        check_type(sample, self.config)
+        frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
+        videos = tuple(video_of(trajectory, frame_steps) for trajectory in sample.trajectories)
+        self._check_task(sample.trajectories[0].task)
+        row = self._row(sample, videos)
+        if frame_steps:
+            # All prefixes show equally many frames of equal size, so all conversations have the same tokens.
+            return [replace(row, picked=picked) for picked in videos[0].conversations]
+        return [row]
+
+    def _row(self, sample: Sample, videos: tuple[VlmVideo, ...]) -> VlmRow:
+        parts: list[str | Visual] = []
+        for part in question(sample, progress_in_preference=self.config.progress_in_preference):
+            parts += self._frame_parts(videos[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
+        text, pad, lengths = self._placed(self._chat.text(tuple(parts)), videos)
+        ids = expanded(self._chat.tokens(text), self.tokenizer.convert_tokens_to_ids(pad), lengths)
+        is_similarity = isinstance(sample, SimilaritySample)
+        query_token = SIMILARITY_TOKEN if is_similarity else PREFERENCE_TOKEN
+        query = int(self._positions(ids, query_token)[-1]) if len(videos) > 1 else None
+        return VlmRow(
+            ids, videos, self._spans(ids, videos), query, is_similarity, position_ids=self._position_ids(ids, videos)
+        )
+
+    def _frame_parts(self, num_frames: int) -> list[str | Visual]:
+        if not self.config.multi_image:
+            return [Visual.VIDEO]
+        each: list[str | Visual] = [Visual.IMAGE]
+        if self.config.per_frame_progress_token:
+            each.append(PROGRESS_TOKEN)
+        return each * num_frames
+
+    def _image_spans(self, ids: Indices, videos: tuple[VlmVideo, ...], ends: Spans) -> tuple[Spans, ...]:
+        """Return the spans of frames that are separate images; ``ends``: the tokens around each image."""
+        if self.config.per_frame_progress_token:
+            spans = [(int(token), int(token) + 1) for token in self._positions(ids, PROGRESS_TOKEN)]
+        elif self.config.frame_pooling == "boundary":
+            spans = [(end - 1, end) for _, end in ends]
+        else:
+            spans = [(start + 1, end) for start, end in ends]
+        bounds = np.cumsum([0, *(video.num_shown for video in videos)])
+        return tuple(spans[bounds[i] : bounds[i + 1]] for i in range(len(videos)))
+
+    def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
+        """Return the text with a pad token for each image, video or temporal patch, this token, and its repetitions."""
+        grids = [self.grid(video) for video in videos]
+        of_shots = [grid.tokens_per_group for grid in grids for _ in range(grid.groups)]
+        if self.config.multi_image:
+            return text, IMAGE_PAD, of_shots
+        if self.config.family != QWEN3:
+            return text, VIDEO_PAD, [grid.groups * grid.tokens_per_group for grid in grids]
+        timed = ["".join(self._around(timed_groups(group_times(grid.groups)))) for grid in grids]
+        return _replaced(text, VISION_START + VIDEO_PAD + VISION_END, timed), VIDEO_PAD, of_shots
+
+    def _spans(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> tuple[Spans, ...]:
+        """Return the tokens at which each frame's state is read."""
+        starts = self._positions(ids, VISION_START)
+        if self.config.multi_image:
+            ends = list(zip(starts.tolist(), self._positions(ids, VISION_END).tolist(), strict=True))
+            return self._image_spans(ids, videos, ends)
+        # As upstream: strides from the row's n-th vision start for the n-th trajectory. Upstream ignores, in training
+        # and inference, that Qwen3-VL writes a time and a vision start before each temporal patch.
+        grids = map(self.grid, videos)
+        return tuple(self._video_spans(int(start), grid) for start, grid in zip(starts, grids, strict=False))
+
+    def _video_spans(self, start: int, grid: Grid) -> Spans:
+        bounds = [start + group * grid.tokens_per_group for group in range(grid.groups + 1)]
+        if self.config.average_temporal_patches:
+            return list(pairwise(bounds))
+        return [(bound, bound + 1) for bound in bounds[1:]]
 
 
 def video_of(trajectory: Trajectory, frame_steps: int) -> VlmVideo:

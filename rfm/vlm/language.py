@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.provenance import Assumption
+from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, expecting, shown
+from rfm.saved import REWARD_MODEL, Saved
 from rfm.engine.graphs import Graphs
 from rfm.engine.pixels import Normalisation
 from rfm.engine.predictor import check_type
@@ -26,7 +26,7 @@ from rfm.vlm.collator import (
     VIDEO_PAD,
     VISION_END,
     VISION_START,
-    VlmCollator,
+    QwenCollator,
     expanded,
     timed_groups,
     video_of,
@@ -41,7 +41,9 @@ from rfm.vlm.row import VlmRow
 from rfm.vlm.video import Indices, VlmVideo
 from rfm_client.contract import ProgressSample, Sample
 
-REWARD_MODEL = "reward_model"  # key of SETTINGS in an exported config.json
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 VIDEO = VISION_START + VIDEO_PAD + VISION_END  # a video, or a temporal patch, in the text of a prompt
 HEAD, EMBEDDING = "lm_head.weight", "model.language_model.embed_tokens.weight"
 MOST_PIECES = 4096  # cached texts of a prompt and of times
@@ -61,6 +63,22 @@ class LanguageConfig(BackboneConfig):
     has_preference: ClassVar[bool] = False
     has_success: ClassVar[bool] = False
     has_similarity: ClassVar[bool] = False
+
+    @classmethod
+    def of(cls, saved: Saved) -> Self:
+        """Return the configuration in an export. Raises CheckpointError for an export of another reward model."""
+        file = saved.folder / NETWORK_CONFIG
+        fields = {name: tuple(each) if isinstance(each, list) else each for name, each in saved.settings.items()}
+        name = fields.pop(REWARD_MODEL, None)
+        if name != cls.reward_model:
+            raise CheckpointError.at(saved.folder, f"an export of {cls.reward_model}", f"one of {shown(name)}")
+        with expecting(f"the settings of an export of {cls.reward_model}", file):
+            return cls(backbone=saved.backbone, **cls.fields_of(fields))
+
+    @classmethod
+    def fields_of(cls, settings: dict[str, Any]) -> dict[str, Any]:
+        """Return the fields of this class from an export's settings."""
+        return settings
 
 
 @dataclass(frozen=True)
@@ -91,7 +109,7 @@ class LanguageNetwork(nn.Module):
         return LanguageOutput(self.lm_head(hidden[batch.query_rows, batch.query_tokens]), made)
 
 
-class LanguageCollator(VlmCollator):
+class LanguageCollator(QwenCollator):
     """The collator of prompts with one video, each temporal patch behind its time."""
 
     def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
@@ -157,13 +175,10 @@ class LanguageCheckpoint(QwenCheckpoint):
     """A Qwen3-VL in memory that is asked in words.
 
     weights: of LanguageNetwork; the head's only if it is not tied to the embedding
-    processor: folder or id with tokenizer and preprocessing
-    assumptions: settings that neither weights nor files prove
+    made_of: class of the configuration
     """
 
-    processor: str | Path
-    assumptions: tuple[Assumption, ...] = ()
-
+    made_of: ClassVar[type[LanguageConfig]]
     reads_videos: ClassVar[bool] = True  # else separate images
 
     @property
@@ -171,14 +186,16 @@ class LanguageCheckpoint(QwenCheckpoint):
         """The ids of tokens that an ordinary Qwen3-VL lacks, by token."""
         return {}
 
-    @property
-    def notes(self) -> list[str]:
-        """Return no line: no facts of training are known here."""
-        return []
+    @classmethod
+    def restore(cls, folder: Path) -> Self:
+        """Load what ``save`` wrote. Raises CheckpointError."""
+        saved = Saved.read(folder)
+        checkpoint = cls(cls.made_of.of(saved), saved.weights, saved.processor)
+        checkpoint.check()
+        return checkpoint
 
-    @cached_property
-    def collator(self) -> LanguageCollator:
-        """The collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+    def load_collator(self) -> LanguageCollator:
+        """Return the collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
         tokenizer, preprocessor = read_processor(self.processor, videos=self.reads_videos)
         num_rows = self.config.backbone["text_config"]["vocab_size"]
         if len(tokenizer) > num_rows:

@@ -1,26 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Read the files of a Qwen-VL with its language head: of Hugging Face, or of an export."""
+"""Read the files of a Qwen-VL with its language head, as Hugging Face has them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
 from rfm.checkpoint.provenance import Assumption, source_name
-from rfm.checkpoint.weights import read_weights
 from rfm.family import Options, VideoPrompt, Weights
 from rfm.vlm.backbone import QWEN_2_5, QWEN_NAMES, Renames, backbone_config, renamed
 from rfm.vlm.collator import QWEN3
-from rfm.vlm.language import EMBEDDING, HEAD, REWARD_MODEL, LanguageConfig
+from rfm.vlm.language import EMBEDDING, HEAD, LanguageCheckpoint, LanguageConfig
 from rfm.vlm.network import Dtype
-from rfm.vlm.processor import PROCESSOR_FOLDER
-from rfm.vlm.qwen_checkpoint import SETTINGS
+from rfm.saved import PROCESSOR_FOLDER
 from rfm.vlm.rounding import kind_of, read_published, read_unrounded_config, round_layers
 from rfm.vlm.run_config import DTYPES
 from rfm.vlm.video_prompt import decided
@@ -30,25 +28,23 @@ _TIED = "tie_word_embeddings"
 ONLY_QWEN3 = {QWEN3: "Qwen3-VL"}
 ANY_QWEN = {QWEN_2_5: "Qwen2.5-VL", **ONLY_QWEN3}
 
-Config = TypeVar("Config", bound=LanguageConfig)
+Made = TypeVar("Made", bound=LanguageCheckpoint)
 
 
 @dataclass(frozen=True)
 class LanguageFolder:
-    """The files of a Qwen-VL: of Hugging Face, or of an export.
+    """The files of a Qwen-VL.
 
     backbone: as ``BackboneConfig``'s
-    settings: this project's settings, in an export; None: the folder is no export
     dtype: stated by config.json
     base_model: source of the tokenizer and processor
-    video_prompt: form of the prompt, of a folder that is no export
+    video_prompt: form of the prompt
     rounded: form of rounded layers; None: not rounded
-    assumed: dtype and video_prompt, if no file of a folder that is no export proves them
+    assumed: dtype and video_prompt, if no file proves them
     """
 
     folder: Path
     backbone: dict[str, Any]
-    settings: dict[str, Any] | None
     weights: dict[str, Tensor]
     processor: str | Path
     dtype: str
@@ -68,10 +64,9 @@ class LanguageFolder:
         if content.get("model_type") not in backbones:
             expected = " or ".join(f"{kind}, of an ordinary {name}" for kind, name in backbones.items())
             raise CheckpointError.at(f"{file}: model_type", expected, shown(content.get("model_type")))
-        settings = content.pop(SETTINGS, None)
         backbone = backbone_config(content, file)
         is_nf4 = read_unrounded_config(backbone, file)
-        tensors = read_weights(folder) if settings is not None else read_published(folder, is_nf4)[0]
+        tensors, _ = read_published(folder, is_nf4)
         weights = {name: tensor for name, tensor in renamed(tensors, _NAMES).items() if "inv_freq" not in name}
         if any(name.startswith("progress_head") for name in weights):
             raise CheckpointError.at(folder, "an ordinary Qwen3-VL", "reward heads: leave out --as")
@@ -80,17 +75,16 @@ class LanguageFolder:
         processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
         dtype, of_dtype = dtype_of(backbone, file)
         form, of_form = decided(options.video_prompt, backbone, NETWORK_CONFIG, may_be_saved_later=True)
-        rounded = kind_of(weights) if settings is None else settings.get("weights")
+        rounded = kind_of(weights)
         if rounded is None and options.weights is not None:
             weights, _ = round_layers(weights, {}, options.weights, getattr(torch, dtype))
             rounded = options.weights
-        assumed = (*of_dtype, *of_form) if settings is None else ()
         name = source_name(processor)
-        return cls(folder, backbone, settings, weights, processor, dtype, name, form, rounded, assumed)
+        return cls(folder, backbone, weights, processor, dtype, name, form, rounded, (*of_dtype, *of_form))
 
     @property
     def made_of(self) -> dict[str, Any]:
-        """The fields of LanguageConfig for a folder that is no export."""
+        """The fields of LanguageConfig."""
         return {
             "backbone": self.backbone,
             "dtype": self.dtype,
@@ -99,27 +93,19 @@ class LanguageFolder:
             "weights": self.rounded,
         }
 
-    def saved(self, config: type[Config]) -> Config | None:
-        """Return the configuration that ``LanguageCheckpoint.save`` wrote; None: the folder is no export.
-
-        Raises CheckpointError for an export of another reward model.
-        """
-        if self.settings is None:
-            return None
-        if self.settings.get(REWARD_MODEL) != config.reward_model:
-            got = shown(self.settings.get(REWARD_MODEL))
-            raise CheckpointError.at(self.folder, f"an export of {config.reward_model}", f"one of {got}")
-        fields = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in self.settings.items()
-            if name != REWARD_MODEL
-        }
-        made: Any = config
-        return cast(Config, made(**{"backbone": self.backbone, **fields, "weights": self.rounded}))
-
     def assumptions(self, config: LanguageConfig) -> tuple[Assumption, ...]:
         """Return the settings that nothing proves and that have an effect."""
         return tuple(each for each in self.assumed if not (config.multi_image and each.name == "video_prompt"))
+
+
+def reopened(made: type[Made], folder: Path, options: Options) -> Made:
+    """Load an export, with the processor and the form of weights that the user asks for. Raises CheckpointError."""
+    checkpoint = made.restore(folder)
+    config, weights = checkpoint.config, checkpoint.weights
+    if options.weights is not None and config.weights is None:
+        weights, _ = round_layers(weights, {}, options.weights, config.torch_dtype)
+        config = replace(config, weights=options.weights)
+    return replace(checkpoint, config=config, weights=weights, processor=options.base_model or checkpoint.processor)
 
 
 def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> None:
@@ -157,11 +143,3 @@ def dtype_of(config: Mapping[str, Any], file: Path) -> tuple[Dtype, tuple[Assump
     if dtype not in DTYPES:
         raise CheckpointError.at(f"{file}: {key}", f"one of {', '.join(DTYPES)}", shown(dtype))
     return dtype, ()
-
-
-def reward_model_of(folder: Path) -> str | None:
-    """Return the reward model that an export's config.json names; None: there is none."""
-    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
-    settings = content.get(SETTINGS)
-    name = settings.get(REWARD_MODEL) if isinstance(settings, dict) else None
-    return name if isinstance(name, str) else None

@@ -83,11 +83,18 @@ class Scaling:
             raise CheckpointError.at(file, "plain LoRA", cut(", ".join(unsupported)), MERGE)
         return cls(file, rank, float(config["lora_alpha"]))
 
-    def check_rank(self, module: str, factor: Tensor) -> None:
-        """Raise CheckpointError for a factor A, [r, D], of another rank."""
-        if len(factor) != self.rank:
-            where, remedy = f"{self.file}: r", "put in r and lora_alpha of the run that trained these factors"
-            raise CheckpointError.at(where, f"{len(factor)}, the rows of {module}.lora_A", self.rank, remedy)
+    def scaled(self, factors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the factors, with alpha / r in B. Raises CheckpointError for a factor A, [r, D], of another rank."""
+        scale = self.alpha / self.rank
+        found = {}
+        for name, factor in factors.items():
+            is_a = name.endswith("lora_A.weight")
+            if is_a and len(factor) != self.rank:
+                where, remedy = f"{self.file}: r", "put in r and lora_alpha of the run that trained these factors"
+                got = f"{len(factor)}, the rows of {module_of(name)}.lora_A"
+                raise CheckpointError.at(where, got, self.rank, remedy)
+            found[name] = factor if is_a or scale == 1 else scale * factor.float()
+        return found
 
     def check_equal(self, other: Scaling) -> None:
         """Raise CheckpointError if another file has other values."""
@@ -106,11 +113,10 @@ def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
         raise CheckpointError.at(f"{file}: bias", "none", f"{shown(bias)}, which PEFT does not always save", MERGE)
 
 
-def split(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def split(tensors: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Split tensors into weights and LoRA factors ``<module>.lora_A.weight`` and ``<module>.lora_B.weight``.
 
-    scaling: B is multiplied by its alpha / r; None: B is multiplied already
-    Raises CheckpointError for factors that do not fit their weight, or have another rank.
+    Raises CheckpointError for factors that do not fit their weight.
     """
     weights: dict[str, Tensor] = {}
     pairs: dict[str, dict[str, Tensor]] = {}
@@ -123,11 +129,7 @@ def split(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tupl
     factors = {}
     for module, pair in pairs.items():
         _check(module, weights.get(f"{module}.weight"), pair)
-        if scaling is not None:
-            scaling.check_rank(module, pair["A"])
-        scale = 1.0 if scaling is None else scaling.alpha / scaling.rank
-        factors[_name(module, "A")] = pair["A"]
-        factors[_name(module, "B")] = pair["B"] if scale == 1 else scale * pair["B"].float()
+        factors |= {_name(module, side): pair[side] for side in "AB"}
     return weights, factors
 
 

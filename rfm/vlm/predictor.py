@@ -19,7 +19,7 @@ from rfm.engine.layers import progress_from_logits, speed_up
 from rfm.engine.predictor import RowScores, no_success, of_rows
 from rfm.engine.threads import FrameThreads
 from rfm.vlm.batch import Layout, VlmBatch
-from rfm.vlm.collator import VlmCollator
+from rfm.vlm.collator import QwenCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.network import VlmOutput
 from rfm.vlm.row import VlmRow
@@ -27,8 +27,8 @@ from rfm.vlm.tree import trees
 from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
 
 
-class VlmPredictor:
-    """A vision-language reward model on a device.
+class QwenPredictor:
+    """A reward model on a Qwen backbone, on a device. A family gives its ``score``.
 
     cache: holds frames, which requests may name, and features of temporal patches; None: no cache
     threads: prepare the frames of all samples
@@ -39,7 +39,7 @@ class VlmPredictor:
     reads_views = False
 
     def __init__(
-        self, network: Any, collator: VlmCollator, device: torch.device, cache: FeatureCache[Any] | None = None
+        self, network: Any, collator: QwenCollator, device: torch.device, cache: FeatureCache[Any] | None = None
     ) -> None:
         self.network = network.to(device).eval()
         speed_up(self.network)
@@ -102,31 +102,9 @@ class VlmPredictor:
         execution.num_found += 0 if batch.layout is None else len(batch.layout.kept) * self.collator.frames_per_shot
         execution.cache_bytes = None if self.cache is None else self.cache.num_bytes
 
-    @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
         """Run one forward pass; return each row's scores, or its error."""
-        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
-        output = self._output(batch)
-        scores, preference, similarity, may_keep = _read(output)
-        of_rows, read, num_queries = [], 0, 0
-        for row in rows:
-            if row.packs:
-                prefixes = slice(read, read + len(row.leaves) + 1)
-                of_rows.append(RowScores([scores.at(prefixes)], is_of_prefixes=True))
-                read = prefixes.stop
-                continue
-            frames = []
-            for spans, video in zip(row.spans, row.videos, strict=True):
-                frames.append(self._per_frame(scores.at(slice(read, read + len(spans))), video.num_shown))
-                read += len(spans)
-            query = None
-            if row.query is not None:
-                query = (similarity if row.is_similarity else preference)[num_queries]
-                num_queries += 1
-            of_rows.append(RowScores(frames, query))
-        if may_keep:
-            self._keep(rows, batch.layout, output.made)
-        return list(of_rows)
+        raise NotImplementedError
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
         """Return the scores of a progress sample's frames, from those of all its rows."""
@@ -166,6 +144,37 @@ class VlmPredictor:
             for key in video.ready.keys.values():
                 if made is not None and key in layout.made:
                     cache.keep({key: made[layout.made[key]].clone()})
+
+
+
+class VlmPredictor(QwenPredictor):
+    """RFM or Robometer on a device."""
+
+    @torch.inference_mode()
+    def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
+        """Run one forward pass; return each row's scores, or its error."""
+        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
+        output = self._output(batch)
+        scores, preference, similarity, may_keep = _read(output)
+        of_rows, read, num_queries = [], 0, 0
+        for row in rows:
+            if row.packs:
+                prefixes = slice(read, read + len(row.leaves) + 1)
+                of_rows.append(RowScores([scores.at(prefixes)], is_of_prefixes=True))
+                read = prefixes.stop
+                continue
+            frames = []
+            for spans, video in zip(row.spans, row.videos, strict=True):
+                frames.append(self._per_frame(scores.at(slice(read, read + len(spans))), video.num_shown))
+                read += len(spans)
+            query = None
+            if row.query is not None:
+                query = (similarity if row.is_similarity else preference)[num_queries]
+                num_queries += 1
+            of_rows.append(RowScores(frames, query))
+        if may_keep:
+            self._keep(rows, batch.layout, output.made)
+        return list(of_rows)
 
     def _per_frame(self, scores: FrameScores, num_frames: int) -> FrameScores:
         """Return the scores of each frame; in video mode both frames of a temporal patch share its score."""

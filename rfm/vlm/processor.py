@@ -17,6 +17,7 @@ from rfm.vlm.collator import (
     QWEN3,
     VIDEO_PAD,
     VISION_START,
+    QwenCollator,
     VlmCollator,
 )
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, QwenImages, fitted_size
@@ -32,7 +33,6 @@ from rfm.vlm.preprocessor import (
 from rfm.vlm.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS, Chat, Visual
 from rfm_client.contract import FrameSize
 
-PROCESSOR_FOLDER = "processor"  # in an exported checkpoint
 TOKENIZER_CONFIG = "tokenizer_config.json"
 # Fields of TOKENIZER_CONFIG that transformers 4.57 and 5 read alike; the rest is in tokenizer.json.
 _KEPT = (
@@ -140,7 +140,7 @@ def _chat_template(folder: Path, tokenizer: Any) -> str:
     return template
 
 
-def save_processor(collator: VlmCollator, folder: Path) -> None:
+def save_processor(collator: QwenCollator, folder: Path) -> None:
     """Write the files that ``load_collator`` reads, so that serving needs no internet."""
     collator.tokenizer.save_pretrained(folder)
     (folder / PREPROCESSOR_CONFIG).write_text(json.dumps(collator.images.to_config(), indent=2) + "\n")

@@ -3,30 +3,29 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS, CheckpointError, expecting, shown
+from rfm.saved import PROCESSOR_FOLDER, SETTINGS, write_network
+from rfm.checkpoint.content import NETWORK_CONFIG, CheckpointError, expecting, shown
 from rfm.checkpoint.weights import check_shapes
 from rfm.engine.feature_cache import FeatureCache
 from rfm.family import NETWORK, config_fields
-from rfm.vlm.collator import VlmCollator
+from rfm.vlm.collator import QwenCollator
 from rfm.vlm.lora import merged
-from rfm.vlm.predictor import VlmPredictor
-from rfm.vlm.processor import PROCESSOR_FOLDER, save_processor
+from rfm.vlm.predictor import QwenPredictor
+from rfm.vlm.processor import save_processor
 from rfm.vlm.rounded import fit
 from rfm.vlm.work import flop
 from rfm_client.contract import Sample
 
 LORA = "lora"  # key in ``parts``: the factors that change the network's weights
-SETTINGS = "rfm"  # key in an exported config.json: this project's fields
 MAX_LAYERS = 1024
 
 _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
@@ -34,19 +33,28 @@ _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
 
 @dataclass(frozen=True)
 class QwenCheckpoint:
-    """A checkpoint in memory. weights: of its network, without LoRA"""
+    """A checkpoint in memory.
+
+    weights: of its network, without LoRA
+    processor: folder or id with tokenizer and preprocessing
+    """
 
     config: Any
     weights: dict[str, Tensor]
+    processor: str | Path
 
     @property
     def parts(self) -> dict[str, dict[str, Tensor]]:
         """All weights of the network."""
         return {NETWORK: self.weights}
 
-    @property
-    def collator(self) -> VlmCollator:
+    @cached_property
+    def collator(self) -> Any:
         """The collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+        return self.load_collator()
+
+    def load_collator(self) -> QwenCollator:
+        """Return the collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
         raise NotImplementedError
 
     def network(self, dtype: torch.dtype) -> nn.Module:
@@ -58,7 +66,7 @@ class QwenCheckpoint:
         with torch.device("meta"):
             return self.network(self.config.torch_dtype)
 
-    def make_predictor(self, network: Any, device: torch.device, cache: FeatureCache[Any] | None) -> VlmPredictor:
+    def make_predictor(self, network: Any, device: torch.device, cache: FeatureCache[Any] | None) -> QwenPredictor:
         """Return the predictor with this network."""
         raise NotImplementedError
 
@@ -74,12 +82,9 @@ class QwenCheckpoint:
         """Return the operations of a sample's products. Raises CheckpointError, InvalidSampleError."""
         return flop(self.config, self.collator, sample)
 
-    def encoders(self) -> None:
-        """Return None: the network reads raw frames and needs no encoders."""
-
     def predictor(
         self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
-    ) -> VlmPredictor:
+    ) -> QwenPredictor:
         """Return a predictor with the network on ``device``. Raises CheckpointError.
 
         dtype: of the network; None: float32 on the CPU, else the checkpoint's own
@@ -93,11 +98,8 @@ class QwenCheckpoint:
     def save(self, folder: Path) -> None:
         """Write all weights, a config.json with all settings, and the processor."""
         collator = self.collator  # first, so that a missing file is reported before the weights are written
-        folder.mkdir(parents=True)
         config = {**self.config.backbone, SETTINGS: self.saved_settings()}
-        (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
-        tensors = {name: tensor.contiguous() for part in self.parts.values() for name, tensor in part.items()}
-        save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
+        write_network(folder, config, {name: each for part in self.parts.values() for name, each in part.items()})
         save_processor(collator, folder / PROCESSOR_FOLDER)
 
     def build(self, dtype: torch.dtype | None = None) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import torch
 
-from rfm.vlm.collator import VlmCollator
+from rfm.vlm.collator import QwenCollator
 from rfm.vlm.network import BackboneConfig, build_backbone
 from rfm.vlm.tree import trees
 from rfm_client.contract import Sample
@@ -14,7 +14,7 @@ _VISION = "visual."  # beginning of parameters that patches pass
 _EMBEDDING = "embed_tokens."  # looked up, not multiplied
 
 
-def flop(config: BackboneConfig, collator: VlmCollator, sample: Sample) -> float:
+def flop(config: BackboneConfig, collator: QwenCollator, sample: Sample) -> float:
     """Return the operations of a sample's products with weights: two for each parameter and each patch or token.
 
     The products of attention, about a tenth, and the heads are left out.

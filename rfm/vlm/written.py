@@ -27,7 +27,7 @@ from rfm.engine.predictor import RowScores, no_success
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.images import QwenImages
 from rfm.vlm.language import LanguageCollator, LanguageConfig
-from rfm.vlm.predictor import VlmPredictor
+from rfm.vlm.predictor import QwenPredictor
 from rfm.vlm.qwen import Indices, KeyValues, next_hidden_state
 from rfm.vlm.row import VlmRow
 from rfm_client.contract import FrameScores, InferenceFailedError, InvalidSampleError, RewardError
@@ -74,7 +74,7 @@ class WritingCollator(LanguageCollator):
     def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> VlmBatch:
         """Return the batch of conversations with the draft behind each.
 
-        length: as in ``VlmCollator.collate``
+        length: as in ``QwenCollator.collate``
         The queries are the last token of each conversation and the tokens of the draft.
         """
         batch = super().collate([self._drafted(row) for row in rows], length)
@@ -111,7 +111,7 @@ class WrittenAnswer:
     is_finite: bool = True
 
 
-class WritingPredictor(VlmPredictor):
+class WritingPredictor(QwenPredictor):
     """A vision-language model on a device, which writes answers.
 
     expected: what an answer must hold, for the error of one that cannot be read
