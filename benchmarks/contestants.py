@@ -21,12 +21,12 @@ import torch
 from load import Calls, Load, Measured, samples
 
 import rfm_export
-from rfm import families
+from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
+from rfm.families.rewind.checkpoint import RewindCheckpoint
+from rfm.families.rewind.network import RewindConfig, RewindTransformer
 from rfm.launch.triton_server import Endpoints
-from rfm.rewind.checkpoint import RewindCheckpoint
-from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm_commands.config import Config
 
 HERE = Path(__file__).parent
@@ -153,7 +153,7 @@ class BareEngine:
     """``Engine.evaluate`` in this process, batch after batch: the upper bound for a server around it."""
 
     def __init__(self, measured: Checkpoint) -> None:
-        self._engine, self._widths = Engine.of(families.load(measured.folder)), measured.widths
+        self._engine, self._widths = Engine.of(published.load(measured.folder)), measured.widths
 
     def measure(self, load: Load, batch_size: int) -> dict[str, float]:
         """Return rates and latencies for the load's samples. Two batches warm up."""

@@ -84,7 +84,7 @@ def write(folder: Path, kind: str, size: Size, device: str = "cpu") -> Path:
         config["text_config"]["vocab_size"] = size.vocabulary or config["text_config"]["vocab_size"]
         config["text_config"]["tie_word_embeddings"] = config["tie_word_embeddings"] = False
     if kind == RYNNVALUE and size.published_heads:
-        from rfm.rynnvalue.settings import PUBLISHED  # older commits lack it
+        from rfm.published.rynnvalue import PUBLISHED
 
         config |= {name: value for name, value in PUBLISHED.items() if name.endswith("_config")}
     (of_kind / "config.json").write_text(json.dumps(config, indent=2))
@@ -140,7 +140,7 @@ def _score_heads(width: int) -> dict[str, torch.Tensor]:
 
 
 def _value_heads(config: Mapping[str, Any]) -> dict[str, torch.Tensor]:
-    from rfm.rynnvalue.network import HeadConfig, ValueHead
+    from rfm.families.rynnvalue.network import HeadConfig, ValueHead
 
     made: dict[str, torch.Tensor] = {}
     names = {"value": [f"value_heads.{number}" for number in range(config["num_value_heads"])]}

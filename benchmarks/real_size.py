@@ -23,7 +23,7 @@ from load import Calls, Load, Measured, samples
 from random_checkpoints import BASE_MODEL, DESCRIBED, QWEN, QWEN3_VL_4B, ROBOMETER, RYNNVALUE, TINY, Size
 from torch.profiler import ProfilerActivity, profile
 
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
 
 FRAMES = 8
@@ -113,7 +113,7 @@ def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
         ("roboreward", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
         ("roboreward-expected", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
     ]
-    if "robot_description" in inspect.signature(families.load).parameters:
+    if "robot_description" in inspect.signature(published.load).parameters:
         plans += [("rynnvalue", RYNNVALUE, [(n, FRAMES, small) for n in (one, some, many)])]
     knows_graphs = "cuda_graphs" in inspect.signature(Engine.of).parameters
     for what, kind, sizes in plans:
@@ -121,7 +121,7 @@ def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
             known: dict[str, dict[str, Any]] = {ROBOMETER: {"base_model": str(BASE_MODEL)}, RYNNVALUE: DESCRIBED}
             sources = known.get(kind, {"reward_model": what})
             options: dict[str, Any] = {"cuda_graphs": True} if graphs else {}
-            checkpoint = families.load(folder / kind, **sources)
+            checkpoint = published.load(folder / kind, **sources)
             engine = Engine.of(checkpoint, device=scale.device, max_sample_tokens=MAX_TOKENS, **options)
             for size in sizes[:2] if graphs else sizes:
                 yield {

@@ -16,7 +16,7 @@ from typing import Any
 from safetensors.torch import save_file
 from torch import Tensor
 
-from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS, CheckpointError, is_there, read_json, read_tensors, shown
+from rfm.files import NETWORK_CONFIG, WEIGHTS, CheckpointError, is_there, read_json, read_tensors, shown
 
 SETTINGS = "rfm"  # key in config.json
 REWARD_MODEL = "reward_model"  # key in SETTINGS, of a model that is asked in words
@@ -48,7 +48,9 @@ class Saved:
         content = read_json(folder / NETWORK_CONFIG)
         settings = content.pop(SETTINGS, None)
         if not isinstance(settings, dict):
-            raise CheckpointError.at(f"{folder / NETWORK_CONFIG}: {SETTINGS}", "the settings of an export", shown(settings))
+            raise CheckpointError.at(
+                f"{folder / NETWORK_CONFIG}: {SETTINGS}", "the settings of an export", shown(settings)
+            )
         return cls(folder, content, settings, read_tensors(folder / WEIGHTS))
 
 

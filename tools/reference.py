@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rfm.vlm.network import VlmConfig
-from rfm.vlm.run_config import SETTINGS, RunConfig
+from rfm.families.robometer.network import VlmConfig
+from rfm.published.robometer_config import SETTINGS, RunConfig
 from rfm_client.contract.settings import Setting, Settings
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 

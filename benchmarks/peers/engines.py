@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from rfm import families
+from rfm import published
 from rfm.engine import Engine, Outcome
 from rfm_client import (
     FrameScores,
@@ -77,4 +77,4 @@ def _frames(*scores: FrameScores) -> dict[str, Any]:
 
 def engine_of(checkpoint: str) -> Engine:
     """Return the engine of a checkpoint, on the CPU."""
-    return Engine.of(families.load(checkpoint))
+    return Engine.of(published.load(checkpoint))

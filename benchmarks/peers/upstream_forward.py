@@ -15,9 +15,9 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from rfm.families import load as load_checkpoint
-from rfm.rewind.checkpoint import RewindCheckpoint
-from rfm.rewind.network import RewindConfig
+from rfm.families.rewind.checkpoint import RewindCheckpoint
+from rfm.families.rewind.network import RewindConfig
+from rfm.published import load as load_checkpoint
 
 SampleType = Literal["progress", "preference", "similarity"]
 

@@ -14,14 +14,13 @@ from typing import Any, cast
 import torch
 from safetensors import SafetensorError
 
-from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.provenance import settings_digest, weights_digest
-from rfm.checkpoint.run_config import PROGRESS, SUCCESS
+from rfm import published
 from rfm.engine import Engine
 from rfm.engine.computation import computation
 from rfm.engine.execution import Execution
-from rfm.family import Checkpoint, FrameEncoders, config_fields
+from rfm.engine.family import Checkpoint, FrameEncoders, config_fields
+from rfm.files import CheckpointError, settings_digest, weights_digest
+from rfm.published.run_config import PROGRESS, SUCCESS
 from rfm_client import FRAME_SCORES, ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import EncoderSample, UInt8Array
 from rfm_export.source import device_named
@@ -33,18 +32,18 @@ class EngineScorer:
 
     The first call moves the checkpoint to the device.
 
-    notes: lines for the user, from ``rfm.families.notes`` for progress and success
+    notes: lines for the user, from ``rfm.published.notes`` for progress and success
     """
 
     def __init__(self, source: str, *, device: str = "cpu", dtype: torch.dtype | None = None, **options: Any) -> None:
         """Load a checkpoint folder or Hugging Face id. Raises CheckpointError, or ExportError for a missing device.
 
         dtype: of the network; None: float32 on the CPU, else the checkpoint's own
-        options: as in ``rfm.families.load``
+        options: as in ``rfm.published.read``
         """
         on = device_named(device)
-        self._checkpoint = families.load(source, **options)
-        self._encoders = self._checkpoint.encoders()
+        loaded = published.read(source, **options)
+        self._checkpoint, self._encoders = loaded.checkpoint, loaded.encoders()
         told = {"device": on.type, **{name: _named(value) for name, value in options.items()}}
         told |= {} if dtype is None else {"dtype": str(dtype)}
         newer = [name for name in self._checkpoint.description.more_scores if FRAME_SCORES[name].is_newer]
@@ -52,7 +51,7 @@ class EngineScorer:
         folders = _folders(source, options)
         computed = computation(self._checkpoint, dtype, on_gpu=on.type != "cpu")
         self._facts = replace(_facts(source, self._checkpoint, self._encoders, folders, told), computation=computed)
-        self.notes = families.notes(folders[0], self._checkpoint, (PROGRESS, SUCCESS))
+        self.notes = published.notes(folders[0], loaded, (PROGRESS, SUCCESS))
         self._device, self._dtype = on, dtype
         self._lock = threading.Lock()
 
@@ -129,7 +128,7 @@ def _named(value: Any) -> Any:
 def _folders(source: str, options: dict[str, Any]) -> list[Path]:
     """The local folders whose weights decide the scores, the checkpoint's first."""
     named = [options.get(name) for name in ("image_encoder", "text_encoder", "base_model")]
-    found = families.find(source, lambda line: None)  # ``families.load`` has told the line
+    found = published.find(source, lambda line: None)  # ``published.read`` has told the line
     return [found, *(Path(folder) for folder in named if folder and Path(folder).is_dir())]
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from demo_training.groups import CLIP_FRAMES, FAILURE, OTHER_TASK, SECOND_SUCCESS, SUCCESS, Groups
 from demo_training.networks import Learner
-from rfm.rewind.network import RewindBatch
+from rfm.families.rewind.network import RewindBatch
 from toy_world.tasks import TASKS, VERBS
 
 LENGTHS = (4, 17)  # range of frames of a row, without the upper bound

@@ -15,10 +15,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from demo_training.groups import HINT_DIM
-from rfm.checkpoint.content import WEIGHTS
-from rfm.rewind.checkpoint import IMAGE_ENCODER_PREFIX, TEXT_ENCODER_PREFIX, RewindCheckpoint
-from rfm.rewind.encoders import Encoders, ImagePreprocessor
-from rfm.rewind.network import RewindConfig, RewindTransformer
+from rfm.families.rewind.checkpoint import RewindCheckpoint
+from rfm.families.rewind.encoders import Encoders, ImagePreprocessor
+from rfm.families.rewind.network import RewindConfig, RewindTransformer
+from rfm.files import WEIGHTS
+from rfm.published.rewind import IMAGE_ENCODER_PREFIX, TEXT_ENCODER_PREFIX
 from toy_world.tasks import COLOURS, TARGETS, TASKS, VERBS
 
 IMAGE_SIZE_PX = 48

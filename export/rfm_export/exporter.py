@@ -12,12 +12,11 @@ from typing import Any
 from google.protobuf.text_format import ParseError
 from safetensors import SafetensorError
 
-from rfm import families
-from rfm.checkpoint.provenance import write
+from rfm import families, published
 from rfm.config import ExportConfig
-from rfm.family import Options
 from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import CHECKPOINT_FOLDER, FAMILY_PARAMETER
+from rfm.published.provenance import write
 from rfm_client.contract import FRAME_SCORES, wire
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.errors import ExportError
@@ -57,7 +56,7 @@ def export(
     other_machine: True: another machine serves it, so ``num_gpus`` may exceed the GPUs of this machine
     family: package of the checkpoint's family, which the server must also be able to import; None: a built-in family
     device: for the comparison of scores; None: the CPU, for a large network a GPU with room for it
-    say: takes a line for the user: the run's config.yaml, ``rfm.families.notes``, a derived ``max_batch_size``, the
+    say: takes a line for the user: the run's config.yaml, ``rfm.published.notes``, a derived ``max_batch_size``, the
         device of a large network
 
     Raises CheckpointError, ExportError.
@@ -91,7 +90,7 @@ def _needing_disk(repository: Path) -> Iterator[None]:
 def _save(source: Source, version: Version, staged: Path) -> None:
     folder = version.checkpoint_folder(source.checkpoint.description, staged)
     source.checkpoint.save(folder)
-    write(source.checkpoint.assumptions, source.description.computation, folder)
+    write(source.assumptions, source.description.computation, folder)
     if source.encoders is not None:
         source.encoders.save(version.encoders_folder(staged))
 
@@ -109,8 +108,8 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
         raise ExportError.at(repository / scorer, "a configuration that names its versions", "none")
     number = max(versions)
     folder = repository / scorer / str(number) / CHECKPOINT_FOLDER
-    family = families.choose(folder, config.parameters[FAMILY_PARAMETER].string_value or None)
-    checkpoint = family.load(folder, Options())
+    family = published.choose(folder, config.parameters[FAMILY_PARAMETER].string_value or None)
+    checkpoint = families.restore(folder, family.name)
     description = described(checkpoint, origin)
     _check_weights(folder, description.weights, settings)
     settings = with_batch_size(settings, checkpoint, _nobody)

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from tritonclient.grpc import model_config_pb2 as pb
 
-from rfm.checkpoint.provenance import settings_digest, weights_digest
 from rfm.config import ExportConfig
+from rfm.files import settings_digest, weights_digest
 from rfm.launch.repository_folder import CONFIG_FILE, MODEL_FILE
 from rfm.parameters import (
     CHECKPOINT_FOLDER,

@@ -22,17 +22,18 @@ import numpy as np
 import torch
 from google.protobuf.text_format import ParseError
 
-from rfm import families
-from rfm.checkpoint.content import read_run_config
-from rfm.checkpoint.hub import check_links, commit_of
-from rfm.checkpoint.provenance import is_folder, license_of, source_name
-from rfm.checkpoint.run_config import find_run_config
-from rfm.checkpoint.weights import num_values
+from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine.computation import computation
-from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options, config_fields
+from rfm.engine.family import NETWORK, Checkpoint, Family, FrameEncoders, config_fields
+from rfm.files import read_run_config
 from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import CHECKPOINT_FOLDER
+from rfm.published.hub import check_links, commit_of
+from rfm.published.provenance import Assumption, is_folder, license_of, source_name
+from rfm.published.reader import Options
+from rfm.published.run_config import find_run_config
+from rfm.weights import num_values
 from rfm_client.contract import ProgressSample
 from rfm_client.contract.description import Description, Origin
 from rfm_client.contract.synthetic import random_trajectory
@@ -64,6 +65,7 @@ class Source:
 
     family: Family
     checkpoint: Checkpoint
+    assumptions: tuple[Assumption, ...]
     encoders: FrameEncoders | None
     description: Description
     of_encoders: Description | None
@@ -87,25 +89,30 @@ def read_for_export(
 
 def read_source(source: str | Path, settings: ExportConfig, family: str | None, say: Say) -> Source:
     """Read a checkpoint. Tell the user the file of the training run's settings, and possible faults."""
-    folder = families.find(source, say)
+    folder = published.find(source, say)
     options = Options.of(settings)
-    kind = families.choose(folder, family, options)
-    checkpoint = families.load_from(folder, kind, options)
+    kind = published.choose(folder, family, options)
+    loaded = published.read_from(folder, kind, options)
+    checkpoint = loaded.checkpoint
     check_links(folder)
-    encoders = checkpoint.encoders()
+    encoders = loaded.encoders()
     if (run_config := find_run_config(folder)) is not None:
         say(f"{run_config}: read as the settings of the training run")
-    for note in families.notes(folder, checkpoint):
+    for note in published.notes(folder, loaded):
         say(note)
     gpus = num_gpus(settings)
     computed = computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0)
     origin = origin_of(source, folder, computed)
     of_encoders = None if encoders is None else described_encoders(encoders.description, origin)
-    full = (
-        None if options.weights is None else partial(families.load_from, folder, kind, replace(options, weights=None))
-    )
+    full = None if options.weights is None else partial(_full, folder, kind, options)
     description = described(checkpoint, origin)
-    return Source(kind, checkpoint, encoders, description, of_encoders, settings, gpus, None, full)
+    return Source(
+        kind, checkpoint, tuple(loaded.assumptions), encoders, description, of_encoders, settings, gpus, None, full
+    )
+
+
+def _full(folder: Path, family: Family, options: Options) -> Checkpoint:
+    return published.read_from(folder, family, replace(options, weights=None)).checkpoint
 
 
 def device_named(name: str) -> torch.device:

@@ -14,8 +14,8 @@ import torch
 
 from rfm import families
 from rfm.engine import Engine, Outcome
+from rfm.engine.family import NETWORK, Checkpoint
 from rfm.engine.graphs import PLAIN_CALLS
-from rfm.family import NETWORK, Checkpoint, Options
 from rfm_client.contract import (
     InvalidSampleError,
     PreferenceSample,
@@ -75,7 +75,7 @@ def _compare_staged(source: Source, version: Version, staged: Path, say: Say) ->
         say(f"the export's scores are compared with the checkpoint's on {device} (--device names another one)")
 
     def exported(*, cuda_graphs: bool = False) -> Engine:
-        checkpoint = families.named(source.family.name).load(version.checkpoint_folder(description, staged), Options())
+        checkpoint = families.restore(version.checkpoint_folder(description, staged), source.family.name)
         if source.encoders is None:
             return engine(checkpoint, cuda_graphs=cuda_graphs)
         served_by = families.encoders_of(source.family.name)

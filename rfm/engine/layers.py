@@ -21,7 +21,7 @@ class Linear(nn.Linear):
 
     PyTorch uses MKL, which is slow on processors other than Intel's (docs/explanation/performance.md), and oneDNN only
     for bfloat16. torch.compile uses the same operation. oneDNN builds a kernel for each new shape, so ReWiND pads
-    tokens to few shapes (``rfm.rewind.network.rounded_up``).
+    tokens to few shapes (``rfm.families.rewind.network.rounded_up``).
     """
 
     def forward(self, input: Tensor, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rfm.checkpoint.content import MAX_UINT8
+from rfm.files import MAX_UINT8
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ import torch
 from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
 from rfm.engine.device import memory_errors
 from rfm.engine.execution import Execution
+from rfm.engine.family import Checkpoint, FrameEncoders
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.engine.finite import finite
 from rfm.engine.graphs import CudaCapture, Graphs
 from rfm.engine.layers import keep_float32
 from rfm.engine.predictor import GraphedPredictor, Predictor, RowScores, of_prefixes
-from rfm.family import Checkpoint, FrameEncoders
 from rfm_client.contract import (
     BatchTiming,
     InvalidSampleError,

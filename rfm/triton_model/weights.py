@@ -8,8 +8,7 @@ from pathlib import Path
 from google.protobuf import text_format
 from tritonclient.grpc import model_config_pb2 as pb
 
-from rfm.checkpoint.content import CheckpointError, is_there
-from rfm.checkpoint.provenance import weights_digest
+from rfm.files import CheckpointError, is_there, weights_digest
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 
 

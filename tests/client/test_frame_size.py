@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from rfm.engine.pixels import Normalisation
-from rfm.rewind.encoders import ImagePreprocessor
-from rfm.vlm.images import QwenImages, fitted_size
+from rfm.families.rewind.encoders import ImagePreprocessor
+from rfm.qwen.images import QwenImages, fitted_size
 from rfm_client import FrameSize, ProgressSample, Trajectory, UInt8Array
 from rfm_client.frames import resize_frames
 from rfm_client.frames.fit_to_checkpoint import fitted, snapshot

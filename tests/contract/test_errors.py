@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rfm.checkpoint.content import CheckpointError
+from rfm.files import CheckpointError
 from rfm.launch.installation import ServerStartError
 from rfm_client import InvalidSampleError
 from rfm_client.contract import triton

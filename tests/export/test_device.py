@@ -19,10 +19,10 @@ import rfm_export
 from captures import CalledAgain
 from in_process import rfm
 from labelling import LEROBOT
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
+from rfm.engine.family import NETWORK
 from rfm.engine.graphs import Captured, Function, Graphs
-from rfm.family import NETWORK
 from rfm_client import ProgressResult
 from rfm_client.contract import Sample
 from rfm_export import ExportDiffersError
@@ -50,7 +50,7 @@ def test_a_large_network_goes_where_most_room_is(free_bytes: list[float], monkey
     def full() -> tuple[float, float]:
         raise RuntimeError("CUDA error: out of memory")
 
-    checkpoint = families.load(LARGE.checkpoint, base_model=str(LARGE.base_model))
+    checkpoint = published.load(LARGE.checkpoint, base_model=str(LARGE.base_model))
     needed = WORKING_ROOM * sum(each.numel() * dtype.itemsize for each in checkpoint.parts[NETWORK].values())
     free_bytes[:] = [needed / 2, needed + 2, needed + 1]
     assert device_for(checkpoint, dtype, may_use_gpu=True) == torch.device("cuda", 1)
@@ -60,7 +60,7 @@ def test_a_large_network_goes_where_most_room_is(free_bytes: list[float], monkey
     free_bytes[:] = [needed + 1, needed + 2]
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda index: full() if index else (free_bytes[0], free_bytes[0]))
     assert device_for(checkpoint, dtype, may_use_gpu=True) == torch.device("cuda", 0)
-    assert device_for(families.load(SMALL.checkpoint), dtype, may_use_gpu=True) == torch.device("cpu")
+    assert device_for(published.load(SMALL.checkpoint), dtype, may_use_gpu=True) == torch.device("cpu")
     free_bytes.clear()
     assert device_for(checkpoint, dtype, may_use_gpu=True) == torch.device("cpu")
 
@@ -112,7 +112,7 @@ class Failing(CalledAgain):
 
 def compare(capture: CalledAgain) -> tuple[Graphs, list[str]]:
     """Compare a reference checkpoint's graphs with plain passes. Also return the messages."""
-    checkpoint, graphs, said = families.load(PLAIN.checkpoint, **PLAIN.sources), Graphs(capture), list[str]()
+    checkpoint, graphs, said = published.load(PLAIN.checkpoint, **PLAIN.sources), Graphs(capture), list[str]()
     engine = Engine(checkpoint.predictor(torch.device("cpu")), graphs=graphs)
     verify_graphs(lambda: engine, checkpoint.description, said.append)
     return graphs, said
@@ -146,7 +146,7 @@ class OfSeconds:
 
 
 def test_seconds_of_graphs_may_differ_as_their_size_lets_them() -> None:
-    description = families.load(PLAIN.checkpoint, **PLAIN.sources).description
+    description = published.load(PLAIN.checkpoint, **PLAIN.sources).description
     verify_graphs(lambda: cast(Engine, OfSeconds(5e-6)), description, print)
     with pytest.raises(ExportDiffersError, match="a difference of 2e-05 times the largest"):
         verify_graphs(lambda: cast(Engine, OfSeconds(2e-5)), description, print)

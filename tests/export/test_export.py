@@ -20,8 +20,8 @@ import rfm_export
 from engines import serve_config, training_run
 from in_process import rfm
 from repositories import changing, description_of, forget_input
-from rfm.families import CheckpointError
-from rfm.rewind.checkpoint import RewindCheckpoint
+from rfm.families.rewind.checkpoint import RewindCheckpoint
+from rfm.files import CheckpointError
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Origin
 from rfm_export import ExportDiffersError, ExportError
 from rfm_export.source import origin_of, read_source

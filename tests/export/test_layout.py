@@ -15,7 +15,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 import goldens
 from engines import serve_config
 from reward_models import ROOT
-from rfm import families
+from rfm import published
 from rfm.config import ExportConfig
 from rfm_client.contract import wire
 from rfm_export import ExportError
@@ -198,13 +198,13 @@ def test_a_robometer_is_scored_as_its_size_and_clips_allow_and_the_export_says_w
     ],
 )
 def test_models_of_4b_that_are_asked_in_words(folder: str, reward_model: str, expected: int) -> None:
-    assert batch_size(of_real_size(families.load(ROOT / folder, reward_model=reward_model)))[0] == expected
+    assert batch_size(of_real_size(published.load(ROOT / folder, reward_model=reward_model)))[0] == expected
 
 
 @pytest.mark.parametrize("name", ["c1_t1_disc10", "q3_tok_disc10", "q25_video_avg_disc10"])
 def test_a_small_network_keeps_batches_of_64_without_a_line(name: str) -> None:
     config = goldens.config(name)
-    assert batch_size(families.load(config.checkpoint, **config.sources)) == (64, [])
+    assert batch_size(published.load(config.checkpoint, **config.sources)) == (64, [])
 
 
 def test_the_number_is_at_least_1_and_at_most_64() -> None:

@@ -19,8 +19,8 @@ from transformers import AutoTokenizer
 import goldens
 import rfm_export
 from engines import serve_config
-from rfm import families
-from rfm.families import CheckpointError
+from rfm import published
+from rfm.files import CheckpointError
 
 PLAIN, VIDEO, POOLED, ADAPTER = (
     "q3_tok_disc10",
@@ -60,8 +60,8 @@ def vlm(tmp_path: Path) -> Copy:
 
 def notes(folder: Path, base: Path | None = None) -> list[str]:
     """The lines about assumptions and contradictions."""
-    checkpoint = families.load(folder, base_model=None if base is None else str(base))
-    return [line for line in families.notes(folder, checkpoint) if "did not train" not in line]
+    loaded = published.read(folder, base_model=None if base is None else str(base))
+    return [line for line in published.notes(folder, loaded) if "did not train" not in line]
 
 
 # Settings from a checkpoint: the keys, and the value without them.
@@ -105,7 +105,7 @@ def test_positions_behind_videos_are_assumed_unless_a_version_is_stated(
 ) -> None:
     folder, base = vlm(VIDEO)
     rewritten(folder / "config.json", lambda config: config.update(transformers_version=version))
-    assumed = families.load(folder, base_model=str(base)).assumptions
+    assumed = published.read(folder, base_model=str(base)).assumptions
     assert ["positions_behind_videos"] * is_assumed == [each.name for each in assumed]
     assert len(notes(folder, base)) == (version != "4.57.6")  # version 5 has a line of its own
 
@@ -132,12 +132,12 @@ def test_an_export_keeps_assumptions_and_versions_and_nothing_reads_them(tmp_pat
     assert rfm_export.check(tmp_path, settings) == []
     (checkpoint / "provenance.json").write_text("no JSON")
     assert rfm_export.check(tmp_path, settings) == []  # which compares settings_digest
-    assert families.load(checkpoint).config == families.load(FRAMES.checkpoint).config
+    assert published.load(checkpoint).config == published.load(FRAMES.checkpoint).config
 
 
 def test_an_export_of_a_vision_language_checkpoint_assumes_nothing(vlm: Copy, tmp_path: Path) -> None:
     folder, base = vlm(PLAIN)
-    families.load(folder, base_model=str(base)).save(tmp_path / "saved")
+    published.load(folder, base_model=str(base)).save(tmp_path / "saved")
     assert notes(tmp_path / "saved") == []
 
 

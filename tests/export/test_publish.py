@@ -21,8 +21,8 @@ import rfm_export
 from commands import REPOSITORY
 from engines import serve_config
 from in_process import rfm
-from rfm import families
-from rfm.families import CheckpointError
+from rfm import published
+from rfm.files import CheckpointError
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm_export import ExportError
 from rfm_export.publish import alone, read_config, staging
@@ -56,7 +56,7 @@ def test_a_file_that_may_not_be_read_is_told(tmp_path: Path, monkeypatch: pytest
     folder = copied(SMALL, Path("checkpoint"))
     (folder / "config.json").chmod(0)
     with as_any_user(tmp_path), pytest.raises(CheckpointError, match=r"Permission ?[dD]enied|PermissionError"):
-        families.load(folder)
+        published.load(folder)
 
 
 def test_only_the_repository_must_be_writable(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import goldens
 from engines import load_engine
 from pretended import CUDA, SECOND, Seen, pretended
 from reward_models import ROOT, references
-from rfm import families
+from rfm import published
 from rfm.engine import Engine, Execution
 from rfm.triton_model.placement import Placement
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Sample
@@ -30,10 +30,10 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
 def engine_there(name: str, feature_cache_mib: int = 0, device: torch.device = CUDA) -> Engine:
     """The engine of a reference checkpoint on a device."""
     config = goldens.config(name)
-    checkpoint = families.load(config.checkpoint, **config.sources)
+    loaded = published.read(config.checkpoint, **config.sources)
     options = {"device": device, "dtype": torch.float32, "feature_cache_mib": feature_cache_mib}
     with torch.inference_mode():  # tensors made in it need no version counters
-        return Engine.of(checkpoint, encoders=checkpoint.encoders(), **options)
+        return Engine.of(loaded.checkpoint, encoders=loaded.encoders(), **options)
 
 
 # Waits of the host in a batch like an earlier one: for values, and for copies to the device.
@@ -74,7 +74,7 @@ def test_a_device_gives_the_reference_answers_and_waits_no_more_often_than_it_mu
 def test_a_device_writes_the_answers_of_the_original(seen: Seen) -> None:
     names = ["T1_single", "fallback_digits_T2", "lower_T2"]  # 'ANSWER: 2', 'Score 2 of 5', 'answer: 3'
     cases = [next(case for case in references("roboreward") if case.file.stem == name) for name in names]
-    checkpoint = families.load(cases[0].config / "checkpoint", reward_model="roboreward")
+    checkpoint = published.load(cases[0].config / "checkpoint", reward_model="roboreward")
     with torch.inference_mode():
         engine = Engine.of(checkpoint, device=CUDA, dtype=torch.float32)
     results = engine.evaluate([case.samples()[0] for case in cases])
@@ -88,7 +88,7 @@ def test_a_device_writes_the_answers_of_the_original(seen: Seen) -> None:
 def test_reward_models_that_are_asked_in_words_stay_on_their_device(seen: Seen, name: str) -> None:
     of_topreward = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
     folder = of_topreward if name.startswith("topreward") else references("roboreward")[0].config / "checkpoint"
-    checkpoint = families.load(folder, reward_model=name)
+    checkpoint = published.load(folder, reward_model=name)
     sample = ProgressSample(video(0, 4, 64, 64))
     with torch.inference_mode():
         engine = Engine.of(checkpoint, device=SECOND, dtype=torch.float32, feature_cache_mib=1)

@@ -16,9 +16,9 @@ from safetensors.torch import load_file, save_file
 
 import goldens
 from paths import GOLDEN
-from rfm import families
-from rfm.families import CheckpointError
-from rfm.vlm.lora import Scaling, split
+from rfm import published
+from rfm.files import CheckpointError
+from rfm.published.lora import Scaling
 from spoilt import Spoil, beside, both, in_yaml, renamed, run_settings, settings, weights, with_sources
 from vlm import PLAIN, load
 
@@ -145,7 +145,7 @@ def test_updates_too_small_for_bfloat16_are_not_lost(tmp_path: Path) -> None:
 def test_factors_in_bfloat16_are_scaled_in_float32() -> None:
     factors = {"A": torch.ones(3, 4).bfloat16(), "B": torch.randn(5, 3, generator=torch.manual_seed(0)).bfloat16()}
     tensors = {f"layer.lora_{side}.weight": factor for side, factor in factors.items()}
-    _, scaled = split({"layer.weight": torch.zeros(5, 4), **tensors}, Scaling(Path(CONFIG), 3, 1.0))
+    scaled = Scaling(Path(CONFIG), 3, 1.0).scaled(tensors)
     torch.testing.assert_close(scaled["layer.lora_B.weight"], factors["B"].float() / 3, rtol=1e-6, atol=0)
 
 
@@ -306,5 +306,5 @@ def test_an_adapter_on_another_base_model_needs_its_option(
     folder, _ = with_sources(ADAPTER, tmp_path)
     settings(CONFIG, base_model_name_or_path=base_model)(folder)
     with pytest.raises(CheckpointError, match=message):
-        families.load(folder)
+        published.load(folder)
     assert load(ADAPTER, folder).config == load(ADAPTER).config

@@ -16,10 +16,10 @@ from torch import Tensor
 
 import rfm_export
 from reward_models import BASE, ROOT, as_before_marks
-from rfm import families
+from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.families import CheckpointError
+from rfm.files import CheckpointError
 from rfm_client import ProgressResult, ProgressSample, Trajectory
 
 CHECKPOINT = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
@@ -52,7 +52,7 @@ def test_a_head_scores_as_config_json_says(tmp_path: Path) -> None:
         ("equal, own", (False, False), lambda _, embedding: embedding),
         ("equal, tied", (True, True), lambda _, embedding: embedding),
     ):
-        checkpoint = families.load(with_head(tmp_path / name, stated, head), reward_model="topreward")
+        checkpoint = published.load(with_head(tmp_path / name, stated, head), reward_model="topreward")
         (result,) = Engine.of(checkpoint).evaluate([SAMPLE])
         assert isinstance(result, ProgressResult)
         log_probs[name] = result.log_prob
@@ -71,13 +71,13 @@ def test_a_head_scores_as_config_json_says(tmp_path: Path) -> None:
     ],
 )
 def test_an_ordinary_model_lacks_no_head_and_nothing_is_assumed(source: Path, options: dict[str, Any]) -> None:
-    assert families.notes(source, families.load(source, **options)) == []
+    assert published.notes(source, published.read(source, **options)) == []
 
 
 def test_a_checkpoint_in_the_hub_s_cache_is_named_by_its_id_and_commit(tmp_path: Path) -> None:
     snapshot = tmp_path / "models--Qwen--Qwen3-VL-8B-Instruct" / "snapshots" / "0123abcd"
     shutil.copytree(CHECKPOINT, snapshot)
-    config = families.load(snapshot, reward_model="topreward").config
+    config = published.load(snapshot, reward_model="topreward").config
     assert config.base_model_id == "Qwen/Qwen3-VL-8B-Instruct@0123abcd"
 
 
@@ -93,20 +93,20 @@ def test_a_checkpoint_in_the_hub_s_cache_is_named_by_its_id_and_commit(tmp_path:
 def test_the_options_or_the_name_decide_how_roboreward_is_asked(
     tmp_path: Path, name: str, options: dict[str, Any], is_expected: bool
 ) -> None:
-    checkpoint = families.load(shutil.copytree(ROBO, tmp_path / "models" / name), **options)
+    checkpoint = published.load(shutil.copytree(ROBO, tmp_path / "models" / name), **options)
     config = checkpoint.config
     assert (config.is_expected, config.dtype) == (is_expected, "bfloat16")
     assert checkpoint.collator.example().endswith("ANSWER: ") is is_expected
     assert config.strict_answers is options.get("strict_answers", False)
     checkpoint.save(tmp_path / "saved")
-    assert families.load(tmp_path / "saved").config == config
+    assert published.load(tmp_path / "saved").config == config
 
 
 @pytest.mark.parametrize("reward_model", ["roboreward-expected", "topreward"])
 def test_strictness_without_a_written_answer_is_refused(reward_model: str) -> None:
     source = ROBO if reward_model.startswith("robo") else CHECKPOINT
     with pytest.raises(CheckpointError, match="--strict-answers: expected a RoboReward that writes its answers"):
-        families.load(source, reward_model=reward_model, strict_answers=True)
+        published.load(source, reward_model=reward_model, strict_answers=True)
 
 
 def test_a_file_without_a_dtype_gets_a_line(tmp_path: Path) -> None:
@@ -114,7 +114,7 @@ def test_a_file_without_a_dtype_gets_a_line(tmp_path: Path) -> None:
     content = json.loads((folder / "config.json").read_text())
     del content["dtype"]
     (folder / "config.json").write_text(json.dumps(content))
-    (line,) = families.notes(folder, families.load(folder, reward_model="topreward"))
+    (line,) = published.notes(folder, published.read(folder, reward_model="topreward"))
     assert "assumed, and not shown by the checkpoint: dtype bfloat16 (default, as config.json has no dtype);" in line
 
 

@@ -16,8 +16,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import goldens
-from rfm import families
-from rfm.families import CheckpointError
+from rfm import published
+from rfm.files import CheckpointError
 from spoilt import Spoil, both, convert, copied, in_two_shards, settings, sharded_pickle, taken, weights
 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
@@ -34,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_weights_decide_where_configurations_disagree() -> None:
-    config = families.load(goldens.config(MISMATCHED).checkpoint).config
+    config = published.load(goldens.config(MISMATCHED).checkpoint).config
     assert (config.progress_bins, config.max_len, config.num_layers, config.hidden_dim) == (5, 10, 3, 40)
     assert (config.video_feature_dim, config.text_feature_dim) == (256, 96)
     assert config.use_per_frame_progress_token
@@ -42,11 +42,11 @@ def test_weights_decide_where_configurations_disagree() -> None:
 
 @pytest.mark.parametrize("place", ["config.yml", ".hydra/config.yaml", "../config.yml", "../.hydra/config.yaml"])
 def test_config_yaml_may_have_other_names(folder: Path, place: str) -> None:
-    expected = families.load(folder).config
+    expected = published.load(folder).config
     target = folder / place
     target.parent.mkdir(exist_ok=True)
     (folder / "config.yaml").rename(target)
-    assert families.load(folder).config == expected
+    assert published.load(folder).config == expected
 
 
 def assert_same(after: Any, before: Any) -> None:
@@ -65,7 +65,7 @@ def in_fsdp(name: str) -> str:
 
 def saved_by_us(folder: Path) -> None:
     shutil.rmtree(folder)
-    families.load(goldens.config(IN_RUN_FOLDER).checkpoint).save(folder)
+    published.load(goldens.config(IN_RUN_FOLDER).checkpoint).save(folder)
 
 
 OTHER_FORMS: dict[str, tuple[str, Spoil]] = {
@@ -92,7 +92,7 @@ def test_a_checkpoint_in_another_form_is_the_same(tmp_path: Path, name: str, cha
     golden = goldens.config(name)
     folder = copied(golden, tmp_path / "checkpoint")
     change(folder)
-    assert_same(families.load(folder, **golden.sources), families.load(golden.checkpoint, **golden.sources))
+    assert_same(published.load(folder, **golden.sources), published.load(golden.checkpoint, **golden.sources))
 
 
 def test_the_links_of_the_hub_s_cache_are_followed(tmp_path: Path) -> None:
@@ -103,8 +103,8 @@ def test_the_links_of_the_hub_s_cache_are_followed(tmp_path: Path) -> None:
     for number, file in enumerate(sorted(golden.iterdir())):
         shutil.copy(file, blobs / str(number))
         (snapshot / file.name).symlink_to(Path("..", "..", "blobs", str(number)))
-    families.load(snapshot).save(tmp_path / "saved")
-    assert_same(families.load(tmp_path / "saved"), families.load(golden))
+    published.load(snapshot).save(tmp_path / "saved")
+    assert_same(published.load(tmp_path / "saved"), published.load(golden))
     assert not [path for path in (tmp_path / "saved").rglob("*") if path.is_symlink()]
 
 
@@ -128,10 +128,10 @@ def test_notes_name_another_meaning_of_progress(folder: Path, kind: str, order: 
     text = (folder / "config.yaml").read_text()
     text = text.replace("progress_pred_type: absolute_wrt_total_frames", kind)
     (folder / "config.yaml").write_text(text.replace("shuffle_progress_frames: false", order) if order else text)
-    checkpoint = families.load(folder)
-    found = [line for line in families.notes(folder, checkpoint) if "config.yaml: data." in line]
+    loaded = published.read(folder)
+    found = [line for line in published.notes(folder, loaded) if "config.yaml: data." in line]
     assert [line[: len(begins)] for line, begins in zip(found, expected, strict=True)] == expected
-    assert not [line for line in families.notes(folder, checkpoint, ["success"]) if "config.yaml: data." in line]
+    assert not [line for line in published.notes(folder, loaded, ["success"]) if "config.yaml: data." in line]
 
 
 STATES = ("optimizer.pt", "scheduler.pt", "rng_state.pth", "rng_state_0.pth", "training_args.bin", "scaler.pt")
@@ -160,20 +160,20 @@ PICKLES: dict[str, tuple[Spoil, str]] = {
 
 @pytest.mark.parametrize(("spoil", "named"), PICKLES.values(), ids=PICKLES)
 def test_the_conversion_that_the_refusal_of_a_pickle_names_works(folder: Path, spoil: Spoil, named: str) -> None:
-    before = families.load(folder)
+    before = published.load(folder)
     spoil(folder)
     for state in STATES:
         torch.save({"state": {}}, folder / state)
     expected = rf"expected model\.safetensors, got {named}: pickles may run .* weights_only=True lets "
     with pytest.raises(CheckpointError, match=expected):
-        families.load(folder)
-    convert(families.load, folder)
-    assert_same(families.load(folder), before)
+        published.load(folder)
+    convert(published.load, folder)
+    assert_same(published.load(folder), before)
 
 
 def test_the_conversion_of_a_pickled_adapter_works(tmp_path: Path) -> None:
     golden = goldens.config(ADAPTER)
-    load = partial(families.load, **golden.sources)
+    load = partial(published.load, **golden.sources)
     folder = copied(golden, tmp_path / "checkpoint")
     torch.save(load_file(folder / "adapter_model.safetensors"), folder / "adapter_model.bin")
     (folder / "adapter_model.safetensors").unlink()
@@ -184,15 +184,15 @@ def test_the_conversion_of_a_pickled_adapter_works(tmp_path: Path) -> None:
 
 
 def test_the_command_that_strips_a_prefix_works(folder: Path) -> None:
-    before = families.load(folder)
+    before = published.load(folder)
     renamed(lambda name: name if name.startswith("video") else f"student.{name}")(folder)
     expected = (
         r"got 'student\.progress_head\.4\.weight', with the prefix student\. that 'video_proj\.bias' lacks; strip"
     )
     with pytest.raises(CheckpointError, match=expected):
-        families.load(folder)
-    convert(families.load, folder)
-    assert_same(families.load(folder), before)
+        published.load(folder)
+    convert(published.load, folder)
+    assert_same(published.load(folder), before)
 
 
 ZEROED = {
@@ -206,7 +206,7 @@ ZEROED = {
 @pytest.mark.parametrize(("zeroed", "expected"), ZEROED.values(), ids=ZEROED)
 def test_notes_name_a_head_of_zeros(folder: Path, zeroed: list[str], expected: list[str]) -> None:
     weights(lambda w: [t.zero_() for key, t in w.items() if key.startswith(tuple(zeroed))])(folder)
-    notes = families.notes(folder, families.load(folder), ("progress", "success"))
+    notes = published.notes(folder, published.read(folder), ("progress", "success"))
     assert [line for line in notes if "model.safetensors" in line] == [
         f"model.safetensors: {each}_head.4.weight is 0 throughout: {each} is the same whatever is scored, as if untrained"
         for each in expected

@@ -13,9 +13,9 @@ from torch import Tensor
 
 import goldens
 from engines import load_engine
-from rfm.checkpoint.content import PREPROCESSOR_CONFIG
 from rfm.engine import Execution
-from rfm.rewind.encoders import Encoders, ImagePreprocessor
+from rfm.families.rewind.encoders import Encoders, ImagePreprocessor
+from rfm.files import PREPROCESSOR_CONFIG
 from rfm_client import (
     InferenceFailedError,
     PreferenceSample,

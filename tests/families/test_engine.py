@@ -166,8 +166,8 @@ from small_network import SMALL
 from trajectories import random_trajectory
 from rfm.engine import Engine
 from rfm.engine import Execution
-from rfm.rewind.predictor import RewindPredictor
-from rfm.rewind.network import RewindTransformer
+from rfm.families.rewind.predictor import RewindPredictor
+from rfm.families.rewind.network import RewindTransformer
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample
 
 MIB = 2**20

@@ -21,10 +21,10 @@ import rfm_export
 import toy_family
 from paths import ROOT
 from repositories import description_of
-from rfm import families
+from rfm import families, published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.families import CheckpointError
+from rfm.files import CheckpointError
 from rfm.launch.installation import Installation
 from rfm_client import (
     InferenceFailedError,
@@ -124,9 +124,9 @@ def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> No
 @pytest.mark.triton
 def test_a_family_from_elsewhere_is_served_beside_one_of_this_package(running: Running) -> None:
     demo = running.repository / "rfm" / "1" / "checkpoint"
-    encoders = families.encoders_of("rfm.rewind").load(running.repository / "rfm_encoder" / "1")
+    encoders = families.encoders_of("rfm.families.rewind").load(running.repository / "rfm_encoder" / "1")
     sample = ProgressSample(video([0.1, 0.5, 0.9]))
-    (expected,) = Engine.of(families.load(demo), encoders=encoders).evaluate([sample])
+    (expected,) = Engine.of(published.load(demo), encoders=encoders).evaluate([sample])
     with RewardClient(running.url) as client:
         (result,) = client.evaluate([sample])
     np.testing.assert_allclose(result.progress, expected.progress, atol=1e-5)
@@ -162,9 +162,9 @@ NO_FAMILY = {
 @pytest.mark.parametrize(("family", "message"), NO_FAMILY.values(), ids=NO_FAMILY)
 def test_what_is_no_family_s_is_refused(checkpoint: Path, family: str | None, message: str) -> None:
     with pytest.raises(CheckpointError, match=message):
-        families.load(checkpoint, family=family)
+        published.load(checkpoint, family=family)
 
 
 def test_a_family_without_encoders_has_none_to_load() -> None:
-    with pytest.raises(CheckpointError, match=r"family: expected one with encoders, got rfm\.vlm"):
-        families.encoders_of("rfm.vlm")
+    with pytest.raises(CheckpointError, match=r"family: expected one with encoders, got rfm\.families\.robometer"):
+        families.encoders_of("rfm.families.robometer")

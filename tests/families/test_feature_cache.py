@@ -11,8 +11,8 @@ import pytest
 
 from engines import load_engine
 from rfm.engine import Execution
+from rfm.engine.family import FrameEncoders
 from rfm.engine.feature_cache import FeatureCache, get_or_make
-from rfm.family import FrameEncoders
 from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, UInt8Array
 from rfm_client.contract import wire
 from rfm_client.contract.samples import EncoderSample

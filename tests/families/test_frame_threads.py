@@ -14,13 +14,13 @@ import torch
 from engines import load_engine
 from pretended import CUDA, pretended
 from reward_models import ROOT
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.engine.threads import IN_TURN, FrameThreads
-from rfm.rewind.encoders import Encoders
-from rfm.roboreward import prompts
-from rfm.vlm.predictor import VlmPredictor
+from rfm.families.rewind.encoders import Encoders
+from rfm.families.roboreward import prompts
+from rfm.qwen.predictor import QwenPredictor
 from rfm_client import ProgressSample, UInt8Array
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import frame_digest
@@ -33,10 +33,10 @@ MODELS = [PLAIN, "q25_video_avg_disc10", "roboreward", "topreward", "topreward-r
 SIZES = [(5, 56, 84), (7, 256, 256), (3, 340, 500), (1, 64, 64)]  # frames, height, width
 
 
-def predictor_of(model: str) -> VlmPredictor:
+def predictor_of(model: str) -> QwenPredictor:
     is_asked = model.startswith(("robo", "top"))
-    engine = Engine.of(families.load(str(ASKED), reward_model=model)) if is_asked else load_engine(model)
-    assert isinstance(engine.predictor, VlmPredictor)
+    engine = Engine.of(published.load(str(ASKED), reward_model=model)) if is_asked else load_engine(model)
+    assert isinstance(engine.predictor, QwenPredictor)
     return engine.predictor
 
 
@@ -115,7 +115,7 @@ def test_the_frames_of_a_lone_sample_are_divided_among_the_threads(monkeypatch: 
 
 def test_only_frames_that_the_model_sees_are_resized() -> None:
     collator = Engine.of(
-        families.load(str(ASKED), reward_model="topreward-robometer,num_prefixes=3")
+        published.load(str(ASKED), reward_model="topreward-robometer,num_prefixes=3")
     ).predictor.collator  # type: ignore[attr-defined]
     rows = collator.rows(ProgressSample(video(0, 20, 64, 64)))
     sized = collator.to_size(rows[0].videos[0])
@@ -132,7 +132,7 @@ def test_a_frame_of_several_prefixes_makes_one_round_trip_through_jpeg(monkeypat
         return as_jpeg(frame)
 
     monkeypatch.setattr(prompts, "as_jpeg", counted)
-    engine = Engine.of(families.load(str(ASKED), reward_model="roboreward-expected"), feature_cache_mib=4)
+    engine = Engine.of(published.load(str(ASKED), reward_model="roboreward-expected"), feature_cache_mib=4)
     for _ in range(2):  # the second time, all features are cached
         (result,) = engine.evaluate([ProgressSample(video(0, 6, 64, 64), frame_steps=3)])
         assert not isinstance(result, Exception), result

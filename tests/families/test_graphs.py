@@ -17,7 +17,7 @@ from captures import CalledAgain
 from engines import load_engine
 from pretended import CUDA, pretended
 from reward_models import references
-from rfm import families
+from rfm import published
 from rfm.engine import Engine, Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.graphs import IDLE_CALLS, STEP_TOKENS, Captured, Function, Graphs
@@ -30,7 +30,7 @@ CPU = torch.device("cpu")
 
 def engine_with(graphs: Graphs, config: goldens.Config, feature_cache_mib: int = 0) -> Engine:
     """The engine of a reference checkpoint with these graphs, on the CPU."""
-    checkpoint = families.load(config.checkpoint, **config.sources)
+    checkpoint = published.load(config.checkpoint, **config.sources)
     cache = FeatureCache[Any](feature_cache_mib << 20) if feature_cache_mib else None
     return Engine(checkpoint.predictor(CPU, None, cache), graphs=graphs)
 
@@ -59,7 +59,7 @@ def test_replays_give_the_reference_answers(config: goldens.Config, feature_cach
 
 def test_an_expected_score_is_replayed_and_a_written_answer_is_not() -> None:
     names = "roboreward-expected", "roboreward"
-    expected, written = (families.load(ROBOREWARD, reward_model=name) for name in names)
+    expected, written = (published.load(ROBOREWARD, reward_model=name) for name in names)
     assert (expected.description.uses_graphs, written.description.uses_graphs) == (True, False)
     plain, graphs = Engine.of(expected), Graphs(CalledAgain())
     engine = Engine(expected.predictor(CPU), graphs=graphs)
@@ -213,7 +213,7 @@ def test_nothing_waits_inside_a_captured_call(name: str, monkeypatch: pytest.Mon
                 waits.append((seen.asked.total() - before[0], seen.awaited - before[1]))
                 return captured
 
-        checkpoint = families.load(config.checkpoint, **config.sources)
+        checkpoint = published.load(config.checkpoint, **config.sources)
         graphs = Graphs(Watched())
         engine = Engine(checkpoint.predictor(CUDA, torch.float32), graphs=graphs)
         for _ in range(4):
@@ -223,10 +223,10 @@ def test_nothing_waits_inside_a_captured_call(name: str, monkeypatch: pytest.Mon
 
 
 def test_an_engine_has_graphs_where_they_can_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint = families.load(goldens.config(PLAIN).checkpoint, **goldens.config(PLAIN).sources)
+    checkpoint = published.load(goldens.config(PLAIN).checkpoint, **goldens.config(PLAIN).sources)
     assert Engine.of(checkpoint, cuda_graphs=True).graphs is None  # the CPU
     with pretended(monkeypatch), torch.inference_mode():
         assert Engine.of(checkpoint, device=CUDA).graphs is None
         assert Engine.of(checkpoint, device=CUDA, cuda_graphs=True).graphs is not None
-        embedded = families.load(goldens.REWIND[0].checkpoint)
+        embedded = published.load(goldens.REWIND[0].checkpoint)
         assert Engine.of(embedded, device=CUDA, cuda_graphs=True).graphs is None

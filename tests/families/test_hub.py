@@ -16,11 +16,10 @@ import torch
 
 import goldens
 import local_hub
-from rfm import families
-from rfm.checkpoint import hub
-from rfm.checkpoint.hub import best_tag
-from rfm.checkpoint.run_config import find_run_config
-from rfm.families import CheckpointError
+from rfm import files, published
+from rfm.files import CheckpointError
+from rfm.published.hub import best_tag
+from rfm.published.run_config import find_run_config
 from spoilt import settings, with_sources
 
 WITH_IMAGES = "q3_tok_disc10"  # vision-language: every frame an image, with a progress token
@@ -36,7 +35,7 @@ OFFLINE = (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER, UNTAGGED, OTHER_TAG, ABSEN
 def outcome(source: str) -> Any:
     """Return a checkpoint's configuration, or the refusal."""
     try:
-        return families.load(source).config
+        return published.load(source).config
     except CheckpointError as error:
         return str(error)
 
@@ -79,7 +78,7 @@ IN_CACHE = [f"offline {source}" for source in (f"{UNTAGGED}@{TAG}", TAGGED, UNTA
 
 @pytest.mark.parametrize("source", [UNTAGGED, TAGGED, IN_SUBFOLDER, LATE, LATE_ABOVE, *IN_CACHE])
 def test_config_yaml_is_found_on_main_of_the_hub_s_repository(from_hub: dict[str, Any], source: str) -> None:
-    expected: Any = families.load(goldens.config(WITH_IMAGES).checkpoint).config
+    expected: Any = published.load(goldens.config(WITH_IMAGES).checkpoint).config
     assert expected.multi_image and expected.per_frame_progress_token
     assert from_hub[source] == expected
 
@@ -122,10 +121,10 @@ def test_a_repository_in_the_cache_is_found_offline_and_its_revision_is_named(
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     lines: list[str] = []
     commit = local_hub.commit_of(expected)
-    assert families.find("org/name", lines.append) == home / "snapshots" / commit
+    assert published.find("org/name", lines.append) == home / "snapshots" / commit
     used = f"org/name@{expected} of the cache is used (commit {commit}), because HF_HUB_OFFLINE is set; the Hub may"
     assert [line[: len(used)] for line in lines] == [used]
-    assert families.find(f"org/name@{expected}", lines.append) == home / "snapshots" / commit
+    assert published.find(f"org/name@{expected}", lines.append) == home / "snapshots" / commit
     assert len(lines) == 1
 
 
@@ -146,10 +145,10 @@ def test_the_hub_gives_all_files_that_are_read_in_a_folder(tmp_path: Path) -> No
     (folder / "pytorch_model.bin").touch()
     (folder / "modeling.py").touch()
     with local_hub.hub({"org/asked": {"main": folder}}) as endpoint, local_hub.asked(endpoint, tmp_path / "cache"):
-        fetched = families.find("org/asked")
+        fetched = published.find("org/asked")
     assert sorted(str(file.relative_to(fetched)) for file in fetched.rglob("*") if file.is_file()) == files
     shutil.rmtree(fetched / "additional_chat_templates")  # which transformers leaves open
-    assert "older" not in families.load(fetched, **options).collator.example()
+    assert "older" not in published.load(fetched, **options).collator.example()
 
 
 @pytest.mark.slow
@@ -181,8 +180,8 @@ def test_a_base_model_of_the_hub_is_read_from_the_cache_once_the_hub_is_gone(tmp
     (folder / "config.yaml").write_text(re.sub(r"base_model_id: \S+", "base_model_id: org/base-qwen3-vl", run))
 
     def template_of(base_model: str) -> str:
-        hub._main_of.cache_clear()
-        return str(families.load(folder, base_model=base_model).collator.tokenizer.chat_template)
+        files._main_of.cache_clear()
+        return str(published.load(folder, base_model=base_model).collator.tokenizer.chat_template)
 
     with local_hub.hub({"org/base": {"main": base}}) as endpoint, local_hub.asked(endpoint, tmp_path / "cache"):
         assert template_of("org/base") == template
@@ -193,7 +192,7 @@ def test_a_base_model_of_the_hub_is_read_from_the_cache_once_the_hub_is_gone(tmp
         assert template_of("org/base") == template
         with pytest.raises(CheckpointError, match=rf"{endpoint} cannot be reached: Connection refused, and the cache"):
             template_of("org/other")
-    hub._main_of.cache_clear()
+    files._main_of.cache_clear()
 
 
 def test_a_misspelt_folder_is_named_beside_the_hub_s_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,10 +200,10 @@ def test_a_misspelt_folder_is_named_beside_the_hub_s_answer(tmp_path: Path, monk
     monkeypatch.chdir(tmp_path)
     expected = f"there is no folder {tmp_path}/runs/chekpoint@v2 either (but runs/checkpoint); name one, or see"
     with pytest.raises(CheckpointError, match=re.escape(expected)):
-        families.load("runs/chekpoint@v2")
+        published.load("runs/chekpoint@v2")
     expected = f"got '{tmp_path}/runs/chekpoint' (but {tmp_path}/runs/checkpoint)"
     with pytest.raises(CheckpointError, match=re.escape(expected)):
-        families.load(tmp_path / "runs" / "chekpoint")
+        published.load(tmp_path / "runs" / "chekpoint")
 
 
 TAGS = {

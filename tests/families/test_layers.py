@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import goldens
 from pretended import CUDA, pretended
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
 from rfm.engine.layers import MKL_FUNCTIONS, WORTH_ONEDNN, Linear, RmsNorm, is_rms_norm, linear, speed_up
 from vlm import PLAIN, load
@@ -144,6 +144,6 @@ def test_the_first_calls_of_all_functions_of_mkl_are_made_by_one_thread() -> Non
 def test_an_engine_multiplies_float32_as_float32(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
     monkeypatch.setattr(torch.backends.cuda.matmul, "allow_tf32", True)
-    Engine.of(families.load(goldens.REWIND[0].checkpoint))
+    Engine.of(published.load(goldens.REWIND[0].checkpoint))
     assert not torch.backends.cudnn.allow_tf32
     assert not torch.backends.cuda.matmul.allow_tf32

@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from reward_models import BASE, ROOT, Reference, references
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
 from rfm_client import ProgressResult
 
@@ -40,10 +40,10 @@ def check(results: list[Any], decoded: dict[str, Any], frames_per_value: int, to
 def test_scores_are_those_of_lerobot(case: Reference) -> None:
     content, frames_per_value = case.content, 1 if case.summary["use_multi_image"] else 2
     last, is_rounded = content.get("cropped_to_last"), case.summary["torch_dtype"] == "bfloat16"
-    engine = Engine.of(families.load(str(case.config / "checkpoint"), base_model=str(BASE)))
+    engine = Engine.of(published.load(str(case.config / "checkpoint"), base_model=str(BASE)))
     results = engine.evaluate(case.samples(last))
     if is_rounded:
-        rounded = Engine.of(families.load(str(case.config / "checkpoint"), base_model=str(BASE)), dtype=torch.bfloat16)
+        rounded = Engine.of(published.load(str(case.config / "checkpoint"), base_model=str(BASE)), dtype=torch.bfloat16)
         check(rounded.evaluate(case.samples(last)), content["decoded"], frames_per_value, ROUNDED)
         if "fp32_decoded" in content:
             check(results, content["fp32_decoded"], frames_per_value, TOLERANCES[1])
@@ -61,14 +61,14 @@ def test_scores_are_those_of_lerobot(case: Reference) -> None:
 
 def test_an_export_scores_the_same_and_assumptions_are_told(tmp_path: Path) -> None:
     case = next(case for case in CASES if case.config == CHECKPOINT.parent)
-    checkpoint = families.load(CHECKPOINT, base_model=str(BASE))
-    checkpoint.save(tmp_path / "saved")
-    saved = Engine.of(families.load(str(tmp_path / "saved"))).evaluate(case.samples())
-    for result, expected in zip(saved, Engine.of(checkpoint).evaluate(case.samples()), strict=True):
+    loaded = published.read(CHECKPOINT, base_model=str(BASE))
+    loaded.checkpoint.save(tmp_path / "saved")
+    saved = Engine.of(published.load(str(tmp_path / "saved"))).evaluate(case.samples())
+    for result, expected in zip(saved, Engine.of(loaded.checkpoint).evaluate(case.samples()), strict=True):
         assert isinstance(result, ProgressResult)
         assert isinstance(expected, ProgressResult)
         np.testing.assert_array_equal(result.progress, expected.progress)
-    assumed = [each.name for each in checkpoint.assumptions]
+    assumed = [each.name for each in loaded.assumptions]
     # the tests' own processor, and a prompt about pairs, which LeRobot does not score
     assert assumed == ["base_model", "progress_in_preference"]
 
@@ -90,7 +90,7 @@ def text_config(config: dict[str, Any]) -> dict[str, Any]:
 
 def test_the_theta_of_the_rotation_is_the_file_s(tmp_path: Path) -> None:
     folder = changed(tmp_path, lambda config, _: text_config(config)["rope_parameters"].update(rope_theta=20_000.0))
-    assert families.load(folder, base_model=str(BASE)).config.backbone["text_config"]["rope_theta"] == 20_000.0
+    assert published.load(folder, base_model=str(BASE)).config.backbone["text_config"]["rope_theta"] == 20_000.0
 
 
 def test_of_untied_weights_the_embedding_is_read(tmp_path: Path) -> None:
@@ -102,5 +102,5 @@ def test_of_untied_weights_the_embedding_is_read(tmp_path: Path) -> None:
         config["vlm_config"]["tie_word_embeddings"] = False
 
     case = next(case for case in CASES if case.config == CHECKPOINT.parent)
-    engine = Engine.of(families.load(str(changed(tmp_path, untie)), base_model=str(BASE)))
+    engine = Engine.of(published.load(str(changed(tmp_path, untie)), base_model=str(BASE)))
     check(engine.evaluate(case.samples(case.content.get("cropped_to_last"))), case.content["decoded"], 1, TOLERANCES[1])

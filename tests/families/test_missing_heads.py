@@ -20,10 +20,10 @@ import goldens
 import rfm_export
 from engines import serve_config
 from repositories import description_of
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
-from rfm.families import CheckpointError
-from rfm.family import Checkpoint
+from rfm.engine.family import Checkpoint
+from rfm.files import CheckpointError
 from rfm_client import (
     InvalidSampleError,
     PreferenceResult,
@@ -43,7 +43,7 @@ LACKS = [("preference",), ("success",), ("preference", "success")]
 
 
 def load(name: str, folder: Path) -> Checkpoint:
-    return families.load(folder, **goldens.config(name).sources)
+    return published.load(folder, **goldens.config(name).sources)
 
 
 def pair(name: str) -> tuple[Trajectory, Trajectory]:
@@ -94,7 +94,7 @@ def test_what_is_exported_has_the_same_heads(tmp_path: Path, name: str) -> None:
 def test_a_head_that_is_missing_is_not_said_to_be_untrained(tmp_path: Path) -> None:
     folder = without(REWIND, ["success"], tmp_path / "checkpoint")
     (folder / "config.yaml").write_text("model: {train_success_head: false, train_preference_head: false}\n")
-    lacking, untrained = families.notes(folder, load(REWIND, folder))
+    lacking, untrained = published.notes(folder, published.read(folder))
     assert lacking == "model.safetensors: there is no head of success: served without"
     assert untrained.startswith("config.yaml: model.train_preference_head is false")
 
@@ -135,7 +135,7 @@ def first_code(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FirstCod
     args = argparse.Namespace(max_length=16, subsample_video=True, lr=1e-4)
     folder = tmp_path_factory.mktemp("run")
     torch.save({"args": args, "model_state_dict": network.state_dict(), **run}, folder / "rewind_epoch_19.pth")
-    convert(families.load, folder)
+    convert(published.load, folder)
     return folder, network.eval()
 
 
@@ -147,10 +147,11 @@ def run(first_code: tuple[Path, FirstCode], tmp_path: Path) -> Path:
 
 def test_a_checkpoint_of_the_first_rewind_code_has_its_scores(first_code: tuple[Path, FirstCode]) -> None:
     folder, network = first_code
-    checkpoint = families.load(folder)
+    loaded = published.read(folder)
+    checkpoint = loaded.checkpoint
     assert (checkpoint.description.trained_frames, checkpoint.description.network_frames) == (16, None)
     assert checkpoint.description.lacks == ("preference", "similarity", "success")
-    lacking, line = families.notes(folder, checkpoint)
+    lacking, line = published.notes(folder, loaded)
     assert lacking == "model.safetensors: there is no head of preference and success: served without"
     source = "(default of the first ReWiND code)"
     assert line.startswith(
@@ -173,27 +174,27 @@ def test_a_checkpoint_of_the_first_rewind_code_has_its_scores(first_code: tuple[
         assert str(refused).startswith("sample_type: expected progress (this checkpoint has no ")
     for option in ("image_encoder", "text_encoder"):
         with pytest.raises(CheckpointError, match=r": encoders: expected none for a checkpoint of the first ReWiND"):
-            families.load(folder, **{option: "some/other"})
+            published.load(folder, **{option: "some/other"})
 
 
 def test_a_checkpoint_of_the_first_rewind_code_is_exported_and_labels(run: Path, tmp_path: Path) -> None:
     (run / "config.json").write_text('{"max_len": 32}')
     rfm_export.export(run, tmp_path / "repository", serve_config(goldens.config(REWIND)))
-    checkpoint = families.load(run)
-    exported = families.load(tmp_path / "repository" / "rfm" / "1" / "checkpoint")
-    assert exported.config == checkpoint.config
+    loaded = published.read(run)
+    exported = published.load(tmp_path / "repository" / "rfm" / "1" / "checkpoint")
+    assert exported.config == loaded.checkpoint.config
     assert exported.config.trained_frames == 32
     scorer = EngineScorer(str(run))
     assert scorer.checkpoint().max_frames == 32
     assert "causal_mask" in scorer.notes[1]
     assert "max_len" not in scorer.notes[1]
-    assert [each.name for each in checkpoint.assumptions] == ["num_attention_heads", "causal_mask"]
+    assert [each.name for each in loaded.assumptions] == ["num_attention_heads", "causal_mask"]
 
 
 def test_a_checkpoint_of_the_first_rewind_code_is_causal_whatever_upstream_s_older_files_mean(run: Path) -> None:
     """Upstream's configurations from before causal_mask state all of these."""
     fields = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len")
-    config = families.load(run).config
+    config = published.load(run).config
     (run / "config.json").write_text(json.dumps({name: getattr(config, name) for name in fields}))
-    assert families.load(run).config == config
+    assert published.load(run).config == config
     assert config.causal_mask

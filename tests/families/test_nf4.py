@@ -12,9 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
+import goldens
 from few_bits import as_bytes, case, change_config, in_both_forms
-from rfm.families import CheckpointError
-from rfm.vlm import nf4
+from rfm import published
+from rfm.files import CheckpointError
+from rfm.published import nf4
 from vlm import PLAIN, load
 
 CASES = ("nested", "plain", "float32", "blocks_across_rows", "odd")
@@ -98,8 +100,10 @@ def test_config_json_may_say_nothing_of_nf4_but_nothing_wrong(both: tuple[Path, 
     """A trainer that saves weights alone keeps the base model's configuration."""
     few_bits, full = both
     shutil.copyfile(full / "config.json", few_bits / "config.json")
-    assert "rounded_weights" in [each.name for each in load(PLAIN, few_bits).assumptions]
-    assert "rounded_weights" not in [each.name for each in load(PLAIN, full).assumptions]
+    sources = goldens.config(PLAIN).sources
+    for folder, is_assumed in ((few_bits, True), (full, False)):
+        assumed = [each.name for each in published.read(folder, **sources).assumptions]
+        assert ("rounded_weights" in assumed) == is_assumed
     change_config(full, "nf4")
     expected = (
         r"config\.json: quantization_config: expected weights in NF4, got none; if they are meant in full precision"

@@ -18,7 +18,7 @@ import rfm_export
 import robodopamine
 from engines import load_engine, serve_config
 from reward_models import ROOT, references
-from rfm import families
+from rfm import published
 from rfm.engine import Engine, Execution
 from rfm_client import (
     PreferenceSample,
@@ -51,11 +51,11 @@ EMBEDDED: list[Sample] = [
 
 def reference(name: str, **options: Any) -> Callable[[], Any]:
     config = goldens.config(name)
-    return lambda: families.load(config.checkpoint, **config.sources, **options)
+    return lambda: published.read(config.checkpoint, **config.sources, **options)
 
 
 def asked(folder: Path, reward_model: str) -> Callable[[], Any]:
-    return lambda: families.load(folder, reward_model=reward_model)
+    return lambda: published.read(folder, reward_model=reward_model)
 
 
 MODELS: dict[str, tuple[Callable[[], Any], list[Any], float]] = {
@@ -88,8 +88,8 @@ def check(results: list[Any], expected: list[Any], tolerance: float) -> None:
 @pytest.mark.parametrize(("load", "samples", "tolerance"), MODELS.values(), ids=MODELS)
 def test_a_gpu_gives_the_cpu_s_numbers(load: Callable[[], Any], samples: list[Any], tolerance: float) -> None:
     on_cpu, on_gpu = (
-        Engine.of(checkpoint, device=device, dtype=torch.float32, encoders=checkpoint.encoders()).evaluate(samples)
-        for device, checkpoint in (("cpu", load()), ("cuda", load()))
+        Engine.of(loaded.checkpoint, device=device, dtype=torch.float32, encoders=loaded.encoders()).evaluate(samples)
+        for device, loaded in (("cpu", load()), ("cuda", load()))
     )
     check(on_gpu, on_cpu, tolerance)
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import goldens
-from rfm import families
+from rfm import published
 from spoilt import Spoil, settings, with_sources
 from vlm import PLAIN, load
 
@@ -64,7 +64,7 @@ def test_a_setting_without_effect_changes_nothing(tmp_path: Path, name: str, spo
 
 def test_transformers_5_s_file_of_videos_reads_the_same(tmp_path: Path) -> None:
     folder, options = with_sources("topreward", tmp_path)
-    known = families.load(folder, **options).collator.images
+    known = published.load(folder, **options).collator.images
     (folder / BOTH).write_text(json.dumps({"video_processor": json.loads((folder / VIDEOS).read_text())}))
     (folder / VIDEOS).unlink()
-    assert families.load(folder, **options).collator.images == known
+    assert published.load(folder, **options).collator.images == known

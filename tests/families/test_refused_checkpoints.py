@@ -23,8 +23,8 @@ from safetensors.torch import load_file, save_file
 
 import goldens
 from reward_models import ROOT
-from rfm import families
-from rfm.families import CheckpointError
+from rfm import published
+from rfm.files import CheckpointError
 from spoilt import (
     REWARD_MODELS,
     WEIGHTS,
@@ -410,9 +410,9 @@ def test_a_spoilt_checkpoint_is_refused(tmp_path: Path, name: str, spoil: Spoil,
     spoil(folder)
     largest_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(CheckpointError, match=message) as refusal:
-        checkpoint = families.load(folder, **options)
-        checkpoint.encoders()
-        checkpoint.predictor(torch.device("cpu"))
+        loaded = published.read(folder, **options)
+        loaded.encoders()
+        loaded.checkpoint.predictor(torch.device("cpu"))
     assert len(str(refusal.value)) < 10_000
     assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - largest_kib) * 1024 < MOST_MEMORY_BYTES
 
@@ -441,12 +441,12 @@ OPTIONS = {
 @pytest.mark.parametrize(("reward_model", "message"), OPTIONS.values(), ids=OPTIONS)
 def test_a_reward_model_in_words_that_makes_no_sense_is_refused(reward_model: str | None, message: str) -> None:
     with pytest.raises(CheckpointError, match=message):
-        families.load(ROOT / REWARD_MODELS[TOP][0], reward_model=reward_model)
+        published.load(ROOT / REWARD_MODELS[TOP][0], reward_model=reward_model)
 
 
 def test_a_model_with_reward_heads_is_not_asked_in_words() -> None:
     with pytest.raises(CheckpointError, match="expected an ordinary Qwen3-VL, got reward heads: leave out --as"):
-        families.load(goldens.config(Q3).checkpoint, reward_model="topreward")
+        published.load(goldens.config(Q3).checkpoint, reward_model="topreward")
 
 
 @pytest.mark.parametrize(
@@ -454,7 +454,7 @@ def test_a_model_with_reward_heads_is_not_asked_in_words() -> None:
 )
 def test_what_is_neither_folder_nor_id_is_refused(source: str) -> None:
     with pytest.raises(CheckpointError, match="expected a folder that exists or a Hugging Face id"):
-        families.load(source)
+        published.load(source)
 
 
 def test_a_run_folder_is_refused_with_its_checkpoints(tmp_path: Path) -> None:
@@ -464,16 +464,16 @@ def test_a_run_folder_is_refused_with_its_checkpoints(tmp_path: Path) -> None:
     with pytest.raises(
         CheckpointError, match=rf"name the checkpoint in it: {tmp_path}/ckpt-1/\w+, {tmp_path}/ckpt-2/\w+"
     ):
-        families.load(tmp_path)
+        published.load(tmp_path)
 
 
 def test_yaml_and_a_base_model_run_no_code(tmp_path: Path) -> None:
     mark, (folder, _) = tmp_path / "was_here", with_sources(REWIND, tmp_path)
     (folder / RUN).write_text(f'model: {{rewind: !!python/object/apply:os.system ["touch {mark}"]}}\n')
     with pytest.raises(CheckpointError, match=r"config\.yaml: model\.rewind: expected a mapping, got"):
-        families.load(folder)
+        published.load(folder)
     (tmp_path / "evil.py").write_text(f"open({str(mark)!r}, 'w')\n")
     (tmp_path / CONFIG).write_text(json.dumps({"model_type": "evil", "auto_map": {"AutoConfig": "evil.Config"}}))
     with pytest.raises(CheckpointError, match=r"base model .*: model_type: expected one of .*, got 'evil'"):
-        families.load(goldens.config("q25_peft_adapter_disc10").checkpoint, base_model=str(tmp_path))
+        published.load(goldens.config("q25_peft_adapter_disc10").checkpoint, base_model=str(tmp_path))
     assert not mark.exists()

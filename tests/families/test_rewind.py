@@ -13,13 +13,13 @@ import torch
 from torch import Tensor, nn
 
 import goldens
-from rfm import families
+from rfm import published
 from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
 from rfm.engine.layers import progress_from_logits
 from rfm.engine.predictor import prefix_indices
-from rfm.rewind.network import Packing, RewindConfig, RewindTransformer, rounded_up
-from rfm.rewind.predictor import RewindCollator, RewindPredictor
+from rfm.families.rewind.network import Packing, RewindConfig, RewindTransformer, rounded_up
+from rfm.families.rewind.predictor import RewindCollator, RewindPredictor
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,
@@ -244,7 +244,7 @@ def test_the_engine_gives_every_reference_answer(case: goldens.Case, engine: Cal
 def test_half_precision_scores_are_near_those_of_float32() -> None:
     """ReWiND in bfloat16, on request."""
     checkpoint = goldens.config("c1_t1_disc10").checkpoint
-    in_float32, in_bfloat16 = (Engine.of(families.load(checkpoint), dtype=dtype) for dtype in (None, torch.bfloat16))
+    in_float32, in_bfloat16 = (Engine.of(published.load(checkpoint), dtype=dtype) for dtype in (None, torch.bfloat16))
     samples = [ProgressSample(random_trajectory(seed, 1 + seed)) for seed in range(8)]
     for exact, near in zip(in_float32.evaluate(samples), in_bfloat16.evaluate(samples), strict=True):
         assert isinstance(exact, ProgressResult) and isinstance(near, ProgressResult)

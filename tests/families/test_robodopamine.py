@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from rfm import families
+from rfm import published
 from rfm.engine import Engine, Execution
-from rfm.robodopamine.answers import fused, hops, parsed, sampled_frames
+from rfm.families.robodopamine.answers import fused, hops, parsed, sampled_frames
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
 from robodopamine import ANSWERED, CHECKPOINT, FOLDER, READABLE, Case, case_named
 
@@ -165,7 +165,7 @@ def test_the_mean_is_that_of_the_three_modes() -> None:
     checkpoint, sample = CHECKPOINT, case_named("forward_T5").sample
     results = {}
     for mode in ("incremental", "forward", "backward", "mean"):
-        (results[mode],) = Engine.of(families.load(checkpoint, reward_model=f"robodopamine,mode={mode}")).evaluate(
+        (results[mode],) = Engine.of(published.load(checkpoint, reward_model=f"robodopamine,mode={mode}")).evaluate(
             [sample]
         )
         assert isinstance(results[mode], ProgressResult), results[mode]
@@ -189,24 +189,24 @@ FRONT = np.zeros((3, 32, 32, 3), np.uint8)
 @pytest.mark.parametrize("name", ["Robo-Dopamine-GRM-3B", "models--tanhuajie2001--Robo-Dopamine-GRM-2.0-4B-Preview"])
 def test_a_published_folder_is_known_by_its_name(name: str, tmp_path: Path) -> None:
     shutil.copytree(FOLDER / "grm_qwen25vl_bf16_tied" / "checkpoint", tmp_path / name)
-    checkpoint = families.load(tmp_path / name)
+    checkpoint = published.load(tmp_path / name)
     assert checkpoint.description.kind == "Robo-Dopamine, incremental"
 
 
 def test_an_export_gives_the_same_scores_and_takes_another_mode(tmp_path: Path) -> None:
     case = case_named("forward_T5")
-    families.load(case.config / "checkpoint", reward_model=case.said).save(tmp_path / "saved")
+    published.load(case.config / "checkpoint", reward_model=case.said).save(tmp_path / "saved")
     (before,), (after,) = (
-        engine.evaluate([case.sample]) for engine in (case.engine(), Engine.of(families.load(tmp_path / "saved")))
+        engine.evaluate([case.sample]) for engine in (case.engine(), Engine.of(published.load(tmp_path / "saved")))
     )
     np.testing.assert_array_equal(before.progress, after.progress)
-    changed = families.load(tmp_path / "saved", reward_model="robodopamine,mode=mean")
+    changed = published.load(tmp_path / "saved", reward_model="robodopamine,mode=mean")
     assert changed.config.mode == "mean"
 
 
 def test_cached_features_give_the_same_scores() -> None:
     case, execution = case_named("backward_T5"), Execution()
-    checkpoint = families.load(CHECKPOINT, reward_model=case.said)
+    checkpoint = published.load(CHECKPOINT, reward_model=case.said)
     cached = Engine.of(checkpoint, feature_cache_mib=64)
     (expected,), (first,) = case.engine().evaluate([case.sample]), cached.evaluate([case.sample])
     (again,) = cached.evaluate([case.sample], execution)
@@ -218,6 +218,6 @@ def test_cached_features_give_the_same_scores() -> None:
 
 
 def test_the_work_grows_with_the_number_of_questions() -> None:
-    checkpoint = families.load(CHECKPOINT, reward_model="robodopamine,mode=mean")
+    checkpoint = published.load(CHECKPOINT, reward_model="robodopamine,mode=mean")
     short, long = (checkpoint.flop(ProgressSample(Trajectory(frames=FRONT[[0] * count], task="t"))) for count in (2, 3))
     assert 1.9 < long / short < 2.1  # twice as many questions

@@ -18,13 +18,13 @@ from PIL import Image
 
 from engines import asked_engine
 from reward_models import Reference, references
-from rfm import families
+from rfm import published
 from rfm.engine import Engine, Execution
-from rfm.roboreward.predictor import RoboRewardPredictor
-from rfm.roboreward.prompts import as_jpeg, is_unclear, parsed
-from rfm.vlm.qwen import ROOM
-from rfm.vlm.row import VlmRow
-from rfm.vlm.written import WrittenAnswer
+from rfm.families.roboreward.predictor import RoboRewardPredictor
+from rfm.families.roboreward.prompts import as_jpeg, is_unclear, parsed
+from rfm.qwen.backbone import ROOM
+from rfm.qwen.batch import VlmRow
+from rfm.qwen.written import WrittenAnswer
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -165,10 +165,10 @@ def test_dense_mode_marks_the_frames_whose_prefix_has_an_unclear_answer(engine: 
 def test_strict_answers_refuse_an_unclear_answer(tmp_path: Path, is_exported: bool) -> None:
     folder, options = CHECKPOINT, {"reward_model": "roboreward", "strict_answers": True}
     if is_exported:
-        families.load(CHECKPOINT, **options).save(tmp_path / "saved")  # type: ignore[arg-type]
+        published.load(CHECKPOINT, **options).save(tmp_path / "saved")  # type: ignore[arg-type]
         folder, options = tmp_path / "saved", {}
     execution = Execution()
-    strict = Engine.of(families.load(folder, **options))  # type: ignore[arg-type]
+    strict = Engine.of(published.load(folder, **options))  # type: ignore[arg-type]
     samples = [*samples_named("fallback_digits_T2"), *samples_named("score5_T4")]
     refused, clear = strict.evaluate(samples, execution)
     assert isinstance(refused, InvalidSampleError)
@@ -180,7 +180,7 @@ def test_strict_answers_refuse_an_unclear_answer(tmp_path: Path, is_exported: bo
 
 @pytest.fixture(scope="module")
 def engine() -> Engine:
-    return Engine.of(families.load(str(CHECKPOINT), reward_model="roboreward"), feature_cache_mib=16)
+    return Engine.of(published.load(str(CHECKPOINT), reward_model="roboreward"), feature_cache_mib=16)
 
 
 PASSES = {"score4_T7": 2, "fallback_digits_T2": 8, "lower_T2": 8}  # 'ANSWER: 4', 'Score 2 of 5', 'answer: 3'
@@ -194,7 +194,7 @@ def test_a_usual_answer_takes_two_passes_and_every_pass_is_progress_of_the_batch
 
 
 def writer(dtype: torch.dtype = torch.float32, **settings: Any) -> RoboRewardPredictor:
-    checkpoint: Any = families.load(CHECKPOINT, reward_model="roboreward")
+    checkpoint: Any = published.load(CHECKPOINT, reward_model="roboreward")
     changed = replace(checkpoint, config=replace(checkpoint.config, **settings))
     predictor = Engine.of(changed, dtype=dtype).predictor
     assert isinstance(predictor, RoboRewardPredictor)
@@ -300,7 +300,7 @@ def test_only_conversations_of_other_lengths_need_a_mask(
 
 
 def test_logits_that_are_not_finite_are_a_failure_and_no_answer() -> None:
-    checkpoint = families.load(CHECKPOINT, reward_model="roboreward")
+    checkpoint = published.load(CHECKPOINT, reward_model="roboreward")
     checkpoint.parts["network"]["model.language_model.norm.weight"].fill_(torch.inf)
     engine = Engine.of(checkpoint)
     (outcome,) = engine.evaluate(CASES[0].samples()[:1])
@@ -309,11 +309,11 @@ def test_logits_that_are_not_finite_are_a_failure_and_no_answer() -> None:
 
 def test_a_folder_of_its_name_needs_no_option(tmp_path: Path) -> None:
     folder = shutil.copytree(CHECKPOINT, tmp_path / "RoboReward-4B")
-    checkpoint = families.load(folder)
+    checkpoint = published.load(folder)
     assert checkpoint.description.kind == "RoboReward"
     checkpoint.save(tmp_path / "saved")
     case = next(case for case in CASES if case.file.stem == "score2_T4")
-    saved, original = (Engine.of(families.load(each)) for each in (tmp_path / "saved", folder))
+    saved, original = (Engine.of(published.load(each)) for each in (tmp_path / "saved", folder))
     for result, expected in zip(saved.evaluate(case.samples()), original.evaluate(case.samples()), strict=True):
         assert isinstance(result, ProgressResult)
         assert isinstance(expected, ProgressResult)

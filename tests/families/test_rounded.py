@@ -22,12 +22,12 @@ from few_bits import LORA_INSIDE, TOLERANCES, in_both_forms
 from few_bits import rounded as in_nf4
 from pretended import CUDA, pretended
 from reward_models import ROOT
-from rfm import families
+from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.families import CheckpointError
-from rfm.vlm import nf4
-from rfm.vlm.rounded import Int8Linear, Nf4Linear, RoundedLinear, fit, rounded
+from rfm.files import CheckpointError
+from rfm.published.nf4 import dequantize
+from rfm.qwen.rounded import Int8Linear, Nf4Linear, RoundedLinear, fit, quantize, rounded
 from rfm_client import ModelInfo, ProgressSample
 from rfm_commands.engine_scorer import EngineScorer
 from rfm_export.errors import ExportError
@@ -73,20 +73,20 @@ def layers_of(engine: Engine) -> dict[str, RoundedLinear]:
     ],
 )
 def test_a_rounded_network_scores_a_sample_alone_as_in_a_batch(name: str, kind: str, dtype: torch.dtype) -> None:
-    engine = Engine.of(families.load(**sources(name), weights=kind), dtype=dtype)
+    engine = Engine.of(published.load(**sources(name), weights=kind), dtype=dtype)
     assert {type(layer) for layer in layers_of(engine).values()} == {KINDS[kind]}
     together = engine.evaluate(SAMPLES)
     for sample, expected in zip(SAMPLES, together, strict=True):
         (alone,) = engine.evaluate([sample])
         assert_close(alone, expected, 1e-5 if dtype is torch.float32 else 5e-3)
-    full = Engine.of(families.load(**sources(name)), dtype=dtype).evaluate(SAMPLES)
+    full = Engine.of(published.load(**sources(name)), dtype=dtype).evaluate(SAMPLES)
     with pytest.raises(AssertionError):
         assert_close(full[0], together[0], 1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_layers_of_the_language_model_and_the_vision_tower_are_rounded_and_nothing_else(kind: str) -> None:
-    engine, full = Engine.of(families.load(**sources(PLAIN), weights=kind)), load_engine(PLAIN)
+    engine, full = Engine.of(published.load(**sources(PLAIN), weights=kind)), load_engine(PLAIN)
     linear = {name for name, each in network_of(full).named_modules() if isinstance(each, nn.Linear)}
     inside = {name for name in linear if ".layers." in name or ".blocks." in name}
     assert layers_of(engine).keys() == inside
@@ -123,7 +123,7 @@ def test_int8_takes_the_nearest_of_255_steps_of_each_row() -> None:
 @pytest.mark.parametrize("shape", [(6, 128), (5, 100), (3, 34), (1, 2)])
 def test_nf4_rounds_and_decodes_as_bitsandbytes(shape: tuple[int, int]) -> None:
     weight = torch.randn(shape, generator=torch.Generator().manual_seed(1)) * 0.02
-    codes, scales = nf4.quantize(weight)
+    codes, scales = quantize(weight)
     from bitsandbytes import functional as bitsandbytes  # a GPU's tests run without it
 
     theirs, state = bitsandbytes.quantize_4bit(weight, blocksize=64, quant_type="nf4")
@@ -131,9 +131,9 @@ def test_nf4_rounds_and_decodes_as_bitsandbytes(shape: tuple[int, int]) -> None:
     assert torch.equal(scales, state.absmax)
     parts, values = in_nf4("layer.weight", weight)
     assert torch.equal(layer_with(weight, "nf4", torch.bfloat16).values(torch.bfloat16), values)
-    assert nf4.dequantize(parts) == 1
+    assert dequantize(parts) == 1
     assert torch.equal(parts["layer.weight"], values)
-    assert not nf4.quantize(torch.zeros(2, 32))[1].any()
+    assert not quantize(torch.zeros(2, 32))[1].any()
 
 
 @pytest.mark.slow
@@ -144,8 +144,8 @@ def test_an_export_holds_the_rounded_weights_and_says_how_far_scores_are(tmp_pat
     rfm_export.export(config.checkpoint, tmp_path, settings, say=said.append)
     folder = tmp_path / "rfm_frames"
     exported, memory = (
-        Engine.of(families.load(folder / "1" / "checkpoint")),
-        families.load(**sources(name), weights=kind),
+        Engine.of(published.load(folder / "1" / "checkpoint")),
+        published.load(**sources(name), weights=kind),
     )
     in_memory = Engine.of(memory).evaluate(SAMPLES)
     for result, expected in zip(exported.evaluate(SAMPLES), in_memory, strict=True):
@@ -164,7 +164,7 @@ def test_an_export_holds_the_rounded_weights_and_says_how_far_scores_are(tmp_pat
         rfm_export.check(tmp_path, replace(settings, weights=other))
     stored = load_file(folder / "1" / "checkpoint" / "model.safetensors")
     assert not any("lora" in key for key in stored)
-    again = families.load(folder / "1" / "checkpoint", weights=kind)  # the same may be asked for again
+    again = published.load(folder / "1" / "checkpoint", weights=kind)  # the same may be asked for again
     assert again.config.weights == kind
 
 
@@ -197,7 +197,7 @@ def numbers_of(engine: Engine) -> Mapping[str, int]:
 def test_a_checkpoint_in_nf4_keeps_its_codes_and_is_labelled(tmp_path: Path, name: str) -> None:
     few_bits, full = in_both_forms(name, tmp_path)
     options = goldens.config(name).sources
-    checkpoint = families.load(few_bits, **options)
+    checkpoint = published.load(few_bits, **options)
     engine = Engine.of(checkpoint)
     assert {type(layer) for layer in layers_of(engine).values()} == {Nf4Linear}
     assert checkpoint.config.weights == "nf4"
@@ -205,7 +205,7 @@ def test_a_checkpoint_in_nf4_keeps_its_codes_and_is_labelled(tmp_path: Path, nam
     for path, layer in layers_of(engine).items():
         kept = [key for key in weights if key.endswith(".weight") and _is_of(key, path)]
         assert torch.equal(layer.weight.flatten(), weights[kept[0]].flatten())
-    dense = Engine.of(families.load(full, **options))
+    dense = Engine.of(published.load(full, **options))
     for result, expected in zip(engine.evaluate(SAMPLES), dense.evaluate(SAMPLES), strict=True):
         assert_close(result, expected, TOLERANCES[name])
 
@@ -215,7 +215,7 @@ def test_a_checkpoint_in_nf4_keeps_its_codes_and_is_labelled(tmp_path: Path, nam
     exported = tmp_path / "models" / "rfm_frames" / "1" / "checkpoint"
     assert "quantization_config" not in json.loads((exported / "config.json").read_text())
     for result, expected in zip(
-        Engine.of(families.load(exported)).evaluate(SAMPLES), dense.evaluate(SAMPLES), strict=True
+        Engine.of(published.load(exported)).evaluate(SAMPLES), dense.evaluate(SAMPLES), strict=True
     ):
         assert_close(result, expected, TOLERANCES[name])
     info = info_of(tmp_path / "models" / "rfm_frames")
@@ -247,10 +247,10 @@ def test_an_ordinary_qwen_in_nf4_is_read(tmp_path: Path) -> None:
         "bnb_4bit_quant_type": "nf4",
     }
     (folder / "config.json").write_text(json.dumps(content))
-    published = families.load(folder, reward_model="roboreward-expected")
-    rounded_here = families.load(ROBOREWARD, reward_model="roboreward-expected", weights="nf4")
-    assert published.config.weights == "nf4"
-    scores = [Engine.of(each).evaluate(SAMPLES) for each in (published, rounded_here)]
+    as_published = published.load(folder, reward_model="roboreward-expected")
+    rounded_here = published.load(ROBOREWARD, reward_model="roboreward-expected", weights="nf4")
+    assert as_published.config.weights == "nf4"
+    scores = [Engine.of(each).evaluate(SAMPLES) for each in (as_published, rounded_here)]
     for result, expected in zip(*scores, strict=True):
         assert_close(result, expected, 1e-6)
 
@@ -260,31 +260,31 @@ def test_weights_that_are_rounded_are_not_rounded_in_another_way(tmp_path: Path)
     options = goldens.config(PLAIN).sources
     expected = "^--weights: expected a vision-language checkpoint whose weights are not rounded .*; leave it out"
     with pytest.raises(CheckpointError, match=expected):
-        families.load(few_bits, weights="int8", **options)
-    assert families.load(few_bits, weights="nf4", **options).config.weights == "nf4"
+        published.load(few_bits, weights="int8", **options)
+    assert published.load(few_bits, weights="nf4", **options).config.weights == "nf4"
     rewind = goldens.config("c1_t1_disc10")
     with pytest.raises(CheckpointError, match=expected):
-        families.load(rewind.checkpoint, weights="int8", **rewind.sources)
+        published.load(rewind.checkpoint, weights="int8", **rewind.sources)
 
 
 def test_a_missing_bitsandbytes_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "bitsandbytes", None)
     expected = r'^weights: expected bitsandbytes, which decodes .* got none; pip install "\.\[quantized\]"$'
     with pytest.raises(CheckpointError, match=expected):
-        families.load(**sources(PLAIN), weights="nf4")
-    Engine.of(families.load(**sources(PLAIN), weights="int8"))  # which PyTorch decodes
+        published.load(**sources(PLAIN), weights="nf4")
+    Engine.of(published.load(**sources(PLAIN), weights="int8"))  # which PyTorch decodes
 
 
 @pytest.mark.parametrize("part", ["weight", "scale"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_tensors_of_other_shapes_are_refused(tmp_path: Path, kind: Any, part: str) -> None:
-    families.load(**sources(PLAIN), weights=kind).save(tmp_path / "saved")
+    published.load(**sources(PLAIN), weights=kind).save(tmp_path / "saved")
     tensors = load_file(tmp_path / "saved" / "model.safetensors")
     name = f"model.language_model.layers.0.mlp.up_proj.{part}"
     tensors[name] = tensors[name][:-1].clone()
     save_file(tensors, tmp_path / "saved" / "model.safetensors", {"format": "pt"})
     with pytest.raises(CheckpointError, match=r"layers\.0\.mlp\.up_proj\.(weight|scale): expected \[.*\], got \["):
-        families.load(tmp_path / "saved")
+        published.load(tmp_path / "saved")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -298,9 +298,9 @@ def test_labels_tell_rounded_weights(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_device_decodes_without_a_wait(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    expected = Engine.of(families.load(**sources(PLAIN), weights=kind)).evaluate(SAMPLES)
+    expected = Engine.of(published.load(**sources(PLAIN), weights=kind)).evaluate(SAMPLES)
     with pretended(monkeypatch) as seen, torch.inference_mode():
-        engine = Engine.of(families.load(**sources(PLAIN), weights=kind), device=CUDA, dtype=torch.float32)
+        engine = Engine.of(published.load(**sources(PLAIN), weights=kind), device=CUDA, dtype=torch.float32)
         results = engine.evaluate(SAMPLES)
         asked = seen.asked.total()
         engine.evaluate(SAMPLES)
@@ -311,7 +311,7 @@ def test_a_device_decodes_without_a_wait(monkeypatch: pytest.MonkeyPatch, kind: 
 
 def test_a_gpu_needs_room_for_the_rounded_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exports are compared on a GPU with room for them."""
-    checkpoints = [families.load(**sources(PLAIN), weights=kind) for kind in (None, "int8", "nf4")]
+    checkpoints = [published.load(**sources(PLAIN), weights=kind) for kind in (None, "int8", "nf4")]
     rooms = []
     for checkpoint in checkpoints:
         low, high = 0, 2**30

@@ -15,10 +15,10 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from rfm import families
+from rfm import published
 from rfm.engine import Engine, Execution
-from rfm.families import CheckpointError
-from rfm.rynnvalue.network import Bins, entropy
+from rfm.families.rynnvalue.network import Bins, entropy
+from rfm.files import CheckpointError
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressResult, ProgressSample, Trajectory, UInt8Array
 from rynnvalue import CASES, FOLDER, ISOLATED, RELATIVE_TOLERANCE, USUAL, Case, engine_of, said
 from tolerances import BATCHED_VLM_TOLERANCE
@@ -110,7 +110,7 @@ def symlog(seconds: Any) -> npt.NDArray[Any]:
 def test_seconds_in_bfloat16_are_near_the_original_s() -> None:
     case = next(each for each in CASES if str(each) == f"{ISOLATED_CONFIG}/T3")
     (asked,) = case.asked()
-    engine = Engine.of(families.load(case.checkpoint, **said(asked.meta)), dtype=torch.bfloat16)
+    engine = Engine.of(published.load(case.checkpoint, **said(asked.meta)), dtype=torch.bfloat16)
     (result,) = scored(engine, asked.sample)
     expected = case.arrays[f"{asked.prefix}inv_freq_float32.{ISOLATED}.value.pred_value"][0]
     assert np.abs(symlog(result.remaining_s) - symlog(expected)).max() < 0.4
@@ -184,7 +184,7 @@ def test_preferences_and_special_tokens_in_a_task_are_refused() -> None:
 
 
 def test_features_of_frames_are_computed_once() -> None:
-    cached = Engine.of(families.load(NO_META), feature_cache_mib=16)
+    cached = Engine.of(published.load(NO_META), feature_cache_mib=16)
     execution, again = Execution(), Execution()
     first, second = (scored(cached, progress(noise(3)), execution=each)[0] for each in (execution, again))
     assert (execution.num_encoded, again.num_encoded, again.num_found) == (3, 0, 3)
@@ -192,12 +192,12 @@ def test_features_of_frames_are_computed_once() -> None:
 
 
 def test_an_export_gives_the_same_seconds_and_takes_another_robot(tmp_path: Path) -> None:
-    loaded = families.load(CAUSAL, **said(USUAL))
+    loaded = published.load(CAUSAL, **said(USUAL))
     loaded.save(tmp_path / "export")
-    saved = families.load(tmp_path / "export")
-    assert families.choose(tmp_path / "export").name == "rfm.rynnvalue"
+    saved = published.load(tmp_path / "export")
+    assert published.choose(tmp_path / "export").name == "rfm.families.rynnvalue"
     assert saved.config == loaded.config
-    other = families.load(tmp_path / "export", robot_description="another, with two arms")
+    other = published.load(tmp_path / "export", robot_description="another, with two arms")
     assert other.config == replace(saved.config, robot_description="another, with two arms")
     before, after, differing = (scored(Engine.of(each), progress(noise(3)))[0] for each in (loaded, saved, other))
     np.testing.assert_array_equal(before.remaining_s, after.remaining_s)
@@ -205,7 +205,7 @@ def test_an_export_gives_the_same_seconds_and_takes_another_robot(tmp_path: Path
 
 
 def test_layers_are_rounded_but_not_the_heads() -> None:
-    rounded = families.load(CAUSAL, **said(USUAL), weights="int8")
+    rounded = published.load(CAUSAL, **said(USUAL), weights="int8")
     assert rounded.weights["model.language_model.layers.0.mlp.up_proj.weight"].dtype is torch.int8
     assert rounded.weights["value_heads.0.proj.blocks.0.fc1.weight"].dtype is torch.float32
     (result,) = scored(Engine.of(rounded), progress(noise(2)))
@@ -235,17 +235,17 @@ def test_descriptions_that_do_not_fit_the_prompt_are_refused(
     checkpoint: Path, options: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(CheckpointError, match=message):
-        _ = families.load(checkpoint, **options).collator
+        _ = published.load(checkpoint, **options).collator
 
 
 def test_missing_settings_are_assumed_and_unexpected_keys_told(copied: Path) -> None:
     changed(copied / "config.json", lambda config: config.pop("attn_implementation"))
     changed(copied / "config.json", lambda config: config.update(success_head_config={}))
     changed(copied / "config.json", lambda config: config["value_head_config"].update(dropout=0.1))
-    loaded = families.load(copied)
-    assert loaded.config.attention == "isolated"
+    loaded = published.read(copied)
+    assert loaded.checkpoint.config.attention == "isolated"
     assert [(each.name, each.value) for each in loaded.assumptions] == [("attn_implementation", ISOLATED)]
-    assert loaded.notes == [
+    assert loaded.notes() == [
         f"config.json{where}: not expected, and not used: scores may differ from the original's"
         for where in (": 'success_head_config'", ": value_head_config: 'dropout'")
     ]
@@ -266,13 +266,13 @@ WRONG = {
 def test_settings_that_cannot_be_right_are_refused(copied: Path, change: Any, message: str) -> None:
     changed(copied / "config.json", change)
     with pytest.raises(CheckpointError, match=message):
-        families.load(copied)
+        published.load(copied)
 
 
 @pytest.mark.gpu
 @BOTH_KINDS
 def test_a_gpu_gives_the_cpu_s_seconds(name: str) -> None:
-    loaded = families.load(FOLDER / name / "checkpoint", **said(USUAL))
+    loaded = published.load(FOLDER / name / "checkpoint", **said(USUAL))
     on_cpu, on_gpu = (Engine.of(loaded, device=device, dtype=torch.float32) for device in ("cpu", "cuda"))
     for expected, result in zip(scored(on_cpu, *RAGGED), scored(on_gpu, *RAGGED), strict=True):
         check_seconds(result.remaining_s, expected.remaining_s)

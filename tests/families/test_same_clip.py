@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import goldens
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
 from rfm_client import Float32Array, ProgressResult, ProgressSample, Sample
 from vlm import BFLOAT16, video
@@ -33,7 +33,7 @@ COLD = (
 
 def engine(dtype: str) -> Engine:
     config = goldens.config(BFLOAT16)
-    return Engine.of(families.load(config.checkpoint, **config.sources), dtype=getattr(torch, dtype))
+    return Engine.of(published.load(config.checkpoint, **config.sources), dtype=getattr(torch, dtype))
 
 
 def progress(engine: Engine, samples: list[Sample]) -> Float32Array:

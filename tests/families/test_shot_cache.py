@@ -14,7 +14,7 @@ import torch
 
 from rfm.engine import Engine, Execution
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
-from rfm.vlm.predictor import VlmPredictor
+from rfm.qwen.predictor import QwenPredictor
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, Trajectory, UInt8Array
 from rfm_client.contract import wire
 from rfm_client.contract.wire import frame_digest
@@ -42,8 +42,8 @@ def of_both(name: str, cache: FeatureCache[Any] | None = None) -> tuple[Engine, 
     return engine(name, FeatureCache(64 * BYTES_PER_MIB) if cache is None else cache), engine(name)
 
 
-def predictor_of(cached: Engine) -> VlmPredictor:
-    assert isinstance(cached.predictor, VlmPredictor)
+def predictor_of(cached: Engine) -> QwenPredictor:
+    assert isinstance(cached.predictor, QwenPredictor)
     return cached.predictor
 
 
@@ -148,7 +148,7 @@ def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch
     """Frames of very long videos are downscaled more."""
     cached, plain = of_both(MODELS[3])
     frames = frames_of(6, 4, (448, 336))
-    monkeypatch.setattr("rfm.vlm.images.VIDEO_TOTAL_TOKENS", 300.0)
+    monkeypatch.setattr("rfm.qwen.images.VIDEO_TOTAL_TOKENS", 300.0)
     for stop in (2, 4):
         assert_scored(ask(cached, frames[:stop], frames[:stop]), plain, frames[:stop])
     rows = [predictor_of(cached).rows(whole(frames[:stop]))[0] for stop in (2, 4)]

@@ -14,9 +14,9 @@ import torch
 
 from engines import asked_engine
 from reward_models import ROOT, Reference, references
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
-from rfm.families import CheckpointError
+from rfm.files import CheckpointError
 from rfm_client import (
     ProgressResult,
     ProgressSample,
@@ -127,11 +127,11 @@ def test_progress_of_equal_frames_is_noise_between_0_and_1(robometer: Engine) ->
 
 def test_the_settings_of_lerobot_s_config_json_are_used(tmp_path: Path, lerobot: Engine) -> None:
     (expected,) = lerobot.evaluate([progress(noise(5))])
-    by_file = Engine.of(families.load(str(OF_LEROBOT), base_model=str(CHECKPOINT)))
+    by_file = Engine.of(published.load(str(OF_LEROBOT), base_model=str(CHECKPOINT)))
     changed = shutil.copytree(OF_LEROBOT, tmp_path / "changed")
     content = json.loads((changed / "config.json").read_text()) | {"fps": 4.0}
     (changed / "config.json").write_text(json.dumps(content))
-    at_4_fps = Engine.of(families.load(str(changed), base_model=str(CHECKPOINT)))
+    at_4_fps = Engine.of(published.load(str(changed), base_model=str(CHECKPOINT)))
     assert isinstance(expected, ProgressResult)
     for engine, is_equal in ((by_file, True), (at_4_fps, False)):
         (result,) = engine.evaluate([progress(noise(5))])
@@ -140,20 +140,20 @@ def test_the_settings_of_lerobot_s_config_json_are_used(tmp_path: Path, lerobot:
 
 
 def test_a_saved_model_scores_the_same(tmp_path: Path, robometer: Engine) -> None:
-    checkpoint = families.load(CHECKPOINT, reward_model="topreward-robometer")
-    checkpoint.save(tmp_path / "saved")
-    saved = Engine.of(families.load(str(tmp_path / "saved")))
+    loaded = published.read(CHECKPOINT, reward_model="topreward-robometer")
+    loaded.checkpoint.save(tmp_path / "saved")
+    saved = Engine.of(published.load(str(tmp_path / "saved")))
     (result,), (expected,) = (engine.evaluate([progress(noise(5))]) for engine in (saved, robometer))
     assert isinstance(result, ProgressResult)
     assert isinstance(expected, ProgressResult)
     np.testing.assert_array_equal(result.progress, expected.progress)
-    assert checkpoint.assumptions == ()
+    assert loaded.assumptions == ()
 
 
 def test_an_export_keeps_its_reward_model(tmp_path: Path) -> None:
-    families.load(CHECKPOINT, reward_model="topreward").save(tmp_path / "saved")
+    published.load(CHECKPOINT, reward_model="topreward").save(tmp_path / "saved")
     for said in ("topreward-robometer", "topreward,fps=4", "roboreward"):
         with pytest.raises(
             CheckpointError, match=r"--as: expected none for an export|expected an export of roboreward"
         ):
-            families.load(tmp_path / "saved", reward_model=said)
+            published.load(tmp_path / "saved", reward_model=said)

@@ -13,11 +13,11 @@ import torch
 
 from pretended import CUDA, Seen, pretended
 from reward_models import ROOT
-from rfm import families
+from rfm import published
 from rfm.engine import Engine, Execution
-from rfm.vlm import leaves, tree
-from rfm.vlm.row import VlmRow
-from rfm.vlm.tree import Conversation, trees
+from rfm.qwen import leaves, tree
+from rfm.qwen.batch import VlmRow
+from rfm.qwen.tree import Conversation, trees
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
 from rfm_client.contract import wire
 from tolerances import TOLERANCE
@@ -34,7 +34,7 @@ def sample(num_frames: int, height: int = 64, width: int = 64, frame_steps: int 
 
 
 def topreward(settings: str = "", **options: Any) -> Engine:
-    return Engine.of(families.load(str(CHECKPOINT), reward_model=f"topreward{settings}"), **options)
+    return Engine.of(published.load(str(CHECKPOINT), reward_model=f"topreward{settings}"), **options)
 
 
 def robometer(name: str = "q3_tok_disc10", **options: Any) -> Engine:
@@ -74,14 +74,14 @@ COUNTED = {
 
 @pytest.mark.parametrize("name, num_frames, size_px, separate, most", COUNTED.values(), ids=COUNTED)
 def test_a_tree_has_few_tokens(name: str, num_frames: int, size_px: tuple[int, int], separate: int, most: int) -> None:
-    collator: Any = families.load(CHECKPOINT, reward_model=name).collator  # type: ignore[attr-defined]
+    collator: Any = published.load(CHECKPOINT, reward_model=name).collator  # type: ignore[attr-defined]
     rows = collator.rows(sample(num_frames, *size_px))
     assert sum(row.num_tokens for row in rows) == separate
     assert sum(row.cost for row in planned(rows, collator)) <= most
 
 
 def test_conversations_share_the_tokens_before_the_first_that_is_read_or_stands_elsewhere() -> None:
-    collator: Any = families.load(CHECKPOINT, reward_model="topreward").collator  # type: ignore[attr-defined]
+    collator: Any = published.load(CHECKPOINT, reward_model="topreward").collator  # type: ignore[attr-defined]
     whole = Conversation.of(collator.rows(sample(4))[-1], collator.visual_pad, are_images=False)
     assert whole.shared(whole) == whole.reads[0] < whole.row.num_tokens
     position_ids = whole.row.position_ids.copy()
@@ -136,7 +136,7 @@ def test_bounds_of_memory_change_no_score(bounds: dict[str, int], monkeypatch: p
     engine = topreward()
     of_all = max(1, sum(len(row.packs) for each in samples for row in engine.predictor.rows(each)))
     for name, value in bounds.items():
-        monkeypatch.setattr(f"rfm.vlm.{name}", value)
+        monkeypatch.setattr(f"rfm.qwen.{name}", value)
     assert_as_separate(engine, samples, monkeypatch)
     assert sum(len(row.packs) for each in samples for row in engine.predictor.rows(each)) > of_all
     assert max(masks) <= leaves.MOST_MASK_BYTES

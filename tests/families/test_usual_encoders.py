@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 import goldens
-from rfm import families
-from rfm.rewind import pretrained as usual
+from rfm import published
+from rfm.published import rewind as usual
 from spoilt import Spoil, settings
 
 CHECKPOINT = goldens.config("c1_t1_disc10").checkpoint  # of upstream's widths, without encoders
@@ -69,8 +69,8 @@ def test_encoders_that_are_not_upstream_s_are_told(tmp_path: Path) -> None:
         hidden_size=384, num_hidden_layers=6, num_attention_heads=12, intermediate_size=8, vocab_size=180
     )
     AutoModel.from_config(config).save_pretrained(text)
-    checkpoint = families.load(CHECKPOINT, image_encoder=str(image), text_encoder=str(text))
-    *_, of_image, of_text, assumed = families.notes(CHECKPOINT, checkpoint)
+    loaded = published.read(CHECKPOINT, image_encoder=str(image), text_encoder=str(text))
+    *_, of_image, of_text, assumed = published.notes(CHECKPOINT, loaded)
     assert of_image.startswith(
         f"{image}: differs from upstream's facebook/dinov2-base in num_hidden_layers: expected 12, got 1; "
     )

@@ -23,10 +23,10 @@ from transformers.models.qwen3_vl.processing_qwen3_vl import Qwen3VLProcessor
 import goldens
 from paths import GOLDEN
 from reward_models import BASE, ROOT
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
-from rfm.families import CheckpointError
-from rfm.vlm.video_prompt import WRAPPED_SINCE, decided
+from rfm.files import CheckpointError
+from rfm.published.qwen import WRAPPED_SINCE, decided
 from rfm_client import PreferenceSample, ProgressSample, Trajectory
 
 ROBOMETER = ROOT / "lerobot_robometer" / "video_avg_disc10" / "checkpoint"
@@ -61,7 +61,7 @@ class Case:
     sample: Any = PROGRESS
 
     def engine(self, form: Any = None) -> Engine:
-        return Engine.of(families.load(self.source, **self.options, video_prompt=form))
+        return Engine.of(published.load(self.source, **self.options, video_prompt=form))
 
     def ids(self, form: Any) -> list[int]:
         return list(map(int, self.engine(form).predictor.rows(self.sample)[-1].input_ids))
@@ -170,14 +170,14 @@ def test_the_version_of_transformers_decides_the_form(
     tmp_path: Path, source: Path, version: str | None, form: str, ending: str, is_assumed: bool
 ) -> None:
     options: dict[str, Any] = OF_BASE if source == ROBOMETER else {"reward_model": "topreward"}
-    checkpoint = families.load(with_version(source, tmp_path / "checkpoint", version), **options)
-    assert checkpoint.config.video_prompt == form
-    assumed = [each for each in checkpoint.assumptions if each.name == "video_prompt"]
+    loaded: Any = published.read(with_version(source, tmp_path / "checkpoint", version), **options)
+    assert loaded.checkpoint.config.video_prompt == form
+    assumed = [each for each in loaded.assumptions if each.name == "video_prompt"]
     # A later transformers may only have saved an ordinary model.
     assert [each.value for each in assumed] == [form] * (is_assumed or (source == TOP and form == "wrapped"))
     assert all(each.source.endswith(ending) for each in assumed)
-    asked = families.load(tmp_path / "checkpoint", **options, video_prompt="wrapped")
-    assert asked.config.video_prompt == "wrapped"
+    asked = published.read(tmp_path / "checkpoint", **options, video_prompt="wrapped")
+    assert asked.checkpoint.config.video_prompt == "wrapped"
     assert "video_prompt" not in [each.name for each in asked.assumptions]
 
 
@@ -191,14 +191,14 @@ def test_an_adapter_s_base_model_does_not_tell_the_version_of_its_run() -> None:
 def test_an_export_keeps_its_form(tmp_path: Path, name: str) -> None:
     case = CASES[name]
     for form in ("bare", "wrapped"):
-        families.load(case.source, **case.options, video_prompt=form).save(tmp_path / form)
-        saved = Engine.of(families.load(tmp_path / form))
+        published.load(case.source, **case.options, video_prompt=form).save(tmp_path / form)
+        saved = Engine.of(published.load(tmp_path / form))
         assert list(saved.predictor.rows(case.sample)[-1].input_ids) == case.ids(form)
-        assert families.load(tmp_path / form).config.video_prompt == form
+        assert published.load(tmp_path / form).config.video_prompt == form
     settings = json.loads((tmp_path / "bare" / "config.json").read_text())["rfm"]
     assert "video_prompt" not in settings  # as in exports before the setting, which keep the digest
     with pytest.raises(CheckpointError, match="leave it out, or export the checkpoint again"):
-        families.load(tmp_path / "bare", video_prompt="wrapped")
+        published.load(tmp_path / "bare", video_prompt="wrapped")
 
 
 @pytest.mark.parametrize(
@@ -207,4 +207,4 @@ def test_an_export_keeps_its_form(tmp_path: Path, name: str) -> None:
 def test_a_form_that_nothing_follows_is_refused(folder: Path) -> None:
     source = folder / "checkpoint" if (folder / "checkpoint").exists() else folder
     with pytest.raises(CheckpointError, match="--video-prompt: expected a checkpoint that shows videos to a Qwen3-VL"):
-        families.load(source, base_model=str(BASE), video_prompt="wrapped")
+        published.load(source, base_model=str(BASE), video_prompt="wrapped")

@@ -15,12 +15,12 @@ import torch
 
 import goldens
 from engines import TRANSFORMERS, load_engine
-from rfm import families
+from rfm import published
 from rfm.engine import Engine, Execution
 from rfm.engine.layers import progress_from_logits
-from rfm.vlm.backbone import QWEN_2_5
-from rfm.vlm.predictor import VlmPredictor
-from rfm.vlm.qwen import embedded
+from rfm.families.robometer.predictor import VlmPredictor
+from rfm.qwen.backbone import embedded
+from rfm.qwen.network import QWEN_2_5
 from rfm_client import (
     InferenceFailedError,
     PreferenceResult,
@@ -79,7 +79,7 @@ BFLOAT16_CASES = goldens.config(BFLOAT16).cases()
 
 def engine_in_bfloat16() -> tuple[Engine, VlmPredictor]:
     config = goldens.config(BFLOAT16)
-    engine = Engine.of(families.load(config.checkpoint, **config.sources), dtype=torch.bfloat16)
+    engine = Engine.of(published.load(config.checkpoint, **config.sources), dtype=torch.bfloat16)
     assert isinstance(engine.predictor, VlmPredictor)
     return engine, engine.predictor
 

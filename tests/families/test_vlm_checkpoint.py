@@ -17,9 +17,9 @@ import rfm_export
 import spoilt
 from engines import load_engine, serve_config
 from repositories import description_of
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
-from rfm.families import CheckpointError
+from rfm.files import CheckpointError
 from rfm_client import ProgressSample, Result, RewardError
 from spoilt import Spoil, in_json, in_yaml, renamed, run_settings, settings, weights
 from vlm import PLAIN, assert_close, load, video
@@ -43,7 +43,7 @@ def base(tmp_path: Path) -> Path:
 
 
 def scores(folder: Path, name: str, **sources: str) -> Result:
-    (result,) = Engine.of(families.load(folder, **goldens.config(name).sources | sources)).evaluate([SAMPLE])
+    (result,) = Engine.of(published.load(folder, **goldens.config(name).sources | sources)).evaluate([SAMPLE])
     assert not isinstance(result, RewardError), result
     return result
 
@@ -51,7 +51,7 @@ def scores(folder: Path, name: str, **sources: str) -> Result:
 def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
     original = load(LORA_INSIDE)
     original.save(tmp_path / "saved")
-    copy = families.load(tmp_path / "saved")
+    copy = published.load(tmp_path / "saved")
     assert copy.config == original.config
     assert original.factors
     for got, wanted in ((copy.weights, original.weights), (copy.factors, original.factors)):
@@ -121,7 +121,7 @@ def test_a_video_run_of_transformers_5_is_told_about_its_positions(
 ) -> None:
     folder = copied(name)
     in_json("config.json", lambda backbone: backbone.update(transformers_version=version))(folder)
-    notes = families.notes(folder, load(name, folder))
+    notes = published.notes(folder, published.read(folder, **goldens.config(name).sources))
     assert any(f"transformers_version is {version}: text behind a video" in note for note in notes) == is_told
 
 
@@ -221,7 +221,7 @@ def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(
     def prompt(to: str) -> str:
         template = str(load(PLAIN, folder, str(base)).collator.tokenizer.chat_template)
         load(PLAIN, folder, str(base)).save(tmp_path / to)
-        assert families.load(tmp_path / to).collator.tokenizer.chat_template == template
+        assert published.load(tmp_path / to).collator.tokenizer.chat_template == template
         return template
 
     assert prompt("1") == json.loads((base / "chat_template.json").read_text())["chat_template"]

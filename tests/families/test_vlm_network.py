@@ -20,10 +20,10 @@ import goldens
 from engines import TRANSFORMERS
 from rfm.engine import Execution
 from rfm.engine.pixels import Normalisation
-from rfm.vlm.backbone import QWEN_2_5
-from rfm.vlm.collator import VlmCollator
-from rfm.vlm.images import QwenImages, fitted_size
-from rfm.vlm.qwen import embedded
+from rfm.families.robometer.collator import VlmCollator
+from rfm.qwen.backbone import embedded
+from rfm.qwen.images import QwenImages, fitted_size
+from rfm.qwen.network import QWEN_2_5
 from rfm_client import PreferenceSample, ProgressSample
 from vlm import PLAIN, predictor_of, upstream_inputs, video
 

@@ -17,8 +17,8 @@ import robodopamine
 from engines import asked_engine, load_engine
 from reward_models import ROOT
 from rfm.engine import Engine
-from rfm.rewind.network import RewindTransformer
-from rfm.rewind.predictor import RewindPredictor
+from rfm.families.rewind.network import RewindTransformer
+from rfm.families.rewind.predictor import RewindPredictor
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,

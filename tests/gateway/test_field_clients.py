@@ -69,7 +69,7 @@ def test_the_reports_that_clients_read_have_their_keys(gateway: Gateway, request
     answer = json.loads(body)
     assert set(request_.expected["keys"]) <= answer.keys()
     if "model_architecture" in answer:
-        assert answer["model_architecture"]["model_module"] == "rfm.vlm.network"
+        assert answer["model_architecture"]["model_module"] == "rfm.families.robometer.network"
         assert answer["model_architecture"]["architecture_summary"][1].items() >= QWEN3.items()
 
 

@@ -126,7 +126,7 @@ def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: torch.nn.M
     assert {part["name"] for part in parts} == {name.partition(".")[0] for name in tiny_network.state_dict()}
     assert architecture == {
         "model_class": "RewindTransformer",
-        "model_module": "rfm.rewind.network",
+        "model_module": "rfm.families.rewind.network",
         "total_parameters": total,
         "trainable_parameters": 0,
         "frozen_parameters": total,

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from paths import ROOT
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
 from rfm_client import ProgressResult
 
@@ -57,7 +57,7 @@ def test_a_server_of_another_commit_is_started_with_a_relative_python(
 
 def test_a_random_checkpoint_writes_the_answer_of_a_trained_one(tmp_path: Path) -> None:
     folder = random_checkpoints.write(tmp_path, random_checkpoints.QWEN, random_checkpoints.TINY)
-    engine = Engine.of(families.load(folder, reward_model="roboreward"))
+    engine = Engine.of(published.load(folder, reward_model="roboreward"))
     (result,) = engine.evaluate([samples(replace(FILMED, frame_px=(64, 64)), 0, 0)(0)])
     assert isinstance(result, ProgressResult), result
     assert result.last_progress == 0.75

@@ -19,7 +19,7 @@ import rfm_export
 from commands import nothing_left_behind
 from in_process import rfm
 from paths import ROOT
-from rfm import families
+from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine, Outcome
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Sample, Trajectory, load_trajectory
@@ -73,8 +73,8 @@ def test_the_demo_s_checkpoint_tells_right_from_wrong_on_clips_it_never_saw() ->
     encoders = {
         f"{kind}_encoder": str(REPOSITORY / "rfm_encoder" / "1" / f"{kind}_encoder") for kind in ("image", "text")
     }
-    checkpoint = families.load(str(REPOSITORY / "rfm" / "1" / "checkpoint"), **encoders)
-    engine = Engine.of(checkpoint, encoders=checkpoint.encoders())
+    loaded = published.read(str(REPOSITORY / "rfm" / "1" / "checkpoint"), **encoders)
+    engine = Engine.of(loaded.checkpoint, encoders=loaded.encoders())
     samples: list[Sample] = []
     for seed in range(3_000_000, 3_000_012, 4):
         task, other = TASKS[seed // 4 % len(TASKS)], TASKS[(seed // 4 + 1) % len(TASKS)]

@@ -14,7 +14,7 @@ from typing import Any
 import httpx
 import numpy as np
 
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
 from rfm_client import (
     PreferenceResult,
@@ -56,7 +56,7 @@ class Exam:
             first, second = (random_trajectory(2 * index + i, 1 + (5 * index + i) % 8, *WIDTHS) for i in (0, 1))
             pair = PreferenceSample if index % 3 == 1 else SimilaritySample
             samples.append(pair(first, second) if mixed and index % 3 else ProgressSample(first))
-        return cls(samples, [numbers(outcome) for outcome in Engine.of(families.load(checkpoint)).evaluate(samples)])
+        return cls(samples, [numbers(outcome) for outcome in Engine.of(published.load(checkpoint)).evaluate(samples)])
 
     def is_right(self, number: int, got: Numbers) -> bool:
         """True if an answer agrees with the engine's; an answer with NaN never does."""

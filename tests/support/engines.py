@@ -11,10 +11,10 @@ from typing import Any
 import torch
 
 import goldens
-from rfm import families
-from rfm.checkpoint.content import read_run_config
+from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
+from rfm.files import read_run_config
 
 TRANSFORMERS = int(importlib.metadata.version("transformers").partition(".")[0])
 
@@ -35,14 +35,14 @@ def scorer(checkpoint: str, **options: str) -> Any:
 def load_engine(name: str) -> Engine:
     """Return the engine of a reference checkpoint, with encoders if there are any."""
     config = goldens.config(name)
-    checkpoint = families.load(config.checkpoint, **config.sources)
-    return Engine.of(checkpoint, encoders=checkpoint.encoders())
+    loaded = published.read(config.checkpoint, **config.sources)
+    return Engine.of(loaded.checkpoint, encoders=loaded.encoders())
 
 
 @functools.cache
 def asked_engine(folder: Path, reward_model: str, dtype: torch.dtype | None = None) -> Engine:
     """Return the engine of a model that is asked in words. reward_model: as ``--as`` takes it"""
-    return Engine.of(families.load(folder, reward_model=reward_model), dtype=dtype)
+    return Engine.of(published.load(folder, reward_model=reward_model), dtype=dtype)
 
 
 def training_run(file: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from browsers import Browser
     from gateway_requests import Ask, Triton
     from gateways import Gateway
-    from rfm.rewind.network import RewindTransformer
+    from rfm.families.rewind.network import RewindTransformer
 
 TINY, ENCODERS, VLM = "rfm", "encoders", "vlm"  # models: two numbers a frame; encoders; vision-language in video mode
 
@@ -25,7 +25,7 @@ TINY, ENCODERS, VLM = "rfm", "encoders", "vlm"  # models: two numbers a frame; e
 @pytest.fixture(scope="session")
 def tiny_network() -> RewindTransformer:
     from gateway_requests import TINY_CONFIG
-    from rfm.rewind.network import RewindTransformer
+    from rfm.families.rewind.network import RewindTransformer
 
     torch.manual_seed(0)
     return RewindTransformer(TINY_CONFIG)
@@ -40,7 +40,7 @@ def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfo
     from gateway_requests import TINY_CONFIG, Triton
     from proxies import Proxy
     from rfm.config import ExportConfig
-    from rfm.rewind.checkpoint import RewindCheckpoint
+    from rfm.families.rewind.checkpoint import RewindCheckpoint
     from servers import Endpoints, start_triton
 
     folder = tmp_path_factory.mktemp("gateway_triton")

@@ -13,7 +13,7 @@ import pytest
 from callers import Callers, Exam, progress_of
 from paths import ROOT
 from repositories import configure
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
 from rfm_client import ProgressSample, RewardClient, Trajectory
 from servers import MODEL
@@ -73,7 +73,7 @@ def trajectory(seed: int, num_frames: int = 8, mark: float = 0.0) -> Trajectory:
 @pytest.fixture(scope="module")
 def references() -> list[np.ndarray[Any, Any]]:
     """The engine's answers, without Triton."""
-    engine = Engine.of(families.load(ROOT / "model_repository" / MODEL / "1" / "checkpoint"))
+    engine = Engine.of(published.load(ROOT / "model_repository" / MODEL / "1" / "checkpoint"))
     return [result.progress for result in engine.evaluate([ProgressSample(trajectory(n)) for n in range(CALLERS)])]  # type: ignore[union-attr]
 
 

@@ -22,7 +22,7 @@ import torch
 import goldens
 import rfm_export
 from engines import serve_config
-from rfm import families
+from rfm import published
 from rfm.engine import Engine, Outcome
 from rfm_client import (
     AsyncRewardClient,
@@ -109,8 +109,8 @@ def questions() -> list[Sample]:
 def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
     """Return the checkpoint's answers without a server."""
     serve = serve_config(WITH_ENCODERS)
-    loaded = families.load(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
-    return Engine.of(loaded, encoders=loaded.encoders()).evaluate(samples)
+    loaded = published.read(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
+    return Engine.of(loaded.checkpoint, encoders=loaded.encoders()).evaluate(samples)
 
 
 def numbers(outcome: object) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from reward_models import ROOT, Reference
-from rfm import families
+from rfm import published
 from rfm.engine import Engine
 from rfm_client import ProgressSample, Trajectory
 
@@ -93,7 +93,7 @@ def said(meta: Meta) -> dict[str, str | None]:
 
 @lru_cache(maxsize=8)
 def engine_of(checkpoint: Path, meta: Meta) -> Engine:
-    return Engine.of(families.load(checkpoint, **said(meta)))
+    return Engine.of(published.load(checkpoint, **said(meta)))
 
 
 CASES = [Case(file) for file in sorted(FOLDER.glob("*/cases/*.json"))]

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from rfm.rewind.network import RewindConfig
+from rfm.families.rewind.network import RewindConfig
 
 SMALL = RewindConfig(
     video_feature_dim=12,

@@ -20,7 +20,7 @@ from safetensors.torch import load_file, save_file
 
 import goldens
 import reward_models
-from rfm.families import CheckpointError
+from rfm.files import CheckpointError
 
 WEIGHTS = "model.safetensors"
 

@@ -17,11 +17,12 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS
 from rfm.engine import Execution
+from rfm.engine.family import NETWORK, Family
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import RowScores, frame_scores, of_rows, prefix_indices
-from rfm.family import NETWORK, Family, Options
+from rfm.files import NETWORK_CONFIG, WEIGHTS
+from rfm.published.reader import Loaded, Options, Reader
 from rfm_client import (
     FrameScores,
     InvalidSampleError,
@@ -165,22 +166,11 @@ class ToyCheckpoint:
     def parts(self) -> dict[str, dict[str, Tensor]]:
         return {NETWORK: self.weights}
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        return ()
-
     def skeleton(self) -> Redness:
         return Redness(self.config)
 
-    @property
-    def assumptions(self) -> tuple[()]:
-        return ()
-
     def flop(self, sample: Sample) -> float:
         return 2.0 * sum(trajectory.num_frames for trajectory in sample.trajectories) * self.config.num_colours
-
-    def encoders(self) -> Palette:
-        return Palette(torch.full((self.config.num_colours,), 1 / 255))
 
     def predictor(
         self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
@@ -200,9 +190,16 @@ def reads(folder: Path) -> bool:
     return file.exists() and json.loads(file.read_text()).get("model_type") == MODEL_TYPE
 
 
-def load(folder: Path, options: Options) -> ToyCheckpoint:
+def restore(folder: Path) -> ToyCheckpoint:
     content = json.loads((folder / NETWORK_CONFIG).read_text())
     return ToyCheckpoint(ToyConfig(content["num_colours"]), load_file(folder / WEIGHTS))
 
 
-FAMILY = Family(name=__name__, reads=reads, load=load, encoders=Palette)
+def load(folder: Path, options: Options) -> Loaded:
+    checkpoint = restore(folder)
+    scale = torch.full((checkpoint.config.num_colours,), 1 / 255)
+    return Loaded(checkpoint, encoders=lambda: Palette(scale))
+
+
+FAMILY = Family(name=__name__, restore=restore, reader=__name__, encoders=Palette)
+READER = Reader(reads, load)

@@ -11,11 +11,11 @@ import torch
 
 import goldens
 from engines import load_engine
-from rfm import families
-from rfm.vlm.checkpoint import VlmCheckpoint
-from rfm.vlm.predictor import VlmPredictor
-from rfm.vlm.qwen import UNIT
-from rfm.vlm.row import VlmRow
+from rfm import published
+from rfm.families.robometer.checkpoint import VlmCheckpoint
+from rfm.families.robometer.predictor import VlmPredictor
+from rfm.qwen.backbone import UNIT
+from rfm.qwen.batch import VlmRow
 from rfm_client import Trajectory
 
 BFLOAT16 = "q3_tok_disc10_bf16"
@@ -48,7 +48,7 @@ def assert_close(left: object, right: object, tolerance: float) -> None:
 
 def load(name: str, folder: Path | None = None, base: str | None = None) -> VlmCheckpoint:
     config = goldens.config(name)
-    checkpoint = families.load(folder or config.checkpoint, base_model=base or str(config.base_model))
+    checkpoint = published.load(folder or config.checkpoint, base_model=base or str(config.base_model))
     assert isinstance(checkpoint, VlmCheckpoint)
     return checkpoint
 

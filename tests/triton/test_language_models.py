@@ -28,7 +28,7 @@ from gateways import metric_at, poll, running
 from in_process import rfm_client
 from paths import VIDEOS
 from reward_models import BASE, ROOT, Reference, as_before_marks, references
-from rfm import families
+from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm_client import (
@@ -91,7 +91,7 @@ def case(section: str, name: str) -> Reference:
 @pytest.mark.parametrize("model", ["top", "baseline"])
 def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str, model: str) -> None:
     samples = [sample for name in ("T8_48x80", "B2_T4") for sample in case("topreward", name).samples()]
-    engine = Engine.of(families.load(str(TOP), reward_model=NAMES[model][1]))
+    engine = Engine.of(published.load(str(TOP), reward_model=NAMES[model][1]))
     with asked.client(model, protocol) as client:
         results = client.evaluate(samples, log_prob=True)
         plain, full = client.evaluate(samples), client.evaluate(samples, all_scores=True)

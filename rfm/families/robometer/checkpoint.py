@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: MIT
+"""RFM and Robometer checkpoints in memory, and their processors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rfm.engine.family import NETWORK
+from rfm.engine.feature_cache import FeatureCache
+from rfm.families.robometer.collator import VlmCollator
+from rfm.families.robometer.network import VlmConfig, VlmRewardModel
+from rfm.families.robometer.predictor import VlmPredictor
+from rfm.families.robometer.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS
+from rfm.files import NETWORK_CONFIG, CheckpointError, expecting
+from rfm.qwen.checkpoint import LORA, QwenCheckpoint
+from rfm.qwen.images import FRAMES_PER_GROUP, MERGE, QwenImages, fitted_size
+from rfm.qwen.lora import split
+from rfm.qwen.network import build_backbone
+from rfm.qwen.processor import SIZED_BEFORE, check_tokens, normalisation_of, patch_px, read_processor
+from rfm.saved import Saved
+from rfm_client.contract import FrameSize
+from rfm_client.contract.description import Description
+
+
+@dataclass(frozen=True)
+class VlmCheckpoint(QwenCheckpoint):
+    """A vision-language checkpoint in memory.
+
+    weights: of VlmRewardModel, without LoRA
+    factors: of LoRA, with the names of ``rfm.qwen.lora.split``; empty without LoRA
+    """
+
+    config: VlmConfig
+    factors: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def description(self) -> Description:
+        """The checkpoint's inputs and outputs."""
+        return Description(
+            kind="RFM or Robometer",
+            network={"class": VlmRewardModel.__name__},
+            progress_bins=self.config.progress_bins if self.config.progress_bins > 1 else None,
+            trained_frames=self.config.trained_frames,
+            frame_size=frame_size(self.config),
+            frames_per_value=1 if self.config.multi_image else FRAMES_PER_GROUP,
+            has_preference=self.config.has_preference,
+            has_success=self.config.has_success,
+            has_similarity=self.config.has_similarity,
+            keeps_features=True,
+            uses_graphs=True,
+            is_large=True,
+        )
+
+    @property
+    def parts(self) -> dict[str, dict[str, Tensor]]:
+        """All weights: the network's, and the LoRA factors that change them."""
+        return {NETWORK: self.weights, LORA: self.factors}
+
+    def load_collator(self) -> VlmCollator:
+        """Return the collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+        embedding = next(t for name, t in self.weights.items() if name.endswith("embed_tokens.weight"))
+        return load_collator(self.config, len(embedding), self.processor)
+
+    def network(self, dtype: torch.dtype) -> VlmRewardModel:
+        """Return the network, with weights of no use."""
+        return VlmRewardModel(self.config, build_backbone(self.config, dtype))
+
+    def make_predictor(
+        self, network: VlmRewardModel, device: torch.device, cache: FeatureCache[Any] | None
+    ) -> VlmPredictor:
+        """Return the predictor with this network."""
+        return VlmPredictor(network, self.collator, device, cache)
+
+
+def restore(folder: Path) -> VlmCheckpoint:
+    """Load what ``VlmCheckpoint.save`` wrote. Raises CheckpointError."""
+    saved = Saved.read(folder)
+    with expecting("the settings of an exported RFM or Robometer", folder / NETWORK_CONFIG):
+        settings = {**saved.settings}
+        size = settings.pop("size_px")
+        config = VlmConfig(backbone=saved.backbone, size_px=tuple(size) if size else None, **settings)
+    weights, factors = split(saved.weights)
+    checkpoint = VlmCheckpoint(config, weights, saved.processor, factors)
+    checkpoint.check()
+    return checkpoint
+
+
+def frame_size(config: VlmConfig) -> FrameSize | None:
+    """Return the size to which a checkpoint first resizes each frame; None: it depends on the frame."""
+    if config.size_px is None:
+        return None
+    factor = config.backbone["vision_config"]["patch_size"] * MERGE * (1 if config.multi_image else FRAMES_PER_GROUP)
+    return FrameSize("exact", fitted_size(*config.size_px, factor))
+
+
+def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> VlmCollator:
+    """Load the collator of a checkpoint. Raises CheckpointError for a processor that is missing or does not fit.
+
+    num_tokens: rows of the checkpoint's token embedding
+    processor: folder or id with tokenizer and image preprocessing
+    """
+    tokenizer, preprocessor = read_processor(processor, videos=not config.multi_image)
+    tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
+    if len(tokenizer) != num_tokens:  # upstream resizes the embedding to the tokenizer
+        expected = f"a tokenizer of {num_tokens} tokens with the special ones, as the checkpoint's embedding"
+        is_old = num_tokens - len(tokenizer) == OLD_SPECIAL_TOKENS - len(SPECIAL_TOKENS)
+        hint = (
+            f" (with {OLD_SPECIAL_TOKENS} special tokens, as upstream before 2026-01-21, it would fit)"
+            if is_old
+            else ""
+        )
+        raise CheckpointError.at(f"base model {processor}", expected, f"{len(tokenizer)}{hint}")
+    _check_special_tokens(config, tokenizer, processor)
+    return _collator(config, tokenizer, preprocessor, processor)
+
+
+def _check_special_tokens(config: VlmConfig, tokenizer: Any, processor: str | Path) -> None:
+    first = len(tokenizer) - len(SPECIAL_TOKENS)
+    check_tokens(config, tokenizer, processor, {token: first + index for index, token in enumerate(SPECIAL_TOKENS)})
+
+
+def _collator(config: VlmConfig, tokenizer: Any, preprocessor: dict[str, Any], processor: str | Path) -> VlmCollator:
+    where = f"base model {processor}: preprocessing of {'images' if config.multi_image else 'videos'}"
+    vision = config.backbone["vision_config"]
+    normalisation = normalisation_of(preprocessor, SIZED_BEFORE, where)
+    images = QwenImages(patch_px(preprocessor, vision, where), normalisation, config.size_px)
+    return VlmCollator(config, tokenizer, images)

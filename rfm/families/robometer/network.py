@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: MIT
+"""Reward heads on a vision-language backbone of ``transformers``: RFM and Robometer checkpoints.
+
+F frames (in video mode: temporal patches) and Q queries of all rows, L tokens, D width, K progress bins.
+The heads read the last hidden states, behind the final norm: of a frame, pooled over a span of tokens, and of a query,
+at its token.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import torch
+from torch import Tensor, nn
+
+from rfm.engine.graphs import Graphs
+from rfm.engine.layers import PredictionHead
+from rfm.qwen.batch import VlmBatch
+from rfm.qwen.network import BackboneConfig, qwen_states
+
+Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
+
+
+@dataclass(frozen=True)
+class VlmConfig(BackboneConfig):
+    """The configuration of a checkpoint's network and prompts.
+
+    multi_image: each frame is an image; else a trajectory is a video
+    per_frame_progress_token: the state of an image is that of a progress token behind it
+    frame_pooling: pools an image's tokens to its state, without progress tokens; boundary: takes the last token
+    pooling_temperature: temperature of attention pooling
+    average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
+    progress_in_preference: prompts for preference also ask for progress
+    size_px: for videos: height and width to which every frame is resized first; null: each frame keeps its own
+    trained_frames: most frames of a trajectory in training, by default also of clients; None: unknown
+    """
+
+    multi_image: bool
+    per_frame_progress_token: bool
+    frame_pooling: Pooling
+    pooling_temperature: float
+    average_temporal_patches: bool
+    progress_bins: int
+    has_similarity: bool
+    progress_in_preference: bool
+    size_px: tuple[int, int] | None
+    base_model_id: str
+    trained_frames: int | None = None
+    has_preference: bool = True
+    has_success: bool = True
+
+    @property
+    def pools_images(self) -> bool:
+        """True if an image's tokens are pooled by ``frame_pooling``, which upstream uses only for images."""
+        return self.multi_image and not self.per_frame_progress_token
+
+    @property
+    def pools_by_attention(self) -> bool:
+        """True if the attention of frame_pool_attn weighs an image's tokens."""
+        return self.pools_images and self.frame_pooling == "attention"
+
+
+@dataclass(frozen=True)
+class VlmOutput:
+    """Logits: progress [F, K], success [F], preference and similarity [Q]; None without that head.
+
+    made: features from the vision tower, [merged tokens, levels, D]; None: all shots are cached
+    """
+
+    progress: Tensor
+    success: Tensor | None
+    preference: Tensor | None
+    similarity: Tensor | None
+    made: Tensor | None = None
+
+
+class VlmRewardModel(nn.Module):
+    """Backbone and heads, with upstream's names of the heads."""
+
+    graphs: Graphs | None = None
+
+    def __init__(self, config: VlmConfig, backbone: nn.Module) -> None:
+        super().__init__()
+        self.config = config
+        self.model = backbone
+        width = config.hidden_dim
+        self.progress_head = PredictionHead(width, config.progress_bins)
+        if config.has_success:
+            self.success_head = PredictionHead(width, 1)
+        if config.has_preference:
+            self.preference_head = PredictionHead(width, 1)
+        if config.has_similarity:
+            self.similarity_head = PredictionHead(width, 1)
+        self.frame_pool_attn = nn.Linear(width, 1, bias=False)
+
+    def forward(self, batch: VlmBatch) -> VlmOutput:
+        """Return the logits of every frame and query in the batch, which is on the network's device."""
+        hidden, made = qwen_states(self.model, batch, graphs=self.graphs)
+        frames = self._frame_states(hidden, batch.spans, batch.num_span_tokens)
+        queries = hidden[batch.query_rows, batch.query_tokens]
+        return VlmOutput(
+            self.progress_head(frames),
+            self.success_head(frames).squeeze(-1) if self.config.has_success else None,
+            self.preference_head(queries).squeeze(-1) if self.config.has_preference else None,
+            self.similarity_head(queries).squeeze(-1) if self.config.has_similarity else None,
+            made,
+        )
+
+    def _frame_states(self, hidden: Tensor, spans: Tensor, num_tokens: int) -> Tensor:
+        """Return each span's pooled state, [F, D].
+
+        The spans are packed one after the other, [num_tokens, D], so that a long span adds no padding to the others.
+        """
+        rows, starts, stops = spans.unbind(dim=1)
+        lengths = stops - starts
+        span = torch.arange(len(spans), device=spans.device).repeat_interleave(lengths, output_size=num_tokens)
+        offset = torch.arange(num_tokens, device=spans.device) - (lengths.cumsum(0) - lengths)[span]
+        states = hidden[rows[span], starts[span] + offset]
+        if self.config.pools_by_attention:
+            scores = self.frame_pool_attn(states).squeeze(-1) / self.config.pooling_temperature
+            states = states * _softmax_of_each(scores, lengths, span).unsqueeze(-1)
+            return _of_each("sum", states.float(), lengths).to(hidden.dtype)
+        return (_of_each("sum", states.float(), lengths) / lengths[:, None]).to(hidden.dtype)
+
+
+def _of_each(reduction: str, values: Tensor, lengths: Tensor) -> Tensor:
+    """Return the sum or maximum of each segment, float32 [N, ...] -> [F, ...]."""
+    # unsafe: without a check of the lengths, for which the host would wait
+    return torch.segment_reduce(values, reduction, lengths=lengths, axis=0, unsafe=True)
+
+
+def _softmax_of_each(scores: Tensor, lengths: Tensor, segment: Tensor) -> Tensor:
+    """Return the softmax within segments, [N] -> [N], computed in float32; ``segment``: index for each value."""
+    largest = _of_each("max", scores.float(), lengths)
+    weights = (scores.float() - largest[segment]).exp()
+    return (weights / _of_each("sum", weights, lengths)[segment]).to(scores.dtype)

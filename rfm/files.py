@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: MIT
+"""Files of a checkpoint: read, in bounded memory and time, since they are not trusted; fetch; digest."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import reprlib
+import stat
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+from safetensors import SafetensorError, safe_open
+
+from rfm.plain_yaml import read_yaml
+from rfm_client.contract.errors import LocatedError
+from rfm_client.contract.hub_access import cached_snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+WEIGHTS = "model.safetensors"
+WEIGHTS_INDEX = "model.safetensors.index.json"
+SHARDS = "model-*.safetensors"
+NETWORK_CONFIG = "config.json"
+ADAPTER_CONFIG = "adapter_config.json"
+ADAPTER_WEIGHTS = "adapter_model.safetensors"
+RUN_CONFIG = "config.yaml"
+RUN_CONFIGS = (RUN_CONFIG, "config.yml", ".hydra/config.yaml")  # the first that exists is read
+PREPROCESSOR_CONFIG = "preprocessor_config.json"  # image preprocessing, beside a model's weights
+PIL_BICUBIC = 3  # a value of `resample` in it
+MAX_UINT8 = 255
+MAX_JSON_BYTES = 2**24
+MAX_HEADER_BYTES = 2**24  # of a safetensors file; a tensor takes about 100 bytes
+_LENGTH = struct.Struct("<Q")  # of a safetensors file's header
+_DTYPES = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
+_LFS_POINTER = b"version https://git-lfs"
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+# Exceptions of libraries for unexpected content.
+_MISFITS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = 100
+_MAX_LISTED = 20
+
+
+class CheckpointError(LocatedError):
+    """A checkpoint that cannot be loaded: the file, its fault and the remedy."""
+
+
+def misfits(*others: type[Exception]) -> tuple[type[Exception], ...]:
+    """Return ``others`` and the exceptions of libraries for unexpected content, with the Hub's from transformers 5."""
+    from huggingface_hub import errors
+
+    return (*others, *_MISFITS, getattr(errors, "StrictDataclassError", ValueError))
+
+
+@contextmanager
+def expecting(what: str, where: object) -> Iterator[None]:
+    """Turn exceptions for unexpected content into a CheckpointError."""
+    try:
+        yield
+    except misfits() as error:
+        raise CheckpointError.at(where, what, f"{type(error).__name__}: {cut(str(error))}") from error
+
+
+def shown(value: object) -> str:
+    """Return the value as a short line for an error message."""
+    try:
+        return _short.repr(value)
+    except ValueError:  # Python does not print a number with so many digits
+        return f"a huge {type(value).__name__}"
+
+
+def cut(text: str, most: int = 1000) -> str:
+    """Return the text, or its beginning, on one line."""
+    line = " ".join(text[:most].split())
+    return line if len(text) <= most else f"{line}..."
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return the names, or the first of many, as a Python list."""
+    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+    return cut(repr(list(names[:_MAX_LISTED])), 4000) + more
+
+
+def is_there(file: Path) -> bool:
+    """True if the file exists. Raises CheckpointError for a folder, a broken link or anything else but a file."""
+    try:
+        kind = stat.S_IFMT(file.stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        if file.is_symlink():
+            raise CheckpointError.at(file, "a file", "a link that leads nowhere") from None
+        return False
+    except (OSError, ValueError) as error:
+        raise CheckpointError.at(file, "a file", error) from error
+    if kind != stat.S_IFREG:  # opening a pipe would wait for its writer
+        raise CheckpointError.at(file, "a file", _KINDS.get(kind, "something else"))
+    return True
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """Return the file's JSON object. Raises CheckpointError."""
+    _require(file)
+    try:
+        with file.open("rb") as stream:
+            text = stream.read(MAX_JSON_BYTES + 1)
+        if len(text) > MAX_JSON_BYTES:
+            raise CheckpointError.at(file, f"at most {MAX_JSON_BYTES} bytes of JSON", "more")
+        content = json.loads(text, object_pairs_hook=_once)
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError.at(file, "JSON", cut(str(error))) from error
+    if not isinstance(content, dict):
+        raise CheckpointError.at(file, "a JSON object", type(content).__name__)
+    return content
+
+
+def read_run_config(file: Path) -> dict[str, Any]:
+    """Return config.yaml as plain mappings, lists and scalars, also where its tags name Python objects.
+
+    Raises CheckpointError.
+    """
+    _require(file)
+    try:
+        config = read_yaml(file, _PlainLoader)
+    except (OSError, ValueError) as error:
+        raise CheckpointError.at(file, "YAML", cut(str(error))) from error
+    if not isinstance(config, dict):
+        raise CheckpointError.at(file, "a mapping", type(config).__name__)
+    return config
+
+
+def read_tensors(file: Path) -> dict[str, Tensor]:
+    """Return all tensors of a safetensors file. Raises CheckpointError."""
+    from safetensors.torch import load_file  # imported here: PyTorch takes seconds, and few commands need it
+
+    _require(file)
+    try:
+        _check_header(file)
+        return load_file(file)
+    except (OSError, SafetensorError, *_MISFITS) as error:
+        raise CheckpointError.at(file, "a safetensors file", cut(str(error))) from error
+
+
+def tensor_names(file: Path) -> list[str]:
+    """Return the tensor names in a safetensors file. Raises CheckpointError."""
+    _require(file)
+    try:
+        _check_header(file)
+        with safe_open(file, "np") as content:
+            return list(content.keys())
+    except (OSError, SafetensorError, *_MISFITS) as error:
+        raise CheckpointError.at(file, "a safetensors file", cut(str(error))) from error
+
+
+def check_one_form(folder: Path) -> None:
+    """Raise CheckpointError for weights both in one file and in shards, since no file tells which are newer."""
+    shards = [path.name for path in (folder / WEIGHTS_INDEX, *sorted(folder.glob(SHARDS))) if is_there(path)]
+    if shards and is_there(folder / WEIGHTS):
+        expected = f"{WEIGHTS} or shards"
+        remedy = "move away what is not meant: transformers, which reads the former, leaves it when it writes shards"
+        raise CheckpointError.at(folder, expected, f"{WEIGHTS} and {listed(shards)}, of which one is older", remedy)
+
+
+def _require(file: Path) -> None:
+    if not is_there(file):
+        raise CheckpointError.at(file, "a file", "none")
+
+
+def _check_header(file: Path) -> None:
+    """Check the header beyond the library's offsets and sizes. Raises ValueError, OSError, RecursionError."""
+    with file.open("rb") as content:
+        start = content.read(len(_LFS_POINTER))
+        if start == _LFS_POINTER:
+            raise ValueError("Git LFS's note of where it is; `git lfs pull` fetches it")
+        if start and not any(start):
+            raise ValueError("zeros, as after an unfinished download; fetch or copy it again")
+        if len(start) < _LENGTH.size:
+            raise ValueError(f"only {len(start)} bytes")
+        (length,) = _LENGTH.unpack_from(start)
+        if length > min(MAX_HEADER_BYTES, file.stat().st_size - _LENGTH.size):
+            raise ValueError(f"one whose header would be {length} bytes long")
+        content.seek(_LENGTH.size)
+        header = json.loads(content.read(length), object_pairs_hook=_once)
+    for name, tensor in header.items() if isinstance(header, dict) else ():
+        dtype = tensor.get("dtype") if isinstance(tensor, dict) and name != "__metadata__" else _DTYPES[0]
+        if dtype not in _DTYPES:
+            raise ValueError(f"{shown(name)} of type {shown(dtype)}, which is none of {', '.join(_DTYPES)}")
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in content:
+            raise ValueError(f"the key {shown(name)} twice")
+        content[name] = value
+    return content
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """A SafeLoader that reads nodes tagged as Python objects as plain data."""
+
+
+def _plain(loader: yaml.SafeLoader, _suffix: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    if isinstance(node, yaml.SequenceNode):
+        return loader.construct_sequence(node, deep=True)
+    return node.value
+
+
+_PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
+
+
+PROVENANCE = "provenance.json"  # beside an exported checkpoint's config.json; nothing reads it
+MODEL_CARD = "README.md"
+DIGEST_DIGITS = 16  # of 64; enough to identify a checkpoint and to detect damage
+# Suffixes of the files that decide scores, besides weights: configuration, tokenizer, image processor. The Hub is asked
+# for them, too.
+SETTINGS_SUFFIXES = (".json", ".jinja", ".model", ".txt", ".yaml", ".yml")
+_CHUNK_BYTES = 2**22
+
+
+def weights_digest(folders: Iterable[Path]) -> str:
+    """Return the first DIGEST_DIGITS of the SHA-256 of all safetensors files in the folders. Raises OSError."""
+    digest = hashlib.sha256()
+    for file in (file for folder in folders for file in sorted(folder.rglob("*.safetensors"))):
+        with file.open("rb") as content:
+            while chunk := content.read(_CHUNK_BYTES):
+                digest.update(chunk)
+    return digest.hexdigest()[:DIGEST_DIGITS]
+
+
+def settings_digest(folders: Iterable[Path], told: Mapping[str, Any]) -> str:
+    """Return the first DIGEST_DIGITS of the SHA-256 of all settings that decide scores. Raises OSError.
+
+    folders: of these, all files of SETTINGS_SUFFIXES count, with their paths, except PROVENANCE
+    told: settings that no file holds, as values of JSON
+    """
+    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+    for folder in folders:
+        for file in sorted(file for file in folder.rglob("*") if _counts(file)):
+            content = file.read_bytes()
+            digest.update(f"{file.relative_to(folder).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:DIGEST_DIGITS]
+
+
+def _counts(file: Path) -> bool:
+    return file.suffix in SETTINGS_SUFFIXES and file.name != PROVENANCE and file.is_file()
+
+
+HUB_WEIGHTS = "*.safetensors"
+HUB_FILES = [HUB_WEIGHTS, *(f"*{suffix}" for suffix in SETTINGS_SUFFIXES), MODEL_CARD]
+
+
+def local_copy(source: str | Path, *, with_weights: bool = False) -> Path:
+    """Return the folder of a base model or encoder: the folder itself, or main of a Hub id, fetched if necessary.
+
+    transformers asks an unreachable Hub for each file again and again.
+    with_weights: False: its settings alone
+    Raises OSError.
+    """
+    path = Path(source)
+    return path if path.is_dir() else _main_of(str(source), with_weights=with_weights)
+
+
+@lru_cache
+def _main_of(repo_id: str, *, with_weights: bool) -> Path:
+    return cached_snapshot(
+        repo_id, patterns=HUB_FILES if with_weights else [each for each in HUB_FILES if each != HUB_WEIGHTS]
+    )

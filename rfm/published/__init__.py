@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""Read checkpoints as others published them, or as they were exported: at export and in tools, never in serving.
+
+A checkpoint is a local folder or a Hugging Face id ``org/name[/subfolder][@tag]``. It holds ``model.safetensors`` (or
+shards with an index, or an adapter) and ``config.json`` (the network). ``config.yaml`` (the training run) is there,
+in the parent folder, or on main of the Hub's repository. Nothing in a checkpoint is executed: weights are read from
+safetensors alone, and YAML tags construct no objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from rfm.config import VideoPrompt, Weights
+from rfm.engine.family import NETWORK, Checkpoint, Family
+from rfm.families import FAMILIES, named
+from rfm.files import WEIGHTS, CheckpointError
+from rfm.published.hub import find as find
+from rfm.published.provenance import told
+from rfm.published.reader import Loaded, Options, Reader
+from rfm.published.run_config import HEADS, SIMILARITY, constant_heads, training_notes
+from rfm.weights import check_values
+
+
+def reader_of(family: Family) -> Reader:
+    """Return the family's reader of published checkpoints."""
+    reader = import_module(family.reader).READER
+    assert isinstance(reader, Reader), family.reader
+    return reader
+
+
+def choose(folder: Path, package: str | None = None, options: Options | None = None) -> Family:
+    """Return the family ``package``, or of the reward model in ``options``, else the first that reads the folder.
+
+    Raises CheckpointError.
+    """
+    if package:
+        return named(package)
+    readers = {family: reader_of(family) for family in map(named, FAMILIES)}
+    if options is not None and options.reward_model is not None:
+        wanted, _ = options.named()
+        found = next((family for family, reader in readers.items() if wanted in reader.reward_models), None)
+        if found is not None:
+            return found
+        names = [name for reader in readers.values() for name in reader.reward_models]
+        raise CheckpointError.at("--as", f"one of {', '.join(names)}", repr(wanted))
+    *_, last = readers  # whose load explains the fault
+    return next((family for family, reader in readers.items() if reader.reads(folder)), last)
+
+
+def read(
+    source: str | Path,
+    *,
+    family: str | None = None,
+    base_model: str | None = None,
+    image_encoder: str | None = None,
+    text_encoder: str | None = None,
+    reward_model: str | None = None,
+    video_prompt: VideoPrompt | None = None,
+    strict_answers: bool = False,
+    weights: Weights | None = None,
+    robot_description: str | None = None,
+    camera_description: str | None = None,
+) -> Loaded:
+    """Read the checkpoint of a local folder or Hugging Face id. Raises CheckpointError.
+
+    family: package of its family; None: the family that reads the folder's files
+    others: as in ``rfm.published.reader.Options``
+    """
+    folder = find(source)
+    options = Options(
+        base_model, image_encoder, text_encoder, reward_model, video_prompt, strict_answers, weights,
+        robot_description, camera_description,
+    )  # fmt: skip
+    return read_from(folder, choose(folder, family, options), options)
+
+
+def load(source: str | Path, **options: Any) -> Checkpoint:
+    """Load the checkpoint of a local folder or Hugging Face id. options: as of ``read``. Raises CheckpointError."""
+    return read(source, **options).checkpoint
+
+
+def read_from(folder: Path, family: Family, options: Options) -> Loaded:
+    """Read the checkpoint of a local folder. Raises CheckpointError, also for weights of NaN or zeros."""
+    loaded = reader_of(family).load(folder, options)
+    options.check_used(loaded.checkpoint.config)
+    for weights in loaded.checkpoint.parts.values():
+        check_values(weights)
+    return loaded
+
+
+def notes(folder: Path, loaded: Loaded, answered: Collection[str] = HEADS) -> list[str]:
+    """Return a line for the user about each doubtful setting or head that the checkpoint's scores depend on.
+
+    answered: heads that the model serves; of a missing head, only its absence is noted
+    Raises CheckpointError for a config.yaml that cannot be read.
+    """
+    description = loaded.checkpoint.description
+    heads = [head for head in answered if head not in description.lacks]
+    expected = set() if description.asks_in_words else {*answered} - {SIMILARITY}  # which most lack
+    missing = [head for head in answered if head in expected and head in description.lacks]
+    without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
+    of_weights = constant_heads(loaded.checkpoint.parts[NETWORK], heads)
+    of_run = training_notes(folder, heads)
+    return [*without, *of_run, *of_weights, *loaded.notes(), *told(loaded.assumptions)]

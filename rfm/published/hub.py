@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: MIT
+"""Find a checkpoint: in a local folder, or in a repository of the Hugging Face Hub."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import re
+import shlex
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from rfm.files import HUB_FILES, HUB_WEIGHTS, RUN_CONFIG, WEIGHTS, CheckpointError, cut, is_there, shown
+from rfm.published.provenance import snapshot_of
+from rfm.published.weights import PICKLE_STEM, pickled_weights
+from rfm_client.contract.hub_access import HubError, hub_errors, unreachable
+
+_log = logging.getLogger(__name__)
+_SOURCE = "a folder that exists or a Hugging Face id org/name[/subfolder][@tag]"
+_ID = re.compile(r"(?P<repo>\w[\w.-]*/\w[\w.-]*)(?:/(?P<subfolder>[\w=.+-]+(?:/[\w=.+-]+)*))?(?:@(?P<tag>.+))?")
+_COMMIT = re.compile(r"[0-9a-f]+")
+_BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
+
+
+def find(source: str | Path, say: Callable[[str], object] = _log.warning) -> Path:
+    """Return the local folder of a checkpoint, fetched from the Hub if necessary. Raises CheckpointError.
+
+    An existing folder wins over a Hub id of the same name.
+    say: takes a line about a revision from the Hub's cache while the Hub cannot be reached
+    """
+    try:
+        path = Path(source).expanduser()
+        if str(source) and path.is_dir():
+            return path
+        if path.is_file():
+            is_weights = path.suffix == ".safetensors"
+            remedy = f"name its folder, {path.absolute().parent}" if is_weights else ""
+            raise CheckpointError.at("checkpoint", _SOURCE, f"the file {path}", remedy)
+    except (OSError, RuntimeError) as error:
+        got = f"{shown(str(source))}: {type(error).__name__}"
+        raise CheckpointError.at("checkpoint", _SOURCE, got) from error
+    match = _ID.fullmatch(str(source))
+    if match is None or ".." in Path(source).parts:
+        raise CheckpointError.at("checkpoint", _SOURCE, f"{shown(str(source))}{_near(path)}")
+    return _fetch(match["repo"], match["subfolder"] or "", match["tag"], path, say)
+
+
+def check_links(folder: Path) -> None:
+    """Raise CheckpointError for a link out of ``folder``, in it or one level below.
+
+    Links of the Hub's cache, from ``snapshots/<commit>`` to ``blobs``, are allowed.
+    """
+    home = folder.resolve()
+    snapshot = snapshot_of(home)
+    allowed = home if snapshot is None or not (snapshot.parent.parent / "blobs").is_dir() else snapshot.parent.parent
+    for file in (*folder.glob("*"), *folder.glob("*/*")):
+        if file.is_symlink() and not file.resolve().is_relative_to(allowed):
+            raise CheckpointError.at(file, "a file of the checkpoint", f"a link to {file.resolve()}")
+
+
+def commit_of(folder: Path) -> str:
+    """Return the commit of a checkpoint in the Hub's cache (its snapshot's name), else the folder's name."""
+    return (snapshot_of(folder) or folder).name
+
+
+def best_tag(tags: Iterable[str]) -> str | None:
+    """Return the tag ``best-<metric>-<score>-step-<n>`` with the highest score, the first of equals; else None."""
+    scores = {tag: float(match[1]) for tag in tags if (match := _BEST_TAG.search(tag))}
+    return max(scores, key=scores.__getitem__, default=None)
+
+
+def _fetch(repo_id: str, subfolder: str, tag: str | None, path: Path, say: Callable[[str], object]) -> Path:
+    """Fetch a checkpoint without pickles into the Hub's cache. ``path``: the local folder that does not exist."""
+    down = None
+    try:
+        down = unreachable(repo_id, revision=tag)
+        with hub_errors():
+            tag = tag or (_best_revision(repo_id) if down is None else _cached_revision(repo_id, down, say))
+            return _snapshot(repo_id, subfolder, tag, path, is_down=down is not None)
+    except HubError as error:
+        where = repo_id if tag is None else f"{repo_id}@{tag}"
+        why = str(error) if down in (None, str(error)) else f"{down}, and {error}"
+        raise CheckpointError(
+            f"{where}: cannot be fetched: {cut(why)}; there is no folder {path.absolute()} either{_near(path)}; "
+            f"name one, or see to the Hub's name, login and network{_cached(repo_id, subfolder)}"
+        ) from error
+
+
+def _best_revision(repo_id: str) -> str | None:
+    from huggingface_hub import HfApi
+
+    return best_tag(ref.name for ref in HfApi().list_repo_refs(repo_id).tags)
+
+
+def _cached_revision(repo_id: str, down: str, say: Callable[[str], object]) -> str:
+    """Return the best revision with weights in the Hub's cache, and say which. Raises HubError if there is none."""
+    snapshots = {name: folder for name, folder in _snapshots(repo_id).items() if any(folder.rglob(HUB_WEIGHTS))}
+    revision = best_tag(snapshots) or ("main" if "main" in snapshots else None)
+    if revision is None:
+        raise HubError("the cache has neither a best revision nor a main with weights")
+    used = f"{repo_id}@{revision} of the cache is used (commit {snapshots[revision].name}), because {down}"
+    say(f"{used}; the Hub may have a newer or better revision: to choose one, name {repo_id}@REVISION")
+    return revision
+
+
+def _snapshot(repo_id: str, subfolder: str, tag: str | None, path: Path, *, is_down: bool) -> Path:
+    """Return the folder of a revision in the Hub's cache, with all files that are read. tag: None: main"""
+    from huggingface_hub import snapshot_download
+
+    patterns, run_configs = HUB_FILES, [RUN_CONFIG]
+    if subfolder:
+        above = subfolder.rpartition("/")[0]
+        run_configs = [f"{subfolder}/{RUN_CONFIG}", f"{above}/{RUN_CONFIG}".lstrip("/")]
+        patterns = [*(f"{subfolder}/{pattern}" for pattern in HUB_FILES), run_configs[1]]
+    snapshot = Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns, local_files_only=is_down))
+    folder = snapshot / subfolder
+    if not is_down and not any(folder.rglob(HUB_WEIGHTS)):
+        _refuse_pickles(repo_id, subfolder, tag)
+    if not any(is_there(snapshot / name) for name in run_configs):  # upstream tags the commit before its upload
+        _fetch_run_config_of_main(repo_id, run_configs, is_down=is_down)
+    if not folder.is_dir():
+        raise CheckpointError.at(
+            f"{repo_id}@{tag or 'main'}", f"the folder {subfolder}", f"none of this name{_near(path)}"
+        )
+    return folder
+
+
+def _refuse_pickles(repo_id: str, subfolder: str, tag: str | None) -> None:
+    from huggingface_hub import HfApi
+
+    files = [Path(file.rfilename) for file in HfApi().model_info(repo_id, revision=tag).siblings or ()]
+    names = pickled_weights((file.name for file in files if file.parent == Path(subfolder)), PICKLE_STEM)
+    if names:
+        revision = "" if tag is None else f" --revision {shlex.quote(tag)}"
+        fetch = f"hf download {repo_id}{revision} --local-dir FOLDER"
+        got = (
+            f"{cut(', '.join(names))}: pickles may run code when they are loaded, so none is fetched. If you trust who "
+            f"made it: {fetch}, then name {Path('FOLDER', subfolder)} as the checkpoint, and you are told how to "
+            "convert it"
+        )
+        raise CheckpointError.at(f"{repo_id}@{tag or 'main'}", WEIGHTS, got)
+
+
+def _near(path: Path) -> str:
+    """Name the folders beside a missing path that have similar names."""
+    try:
+        names = [beside.name for beside in path.parent.iterdir() if beside.is_dir()]
+    except OSError:
+        return ""
+    alike = difflib.get_close_matches(path.name, names)
+    return f" (but {', '.join(str(path.parent / name) for name in alike)})" if alike else ""
+
+
+def _snapshots(repo_id: str) -> dict[str, Path]:
+    """Return the folders of a repository's revisions in the Hub's cache, by tag or branch."""
+    from huggingface_hub.constants import HF_HUB_CACHE
+
+    home = Path(HF_HUB_CACHE) / f"models--{repo_id.replace('/', '--')}"
+    refs = [file for file in sorted((home / "refs").rglob("*")) if file.is_file()]
+    commits = {str(file.relative_to(home / "refs")): file.read_text().strip() for file in refs}
+    return {name: home / "snapshots" / commit for name, commit in commits.items() if _COMMIT.fullmatch(commit)}
+
+
+def _cached(repo_id: str, subfolder: str) -> str:
+    """Name the revisions of a repository in the Hub's cache, which need no network."""
+    within = f"/{subfolder}" if subfolder else ""
+    names = [f"{repo_id}{within}@{name}" for name in _snapshots(repo_id)]
+    return f"; without it, name a revision that is in the cache: {', '.join(names)}" if names else ""
+
+
+def _fetch_run_config_of_main(repo_id: str, names: Iterable[str], *, is_down: bool) -> None:
+    """Fetch the first existing of these files of main into the Hub's cache, where ``find_run_config`` looks."""
+    from huggingface_hub import _CACHED_NO_EXIST, hf_hub_download, try_to_load_from_cache
+    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
+
+    for name in names:
+        try:
+            hf_hub_download(repo_id, name, local_files_only=is_down)
+            return
+        except LocalEntryNotFoundError:  # no connection; the cache may record that main lacks the file
+            if try_to_load_from_cache(repo_id, name) is not _CACHED_NO_EXIST:
+                raise
+        except EntryNotFoundError:
+            pass

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: MIT
+"""Read the files of a Qwen-VL with its language head, as Hugging Face has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from rfm.config import VideoPrompt, Weights
+from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
+from rfm.published.provenance import HUB_FOLDER, Assumption, source_name
+from rfm.published.qwen import QWEN_NAMES, Renames, backbone_config, decided, renamed
+from rfm.published.reader import Options
+from rfm.published.robometer_config import DTYPES
+from rfm.published.rounding import kind_of, read_published, read_unrounded_config, round_layers
+from rfm.qwen.language import EMBEDDING, HEAD, LanguageCheckpoint, LanguageConfig
+from rfm.qwen.network import QWEN3, QWEN_2_5, Dtype
+from rfm.saved import PROCESSOR_FOLDER
+
+_NAMES: Renames = ((r"^model\.lm_head\.", "lm_head."), *QWEN_NAMES)
+_TIED = "tie_word_embeddings"
+ONLY_QWEN3 = {QWEN3: "Qwen3-VL"}
+ANY_QWEN = {QWEN_2_5: "Qwen2.5-VL", **ONLY_QWEN3}
+Made = TypeVar("Made", bound=LanguageCheckpoint)
+
+
+@dataclass(frozen=True)
+class LanguageFolder:
+    """The files of a Qwen-VL.
+
+    backbone: as ``BackboneConfig``'s
+    dtype: stated by config.json
+    base_model: source of the tokenizer and processor
+    video_prompt: form of the prompt
+    rounded: form of rounded layers; None: not rounded
+    assumed: dtype and video_prompt, if no file proves them
+    """
+
+    folder: Path
+    backbone: dict[str, Any]
+    weights: dict[str, Tensor]
+    processor: str | Path
+    dtype: str
+    base_model: str
+    video_prompt: VideoPrompt
+    rounded: Weights | None = None
+    assumed: tuple[Assumption, ...] = ()
+
+    @classmethod
+    def read(cls, folder: Path, options: Options, backbones: Mapping[str, str] = ONLY_QWEN3) -> LanguageFolder:
+        """Read the folder. Raises CheckpointError if it is no Qwen-VL with a language head.
+
+        backbones: names for the user of the networks that are read, by model_type
+        """
+        file = folder / NETWORK_CONFIG
+        content = read_json(file)
+        if content.get("model_type") not in backbones:
+            expected = " or ".join(f"{kind}, of an ordinary {name}" for kind, name in backbones.items())
+            raise CheckpointError.at(f"{file}: model_type", expected, shown(content.get("model_type")))
+        backbone = backbone_config(content, file)
+        is_nf4 = read_unrounded_config(backbone, file)
+        tensors, _ = read_published(folder, is_nf4)
+        weights = {name: tensor for name, tensor in renamed(tensors, _NAMES).items() if "inv_freq" not in name}
+        if any(name.startswith("progress_head") for name in weights):
+            raise CheckpointError.at(folder, "an ordinary Qwen3-VL", "reward heads: leave out --as")
+        _tie(weights, backbone, file)
+        own = folder / PROCESSOR_FOLDER
+        processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
+        dtype, of_dtype = dtype_of(backbone, file)
+        form, of_form = decided(options.video_prompt, backbone, NETWORK_CONFIG, may_be_saved_later=True)
+        rounded = kind_of(weights)
+        if rounded is None and options.weights is not None:
+            weights, _ = round_layers(weights, {}, options.weights, getattr(torch, dtype))
+            rounded = options.weights
+        name = source_name(processor)
+        return cls(folder, backbone, weights, processor, dtype, name, form, rounded, (*of_dtype, *of_form))
+
+    @property
+    def made_of(self) -> dict[str, Any]:
+        """The fields of LanguageConfig."""
+        return {
+            "backbone": self.backbone,
+            "dtype": self.dtype,
+            "base_model_id": self.base_model,
+            "video_prompt": self.video_prompt,
+            "weights": self.rounded,
+        }
+
+    def assumptions(self, config: LanguageConfig) -> tuple[Assumption, ...]:
+        """Return the settings that nothing proves and that have an effect."""
+        return tuple(each for each in self.assumed if not (config.multi_image and each.name == "video_prompt"))
+
+
+def reopened(made: type[Made], folder: Path, options: Options) -> Made:
+    """Load an export, with the processor and the form of weights that the user asks for. Raises CheckpointError."""
+    checkpoint = made.restore(folder)
+    config, weights = checkpoint.config, checkpoint.weights
+    if options.weights is not None and config.weights is None:
+        weights, _ = round_layers(weights, {}, options.weights, config.torch_dtype)
+        config = replace(config, weights=options.weights)
+    return replace(checkpoint, config=config, weights=weights, processor=options.base_model or checkpoint.processor)
+
+
+def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> None:
+    """Drop a head that equals the embedding to which config.json ties it.
+
+    Raises CheckpointError for a tied head with other values: transformers 4 reads the embedding in its place,
+    transformers 5 the head.
+    """
+    stated = [part.get(_TIED) for part in (config, config["text_config"])]
+    head, embedding = weights.get(HEAD), weights.get(EMBEDDING)
+    if head is None:
+        if not (stated[1] if stated[0] is None else stated[0]):
+            raise CheckpointError.at(file.parent, f"{HEAD}, since {_TIED} is false", "none")
+    elif embedding is not None and True in stated:
+        if head.shape != embedding.shape or not bool((head == embedding).all()):
+            where = f"{file}: {_TIED}"
+            remedy = (
+                "transformers 4 scores with the embedding, transformers 5 with the head. For the head, set it to false "
+                "here and in text_config. For the embedding, load and save the model with transformers 4, which drops "
+                "the head"
+            )
+            raise CheckpointError.at(where, f"false, since {HEAD} differs from the embedding", "true", remedy)
+        del weights[HEAD]
+
+
+def dtype_of(config: Mapping[str, Any], file: Path) -> tuple[Dtype, tuple[Assumption, ...]]:
+    """Return the number type of the network, and the type as an assumption if config.json states none.
+
+    Raises CheckpointError.
+    """
+    key = next((name for name in ("dtype", "torch_dtype") if config.get(name)), None)
+    if key is None:
+        return "bfloat16", (Assumption("dtype", "bfloat16", f"default, as {NETWORK_CONFIG} has no dtype"),)
+    dtype = str(config[key]).removeprefix("torch.")
+    if dtype not in DTYPES:
+        raise CheckpointError.at(f"{file}: {key}", f"one of {', '.join(DTYPES)}", shown(dtype))
+    return dtype, ()
+
+
+GENERATION_CONFIG = "generation_config.json"
+# Keys of GENERATION_CONFIG without effect on the likeliest token.
+_IDLE_KEYS = {
+    "_from_model_config", "bos_token_id", "do_sample", "eos_token_id", "max_length", "max_new_tokens", "pad_token_id",
+    "temperature", "top_k", "top_p", "transformers_version", "use_cache",
+}  # fmt: skip
+_NEUTRAL = {"repetition_penalty": 1.0, "no_repeat_ngram_size": 0, "num_beams": 1, "min_length": 0}
+
+
+def stops_of(folder: Path) -> tuple[int, ...]:
+    """Return the tokens that end an answer. Raises CheckpointError for settings that change the likeliest token."""
+    file = folder / GENERATION_CONFIG
+    if not is_there(file):
+        raise CheckpointError.at(file, "the file", "none", "copy it from the checkpoint as it was published")
+    content = read_json(file)
+    for key in sorted(content.keys() - _IDLE_KEYS):
+        if key not in _NEUTRAL or content[key] not in (None, _NEUTRAL[key]):
+            expected = f"{_NEUTRAL[key]}" if key in _NEUTRAL else "no such key"
+            raise CheckpointError.at(f"{file}: {key}", expected, shown(content[key]), "remove it")
+    stops = content.get("eos_token_id")
+    found = stops if isinstance(stops, list) else [stops]
+    if not found or not all(type(token) is int for token in found):
+        raise CheckpointError.at(f"{file}: eos_token_id", "ids of tokens", shown(stops))
+    return tuple(found)
+
+
+def is_named(folder: Path, name: str) -> bool:
+    """True if the folder, or the repository of the Hub that it is a copy of, has ``name`` in its name.
+
+    name: lower case, without hyphens
+    """
+    names = [folder.resolve().name, *(part for part in folder.parts if part.startswith(HUB_FOLDER))]
+    return any(name in each.lower().replace("-", "").replace("_", "") for each in names)

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: MIT
+"""What a reader of published checkpoints gets, and what it returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from rfm.config import ExportConfig
+from rfm.config import VideoPrompt as VideoPrompt
+from rfm.config import Weights as Weights
+from rfm.engine.family import Checkpoint, FrameEncoders
+from rfm.files import CheckpointError
+from rfm.published.provenance import Assumption
+
+# Options, with the checkpoints that support them.
+_FOLLOWED_BY = {
+    "video_prompt": "a checkpoint that shows videos to a Qwen3-VL",
+    "strict_answers": "a RoboReward that writes its answers",
+    "weights": "a vision-language checkpoint whose weights are not rounded (other networks are small)",
+    **dict.fromkeys(("robot_description", "camera_description"), "a RynnValue whose prompt names robot and camera"),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """The user's options for files that a checkpoint lacks. Each family reads its own fields.
+
+    base_model: folder or id of a vision-language checkpoint's base model; None: as the checkpoint names it
+    image_encoder, text_encoder: folders or ids of a ReWiND checkpoint's encoders; None: upstream's, if the checkpoint
+        has weights of encoders or the other is set
+    reward_model: the way in which an ordinary vision-language model is asked, ``name,setting=value,...``; None: the
+        checkpoint is a reward model
+    video_prompt: form of a Qwen3-VL's video prompt; None: as the checkpoint's ``transformers_version`` tells
+    strict_answers: refuse an unclear written answer; False: mark it
+    weights: round the weights of a vision-language network's layers; None: as in the checkpoint
+    robot_description, camera_description: words for the robot and the camera in RynnValue's prompt; None: not named
+    """
+
+    base_model: str | None = None
+    image_encoder: str | None = None
+    text_encoder: str | None = None
+    reward_model: str | None = None
+    video_prompt: VideoPrompt | None = None
+    strict_answers: bool = False
+    weights: Weights | None = None
+    robot_description: str | None = None
+    camera_description: str | None = None
+
+    @classmethod
+    def of(cls, settings: ExportConfig) -> Options:
+        """Return the options among an export's settings, which have the same names."""
+        return cls(**{each.name: getattr(settings, each.name) for each in fields(cls)})
+
+    def check_used(self, config: Any) -> None:
+        """Raise CheckpointError for an option that the network does not support."""
+        for name, expected in _FOLLOWED_BY.items():
+            wanted = getattr(self, name)
+            if wanted and getattr(config, name, None) != wanted:
+                flag, mend = f"--{name.replace('_', '-')}", "leave it out, or export the checkpoint again"
+                raise CheckpointError.at(flag, expected, "another checkpoint", mend)
+
+    def named(self) -> tuple[str | None, dict[str, str]]:
+        """Return the reward model's name and the user's settings of it, from ``name,setting=value,...``.
+
+        Raises CheckpointError.
+        """
+        if self.reward_model is None:
+            return None, {}
+        name, *settings = self.reward_model.split(",")
+        if wrong := [setting for setting in settings if setting.count("=") != 1]:
+            raise CheckpointError.at("--as", "setting=value", repr(wrong[0]))
+        return name, dict(setting.split("=") for setting in settings)
+
+    def settings(self, known: Mapping[str, type]) -> dict[str, Any]:
+        """Return the user's settings as numbers or booleans. Raises CheckpointError if one is unknown or wrong.
+
+        known: type of each setting
+        """
+        return {name: _value(name, text, known) for name, text in self.named()[1].items()}
+
+
+def _value(name: str, text: str, known: Mapping[str, type]) -> Any:
+    if name not in known:
+        expected = f"settings among {', '.join(known)}" if known else "no settings of this reward model"
+        raise CheckpointError.at("--as", expected, repr(name))
+    try:
+        return {"true": True, "false": False}[text] if known[name] is bool else known[name](text)
+    except (KeyError, ValueError):
+        raise CheckpointError.at(f"--as: {name}", f"a value of type {known[name].__name__}", repr(text)) from None
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A checkpoint as it was published, and what a user must know about it.
+
+    assumptions: the settings that neither weights nor files prove
+    notes: returns a line for the user about each contradiction to the known facts of training; raises CheckpointError
+    encoders: returns the checkpoint's encoders, or None; raises CheckpointError if they are missing or do not fit
+    """
+
+    checkpoint: Checkpoint
+    assumptions: Sequence[Assumption] = ()
+    notes: Callable[[], Sequence[str]] = list
+    encoders: Callable[[], FrameEncoders | None] = lambda: None
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Reads the checkpoints of a family as they were published, or as they were exported.
+
+    reads: returns True if a folder may hold a checkpoint of the family; used if the caller names no family
+    load: loads the checkpoint of a local folder; raises CheckpointError
+    reward_models: names that ``--as`` takes, for ordinary models that the family asks in its own way
+    """
+
+    reads: Callable[[Path], bool]
+    load: Callable[[Path, Options], Loaded]
+    reward_models: tuple[str, ...] = ()

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: MIT
+"""Read RFM and Robometer checkpoints: whole weights, perhaps with LoRA factors, or an adapter to a base model.
+
+A table of renames for each form turns the names of weights into those of VlmRewardModel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from torch import Tensor
+
+from rfm.families.robometer.checkpoint import VlmCheckpoint, restore
+from rfm.families.robometer.collator import VlmCollator
+from rfm.families.robometer.network import VlmConfig
+from rfm.families.robometer.prompts import OF_AN_OLD_RUN
+from rfm.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, CheckpointError, expecting, is_there, read_json
+from rfm.published.lora import Scaling, adapted, check_inside, has_adapter
+from rfm.published.processor import check_published, differences, is_published
+from rfm.published.provenance import Assumption
+from rfm.published.qwen import (
+    LORA_INSIDE,
+    QWEN_NAMES,
+    UNQUANTIZED,
+    UNUSED,
+    backbone_config,
+    check_not_quantized,
+    decided,
+    renamed,
+)
+from rfm.published.reader import Loaded, Options, Reader
+from rfm.published.robometer_config import (
+    LEROBOT_BACKBONE,
+    RunConfig,
+    assumptions_of,
+    base_of_adapter,
+    check_bins,
+    is_lerobot,
+    lerobot_run,
+    lerobot_weights,
+)
+from rfm.published.rounding import kind_of, read_published, read_unrounded_config, round_layers
+from rfm.published.run_config import check_progress
+from rfm.published.weights import has_head, read_weights
+from rfm.qwen.lora import changed_by, split
+from rfm.qwen.network import BACKBONES, QWEN3, QWEN_2_5
+from rfm.saved import PROCESSOR_FOLDER, is_saved
+
+
+@dataclass(frozen=True)
+class PublishedVlm(VlmCheckpoint):
+    """A checkpoint as it was published.
+
+    base_model: folder or id from the caller; None: as the checkpoint names it
+    has_processor: the processor is the checkpoint's own
+    """
+
+    base_model: str | None = None
+    has_processor: bool = False
+
+    def load_collator(self) -> VlmCollator:
+        """Return the collator. Raises CheckpointError if the caller's base model is not like the one of the run."""
+        collator = super().load_collator()
+        if self.base_model is not None and is_published(self.config.base_model_id, self.config.family):
+            check_published(collator, self.base_model)
+        return collator
+
+    def notes(self) -> list[str]:
+        """Return a line for each sign that prompts, images or positions differ from those in training."""
+        lines = []
+        if not self.has_processor and (found := differences(self.collator)):
+            known = f"the published processors of {self.config.family}"
+            lines.append(f"base model {self.processor}: differs from {known} in {'; '.join(found)}")
+        version = str(self.config.backbone.get("transformers_version"))
+        major = version.partition(".")[0]
+        reads_videos = self.config.family == QWEN_2_5 and not self.config.multi_image
+        if reads_videos and major.isdigit() and int(major) >= 5:
+            lines.append(
+                f"{NETWORK_CONFIG}: transformers_version is {version}: text behind a video stands where transformers 4 "
+                "puts it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the "
+                "run's"
+            )
+        return lines
+
+
+def reads(folder: Path) -> bool:
+    """True if the folder holds an adapter, a network on a known backbone, or a Robometer of LeRobot."""
+    if is_there(folder / ADAPTER_CONFIG):
+        return True
+    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
+    model_type = content.get("model_type")
+    return is_lerobot(content) or (isinstance(model_type, str) and model_type in BACKBONES)
+
+
+def load(folder: Path, options: Options) -> Loaded:
+    """Load the checkpoint of a local folder. Raises CheckpointError."""
+    assumptions: tuple[Assumption, ...] = ()
+    if is_saved(folder):
+        parts = _exported(folder)
+    else:
+        parts, assumptions = _published(folder, options)
+    config, weights, factors, processor = parts
+    if options.weights is not None and config.weights is None:
+        weights, factors = round_layers(weights, factors, options.weights, config.torch_dtype)
+        config = replace(config, weights=options.weights)
+    base = options.base_model
+    has_processor = base is None and isinstance(processor, Path)
+    checkpoint = PublishedVlm(config, weights, base or processor, factors, base, has_processor)
+    checkpoint.check()
+    return Loaded(checkpoint, assumptions, checkpoint.notes)
+
+
+_Parts: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], str | Path]
+_Read: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], tuple[Assumption, ...]]
+
+
+def _exported(folder: Path) -> _Parts:
+    """Return the parts of an export, whose processor and form of weights the caller may change."""
+    restored = restore(folder)
+    return restored.config, restored.weights, restored.factors, restored.processor
+
+
+def _published(folder: Path, options: Options) -> tuple[_Parts, tuple[Assumption, ...]]:
+    with expecting("a vision-language checkpoint", folder):
+        content = {} if has_adapter(folder) else read_json(folder / NETWORK_CONFIG)
+        read = _by_lerobot if is_lerobot(content) else _trained
+        config, weights, factors, assumptions = read(folder, content, options.base_model)
+        if config.family == QWEN3 and not config.multi_image:
+            config, form = _with_video_prompt(config, content, options)
+            assumptions = (*assumptions, *form)
+    own = folder / PROCESSOR_FOLDER
+    return (config, weights, factors, own if own.is_dir() else config.base_model_id), assumptions
+
+
+def _with_video_prompt(
+    config: VlmConfig, content: Mapping[str, Any], options: Options
+) -> tuple[VlmConfig, tuple[Assumption, ...]]:
+    """Return the configuration with the form of its video prompts, and the form if it is assumed.
+
+    content: config.json of the run; empty for an adapter, whose base model may be saved by another transformers
+    """
+    file = f"{NETWORK_CONFIG}: {LEROBOT_BACKBONE}" if is_lerobot(content) else NETWORK_CONFIG
+    form, assumed = decided(options.video_prompt, config.backbone if content else {}, file)
+    return replace(config, video_prompt=form), assumed
+
+
+def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Read:
+    """Read a Robometer that LeRobot saved, with every setting in config.json."""
+    file = folder / NETWORK_CONFIG
+    run = lerobot_run(content, file)
+    backbone = backbone_config(content[LEROBOT_BACKBONE], f"{file}: {LEROBOT_BACKBONE}")
+    check_not_quantized(backbone, file, UNQUANTIZED)
+    weights, factors = _used(lerobot_weights(read_weights(folder), backbone))
+    check_bins(content, weights, file)
+    config = _config(folder, backbone, run, weights)
+    return config, weights, factors, assumptions_of(config, run, base_model)
+
+
+def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Read:
+    """Read the checkpoint of a training run, with the run's config.yaml. content: {} for an adapter."""
+    file = folder / NETWORK_CONFIG
+    backbone = backbone_config(content, file) if content else {}
+    is_nf4, num_nf4 = read_unrounded_config(backbone, file), 0
+    run = RunConfig.of(folder)
+    run.check_model_type()
+    check_progress(run.sections, run.file)
+    scaling: Scaling | None
+    if content:
+        tensors, num_nf4 = read_published(folder, is_nf4)
+        tensors, scaling = _whole(tensors, folder, backbone, run)
+    else:
+        backbone, tensors, scaling = adapted(folder, base_model or base_of_adapter(folder, run))
+    weights, factors = _used(tensors, scaling)
+    config = _config(folder, backbone, run, weights)
+    return config, weights, factors, assumptions_of(config, run, base_model, num_nf4)
+
+
+def _config(
+    folder: Path,
+    backbone: dict[str, Any],
+    run: RunConfig,
+    weights: Mapping[str, Tensor],
+) -> VlmConfig:
+    if "progress_head.4.weight" not in weights:
+        raise CheckpointError.at(folder, "reward heads", "no progress_head.4.weight")
+    if "frame_pool_attn.weight" not in weights:
+        raise CheckpointError.at(folder, "frame_pool_attn.weight", f"none: {OF_AN_OLD_RUN}")
+    network = run.network()
+    config = VlmConfig(
+        backbone=backbone,
+        progress_bins=weights["progress_head.4.weight"].shape[0],
+        has_similarity="similarity_head.0.weight" in weights,
+        size_px=run.size_px(network["multi_image"]),
+        has_preference=has_head(weights, "preference"),
+        has_success=has_head(weights, "success"),
+        weights=kind_of(weights),
+        **network,
+    )
+    if config.per_frame_progress_token and not config.multi_image:
+        where = f"{run.file}: use_multi_image with per-frame progress tokens"
+        raise CheckpointError.at(where, "true", "false")
+    return config
+
+
+def _whole(
+    tensors: dict[str, Tensor], folder: Path, backbone: Mapping[str, Any], run: RunConfig
+) -> tuple[dict[str, Tensor], Scaling | None]:
+    """Return whole weights, renamed, with LoRA factors among them, and the factors' scaling if there are any."""
+    scaling = None
+    if check_inside(tensors, folder / WEIGHTS):
+        tensors, scaling = renamed(tensors, LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
+        if is_there(folder / ADAPTER_CONFIG):
+            scaling.check_equal(Scaling.of(folder / ADAPTER_CONFIG, read_json(folder / ADAPTER_CONFIG)))
+    return renamed(tensors, QWEN_NAMES), scaling
+
+
+def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return the weights that scores depend on, and their LoRA factors; ``scaling``: of these."""
+    weights, factors = split(tensors)
+    factors = factors if scaling is None else scaling.scaled(factors)
+    weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
+    return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
+
+
+READER = Reader(reads, load)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""Checkpoints with rounded weights: rounded here (``rfm export --weights``), or published in NF4."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rfm.config import Weights
+from rfm.files import NETWORK_CONFIG, CheckpointError, shown
+from rfm.published.nf4 import dequantize
+from rfm.published.qwen import NF4, QUANTIZED, UNQUANTIZED, check_not_quantized, quantization
+from rfm.published.weights import read_weights
+from rfm.qwen.lora import changed_by, merged
+from rfm.qwen.rounded import may_be_rounded, rounded
+from rfm.weights import DECODED
+
+_NF4: Weights = "nf4"
+
+
+def read_unrounded_config(backbone: dict[str, Any], file: Path) -> bool:
+    """Return True if the configuration says that weights are in NF4, and remove this entry.
+
+    Raises CheckpointError for weights that are rounded in another way.
+    """
+    is_nf4 = quantization(backbone) == NF4
+    if is_nf4:
+        del backbone["quantization_config"]
+    check_not_quantized(backbone, file, UNQUANTIZED)
+    return is_nf4
+
+
+def read_published(folder: Path, is_nf4: bool, model_type: str | None = None) -> tuple[dict[str, Tensor], int]:
+    """Return a folder's tensors, and the number of weights in NF4. Those of layers stay in NF4, others are decoded.
+
+    is_nf4: True if config.json says that some are in NF4
+    model_type: as in ``read_weights``
+    Raises CheckpointError.
+    """
+    tensors = read_weights(folder, model_type)
+    num_nf4 = dequantize(tensors, may_be_rounded)
+    quantized = next((name for name in tensors if QUANTIZED.search(name)), None)
+    if quantized is not None:
+        raise CheckpointError.at(folder, "weights in full precision", shown(quantized), UNQUANTIZED)
+    if is_nf4 and not num_nf4:
+        got = "none; if they are meant in full precision, remove it"
+        raise CheckpointError.at(f"{folder / NETWORK_CONFIG}: quantization_config", "weights in NF4", got)
+    return tensors, num_nf4
+
+
+def kind_of(weights: Mapping[str, Tensor]) -> Weights | None:
+    """Return the form of weights as they were published: NF4, or None."""
+    return _NF4 if any(name.endswith(DECODED) for name in weights) else None
+
+
+def round_layers(
+    weights: Mapping[str, Tensor], factors: Mapping[str, Tensor], kind: Weights, dtype: torch.dtype
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return the weights with those of layers rounded, and the LoRA factors of the others.
+
+    factors: of LoRA, which are added before rounding
+    dtype: of the decoded values
+    """
+    whole: dict[str, Tensor] = {}
+    rest = dict(factors)
+    for name, weight in weights.items():
+        if not (may_be_rounded(name) and weight.ndim == 2 and weight.shape[1] % 2 == 0):
+            whole[name] = weight
+            continue
+        own = {factor: rest.pop(factor) for factor in factors if changed_by(factor) == name}
+        whole |= rounded(name, merged({name: weight}, own, torch.float32)[name], kind, dtype)
+    return whole, rest

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: MIT
+"""Read TOPReward: the settings of LeRobot, or of the user, and an ordinary Qwen3-VL."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rfm.families.topreward.checkpoint import TopRewardCheckpoint
+from rfm.families.topreward.prompts import PROMPT_PREFIX, PROMPT_SUFFIX, TopRewardConfig
+from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
+from rfm.published.hub import find
+from rfm.published.language import LanguageFolder, reopened
+from rfm.published.reader import Loaded, Options, Reader
+from rfm.qwen.processor import (
+    OF_VIDEOS,
+    SIZED_BY_PROCESSOR,
+    VIDEO_PREPROCESSOR_CONFIG,
+    check_settings,
+    read_preprocessor,
+)
+from rfm.saved import is_saved, reward_model_of
+from rfm_client.contract.checks import require
+
+LEROBOT, ROBOMETER = "topreward", "topreward-robometer"  # of ``--as``
+REWARD_MODELS = (LEROBOT, ROBOMETER)
+_TYPE = "topreward"  # the value of the key ``type`` of LeRobot's config.json
+FPS = 2.0  # LeRobot's default
+MAX_FRAMES, NUM_PREFIXES = 64, 15  # of Robometer's baseline
+MOST_FRAMES = 512  # default limit of LeRobot's variant: each prefix costs a question
+# Keys of LeRobot's config.json about its own pipelines, uploads and cropping of online samples.
+_IDLE = {
+    "attn_implementation", "default_task", "device", "image_key", "input_features", "license", "max_frames",
+    "max_input_length", "normalization_mapping", "output_features", "pretrained_path", "pretrained_revision",
+    "private", "push_to_hub", "repo_id", "success_threshold", "tags", "task_key", "torch_dtype", "type", "vlm_name",
+}  # fmt: skip
+_DECIDING = {
+    "add_chat_template": "chat_template",
+    "fps": "fps",
+    "prompt_prefix": "prompt_prefix",
+    "prompt_suffix_template": "prompt_suffix",
+}
+_OF_USER = {"num_prefixes": int, "fps": float, "chat_template": bool, "max_frames": int}  # settings that ``--as`` takes
+
+
+def reads(folder: Path) -> bool:
+    """True if the folder holds LeRobot's settings of TOPReward, or an export of it."""
+    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
+    return content.get("type") == _TYPE or reward_model_of(folder) == TopRewardConfig.reward_model
+
+
+def load(folder: Path, options: Options) -> Loaded:
+    """Load the model of a local folder: a Qwen3-VL's, LeRobot's settings, or an export. Raises CheckpointError."""
+    name, given = options.named()
+    if is_saved(folder):
+        checkpoint = reopened(TopRewardCheckpoint, folder, options)
+        if given or name not in (None, LEROBOT if checkpoint.config.variant == "lerobot" else ROBOMETER):
+            raise CheckpointError("--as: expected none for an export, which has its own; export the checkpoint again")
+        checkpoint.check()
+        return Loaded(checkpoint)
+    content = read_json(folder / NETWORK_CONFIG)
+    of_lerobot: dict[str, Any] = {}
+    if content.get("type") == _TYPE:
+        if name == ROBOMETER:
+            raise CheckpointError.at("--as", f"{LEROBOT} for a config.json of LeRobot", name)
+        of_lerobot = _lerobot_settings(content, folder / NETWORK_CONFIG)
+        files = _named_by_lerobot(content, options)
+    else:
+        files = LanguageFolder.read(folder, options)
+    config = TopRewardConfig(**files.made_of, **_settings(files, of_lerobot, options))
+    checkpoint = TopRewardCheckpoint(config, files.weights, files.processor)
+    checkpoint.check()
+    return Loaded(checkpoint, files.assumptions(config))
+
+
+def _named_by_lerobot(content: Mapping[str, Any], options: Options) -> LanguageFolder:
+    """Read the Qwen3-VL that LeRobot's config.json or the caller names."""
+    folder = find(options.base_model or str(content.get("vlm_name")))
+    return LanguageFolder.read(folder, replace(options, base_model=None))
+
+
+def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: Options) -> dict[str, Any]:
+    """Return the fields of TopRewardConfig that no file of a Qwen3-VL holds. Raises CheckpointError."""
+    name, given = options.named()
+    is_lerobot = name != ROBOMETER
+    settings: dict[str, Any] = {
+        "variant": "lerobot" if is_lerobot else "robometer",
+        "chat_template": not is_lerobot,
+        "fps": FPS,
+        "num_prefixes": None if is_lerobot else NUM_PREFIXES,
+        "max_frames": MOST_FRAMES if is_lerobot else MAX_FRAMES,
+        "prompt_prefix": PROMPT_PREFIX,
+        "prompt_suffix": PROMPT_SUFFIX,
+        **_limits(files, is_lerobot=is_lerobot),
+        **of_lerobot,
+        **options.settings(_OF_USER),
+    }
+    if not is_lerobot and "fps" in given:
+        raise CheckpointError(f"--as: fps: expected none for {ROBOMETER}, which takes each video for 24 frames/s")
+    _check(settings)
+    return settings
+
+
+def _lerobot_settings(content: Mapping[str, Any], file: Path) -> dict[str, Any]:
+    """Return the fields of TopRewardConfig in LeRobot's config.json. Raises CheckpointError for an unknown key."""
+    if unknown := sorted(content.keys() - _IDLE - _DECIDING.keys()):
+        remedy = "if it changes no score, remove it"
+        raise CheckpointError.at(file, "the keys of LeRobot's TOPReward", shown(unknown[0]), remedy)
+    for key in _DECIDING:
+        if content.get(key) is None:
+            raise CheckpointError.at(f"{file}: {key}", "a value", "none", "save the model with LeRobot again")
+    return {field: content[key] for key, field in _DECIDING.items()}
+
+
+def _limits(files: LanguageFolder, *, is_lerobot: bool) -> dict[str, int]:
+    """Return the least and most pixels of a video by its processor. Raises CheckpointError."""
+    sampling = {} if is_lerobot else {"do_sample_frames": True}  # LeRobot says which frames are shown
+    try:
+        preprocessor = read_preprocessor(files.processor, *OF_VIDEOS)
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"base model {files.processor}: {error} (name its folder with --base-model)") from error
+    size = preprocessor.get("size")
+    where = f"{files.processor}: {VIDEO_PREPROCESSOR_CONFIG}"
+    if not isinstance(size, dict) or not all(type(size.get(edge)) is int for edge in ("shortest_edge", "longest_edge")):
+        raise CheckpointError.at(f"{where}: size", "shortest_edge and longest_edge", shown(size))
+    check_settings(preprocessor, {**SIZED_BY_PROCESSOR, **sampling}, where)
+    return {"least_px": size["shortest_edge"], "most_px": size["longest_edge"]}
+
+
+def _check(settings: Mapping[str, Any]) -> None:
+    """Raise CheckpointError for settings that no prompt can be made of."""
+    prefixes, fps, suffix = settings["num_prefixes"], settings["fps"], settings["prompt_suffix"]
+    if prefixes is not None and prefixes < 2:
+        raise CheckpointError.at("num_prefixes", "at least 2, the first and the last", prefixes)
+    require("max_frames", settings["max_frames"] >= 1, "at least 1", settings["max_frames"], CheckpointError)
+    require("fps", 0 < float(fps) < float("inf"), "a finite number above 0", shown(fps), CheckpointError)
+    try:
+        is_good = suffix.format(instruction="TASK") != suffix.format(instruction="")
+    except (AttributeError, IndexError, LookupError, ValueError):
+        is_good = False
+    require("prompt_suffix", is_good, "text with {instruction}", shown(suffix), CheckpointError)
+
+
+READER = Reader(reads, load, REWARD_MODELS)

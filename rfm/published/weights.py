@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: MIT
+"""Read a checkpoint's weights: from safetensors files, never pickles, without the name prefixes of training code."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rfm.files import (
+    ADAPTER_WEIGHTS,
+    NETWORK_CONFIG,
+    SHARDS,
+    WEIGHTS,
+    WEIGHTS_INDEX,
+    CheckpointError,
+    check_one_form,
+    cut,
+    is_there,
+    listed,
+    read_json,
+    read_tensors,
+    shown,
+    tensor_names,
+)
+from rfm.weights import check_names
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+PICKLE_STEM = "pytorch_model"  # of the names of transformers' pickled weights
+_ENCODERS = ("image_encoder", "text_encoder")  # subfolders of an exported checkpoint
+_LEVELS = ("*", "*/*", "*/*/*")  # depth of checkpoints in the folder of a training run or in a model repository
+_MAX_SUGGESTED = 5
+_PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
+# Files besides weights from which training resumes.
+_STATES = ("optimizer*", "*optim_states*", "scheduler*", "rng_state*", "random_states*", "scaler*", "training_args*")
+_CONVERT = (
+    "import argparse, functools, sys, torch, safetensors.torch as s; "
+    "torch.serialization.add_safe_globals([argparse.Namespace]); "
+    "load = lambda file: functools.reduce("
+    "lambda d, key: d[key] if isinstance(d.get(key), dict) else d, "
+    "('state_dict', 'model_state_dict', 'model', 'module'), "
+    "torch.load(file, map_location='cpu', weights_only=True)); "
+    "s.save_file({name: t.clone(memory_format=torch.contiguous_format) "
+    "for file in sys.argv[2:] for name, t in load(file).items() if torch.is_tensor(t)}, "
+    "sys.argv[1], {'format': 'pt'})"
+)
+# Prefixes that training code puts before the names of weights. Those in _INSIDE also stand before names of layers.
+_INSIDE = r"_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module|_forward_module"
+_WRAPPERS = re.compile(rf"^(?:(?:module|base_model\.model|{_INSIDE})\.)+|(?<=\.)(?:(?:{_INSIDE})\.)+")
+_HEAD = "progress_head.4.weight"  # in every reward network
+# The model_type of config.json, by the name of a weight that such a network has and no other.
+_NETWORKS = {
+    "rewind_transformer": re.compile(r"(^|\.)video_proj\.weight$"),
+    "qwen2_5_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.gate_proj\."),
+    "qwen3_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.linear_fc1\."),
+}
+_STRIP = (
+    "import sys, safetensors.torch as s; prefix, target, *files = sys.argv[1:]; "
+    "t = [(name.removeprefix(prefix), v) for file in files for name, v in s.load_file(file).items()]; "
+    "assert len(dict(t)) == len(t), 'two tensors would have one name'; s.save_file(dict(t), target, {'format': 'pt'})"
+)
+
+
+def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tensor]:
+    """Return all tensors of model.safetensors, or of its shards, without the prefixes of wrappers.
+
+    model_type: in config.json, of a network that contains one of the known networks; None: it is a known one
+    Raises CheckpointError.
+    """
+    check_one_form(folder)
+    if is_there(folder / WEIGHTS):
+        files, weights = [folder / WEIGHTS], read_tensors(folder / WEIGHTS)
+    elif is_there(folder / WEIGHTS_INDEX):
+        files, weights = _read_shards(folder / WEIGHTS_INDEX)
+    else:
+        refuse_pickles(folder, WEIGHTS, PICKLE_STEM)
+        got = cut(", ".join(sorted(path.name for path in folder.iterdir()))) or "nothing"
+        raise CheckpointError.at(folder, f"{WEIGHTS} or {WEIGHTS_INDEX}", f"{got}: {_below(folder)}")
+    _check_network(folder, weights, model_type)
+    return _unwrapped(weights, files, folder / WEIGHTS)
+
+
+def _check_network(folder: Path, names: Iterable[str], model_type: str | None) -> None:
+    """Raise CheckpointError if config.json is of another network than the weights, as some trainers write it."""
+    file = folder / NETWORK_CONFIG
+    content = read_json(file) if is_there(file) else {}
+    stated = content.get("model_type")
+    found = next((kind for name in names for kind, own in _NETWORKS.items() if own.search(name)), None)
+    is_first = stated is None and found == next(iter(_NETWORKS))  # the first ReWiND checkpoints state nothing
+    is_expected = stated is not None and stated in (found, model_type)
+    if found is None or "type" in content or is_first or is_expected:  # ``type``: of LeRobot
+        return
+    got = "none" if stated is None else shown(stated)
+    expected = f"{found}, by the names of the weights"
+    remedy = f"copy {NETWORK_CONFIG} of the model that the run started from"
+    raise CheckpointError.at(f"{file}: model_type", expected, f"{got}: the file describes another network", remedy)
+
+
+def _read_shards(index: Path) -> tuple[list[Path], dict[str, Tensor]]:
+    weight_map = read_json(index).get("weight_map")
+    if not isinstance(weight_map, dict):
+        raise CheckpointError.at(index, "a weight_map", "none")
+    weights: dict[str, Tensor] = {}
+    shard_of: dict[str, str] = {}
+    for shard in dict.fromkeys(map(str, weight_map.values())):
+        if Path(shard).name != shard or not shard.endswith(".safetensors"):
+            raise CheckpointError.at(index, "names of files beside it", shown(shard))
+        if not is_there(index.parent / shard):
+            raise CheckpointError(f"{index}: names the shard {shard}, which is not there")
+        for name, tensor in read_tensors(index.parent / shard).items():
+            if name in shard_of:
+                got = f"{shown(name)} in {shard_of[name]} and in {shard}"
+                raise CheckpointError.at(index, "each tensor in one shard", got, "save the weights again")
+            weights[name], shard_of[name] = tensor, shard
+    check_names(weight_map.keys(), weights.keys())
+    for file in sorted(index.parent.glob(SHARDS)):
+        unknown = set(tensor_names(file)) - shard_of.keys()
+        if unknown:
+            got = f"{file.name}, which it does not name, with {listed(sorted(unknown))}"
+            raise CheckpointError.at(index, "the names of all shards", got, "move that file away")
+    return [index.parent / shard for shard in dict.fromkeys(shard_of.values())], weights
+
+
+def _unwrapped(weights: Mapping[str, Tensor], files: Sequence[Path], target: Path) -> dict[str, Tensor]:
+    """Remove the prefixes of DataParallel, torch.compile, PEFT and FSDP, and any prefix that all names share.
+
+    files: the files with the weights
+    target: the file for the weights without the prefix, in the error's command
+    Raises CheckpointError if only some names have the prefix, or two names would be equal.
+    """
+    bare: dict[str, Tensor] = {}
+    for name, tensor in weights.items():
+        if (short := _WRAPPERS.sub("", name)) in bare:
+            raise CheckpointError.at(target.parent, "each weight once", f"{shown(short)} and {shown(name)}")
+        bare[short] = tensor
+    head = next((name for name in bare if name == _HEAD or name.endswith(f".{_HEAD}")), _HEAD)
+    prefix = head.removesuffix(_HEAD)
+    other = next((name for name in bare if not name.startswith(prefix)), None)
+    if other is not None:
+        stripped = target.parent / "stripped.safetensors"
+        line = f"{_command(_STRIP, [prefix, stripped, *files])} && mv {shlex.join([str(stripped), str(target)])}"
+        then = "" if list(files) == [target] else ", then move the shards and their index away"
+        got = f"{shown(head)}, with the prefix {prefix} that {shown(other)} lacks"
+        raise CheckpointError.at(target.parent, _HEAD, got, f"strip it with: {line}{then}")
+    return {name.removeprefix(prefix): tensor for name, tensor in bare.items()}
+
+
+def _below(folder: Path) -> str:
+    """Name the checkpoints below a folder that has no weights, or describe a checkpoint's folder."""
+    names = (WEIGHTS, WEIGHTS_INDEX, ADAPTER_WEIGHTS)
+    found = [file.parent for level in _LEVELS for name in names for file in sorted(folder.glob(f"{level}/{name}"))]
+    checkpoints = [str(path) for path in dict.fromkeys(found) if path.name not in _ENCODERS]
+    if not checkpoints:
+        return "a checkpoint's folder has it, beside config.json"
+    return f"name the checkpoint in it: {cut(', '.join(checkpoints[:_MAX_SUGGESTED]))}"
+
+
+def take_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Remove the tensors under ``prefix`` from ``weights``; return them without the prefix."""
+    names = [name for name in weights if name.startswith(prefix)]
+    return {name.removeprefix(prefix): weights.pop(name) for name in names}
+
+
+def has_head(weights: Iterable[str], head: str) -> bool:
+    """True if the weights contain any of this head's; ``check_shapes`` finds an incomplete head."""
+    return any(name.startswith(f"{head}_head.") for name in weights)
+
+
+def pickled_weights(names: Iterable[str], stem: str) -> list[str]:
+    """Return the pickles among a folder's files that may hold weights.
+
+    stem: of transformers' names; if files with such names exist, only these are returned
+    """
+
+    def is_any(name: str, patterns: Sequence[str]) -> bool:
+        return any(fnmatch(name, pattern) for pattern in patterns)
+
+    pickles = sorted(name for name in names if is_any(name, _PICKLES) and not is_any(name, _STATES))
+    usual = [name for name in pickles if name == f"{stem}.bin" or fnmatch(name, f"{stem}-*-of-*.bin")]
+    return usual or pickles
+
+
+def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
+    """Raise CheckpointError if ``folder`` has pickled weights in place of the missing file ``wanted``.
+
+    Pickles are never opened, since that may run code. The message holds a command that converts them.
+    """
+    names = pickled_weights((file.name for file in folder.iterdir()), stem)
+    if not names:
+        return
+    if len(names) > 1 and f"{stem}.bin" in names:
+        both = f"{stem}.bin and {names[0]}"
+        raise CheckpointError.at(folder, "one form of the weights", both, "move away what is not meant")
+    files = names if names[0].endswith(".bin") and "-of-" in names[0] else names[:1]  # all shards, or the first other
+    command = _command(_CONVERT, [folder / wanted, *(folder / name for name in files)])
+    got = (
+        f"{cut(', '.join(names))}: pickles may run code when they are loaded, so they are refused. If you trust who "
+        "made it, convert it. weights_only=True lets PyTorch make tensors and little else; do not convert a file that "
+        f"needs more: {command}"
+    )
+    raise CheckpointError.at(folder, wanted, got)
+
+
+def _command(code: str, arguments: Iterable[str | Path]) -> str:
+    """Return a shell command that runs ``code``, which must have no double quotes."""
+    return f'python -c "{code}" {shlex.join(map(str, arguments))}'

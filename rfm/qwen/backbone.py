@@ -1,0 +1,395 @@
+# SPDX-License-Identifier: MIT
+"""The forward pass of the Qwen backbones, with the layers of ``transformers``, without synchronisation.
+
+The host computes all positions and indices beforehand and never waits for the device, so the device always has work.
+Results and order of sums are those of ``transformers`` 4.57.
+
+Language model: B conversations of L tokens, D width, M visual tokens in all. A token has three coordinates: time, row
+and column. From one text token to the next, all three grow by 1. An image or video is a box, in which a token's
+coordinates are its place. The next text continues behind the box's largest coordinate. Padding follows the tokens,
+where causal attention does not see it. So no mask is needed, and PyTorch's fastest attention accepts none.
+
+Vision tower: a shot is a temporal patch, an image or two frames of a video. Attention stays within a shot. N patches
+of all shots in order, those of a merged token together; S patches of a shot, U = MERGE x MERGE of a merged token.
+Shots of a size share a call; transformers computes them one after the other.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from rfm.engine.layers import concatenated
+from rfm.files import CheckpointError
+from rfm.qwen.images import MERGE, Grid
+
+
+@dataclass(frozen=True)
+class Box:
+    """The merged tokens of an image or video in a conversation.
+
+    start: index of the first token
+    groups: number of temporal patches
+    rows, columns: of merged tokens in each
+    step: difference in time coordinate between temporal patches
+    """
+
+    start: int
+    groups: int
+    rows: int
+    columns: int
+    step: int = 1
+
+    @property
+    def num_tokens(self) -> int:
+        """Number of tokens in the box."""
+        return self.groups * self.rows * self.columns
+
+
+def positions(length: int, boxes: Sequence[Box]) -> npt.NDArray[np.int64]:
+    """Return time, row and column of each of ``length`` = L tokens, int64 [3, L]; ``boxes`` in order."""
+    found = np.empty((3, length), np.int64)
+    read = following = 0  # tokens with positions so far; the next text token's coordinate
+    for box in boxes:
+        text = box.start - read
+        found[:, read : box.start] = np.arange(following, following + text)
+        inside = np.indices((box.groups, box.rows, box.columns)).reshape(3, -1)
+        inside[0] *= box.step
+        read = box.start + box.num_tokens
+        found[:, box.start : read] = inside + following + text
+        following += text + 1 + max((box.groups - 1) * box.step, box.rows - 1, box.columns - 1)
+    found[:, read:] = np.arange(following, following + length - read)
+    return found
+
+
+UNIT = MERGE**2
+Runs = tuple[tuple[int, int], ...]
+Indices = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class VisionPlan:
+    """The layout of a batch's shots for a vision tower.
+
+    shots: number of shots and S, for each size
+    positions: int64 [sum of S, 2], row and column of each patch, for a shot of each size
+    corners, weights: Qwen3-VL: int64 and float32 [4, sum of S], learned positions around these patches, their weights
+    windows: Qwen2.5-VL: runs of equal windows, as number of windows and patches of a window
+    order: Qwen2.5-VL: int64 [N / U], the merged tokens in the order of the windows
+    back: the inverse of ``order``
+    """
+
+    shots: Runs
+    positions: Tensor
+    corners: Tensor | None = None
+    weights: Tensor | None = None
+    windows: Runs | None = None
+    order: Tensor | None = None
+    back: Tensor | None = None
+
+    def changed(self, change: Callable[[Tensor], Tensor]) -> VisionPlan:
+        """Return the plan with ``change`` applied to its tensors."""
+        changed: dict[str, Any] = {
+            name: change(value) for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
+        return replace(self, **changed)
+
+
+def plan(grids: Sequence[Grid], config: dict[str, Any]) -> VisionPlan:
+    """Return the plan for shots of these sizes, on the CPU.
+
+    grids: of each size, with its number of shots as ``groups``
+    config: vision_config of config.json
+    """
+    sizes = [(grid.rows, grid.columns) for grid in grids]
+    shots = tuple((grid.groups, grid.rows * grid.columns) for grid in grids)
+    positions = torch.cat([_positions(*size) for size in sizes])
+    if "num_position_embeddings" in config:
+        side = int(config["num_position_embeddings"] ** 0.5)
+        corners, weights = zip(*(_corners(*size, side) for size in sizes), strict=True)
+        return VisionPlan(shots, positions, torch.cat(corners, dim=1), torch.cat(weights, dim=1))
+    side = config["window_size"] // MERGE // config["patch_size"]
+    windows, order = _windows(grids, side)
+    return VisionPlan(
+        shots, positions, windows=windows, order=torch.from_numpy(order), back=torch.from_numpy(np.argsort(order))
+    )
+
+
+def features(visual: Any, patches: Tensor, plan: VisionPlan) -> Tensor:
+    """Return the features of all merged tokens, [N / U, levels, D], of patches [N, C * T * P * P].
+
+    levels: 1, and in Qwen3-VL more from deeper layers
+    C = 3 channels, T = 2 frames, P pixels a side of a patch
+    visual: transformers' vision tower, of which only the layers are used
+    """
+    hidden = embedded(visual.patch_embed.proj, patches)
+    if plan.corners is not None:
+        hidden = hidden + _repeated(_learned_positions(visual.pos_embed, plan), plan.shots)
+    turned = _turned(visual.rotary_pos_emb.inv_freq, plan)
+    if plan.order is not None:
+        hidden = _moved(hidden, plan.order)
+    full = set(getattr(visual, "fullatt_block_indexes", range(len(visual.blocks))))
+    deeper = list(getattr(visual, "deepstack_visual_indexes", ()))
+    of_deeper = {}
+    for number, block in enumerate(visual.blocks):
+        hidden = hidden + _attention(block.attn, block.norm1(hidden), turned, plan, is_full=number in full)
+        hidden = hidden + block.mlp(block.norm2(hidden))
+        if number in deeper:
+            at = deeper.index(number)
+            of_deeper[at] = visual.deepstack_merger_list[at](hidden)
+    merged = visual.merger(hidden)
+    levels = torch.stack([merged, *(of_deeper[at] for at in sorted(of_deeper))], dim=1)
+    return levels if plan.back is None else levels[plan.back]
+
+
+def embedded(projection: Any, patches: Tensor) -> Tensor:
+    """Embed patches with one matrix product: [N, C * T * P * P] -> [N, D].
+
+    ``projection`` is a Conv3d whose kernel equals its stride. Some versions of cuDNN compute this convolution wrong or
+    very slowly in bfloat16 (pytorch issue 163539, transformers issue 45750).
+    """
+    weight: Tensor = projection.weight
+    return F.linear(patches.to(weight.dtype), weight.flatten(1), projection.bias)
+
+
+def _attention(attention: Any, hidden: Tensor, turned: Turn, plan: VisionPlan, *, is_full: bool) -> Tensor:
+    """Attend within each shot (``is_full``) or window, equal sizes in one call: [N, D] -> [N, D]."""
+    heads = attention.qkv(hidden).unflatten(1, (3, attention.num_heads, -1))
+    query, key = turned(heads[:, :2]).unbind(1)
+    value = heads[:, 2]
+    is_moved = is_full and plan.order is not None
+    if is_moved:
+        query, key, value = (_moved(each, plan.back) for each in (query, key, value))
+    runs = plan.shots if is_full or plan.windows is None else plan.windows
+    counts = [count * length for count, length in runs]
+    parts = zip(runs, query.split(counts), key.split(counts), value.split(counts), strict=True)
+    mixed = concatenated([_within(*part, scale=attention.scaling) for part in parts])
+    return attention.proj(_moved(mixed, plan.order) if is_moved else mixed)
+
+
+def _within(run: tuple[int, int], query: Tensor, key: Tensor, value: Tensor, *, scale: float) -> Tensor:
+    """Attend within equal sequences, ``run`` = number and length: [N, heads, D / heads] -> [N, D]."""
+    query, key, value = (each.unflatten(0, run).transpose(1, 2) for each in (query, key, value))
+    return F.scaled_dot_product_attention(query, key, value, scale=scale).transpose(1, 2).flatten(2).flatten(0, 1)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """The rotary embedding: float32 [N, 1, 1, D / heads].
+
+    cosine, sine: of positions; the first half of the sines is negated, so queries and keys need no negation
+    """
+
+    cosine: Tensor
+    sine: Tensor
+
+    def __call__(self, heads: Tensor) -> Tensor:
+        """Rotate queries and keys, [N, 2, heads, D / heads], in float32; the result has their dtype."""
+        first, second = heads.chunk(2, dim=-1)
+        return (heads * self.cosine + torch.cat((second, first), dim=-1) * self.sine).to(heads.dtype)
+
+
+def _turned(frequencies: Tensor, plan: VisionPlan) -> Turn:
+    angles = (plan.positions[..., None].to(frequencies.dtype) * frequencies).flatten(1)
+    cosine, sine = angles.cos().float(), angles.sin().float()
+    of_sizes = torch.stack((torch.cat((cosine, cosine), dim=-1), torch.cat((-sine, sine), dim=-1)), dim=1)
+    of_patches = _repeated(of_sizes, plan.shots)
+    if plan.order is not None:
+        of_patches = _moved(of_patches, plan.order)
+    cosine, sine = of_patches[:, :, None, None].unbind(1)
+    return Turn(cosine, sine)
+
+
+def _learned_positions(embedding: Any, plan: VisionPlan) -> Tensor:
+    """Return interpolated learned positions, [sum of S, D]."""
+    assert plan.corners is not None
+    assert plan.weights is not None
+    around = embedding(plan.corners) * plan.weights.to(embedding.weight.dtype)[..., None]
+    return around[0] + around[1] + around[2] + around[3]
+
+
+def _repeated(of_sizes: Tensor, shots: Runs) -> Tensor:
+    """Repeat the values of a shot of each size for all its shots: [sum of S, ...] -> [N, ...]."""
+    parts = zip(of_sizes.split([length for _, length in shots]), shots, strict=True)
+    return concatenated([part.repeat(count, *(1,) * (part.ndim - 1)) for part, (count, _) in parts])
+
+
+def _moved(patches: Tensor, order: Tensor | None) -> Tensor:
+    """Reorder patches by merged tokens: [N, ...] -> [N, ...]."""
+    return patches.unflatten(0, (-1, UNIT))[order].flatten(0, 1)
+
+
+@lru_cache(maxsize=256)
+def _positions(rows: int, columns: int) -> Tensor:
+    """Return row and column of each patch, int64 [S, 2]."""
+    indices = np.indices((rows, columns)).reshape(2, rows // MERGE, MERGE, columns // MERGE, MERGE)
+    return torch.from_numpy(np.ascontiguousarray(indices.transpose(1, 3, 2, 4, 0).reshape(-1, 2)))
+
+
+@lru_cache(maxsize=256)
+def _corners(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
+    """Return the 4 learned positions (of side x side) around each patch, int64 [4, S], and weights, float32 [4, S]."""
+    of_axes = []
+    for count in (rows, columns):
+        at = torch.linspace(0, side - 1, count)
+        low = at.int()
+        of_axes.append((low, (low + 1).clip(max=side - 1), at - low))
+    (top, bottom, down), (left, right, across) = of_axes
+    corners = [(row[:, None] * side + column[None]) for row in (top, bottom) for column in (left, right)]
+    weights = [(of_row[:, None] * of_column[None]) for of_row in (1 - down, down) for of_column in (1 - across, across)]
+    at = _positions(rows, columns)
+    places = at[:, 0] * columns + at[:, 1]
+    return (
+        torch.stack([corner.flatten()[places] for corner in corners]).long(),
+        torch.stack([weight.flatten()[places] for weight in weights]),
+    )
+
+
+@lru_cache(maxsize=256)
+def _windows_of(rows: int, columns: int, side: int) -> dict[int, Indices]:
+    """Return a shot's merged tokens by window, int64 [windows, tokens], for each number of tokens in a window."""
+    tokens = np.arange(rows * columns).reshape(rows, columns)
+    found: dict[int, list[Indices]] = {}
+    for top in range(0, rows, side):
+        for left in range(0, columns, side):
+            window = tokens[top : top + side, left : left + side].ravel()
+            found.setdefault(len(window), []).append(window)
+    return {length: np.stack(windows) for length, windows in found.items()}
+
+
+def _windows(grids: Sequence[Grid], side: int) -> tuple[Runs, Indices]:
+    """Return runs of windows (number, patches of each), and the merged tokens in the windows' order, int64 [N / U]."""
+    runs, order, start = [], [], 0
+    for grid in grids:
+        for length, windows in _windows_of(grid.rows // MERGE, grid.columns // MERGE, side).items():
+            shots = start + np.arange(grid.groups) * grid.tokens_per_group
+            order.append((shots[:, None, None] + windows).ravel())
+            runs.append((grid.groups * len(windows), length * UNIT))
+        start += grid.groups * grid.tokens_per_group
+    return tuple(runs), np.concatenate(order)
+
+
+FULL_ATTENTION = "full_attention"
+ROOM = 16  # slots that KeyValues adds at a time
+
+
+class KeyValues:
+    """The keys and values of all tokens so far, of each layer, in the form of transformers' cache.
+
+    Each conversation has S slots and fills them from the first. After the pass over the prompts, call ``place`` before
+    the pass over each further token.
+    """
+
+    def __init__(self) -> None:
+        self._of_layers: dict[int, tuple[Tensor, Tensor]] = {}  # [B, S, heads, D / heads] each
+        self._next: Tensor | None = None  # int64 [B], the slots of the next tokens among all B * S
+        self._num_seen = 0
+
+    def place(self, lengths: Tensor, longest: int) -> None:
+        """Put the next token of each conversation behind its first tokens. Forget what was there.
+
+        lengths: int64 [B], number of tokens to keep
+        longest: the largest of them
+        """
+        self._num_seen = longest + 1
+        if self._num_seen > self._of_layers[0][0].shape[1]:
+            for layer, (keys, values) in self._of_layers.items():
+                self._of_layers[layer] = _with_room(keys), _with_room(values)
+        num_slots = self._of_layers[0][0].shape[1]
+        self._next = torch.arange(len(lengths), device=lengths.device) * num_slots + lengths
+
+    def update(self, keys: Tensor, values: Tensor, layer: int, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+        """Add the keys and values of new tokens, [B, heads, L, D / heads]; return those of all tokens.
+
+        Behind a conversation's own tokens, the result has those of padding or of forgotten tokens, or zeros.
+        """
+        new = keys.transpose(1, 2), values.transpose(1, 2)
+        if self._next is None:
+            self._of_layers[layer] = _with_room(new[0]), _with_room(new[1])
+            return keys, values
+        kept = self._of_layers[layer]
+        for slots, tokens in zip(kept, new, strict=True):
+            slots.flatten(0, 1).index_copy_(0, self._next, tokens.flatten(0, 1))
+        return kept[0][:, : self._num_seen].transpose(1, 2), kept[1][:, : self._num_seen].transpose(1, 2)
+
+
+def _with_room(slots: Tensor) -> Tensor:
+    """Return a copy with ROOM more slots: [B, S, heads, D / heads] -> [B, S + ROOM, heads, D / heads].
+
+    The new slots are zeros: attention must not meet a NaN, even where a mask gives it no weight.
+    """
+    return F.pad(slots, (0, 0, 0, 0, 0, ROOM))
+
+
+def last_hidden_state(
+    language: Any, inputs: dict[str, Tensor], features: Tensor, key_values: KeyValues | None = None
+) -> Tensor:
+    """Return the hidden states behind the final norm, [B, L, D].
+
+    language: transformers' language model
+    inputs: on its device: input_ids, int64 [B, L]; position_ids, int64 [3, B, L]; visual_tokens, int64 [M], the visual
+        tokens' indices among all B * L; visual_features, int64 [M], the index of each in ``features``
+    features: [N / U, levels, D], the merged tokens of all shots
+    key_values: receives the keys and values of all tokens; None: they are not needed
+    """
+    at, picked = inputs["visual_tokens"], inputs["visual_features"]
+    merged, *deeper = features.unbind(1)
+    hidden = language.embed_tokens(inputs["input_ids"])
+    hidden.flatten(0, 1).index_copy_(0, at, merged[picked].to(hidden.dtype))
+    turned = language.rotary_emb(hidden, inputs["position_ids"])
+    options = _cached(language, key_values)
+    for number, layer in enumerate(language.layers):
+        hidden = layer(hidden, position_embeddings=turned, attention_mask=None, **options)
+        hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # transformers 4.57 of Qwen2.5-VL
+        if number < len(deeper):
+            hidden.flatten(0, 1).index_add_(0, at, deeper[number][picked].to(hidden.dtype))
+    return language.norm(hidden)
+
+
+def next_hidden_state(
+    language: Any, tokens: Indices, position_ids: Indices, lengths: Indices, key_values: KeyValues
+) -> Tensor:
+    """Return the hidden state of each conversation's next token behind the final norm, [B, D].
+
+    tokens: int64 [B]
+    position_ids: int64 [B], equal in time, row and column, since the token is text
+    lengths: int64 [B], number of tokens before
+    key_values: of the tokens before; receives those of this token, and forgets all others
+    """
+    device = language.embed_tokens.weight.device
+    ids, at, before = torch.from_numpy(np.stack([tokens, position_ids, lengths])).to(device)
+    longest, is_seen = int(lengths.max()), None
+    if int(lengths.min()) < longest:  # else no mask: PyTorch's fastest attention takes none
+        is_seen = (torch.arange(longest + 1, device=device) <= before[:, None])[:, None, None]
+    key_values.place(before, longest)
+    hidden = language.embed_tokens(ids[:, None])
+    turned = language.rotary_emb(hidden, at[None, :, None].expand(3, -1, -1))
+    options = _cached(language, key_values)
+    for layer in language.layers:
+        hidden = layer(hidden, position_embeddings=turned, attention_mask=is_seen, **options)
+        hidden = hidden[0] if isinstance(hidden, tuple) else hidden
+    return language.norm(hidden)[:, 0]
+
+
+def _cached(language: Any, key_values: KeyValues | None) -> dict[str, KeyValues]:
+    """Return the argument of a layer for its cache, whose name transformers changed in 5.x."""
+    if key_values is None:
+        return {}
+    known = inspect.signature(language.layers[0].forward).parameters
+    return {"cache" if "cache" in known else "past_key_values": key_values}
+
+
+def check_attention(backbone: Any) -> None:
+    """Raise CheckpointError for a language model with layers that do not attend to all earlier tokens."""
+    kinds = set(getattr(backbone.config.get_text_config(), "layer_types", None) or [FULL_ATTENTION])
+    if kinds != {FULL_ATTENTION}:
+        raise CheckpointError.at("text_config.layer_types", f"{FULL_ATTENTION} alone", sorted(kinds))

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: MIT
+"""Conversations, and batches of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rfm.engine.device import pinned
+from rfm.engine.layers import concatenated
+from rfm.qwen.backbone import VisionPlan
+from rfm.qwen.images import QwenImages
+from rfm.qwen.leaves import Leaf, Packs
+from rfm.qwen.video import Indices, Shot, SizedFrames, VlmVideo, shots_of
+from rfm_client.contract.samples import UInt8Array
+
+Spans: TypeAlias = list[tuple[int, int]]
+
+
+@dataclass(frozen=True, eq=False)
+class VlmRow:
+    """A conversation.
+
+    input_ids: int64 [L]
+    videos: of each trajectory
+    spans: for each trajectory, the tokens (first, behind the last) whose states are read for each frame
+    query: index of the token whose state gives preference or similarity; None: a single trajectory
+    picked: in dense mode int64 [frame_steps], the frames in the conversation; None: all
+    position_ids: int64 [3, L]
+    packs: conversations about the same video that begin like this one, the trunk, and precede it (``rfm.qwen.tree``)
+    alone: all conversations of a row with packs, as rows
+    """
+
+    input_ids: Indices
+    videos: tuple[VlmVideo, ...]
+    spans: tuple[Spans, ...]
+    query: int | None
+    is_similarity: bool
+    picked: Indices | None = None
+    position_ids: Indices = field(kw_only=True)
+    packs: tuple[tuple[Leaf, ...], ...] = ()
+    alone: tuple[VlmRow, ...] = ()
+
+    @property
+    def leaves(self) -> list[Leaf]:
+        """The conversations that begin like this one, in order."""
+        return [leaf for pack in self.packs for leaf in pack]
+
+    @property
+    def cost(self) -> int:
+        """Number of tokens that the language model computes: the conversation's, and those that its leaves add."""
+        return self.num_tokens + sum(leaf.num_tokens for leaf in self.leaves)
+
+    @property
+    def frames(self) -> tuple[Sequence[UInt8Array] | UInt8Array, ...]:
+        """The frames of each trajectory before resizing, uint8 [H, W, 3] each."""
+        return tuple(video.frames for video in self.videos)
+
+    @property
+    def shown(self) -> Iterator[tuple[VlmVideo, Indices]]:
+        """Each trajectory, and the indices of its frames in the conversation."""
+        return ((video, np.arange(video.num_shown) if self.picked is None else self.picked) for video in self.videos)
+
+    @property
+    def num_tokens(self) -> int:
+        """L, the number of tokens in the conversation."""
+        return len(self.input_ids)
+
+
+@dataclass(eq=False)
+class SizedShots:
+    """Shots of equal size for the vision tower.
+
+    videos: frames of each video, uint8 [N, H', W', 3]
+    firsts: index of each video's first frame among those of all videos, by the id of its SizedFrames
+    shots: indices of a shot's frames among those of all videos, by key
+    """
+
+    videos: list[Tensor] = field(default_factory=list)
+    firsts: dict[int, int] = field(default_factory=dict)
+    shots: dict[Hashable, Shot] = field(default_factory=dict)
+
+    def add(self, sized: SizedFrames, key: Hashable, shot: Shot) -> None:
+        """Add a shot of a video."""
+        if id(sized) not in self.firsts:
+            self.firsts[id(sized)] = sum(map(len, self.videos))
+            self.videos.append(sized.pixels)
+        first = self.firsts[id(sized)]
+        places = [int(sized.places[frame]) for frame in shot]
+        assert min(places) >= 0  # the shot is not cached
+        self.shots[key] = tuple(first + place for place in places)
+
+    def frames(self) -> FramesOfOneSize:
+        """Return the videos, with the frames of each shot."""
+        shots = torch.tensor(list(self.shots.values()))
+        is_each = torch.equal(shots, torch.arange(sum(map(len, self.videos)))[:, None])
+        return FramesOfOneSize(self.videos, None if is_each else shots)
+
+
+class Shots:
+    """The different shots of a batch.
+
+    are_images: each frame is a shot; else each pair
+    """
+
+    def __init__(self, *, are_images: bool) -> None:
+        self._are_images = are_images
+        self._of_size: dict[torch.Size, SizedShots] = {}
+        self._kept: dict[Hashable, Tensor] = {}
+        self._seen: set[Hashable] = set()
+        self._sized: list[SizedFrames] = []  # references, so that their ids stay unique
+
+    @property
+    def sizes(self) -> list[SizedShots]:
+        """The uncached shots of each size, in the order of their addition."""
+        return list(self._of_size.values())
+
+    def add(self, video: VlmVideo, shown: Indices) -> list[Hashable]:
+        """Add the shots of a conversation that shows these frames of a video; return their keys."""
+        sized, keys = video.ready, []
+        self._sized.append(sized)
+        for shot in shots_of(shown, are_images=self._are_images):
+            key = sized.keys[shot]
+            if key not in self._seen:
+                self._seen.add(key)
+                self._place(sized, key, shot)
+            keys.append(key)
+        return keys
+
+    def layout(self, tokens_per_shot: Sequence[int]) -> Layout:
+        """Return the layout of the shots' tokens. ``tokens_per_shot``: for each of ``sizes``."""
+        made: dict[Hashable, slice] = {}
+        start = 0
+        for size, tokens in zip(self.sizes, tokens_per_shot, strict=True):
+            for key in size.shots:
+                made[key] = slice(start, start + tokens)
+                start += tokens
+        return Layout(made, self._kept)
+
+    def _place(self, sized: SizedFrames, key: Hashable, shot: Shot) -> None:
+        if key in sized.kept:
+            self._kept[key] = sized.kept[key]
+        else:
+            self._of_size.setdefault(sized.pixels.shape[1:3], SizedShots()).add(sized, key, shot)
+
+
+@dataclass(frozen=True)
+class FramesOfOneSize:
+    """Frames of equal size, by video, and the shots that they form.
+
+    videos: uint8 [T, H', W', 3] each
+    shots: frames of each of S shots, int64 [S, 1] for images, [S, 2] for videos; None: each frame is an image
+    """
+
+    videos: Sequence[Tensor]
+    shots: Tensor | None
+
+    @property
+    def num_shown(self) -> int:
+        """Number of frames in the shots; a frame that fills up a pair counts twice."""
+        return sum(map(len, self.videos)) if self.shots is None else self.shots.numel()
+
+    def frames(self, device: torch.device) -> Tensor:
+        """Return the frames of all videos on ``device``, uint8 [sum of T, H', W', 3]."""
+        return concatenated([video.to(device, non_blocking=True) for video in self.videos])
+
+
+@dataclass(frozen=True)
+class QwenPixels:
+    """Pixels for the Qwen backbones: patches of images, or of pairs of frames, in the order of ``sizes``."""
+
+    images: QwenImages
+    sizes: Sequence[FramesOfOneSize]
+
+    @property
+    def videos(self) -> list[Tensor]:
+        """The frames of each video, uint8 [T, H', W', 3]."""
+        return [video for size in self.sizes for video in size.videos]
+
+    @property
+    def num_shown(self) -> int:
+        """Number of frames in all shots."""
+        return sum(size.num_shown for size in self.sizes)
+
+    def changed(self, change: Callable[[Tensor], Tensor]) -> QwenPixels:
+        """Return these pixels with ``change`` applied to the indices of the shots."""
+        shots = [None if size.shots is None else change(size.shots) for size in self.sizes]
+        sizes = [replace(size, shots=changed) for size, changed in zip(self.sizes, shots, strict=True)]
+        return replace(self, sizes=sizes)
+
+    def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+        """Return the backbone's input: the patches of all shots on ``device``."""
+        patches = [self.images.patches(size.frames(device), size.shots, dtype) for size in self.sizes]
+        return {"pixel_values": concatenated(patches)}
+
+
+class Layout:
+    """The indices of each shot's merged tokens: first those from the vision tower, by size, then those from the cache.
+
+    made: indices for each shot that the tower reads
+    kept: features of each cached shot, [tokens, levels, D]
+    """
+
+    def __init__(self, made: dict[Hashable, slice], kept: dict[Hashable, Tensor]) -> None:
+        self.made, self.kept = made, kept
+        self._tokens, start = dict(made), max((tokens.stop for tokens in made.values()), default=0)
+        for key, features in kept.items():
+            self._tokens[key] = slice(start, start + len(features))
+            start += len(features)
+
+    def tokens(self, keys: Sequence[Hashable]) -> Indices:
+        """Return the indices of the merged tokens of shots of equal size, in order, int64 [M]."""
+        first = self._tokens[keys[0]]
+        starts = np.array([self._tokens[key].start for key in keys], np.int64)
+        tokens: Indices = (starts[:, None] + np.arange(first.stop - first.start)).ravel()
+        return tokens
+
+
+@dataclass(frozen=True)
+class VlmBatch:
+    """Conversations, padded to the longest, with F frames (or temporal patches) and Q queries.
+
+    inputs: the backbone's arguments by name
+    spans: int64 [F, 3], row, first token and token behind the last of each frame's state
+    query_rows, query_tokens: int64 [Q], row and token of each query
+    num_tokens, num_span_tokens: tokens without padding; tokens in all spans
+    pixels: source of the arguments for pixels; None: these are in ``inputs``, or all shots are cached
+    plan: of the vision tower; None: all shots are cached
+    layout: of the shots; None: not placed yet
+    packs: of conversations that begin like others (``rfm.qwen.tree``). With packs, spans and queries have row 0 and
+        index all tokens: the B * L of the conversations, then those of the packs
+    """
+
+    inputs: dict[str, Tensor]
+    spans: Tensor
+    query_rows: Tensor
+    query_tokens: Tensor
+    num_tokens: int
+    num_span_tokens: int
+    pixels: QwenPixels | None = None
+    plan: VisionPlan | None = None
+    layout: Layout | None = None
+    packs: tuple[Packs, ...] = ()
+
+    @property
+    def num_slots(self) -> int:
+        """Number of tokens, with padding."""
+        return sum(ids.numel() for ids in (self.inputs["input_ids"], *(packs.input_ids for packs in self.packs)))
+
+    def pinned(self) -> VlmBatch:
+        """Return the batch with its tensors, except the frames, in pinned memory."""
+        return self._changed(pinned)
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> VlmBatch:
+        """Return the batch on ``device``, where pixels are normalised, put in order and converted to ``dtype``."""
+        moved = self._changed(lambda tensor: tensor.to(device, non_blocking=True))
+        made = {} if moved.pixels is None else moved.pixels.inputs(device, dtype)
+        return replace(moved, inputs=moved.inputs | made, pixels=None)
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> VlmBatch:
+        return replace(
+            self,
+            inputs={name: change(tensor) for name, tensor in self.inputs.items()},
+            spans=change(self.spans),
+            query_rows=change(self.query_rows),
+            query_tokens=change(self.query_tokens),
+            pixels=None if self.pixels is None else self.pixels.changed(change),
+            plan=None if self.plan is None else self.plan.changed(change),
+            packs=tuple(packs.changed(change) for packs in self.packs),
+        )

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""What checkpoints on a Qwen backbone share: from weights in memory to a network, a predictor and files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from rfm.engine.family import NETWORK, config_fields
+from rfm.engine.feature_cache import FeatureCache
+from rfm.files import NETWORK_CONFIG, CheckpointError, expecting, shown
+from rfm.qwen.collator import QwenCollator
+from rfm.qwen.lora import merged
+from rfm.qwen.network import BackboneConfig, build_backbone
+from rfm.qwen.predictor import QwenPredictor
+from rfm.qwen.processor import save_processor
+from rfm.qwen.rounded import fit
+from rfm.qwen.tree import trees
+from rfm.saved import PROCESSOR_FOLDER, SETTINGS, write_network
+from rfm.weights import check_shapes
+from rfm_client.contract import Sample
+
+_VISION = "visual."  # beginning of parameters that patches pass
+_EMBEDDING = "embed_tokens."  # looked up, not multiplied
+
+
+def flop(config: BackboneConfig, collator: QwenCollator, sample: Sample) -> float:
+    """Return the operations of a sample's products with weights: two for each parameter and each patch or token.
+
+    The products of attention, about a tenth, and the heads are left out.
+    Raises InvalidSampleError.
+    """
+    rows = collator.rows(sample)
+    videos = dict.fromkeys(video for row in rows for video in row.videos)
+    with torch.device("meta"):
+        backbone = build_backbone(config, config.torch_dtype)
+    counts = {name: weights.numel() for name, weights in backbone.named_parameters() if _EMBEDDING not in name}
+    of_vision = sum(count for name, count in counts.items() if name.startswith(_VISION))
+    num_patches = sum(collator.num_patches(video) for video in videos)
+    if collator.makes_trees:
+        rows = trees(rows, collator.visual_pad, are_images=collator.config.multi_image)
+    num_tokens = sum(row.cost for row in rows)
+    return 2.0 * (of_vision * num_patches + (sum(counts.values()) - of_vision) * num_tokens)
+
+
+LORA = "lora"  # key in ``parts``: the factors that change the network's weights
+MAX_LAYERS = 1024
+_LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
+
+
+@dataclass(frozen=True)
+class QwenCheckpoint:
+    """A checkpoint in memory.
+
+    weights: of its network, without LoRA
+    processor: folder or id with tokenizer and preprocessing
+    """
+
+    config: Any
+    weights: dict[str, Tensor]
+    processor: str | Path
+
+    @property
+    def parts(self) -> dict[str, dict[str, Tensor]]:
+        """All weights of the network."""
+        return {NETWORK: self.weights}
+
+    @cached_property
+    def collator(self) -> Any:
+        """The collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+        return self.load_collator()
+
+    def load_collator(self) -> QwenCollator:
+        """Return the collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+        raise NotImplementedError
+
+    def network(self, dtype: torch.dtype) -> nn.Module:
+        """Return the network, with weights of no use."""
+        raise NotImplementedError
+
+    def skeleton(self) -> nn.Module:
+        """Return the network without weights."""
+        with torch.device("meta"):
+            return self.network(self.config.torch_dtype)
+
+    def make_predictor(self, network: Any, device: torch.device, cache: FeatureCache[Any] | None) -> QwenPredictor:
+        """Return the predictor with this network."""
+        raise NotImplementedError
+
+    def loaded(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the weights under all names that the network loads."""
+        return {**weights}
+
+    def saved_settings(self) -> dict[str, Any]:
+        """Return this project's fields of an exported config.json."""
+        return {name: value for name, value in config_fields(self.config).items() if name != "backbone"}
+
+    def flop(self, sample: Sample) -> float:
+        """Return the operations of a sample's products. Raises CheckpointError, InvalidSampleError."""
+        return flop(self.config, self.collator, sample)
+
+    def predictor(
+        self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
+    ) -> QwenPredictor:
+        """Return a predictor with the network on ``device``. Raises CheckpointError.
+
+        dtype: of the network; None: float32 on the CPU, else the checkpoint's own
+        cache: for features of frames; None: no cache
+        """
+        self.collator  # noqa: B018  first, so that a missing file is reported before the network is built
+        if dtype is None and device.type == "cpu":
+            dtype = torch.float32
+        return self.make_predictor(self.build(dtype), device, cache)
+
+    def save(self, folder: Path) -> None:
+        """Write all weights, a config.json with all settings, and the processor."""
+        collator = self.collator  # first, so that a missing file is reported before the weights are written
+        config = {**self.config.backbone, SETTINGS: self.saved_settings()}
+        write_network(folder, config, {name: each for part in self.parts.values() for name, each in part.items()})
+        save_processor(collator, folder / PROCESSOR_FOLDER)
+
+    def build(self, dtype: torch.dtype | None = None) -> Any:
+        """Return the network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own).
+
+        Raises CheckpointError.
+        """
+        wanted, factors = dtype or self.config.torch_dtype, self.parts.get(LORA, {})
+        network = self.network(wanted)
+        fit(network, self.weights, factors)
+        # Parameters only: rotary frequencies stay float32, as upstream.
+        network.load_state_dict(self.loaded(merged(self.weights, factors, wanted)), strict=True, assign=True)
+        return network.eval().requires_grad_(False)
+
+    def check(self) -> None:
+        """Raise CheckpointError unless the weights fit the network, before memory is allocated for it."""
+        _check_layers(self.config.backbone)
+        with expecting("a backbone that transformers can make", NETWORK_CONFIG):
+            network = self.skeleton()
+        fit(network, self.weights)
+        check_shapes(network.state_dict(), self.loaded(self.weights))
+
+
+def _check_layers(config: Any) -> None:
+    inner = config.values() if isinstance(config, dict) else config if isinstance(config, list) else ()
+    for part in inner:
+        _check_layers(part)
+    for name in _LAYER_COUNTS if isinstance(config, dict) else ():
+        count = config.get(name)
+        if isinstance(count, (int, float)) and count > MAX_LAYERS:
+            raise CheckpointError.at(f"{NETWORK_CONFIG}: {name}", f"at most {MAX_LAYERS}", shown(count))

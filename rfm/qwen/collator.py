@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: MIT
+"""Turn samples of raw frames into rows, and rows into padded batches for a vision-language backbone.
+
+T frames, L tokens. A row is a conversation: its tokens, and the tokens whose hidden states are read for each frame and
+for the query.
+Making a row is cheap. Resizing its frames is not, and may be done before its batch is collated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
+from enum import Enum
+from functools import lru_cache, partial
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.threads import IN_TURN, FrameThreads
+from rfm.qwen.backbone import Box, plan, positions
+from rfm.qwen.batch import QwenPixels, Shots, VlmBatch, VlmRow
+from rfm.qwen.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages
+from rfm.qwen.leaves import Leaf, PlacedPack, calls, padded, starts
+from rfm.qwen.network import QWEN3, WRAPPED
+from rfm.qwen.video import Indices, Shot, SizedFrames, VlmVideo
+from rfm_client.contract import InvalidSampleError, Sample, Trajectory
+
+KEPT_TEXTS = 256  # cached conversations; an RL loop repeats the same task
+MAX_KEPT_BYTES = 16_384  # of a conversation's text; a task and 128 frames have fewer. A byte is at most one token
+FRAME_BYTES = 64  # of a chat template's text for a frame, about
+
+
+class Visual(Enum):
+    """The parts of a chat template besides text, by their names in it."""
+
+    IMAGE = "image"
+    VIDEO = "video"
+
+
+class Chat:
+    """A base model's chat template and tokenizer, with a cache of the latest short conversations."""
+
+    def __init__(self, tokenizer: Any) -> None:
+        self._tokenizer = tokenizer
+        self._text = lru_cache(KEPT_TEXTS)(self._render)
+        self._tokens = lru_cache(KEPT_TEXTS)(self._tokenise)
+
+    def text(self, parts: tuple[str | Visual, ...]) -> str:
+        """Return the chat template's text for one user message."""
+        is_short = sum(_num_bytes(part) if isinstance(part, str) else FRAME_BYTES for part in parts) <= MAX_KEPT_BYTES
+        return (self._text if is_short else self._render)(parts)
+
+    def tokens(self, text: str) -> Indices:
+        """Return the text's tokens, int64 [L], read-only."""
+        return (self._tokens if _num_bytes(text) <= MAX_KEPT_BYTES else self._tokenise)(text)
+
+    def _render(self, parts: tuple[str | Visual, ...]) -> str:
+        content = [{"type": "text", "text": part} if isinstance(part, str) else {"type": part.value} for part in parts]
+        conversation = [{"role": "user", "content": content}]
+        return str(self._tokenizer.apply_chat_template(conversation, tokenize=False, add_vision_id=True))
+
+    def _tokenise(self, text: str) -> Indices:
+        ids = np.asarray(self._tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"], np.int64)
+        ids.setflags(write=False)
+        return ids
+
+
+def _num_bytes(text: str) -> int:
+    return len(text.encode(errors="surrogatepass"))
+
+
+SECONDS_PER_GROUP = 1  # upstream's value for videos of Qwen2.5-VL
+TOKENS_PER_SECOND = 4  # transformers' default for Qwen2.5-VL
+VIDEO_FPS = 1  # upstream's value for Qwen3-VL, whose prompt has the time of each temporal patch
+VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
+IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
+
+
+class QwenCollator:
+    """Turns samples into rows, and rows into batches, for Qwen2.5-VL and Qwen3-VL. A family gives its ``rows``.
+
+    Images and videos are pad tokens between vision start and end.
+
+    tokenizer: the base model's, with the checkpoint's special tokens and a chat template
+    images: the backbone's preprocessing
+    """
+
+    makes_trees: ClassVar[bool] = True  # of prefixes, whose common beginnings are computed once
+
+    def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
+        self.config = config
+        self.tokenizer = tokenizer
+        self.images = images
+        self._special_tokens = tuple(tokenizer.get_added_vocab())
+        self._chat = Chat(tokenizer)
+
+    @property
+    def frames_per_shot(self) -> int:
+        """Number of frames in a temporal patch."""
+        return 1 if self.config.multi_image else FRAMES_PER_GROUP
+
+    def rows(self, sample: Sample) -> list[VlmRow]:
+        """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
+        raise NotImplementedError
+
+    def _uncached_to_size(self, video: VlmVideo, threads: FrameThreads) -> SizedFrames:
+        keys = {shot: (id(video), shot) for shot in video.shots(are_images=self.config.multi_image)}
+        needed = sorted({frame for shot in keys for frame in shot})
+        places = np.full(len(video.frames), -1)
+        places[needed] = np.arange(len(needed))
+        return SizedFrames(self._all_to_size(video, needed, threads), places, keys)
+
+    def _all_to_size(self, video: VlmVideo, needed: Sequence[int], threads: FrameThreads) -> Tensor:
+        parts = threads.parts(partial(self._to_size, video), needed)
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+    def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> VlmBatch:
+        """Return the batch of conversations of any kinds and lengths, whose frames have been resized.
+
+        length: L, to which they are padded; None: the longest conversation's
+        """
+        length = length or max(row.num_tokens for row in rows)
+        pad = self.tokenizer.pad_token_id
+        ids = torch.full((len(rows), length), pad, dtype=torch.int64)
+        for index, row in enumerate(rows):
+            ids[index, : row.num_tokens] = torch.from_numpy(row.input_ids)
+        spans = [
+            (index, start, stop)
+            for index, row in enumerate(rows)
+            for of_trajectory in row.spans
+            for start, stop in of_trajectory
+        ]
+        queries = [(index, row.query) for index, row in enumerate(rows) if row.query is not None]
+        query_rows, query_tokens = torch.tensor(queries, dtype=torch.int64).reshape(-1, 2).T.contiguous()
+        batch = VlmBatch(
+            inputs={"input_ids": ids},
+            spans=torch.tensor(spans, dtype=torch.int64),
+            query_rows=query_rows,
+            query_tokens=query_tokens,
+            num_tokens=sum(row.cost for row in rows),
+            num_span_tokens=sum(stop - start for _, start, stop in spans),
+        )
+        return self._with_pixels(batch, rows)
+
+    def _positions(self, ids: Indices, token: str) -> Indices:
+        return np.flatnonzero(ids == self.tokenizer.convert_tokens_to_ids(token))
+
+    def _check_task(self, task: str) -> None:
+        """Raise InvalidSampleError for an empty task or special tokens in it: a task is data."""
+        if not task.strip():
+            raise InvalidSampleError.at("task", "a task sentence", repr(task))
+        for token in self._special_tokens:
+            if token in task:
+                raise InvalidSampleError.at("task", "text without the model's special tokens", repr(token))
+
+    def to_size(
+        self, video: VlmVideo, cache: FeatureCache[Any] | None = None, threads: FrameThreads = IN_TURN
+    ) -> SizedFrames:
+        """Resize the frames of a video's shots for the backbone.
+
+        cache: frames of shots in it need no resizing; None: no cache
+        threads: prepare the frames
+        """
+        if cache is None:
+            return self._uncached_to_size(video, threads)
+        video.compute_digests(threads)
+        keys = self.shot_keys(video)
+        found = cache.found(keys.values())
+        kept = {key: found[key] for shot, key in keys.items() if key in found and not video.is_blank(shot)}
+        alike = video.alike
+        needed = sorted({int(alike[frame]) for shot, key in keys.items() if key not in kept for frame in shot})
+        places = np.full(len(video.frames), -1)
+        places[needed] = np.arange(len(needed))
+        return SizedFrames(self._all_to_size(video, needed, threads), places[alike], keys, kept)
+
+    def shot_keys(self, video: VlmVideo) -> dict[Shot, Hashable]:
+        """Return each shot's key: its size and its frames' digests, on which alone the shot's features depend."""
+        grid, digests = self.grid(video), video.digests
+        shots = video.shots(are_images=self.config.multi_image)
+        return {shot: (grid.rows, grid.columns, *(digests[frame] for frame in shot)) for shot in shots}
+
+    def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
+        """Resize some of a video's frames to uint8 [N, H', W', 3], each independent of the others. Thread-safe."""
+        frames = video.stack(needed)
+        if self.config.multi_image:
+            return self.images.images_to_size(frames)
+        return self.images.video_to_size(frames, video.num_shown)
+
+    @property
+    def _pad(self) -> str:
+        return IMAGE_PAD if self.config.multi_image else VIDEO_PAD
+
+    @property
+    def visual_pad(self) -> int:
+        """The token whose embedding a feature of vision replaces."""
+        return int(self.tokenizer.convert_tokens_to_ids(self._pad))
+
+    def grid(self, video: VlmVideo) -> Grid:
+        """Return the grid of a conversation's frames of a video, as images or as a video."""
+        if self.config.multi_image:
+            return replace(self.images.image_grid(*video.size), groups=video.num_shown)
+        return self.images.video_grid(*video.size, video.num_shown)
+
+    def num_patches(self, video: VlmVideo) -> int:
+        """Return the number of patches of the longest conversation's frames."""
+        grid = self.grid(video)
+        return grid.groups * grid.rows * grid.columns
+
+    def _around(self, *texts: str) -> tuple[str, ...]:
+        """Return the texts of a Qwen3-VL's video in its prompt's form, wrapped as a whole or bare."""
+        return (VISION_START, *texts, VISION_END) if self.config.video_prompt == WRAPPED else texts
+
+    def _position_ids(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> Indices:
+        """Return position ids: a box for each image or temporal patch of Qwen3-VL, or for a video of Qwen2.5-VL."""
+        is_whole = not self.config.multi_image and self.config.family != QWEN3
+        step = SECONDS_PER_GROUP * self.config.backbone["vision_config"].get("tokens_per_second", TOKENS_PER_SECOND)
+        boxes, read, starts = [], 0, self._positions(ids, self._pad)
+        for grid in map(self.grid, videos):
+            groups = grid.groups if is_whole else 1
+            for _ in range(grid.groups // groups):
+                boxes.append(Box(int(starts[read]), groups, grid.rows // MERGE, grid.columns // MERGE, step))
+                read += boxes[-1].num_tokens
+        return positions(len(ids), boxes)
+
+    def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
+        """Return the batch with the backbone's inputs besides tokens."""
+        shots = Shots(are_images=self.config.multi_image)
+        read = [shots.add(video, shown) for row in rows for video, shown in row.shown]
+        read_by = {leaf: shots.add(row.videos[0], leaf.shown) for row in rows for leaf in row.leaves}
+        grids = [self.images.grid(len(each.shots), *each.videos[0].shape[1:3]) for each in shots.sizes]
+        layout = shots.layout([grid.tokens_per_group for grid in grids])
+        ids = batch.inputs["input_ids"]
+        position_ids = torch.zeros(3, *ids.shape, dtype=torch.int64)
+        for index, row in enumerate(rows):
+            position_ids[:, index, : row.num_tokens] = torch.from_numpy(row.position_ids)
+        inputs = {
+            "input_ids": ids,
+            "position_ids": position_ids,
+            "visual_tokens": (ids.flatten() == self.visual_pad).nonzero()[:, 0],
+            "visual_features": torch.from_numpy(np.concatenate([layout.tokens(keys) for keys in read])),
+        }
+        batch = replace(batch, inputs=inputs, layout=layout)
+        if read_by:
+            batch = self._with_leaves(batch, rows, lambda leaf: layout.tokens(read_by[leaf]))
+        if not grids:
+            return batch
+        pixels = QwenPixels(self.images, [each.frames() for each in shots.sizes])
+        return replace(batch, pixels=pixels, plan=plan(grids, self.config.backbone["vision_config"]))
+
+    def _with_leaves(self, batch: VlmBatch, rows: Sequence[VlmRow], features: Callable[[Leaf], Indices]) -> VlmBatch:
+        """Return the batch with all leaves, and with its spans and queries as indices among all tokens.
+
+        features: returns the indices of the features that a leaf's whole conversation shows
+        """
+        packs = [PlacedPack(index, row.num_tokens, pack) for index, row in enumerate(rows) for pack in row.packs]
+        made, first = [], dict[Leaf, int]()
+        num_slots = batch.inputs["input_ids"].numel()
+        for call in calls(packs):
+            made.append(padded(call, self.tokenizer.pad_token_id, self.visual_pad, features))
+            first |= {leaf: num_slots + start for leaf, start in starts(call).items()}
+            num_slots += made[-1].input_ids.numel()
+        length = batch.inputs["input_ids"].shape[1]
+        spans, queries = [], []
+        for index, row in enumerate(rows):
+            reads = [(first[leaf] + leaf.reads[0], first[leaf] + leaf.reads[1]) for leaf in row.leaves]
+            own = [(index * length + start, index * length + stop) for each in row.spans for start, stop in each]
+            spans += own if row.query is not None else [*reads, *own]
+            queries += [] if row.query is None else [*(start for start, _ in reads), index * length + row.query]
+        return replace(
+            batch,
+            packs=tuple(made),
+            spans=torch.tensor([(0, *span) for span in spans], dtype=torch.int64).reshape(-1, 3),
+            num_span_tokens=sum(stop - start for start, stop in spans),
+            query_rows=torch.zeros(len(queries), dtype=torch.int64),
+            query_tokens=torch.tensor(queries, dtype=torch.int64),
+        )
+
+
+def video_of(trajectory: Trajectory, frame_steps: int) -> VlmVideo:
+    """Return the video of a trajectory's frames. Raises InvalidSampleError for embeddings."""
+    if trajectory.named is not None:
+        digests, frames = zip(*trajectory.named, strict=True)
+        return VlmVideo.of(frames, frame_steps, digests)
+    if trajectory.frames is None:
+        raise InvalidSampleError.at("video_embeddings", "frames (this checkpoint reads raw frames)", "embeddings")
+    return VlmVideo.of(trajectory.frames, frame_steps)
+
+
+def expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:
+    """Repeat each ``pad`` token by ``lengths``, which is faster than to tokenise so many."""
+    times = np.ones(len(ids), np.int64)
+    at = np.flatnonzero(ids == pad)
+    assert len(at) == len(lengths), "the chat template shows each image or video once"
+    times[at] = lengths
+    return ids.repeat(times)
+
+
+def group_times(num_groups: int) -> list[float]:
+    """Return the mean time of the frames of each temporal patch, in seconds, at VIDEO_FPS."""
+    frame_times = [
+        [(group * FRAMES_PER_GROUP + frame) / VIDEO_FPS for frame in range(FRAMES_PER_GROUP)]
+        for group in range(num_groups)
+    ]
+    return [sum(times) / FRAMES_PER_GROUP for times in frame_times]
+
+
+def timed_groups(times_s: Sequence[float]) -> str:
+    """Return Qwen3-VL's text of a video: each temporal patch behind its time."""
+    return "".join(f"<{time_s:.1f} seconds>{VISION_START}{VIDEO_PAD}{VISION_END}" for time_s in times_s)

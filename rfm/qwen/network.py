@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: MIT
+"""A Qwen backbone of ``transformers``: its configuration, and its pass over a batch.
+
+The vision tower and the language model become CUDA graphs: both depend on tensors and on the constants of the plan
+alone, and wait for nothing on the host. Trunks and leaves: each layer computes the trunks, keeps their keys and values,
+and then computes every call of packs, whose tokens see them. So memory holds the keys and values of one layer. B trunks
+of L tokens, D width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, TypeAlias
+
+import torch
+from torch import Tensor, nn
+
+from rfm.config import VideoPrompt, Weights
+from rfm.engine.graphs import Graphs
+from rfm.engine.layers import concatenated
+from rfm.qwen.backbone import UNIT, KeyValues, VisionPlan, _cached, check_attention, features, last_hidden_state
+from rfm.qwen.batch import VlmBatch
+from rfm.qwen.leaves import Packs
+
+QWEN_2_5 = "qwen2_5_vl"
+BACKBONES = {QWEN_2_5: "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel"}
+QWEN3 = "qwen3_vl"
+BARE: Final = "bare"
+WRAPPED: Final = "wrapped"
+Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
+
+
+@dataclass(frozen=True)
+class BackboneConfig:
+    """The configuration of a backbone, and the dtype of its parameters and heads.
+
+    backbone: transformers' configuration (config.json)
+    dtype: number type of the network on a GPU
+    video_prompt: form of a Qwen3-VL's prompt with a video (``rfm.published.qwen``)
+    weights: form of rounded layers (``rfm.qwen.rounded``); None: not rounded
+    """
+
+    backbone: dict[str, Any]
+    dtype: Dtype
+    video_prompt: VideoPrompt = field(default="bare", kw_only=True)
+    weights: Weights | None = field(default=None, kw_only=True)
+
+    @property
+    def family(self) -> str:
+        """The backbone's model_type, a key of BACKBONES."""
+        return str(self.backbone["model_type"])
+
+    @property
+    def hidden_dim(self) -> int:
+        """D, the width of the language model."""
+        return int(self.backbone["text_config"]["hidden_size"])
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        """The torch type that ``dtype`` names."""
+        return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[self.dtype]
+
+
+def qwen_states(
+    backbone: Any, batch: VlmBatch, key_values: KeyValues | None = None, graphs: Graphs | None = None
+) -> tuple[Tensor, Tensor | None]:
+    """Return a Qwen backbone's last hidden states, and the features that its vision tower computed.
+
+    The states have the shape [B, L, D], or [1, all tokens, D] for a batch with packs.
+
+    key_values: receives the keys and values of all tokens, for ``next_hidden_state``
+    graphs: for small batches; the language model uses none if ``key_values`` is given
+    """
+    made = None
+    if batch.plan is not None:
+        of_tower = backbone.visual, batch.inputs["pixel_values"], batch.plan
+        made = features(*of_tower) if graphs is None else graphed_features(graphs, *of_tower)
+    assert batch.layout is not None
+    shots = [*([] if made is None else [made]), *batch.layout.kept.values()]
+    merged = concatenated(shots)
+    if batch.packs:
+        return tree_hidden_states(backbone.language_model, batch.inputs, batch.packs, merged), made
+    if graphs is not None and key_values is None:
+        return graphed_hidden_state(graphs, backbone.language_model, batch.inputs, merged), made
+    return last_hidden_state(backbone.language_model, batch.inputs, merged, key_values), made
+
+
+def build_backbone(config: BackboneConfig, dtype: torch.dtype) -> nn.Module:
+    """Return the backbone with uninitialised weights in ``dtype``; buffers keep their own dtype."""
+    try:
+        import transformers
+    except ImportError as error:
+        raise ImportError('vision-language checkpoints need transformers: pip install ".[vlm]"') from error
+    network = getattr(transformers, BACKBONES[config.family])
+    settings = network.config_class.from_dict(config.backbone)
+    with _no_init_weights():
+        backbone: nn.Module = network._from_config(settings, dtype=dtype, attn_implementation="sdpa")
+    check_attention(backbone)
+    return backbone
+
+
+def _no_init_weights() -> AbstractContextManager[None]:
+    """Return transformers' switch, which moved between its major versions."""
+    try:
+        from transformers.initialization import no_init_weights
+    except ImportError:
+        from transformers.modeling_utils import no_init_weights
+    return no_init_weights()
+
+
+LANGUAGE_INPUTS = ("input_ids", "position_ids", "visual_tokens", "visual_features")
+
+
+def graphed_features(graphs: Graphs, visual: Any, patches: Tensor, plan: VisionPlan) -> Tensor:
+    """Return ``rfm.qwen.backbone.features``, computed by a CUDA graph if the shapes recur."""
+    of_plan = [value for value in vars(plan).values() if isinstance(value, Tensor)]
+
+    def vision(patches: Tensor, *parts: Tensor) -> Tensor:
+        left = iter(parts)
+        return features(visual, patches, plan.changed(lambda _: next(left)))
+
+    return graphs(vision, [patches, *of_plan], ("vision", plan.shots, plan.windows), len(patches) // UNIT)
+
+
+def graphed_hidden_state(graphs: Graphs, language: Any, inputs: dict[str, Tensor], features: Tensor) -> Tensor:
+    """Return ``rfm.qwen.backbone.last_hidden_state``, computed by a CUDA graph if the shapes recur."""
+
+    def hidden_state(features: Tensor, *of_batch: Tensor) -> Tensor:
+        return last_hidden_state(language, dict(zip(LANGUAGE_INPUTS, of_batch, strict=True)), features)
+
+    tensors = [features, *(inputs[name] for name in LANGUAGE_INPUTS)]
+    return graphs(hidden_state, tensors, "language", inputs["input_ids"].numel())
+
+
+class TrunkKeyValues:
+    """The keys and values of a layer's trunks, in the form of transformers' cache.
+
+    packs: those whose tokens the layer computes; None: it computes the trunks
+    """
+
+    packs: Packs | None = None
+
+    def __init__(self) -> None:
+        self._of_trunks: tuple[Tensor, ...] = ()
+
+    def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+        """Keep a trunk's keys and values, [B, heads, L, D / heads]; return those that the tokens of a call may see."""
+        if self.packs is None:
+            self._of_trunks = keys, values
+            return keys, values
+        before = [each[self.packs.trunks, :, : self.packs.num_keys] for each in self._of_trunks]
+        return torch.cat([before[0], keys], dim=2), torch.cat([before[1], values], dim=2)
+
+
+class _Part:
+    """The hidden states of the trunks, or of the packs of a call, from layer to layer."""
+
+    def __init__(self, language: Any, inputs: dict[str, Tensor], features: Tensor) -> None:
+        merged, *self._deeper = features.unbind(1)
+        self._at, self._picked = inputs["visual_tokens"], inputs["visual_features"]
+        self.hidden = language.embed_tokens(inputs["input_ids"])
+        self.hidden.flatten(0, 1).index_copy_(0, self._at, merged[self._picked].to(self.hidden.dtype))
+        self._turned = language.rotary_emb(self.hidden, inputs["position_ids"])
+
+    def run(self, number: int, layer: Any, mask: Tensor | None, options: dict[str, Any]) -> None:
+        hidden = layer(self.hidden, position_embeddings=self._turned, attention_mask=mask, **options)
+        self.hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # transformers 4.57 of Qwen2.5-VL
+        if number < len(self._deeper):
+            added = self._deeper[number][self._picked].to(self.hidden.dtype)
+            self.hidden.flatten(0, 1).index_add_(0, self._at, added)
+
+
+def tree_hidden_states(language: Any, inputs: dict[str, Tensor], packs: Sequence[Packs], features: Tensor) -> Tensor:
+    """Return the hidden states behind the final norm, of the trunks and then of each call, [1, all tokens, D].
+
+    language, inputs, features: as in ``rfm.qwen.backbone.last_hidden_state``, of the trunks
+    """
+    key_values = TrunkKeyValues()
+    options = _cached(language, key_values)  # type: ignore[arg-type]  # transformers asks for ``update`` alone
+    trunks, *calls = (_Part(language, each, features) for each in (inputs, *(each.inputs for each in packs)))
+    # The mask of a single call is kept; those of several are made anew for each layer, so that memory holds one.
+    kept = packs[0].mask() if len(packs) == 1 else None
+    for number, layer in enumerate(language.layers):
+        key_values.packs = None
+        trunks.run(number, layer, None, options)
+        for call, key_values.packs in zip(calls, packs, strict=True):
+            call.run(number, layer, key_values.packs.mask() if kept is None else kept, options)
+    return language.norm(torch.cat([part.hidden.flatten(0, 1) for part in (trunks, *calls)]))[None]

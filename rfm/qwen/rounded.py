@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: MIT
+"""Linear layers whose weights have 8 or 4 bits. Each forward pass decodes them; inputs and products are not rounded.
+
+So a row's scores do not depend on the other rows of its batch, as they would with rounded inputs. N outputs and K
+inputs of a layer.
+
+int8: weight int8 [N, K] and scale [N, 1]; a value is weight * scale.
+nf4: weight uint8 [N, K / 2], two codes a byte, and scale float32 [blocks], as ``rfm.published.nf4`` describes them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from rfm.config import Weights
+from rfm.engine.layers import linear
+from rfm.files import CheckpointError
+from rfm.weights import DECODED, SCALE, VALUES_OF_BYTE
+
+# The layers that may be rounded: linear ones of the language model and the vision tower. Their weights are nine tenths
+# of a network's bytes; the embedding, the heads and what stands between the parts keep their numbers.
+_LAYER = re.compile(r"\.(layers|blocks)\.\d+\..*\.weight")
+_MOST = 127  # of int8, so that zero is in the middle
+INSTALL = 'pip install ".[quantized]"'
+
+
+class RoundedLinear(nn.Module):
+    """An ``nn.Linear`` with a rounded weight, and perhaps with LoRA factors beside it, as in PEFT."""
+
+    weight: Tensor
+    scale: Tensor
+    lora_A: nn.Linear | None  # noqa: N815  PEFT's name
+    lora_B: nn.Linear | None  # noqa: N815
+
+    def __init__(self, layer: nn.Linear, rank: int | None) -> None:
+        super().__init__()
+        self.in_features, self.out_features = layer.in_features, layer.out_features
+        self.bias = layer.bias
+        self.lora_A = self.lora_B = None
+        if rank is not None:
+            self.lora_A = nn.Linear(self.in_features, rank, bias=False, device="meta")
+            self.lora_B = nn.Linear(rank, self.out_features, bias=False, device="meta")
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Float [..., K] -> [..., N]."""
+        plus = None if self.lora_A is None or self.lora_B is None else self.lora_B(self.lora_A(input))
+        return linear(input, self.values(input.dtype), self.bias, plus=plus)
+
+    def values(self, dtype: torch.dtype) -> Tensor:
+        """Return the decoded weight, [N, K]."""
+        raise NotImplementedError
+
+
+class Int8Linear(RoundedLinear):
+    """A linear layer with 8 bits for each value, and a scale for each output."""
+
+    def __init__(self, layer: nn.Linear, scale: Tensor, rank: int | None) -> None:
+        super().__init__(layer, rank)
+        shape = self.out_features, self.in_features
+        self.register_buffer("weight", torch.empty(shape, dtype=torch.int8, device="meta"))
+        self.register_buffer("scale", torch.empty(self.out_features, 1, dtype=scale.dtype, device="meta"))
+
+    def values(self, dtype: torch.dtype) -> Tensor:
+        """Return the decoded weight, [N, K]."""
+        return (self.weight * self.scale).to(dtype)
+
+
+class Nf4Linear(RoundedLinear):
+    """A linear layer in NF4, which bitsandbytes decodes. ``decoded``: empty, in the dtype of the decoded values"""
+
+    decoded: Tensor
+
+    def __init__(self, layer: nn.Linear, scale: Tensor, decoded: Tensor, rank: int | None) -> None:
+        super().__init__(layer, rank)
+        try:
+            from bitsandbytes import functional
+        except ImportError as error:
+            expected = "bitsandbytes, which decodes weights in NF4"
+            raise CheckpointError.at("weights", expected, "none", INSTALL) from error
+        self._bitsandbytes: Any = functional
+        count = self.out_features * self.in_features
+        self._block_size = block_size(count, len(scale))
+        num_blocks = math.ceil(count / self._block_size)
+        packed = self.out_features, self.in_features // VALUES_OF_BYTE
+        self.register_buffer("weight", torch.empty(packed, dtype=torch.uint8, device="meta"))
+        self.register_buffer("scale", torch.empty(num_blocks, dtype=torch.float32, device="meta"))
+        self.register_buffer("decoded", torch.empty(0, dtype=decoded.dtype, device="meta"))
+
+    def values(self, dtype: torch.dtype) -> Tensor:
+        """Return the decoded weight, [N, K]."""
+        state = self._bitsandbytes.QuantState(
+            absmax=self.scale,
+            # One row: on the CPU, bitsandbytes takes wrong scales for rows that are not whole blocks.
+            shape=torch.Size([1, self.out_features * self.in_features]),
+            dtype=self.decoded.dtype,
+            blocksize=self._block_size,
+            quant_type="nf4",
+        )
+        flat = self._bitsandbytes.dequantize_4bit(self.weight.view(-1, 1), state)
+        return flat.view(self.out_features, self.in_features).to(dtype)
+
+
+def may_be_rounded(name: str) -> bool:
+    """Return True if a weight of this name, also LoRA-wrapped, belongs to a layer that may be rounded."""
+    return _LAYER.search(name) is not None
+
+
+def is_rounded(name: str, tensor: Tensor) -> bool:
+    """Return True if the tensor belongs to a rounded weight, which keeps its dtype in every network."""
+    return not tensor.is_floating_point() or name.endswith((SCALE, DECODED))
+
+
+def shape_of(weight: Tensor) -> list[int]:
+    """Return the shape of a weight's values, [N, K]."""
+    rows, *columns = weight.shape
+    return [rows, columns[0] * VALUES_OF_BYTE] if weight.dtype is torch.uint8 else [rows, *columns]
+
+
+def fit(network: nn.Module, weights: Mapping[str, Tensor], factors: Mapping[str, Tensor] | None = None) -> None:
+    """Replace layers of the network by rounded ones where the weights are rounded.
+
+    factors: of LoRA; those of rounded weights stay beside them
+    Raises CheckpointError if bitsandbytes is missing.
+    """
+    modules = dict(network.named_modules())
+    for path in (name.removesuffix(SCALE) for name in weights if name.endswith(SCALE)):
+        layer = modules.get(path)
+        if type(layer) is not nn.Linear:
+            continue  # ``check_shapes`` names what does not fit
+        down = (factors or {}).get(f"{path}.lora_A.weight")
+        rank = None if down is None else len(down)
+        scale, decoded = weights[path + SCALE], weights.get(path + DECODED)
+        rounded = Int8Linear(layer, scale, rank) if decoded is None else Nf4Linear(layer, scale, decoded, rank)
+        parent, _, child = path.rpartition(".")
+        setattr(modules[parent], child, rounded)
+
+
+def rounded(name: str, weight: Tensor, kind: Weights, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Return the tensors of a rounded weight by name.
+
+    name: of the weight, which ends in ``.weight``
+    weight: float32 [N, K]
+    dtype: of the decoded values
+    """
+    if kind == "nf4":
+        return of_layer(name, *quantize(weight), dtype)
+    scale = (weight.abs().amax(1, keepdim=True) / _MOST).to(dtype)
+    steps = weight / torch.where(scale == 0, 1, scale).float()
+    return {name: steps.round().clamp(-_MOST, _MOST).to(torch.int8), name.removesuffix(".weight") + SCALE: scale}
+
+
+NF4_BLOCK_SIZES = [2**power for power in range(5, 13)]  # of bitsandbytes, for weights and scales
+_NF4_BITS = 4  # of a value
+_NF4_BLOCK_SIZE = 64  # of ``quantize``, bitsandbytes' default
+NF4_CODES = (
+    -1.0, -0.6961928009986877, -0.5250730514526367, -0.39491748809814453, -0.28444138169288635, -0.18477343022823334,
+    -0.09105003625154495, 0.0, 0.07958029955625534, 0.16093020141124725, 0.24611230194568634, 0.33791524171829224,
+    0.44070982933044434, 0.5626170039176941, 0.7229568362236023, 1.0,
+)  # fmt: skip
+
+
+def of_layer(name: str, codes: Tensor, scales: Tensor, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Return a layer's tensors by name. name: of the weight; dtype: of the decoded values"""
+    path = name.removesuffix(".weight")
+    return {name: codes, path + SCALE: scales, path + DECODED: torch.empty(0, dtype=dtype)}
+
+
+def quantize(weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Round a weight, float32 [N, K] with an even K, to codes, uint8 [N, K / 2], and scales, float32 [blocks]."""
+    blocks = pad(weight.flatten(), (0, -weight.numel() % _NF4_BLOCK_SIZE)).view(-1, _NF4_BLOCK_SIZE)
+    scales = blocks.abs().amax(1)
+    codes = torch.tensor(NF4_CODES)
+    middles = (codes[1:] + codes[:-1]) / 2
+    shares = blocks / torch.where(scales == 0, 1, scales)[:, None]
+    nearest = torch.bucketize(shares, middles, out_int32=True).to(torch.uint8).flatten()[: weight.numel()]
+    return (nearest[0::2] << _NF4_BITS | nearest[1::2]).view(len(weight), -1), scales
+
+
+def block_size(num_values: int, num_blocks: int) -> int:
+    """Return the number of values of a block, a power of 2."""
+    return max(NF4_BLOCK_SIZES[0], 1 << (math.ceil(num_values / num_blocks) - 1).bit_length())
