@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rfm.families.robometer.network import VlmConfig
-from rfm.published.robometer_config import SETTINGS, RunConfig
+from rfm.published.robometer_run import SETTINGS, RunConfig
 from rfm_client.contract.settings import Setting, Settings
 from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 

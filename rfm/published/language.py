@@ -16,7 +16,7 @@ from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, read_json, show
 from rfm.published.provenance import HUB_FOLDER, Assumption, source_name
 from rfm.published.qwen import QWEN_NAMES, Renames, backbone_config, decided, renamed
 from rfm.published.reader import Options
-from rfm.published.robometer_config import DTYPES
+from rfm.published.robometer_run import DTYPES
 from rfm.published.rounding import kind_of, read_published, read_unrounded_config, round_layers
 from rfm.qwen.language import EMBEDDING, HEAD, LanguageCheckpoint, LanguageConfig
 from rfm.qwen.network import QWEN3, QWEN_2_5, Dtype

@@ -137,7 +137,7 @@ class PretrainedEncoders:
 
     @property
     def assumptions(self) -> list[Assumption]:
-        """The encoders."""
+        """The encoders that will be used, which no file proves."""
         found = []
         own = (self.checkpoint.image_encoder, self.checkpoint.text_encoder)
         named = (self.image_source, self.text_source)

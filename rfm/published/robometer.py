@@ -19,7 +19,6 @@ from rfm.families.robometer.network import VlmConfig
 from rfm.families.robometer.prompts import OF_AN_OLD_RUN
 from rfm.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, CheckpointError, expecting, is_there, read_json
 from rfm.published.lora import Scaling, adapted, check_inside, has_adapter
-from rfm.published.processor import check_published, differences, is_published
 from rfm.published.provenance import Assumption
 from rfm.published.qwen import (
     LORA_INSIDE,
@@ -32,7 +31,8 @@ from rfm.published.qwen import (
     renamed,
 )
 from rfm.published.reader import Loaded, Options, Reader
-from rfm.published.robometer_config import (
+from rfm.published.robometer_processor import check_published, differences, is_published
+from rfm.published.robometer_run import (
     LEROBOT_BACKBONE,
     RunConfig,
     assumptions_of,
