@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from client_commands import TASK, WIDTHS
-from rfm_client import FrameScores, InferenceFailedError, PreferenceResult, RewardClient
+from rfm_client import FrameScores, InferenceFailedError, PreferenceResult, ProgressResult, RewardClient
 from rfm_client.cli.comparing import LEGEND, Comparison, compare
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel, plot
@@ -64,10 +64,11 @@ ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int
 def test_a_comparison_names_no_winner_where_the_orders_disagree(
     preferences: dict[tuple[int, int], float], ranks: list[int | None], ranking: list[int] | None, answers: list[str]
 ) -> None:
-    scores = FrameScores(progress=np.zeros(2, np.float32), success=np.zeros(2, np.float32))
+    scores = ProgressResult(progress=np.zeros(2, np.float32), success=np.zeros(2, np.float32))
     seen = random_trajectory(0, 2, *WIDTHS)
     comparison = Comparison(
         [Source(f"{index}.npz", seen, None) for index in range(len(ranks))],
+        [scores] * len(ranks),
         {order: PreferenceResult(preference=each, first=scores, second=scores) for order, each in preferences.items()},
     )
     assert (comparison.ranks, comparison.ranking) == (ranks, ranking)

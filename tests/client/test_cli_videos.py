@@ -13,12 +13,12 @@ import pytest
 from PIL import Image
 
 import clip
-from client_commands import MODEL, TASK, WIDTHS, ask, assert_scores, columns, rows, run
+from client_commands import MODEL, TASK, WIDTHS, ask, assert_scores, columns, invoke, rows, run
 from engine_server import EngineServer
 from rfm_client import Trajectory, load_trajectory
 from rfm_client.command_line import ExitCode
 from rfm_client.plot import plot_scores, save
-from servers import folder_server
+from servers import Served, folder_server
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
@@ -190,8 +190,8 @@ def test_what_cannot_be_scored_or_compared_is_told(
     assert result.stderr.count("\n") == 1
 
 
-def test_compare_asks_both_orders_of_every_two_videos_also_of_several_sizes(
-    engines: EngineServer, video: Path, tmp_path: Path
+def test_compare_asks_both_orders_of_every_two_videos_and_shows_the_scores_of_score(
+    served: Served, video: Path, tmp_path: Path
 ) -> None:
     random = np.random.default_rng(0)
     small, third = tmp_path / "small.npy", tmp_path / "third.npy"
@@ -199,12 +199,13 @@ def test_compare_asks_both_orders_of_every_two_videos_also_of_several_sizes(
     np.save(third, random.integers(0, 256, (3, 40, 30, 3), np.uint8))
     files = [video, small, third]
     target = tmp_path / "scores.json"
-    result = ask(engines, "compare", *files, "--task", TASK, "--json", target, "--plot", tmp_path / "all.svg")
+    asked_of = ("--task", TASK, "--url", served.url("grpc"), "--model", MODEL)
+    result = invoke("compare", *files, *asked_of, "--json", target, "--plot", tmp_path / "all.svg")
     told = f"rfm-client: note: {small}: 16 of 20 frames were scored, evenly spaced\n"
     assert (result.exit_code, result.stderr) == (0, told)
     trajectories = [load_trajectory(video, task=TASK, fps=3), *(load_trajectory(f, task=TASK) for f in files[1:])]
     orders = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
-    with engines.client(MODEL) as client:
+    with served.client("grpc", MODEL) as client:
         asked = {order: client.preference(*(trajectories[i] for i in order), subsample=True) for order in orders}
     document = json.loads(target.read_text())
     assert document.keys() & {"first", "second", "preference"} == set()  # which two videos have
@@ -214,10 +215,12 @@ def test_compare_asks_both_orders_of_every_two_videos_also_of_several_sizes(
     told_preferences = [each["preference"] for each in document["orders"]]
     np.testing.assert_allclose(told_preferences, [each.preference for each in asked.values()], rtol=0, atol=TOLERANCE)
     shares = {(a, b): (asked[a, b].preference + 1 - asked[b, a].preference) / 2 for a, b in orders}
+    scored = json.loads(invoke("score", *files, *asked_of, "--json").stdout)["videos"]
     for index, each in enumerate(document["videos"]):
         wins = np.mean([share for (a, _), share in shares.items() if a == index])
         assert (each["source"], each["wins"]) == (str(files[index]), pytest.approx(wins, abs=TOLERANCE))
-        assert_scores(each, asked[0, 1].first if index == 0 else asked[0, index].second)
+        for name in ("progress", "success"):
+            np.testing.assert_allclose(each[name], scored[index][name], rtol=0, atol=TOLERANCE)
         figures = [f"{figure:.4f}" for figure in (each["wins"], each["progress"][-1], each["success"][-1])]
         assert rows(result.stdout, str(files[index]))[0][2:] == [*figures, str(len(each["progress"]))]
     assert document["videos"][1]["frame_indices"] == np.rint(np.linspace(0, 19, 16)).astype(int).tolist()
@@ -240,9 +243,10 @@ def test_compare_of_two_videos_has_their_preference_and_verdict(engines: EngineS
     with engines.client(MODEL) as client:
         expected = client.preference(first, replace(second, text_embedding=None), both_orders=True)
         once = client.preference(first, second)
+        alone = [client.progress(each) for each in (first, replace(second, text_embedding=first.text_embedding))]
     assert document["preference"] == pytest.approx(once.preference, abs=TOLERANCE)
-    assert_scores(document["first"], expected.first)
-    assert_scores(document["second"], expected.second)
+    assert_scores(document["first"], alone[0])
+    assert_scores(document["second"], alone[1])
     assert (document["verdict"], document["orders_agree"]) == (expected.verdict, expected.orders_agree)
     assert (document["ranking"] is None) == (not expected.orders_agree)
     assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
