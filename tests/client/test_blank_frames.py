@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from encoding import encode
 from rfm_client import ProgressSample, RewardClient, Trajectory, UInt8Array
@@ -30,24 +28,16 @@ def with_pixel(frame: UInt8Array, value: int) -> UInt8Array:
     return marked
 
 
-def through_jpeg(frame: UInt8Array) -> UInt8Array:
-    content = io.BytesIO()
-    Image.fromarray(frame).save(content, "JPEG", quality=50)
-    return np.asarray(Image.open(content))
-
-
 FRAMES: dict[str, tuple[UInt8Array, bool]] = {
     "black": (BLACK, True),
     "floats in 0..1 that became uint8": ((NOISE / 255).astype(np.uint8), True),
     "a covered sensor": (NOISE // 29, True),
     "a grey value beside black": (with_pixel(BLACK, 9), False),
     "blue": (BLACK + np.array([0, 0, 255], np.uint8), True),
-    "grey after JPEG": (through_jpeg(BLACK + np.uint8(117)), True),
     "green that differs by 4": (with_pixel(BLACK + np.array([0, 135, 0], np.uint8), 4), False),
     "grey that differs by 4": (with_pixel(BLACK + np.uint8(60), 64), True),
     "grey that differs by 5": (with_pixel(BLACK + np.uint8(60), 65), False),
     "a light in the dark": (with_pixel(BLACK, 200), False),
-    "noise": (NOISE, False),
     "a strip of one pixel": (NOISE[:1], False),
     "a pixel": (NOISE[:1, :1], True),
 }
@@ -73,7 +63,6 @@ def test_a_real_scene_in_a_twentieth_of_its_light_is_no_blank_one(file: Path) ->
 
 RUNS: dict[str, tuple[str, bool]] = {  # blank frames are dots
     "none": ("", False),
-    "one": (".", True),
     "all of nine": ("." * 9, True),
     "nine of ten": ("." * 9 + "x", False),
     "ten of many": ("x" + "." * 10 + "xx", True),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,20 +14,28 @@ import pytest
 from PIL import Image
 
 import clip
-from client_commands import MODEL, TASK, WIDTHS, ask, assert_scores, columns, rows, run
+from client_commands import MODEL, TASK, WIDTHS, ask, assert_scores, columns, invoke, rows, run
 from engine_server import EngineServer
-from rfm_client import Trajectory, load_trajectory
+from rfm_client import (
+    FrameScores,
+    InferenceFailedError,
+    PreferenceResult,
+    ProgressResult,
+    RewardClient,
+    Trajectory,
+    load_trajectory,
+)
+from rfm_client.cli.comparing import LEGEND, Comparison, compare
+from rfm_client.cli.options import VideoOptions
+from rfm_client.cli.pictures import Panel, plot
+from rfm_client.cli.scoring import Source
 from rfm_client.command_line import ExitCode
-from rfm_client.plot import plot_scores, save
-from servers import folder_server
+from servers import Served, folder_server
+from shelves import Shelf
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
 MAX_FRAMES = 16  # of that checkpoint
-SHADES = 16  # between two answers of a server
-FILE_OF_SEVERAL = "data/videos/observation.images.top/chunk-000/file-000.mp4"
-
-
 EVENLY = np.rint(np.linspace(0, clip.NUM_FRAMES - 1, MAX_FRAMES)).astype(int)
 
 
@@ -53,7 +62,6 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
     with engines.client(MODEL) as client:
         filmed = client.progress(load_trajectory(video, task=TASK, fps=10), subsample=True)
         embedded = client.progress(seen)
-        sources = {client.model_info(frames=frames).source: None for frames in (True, False)}
 
     document = json.loads(target.read_text())
     assert document["servers"] == [engines.url] * 2
@@ -80,19 +88,14 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
     array = np.load(tmp_path / "arrays" / "clip.npy")
     assert array.dtype == np.float32
     np.testing.assert_array_equal(array, np.float32([first["progress"], first["success"]]).T)
-    times_s = [EVENLY / clip.FPS, None]
-    title = f'"{TASK}"\n{", ".join(map(str, sources))}'
-    figure = plot_scores([filmed, embedded], ["clip.mp4", "embeddings.npz"], title=title, times_s=times_s)
-    save(figure, tmp_path / "own.png")
-    with Image.open(plotted) as drawn, Image.open(tmp_path / "own.png") as own:
-        assert np.abs(np.asarray(drawn, np.int16) - np.asarray(own)).max() <= SHADES
-    with Image.open(tmp_path / "strips.png") as strips:
-        assert strips.width == 1400
+    with Image.open(plotted) as curves, Image.open(tmp_path / "strips.png") as strips:
+        assert (curves.width, strips.width) == (700, 1400)
 
 
 OPTIONS: dict[str, tuple[list[object], dict[str, Any]]] = {
     "as it is": ([], {"subsample": True}),
     "dense": (["--frame-steps", 4], {"frame_steps": 4}),
+    "each prefix by a rule": (["--sampling", "linspace_trunc", "--frames", 4], {"frame_steps": 4}),
     "resized": (["--resize"], {"subsample": True, "resize": True}),
 }
 
@@ -147,51 +150,8 @@ def test_score_reads_videos_behind_urls(engines: EngineServer, video: Path) -> N
     assert remote["frame_times_s"] is None
 
 
-NO_TASK = 'task: expected a sentence with frames, got none: add --task "SENTENCE"'
-SEVERAL = (
-    "video: expected a video of one episode, got a file in the layout of LeRobot v3.0, which holds several: label "
-)
-REFUSED: dict[str, tuple[list[object], str]] = {
-    "no frame left out": (
-        ["score", "clip.mp4", "--fps", 10, "--no-subsample"],
-        "clip.mp4: num_frames: expected at most 16",
-    ),
-    "a placeholder": (["score", "clip.mp4", "--task", "N/A"], f"clip.mp4: {NO_TASK.replace('none', repr('N/A'))}"),
-    "no task to compare": (["compare", "clip.mp4", "clip.mp4", "--task", ""], NO_TASK.partition(": add ")[2]),
-    "frames and embeddings": (
-        ["compare", "clip.mp4", "seen.npy"],
-        "clip.mp4 and seen.npy: second: expected frames, as the first trajectory, got video_embeddings",
-    ),
-    "several episodes": (["score", FILE_OF_SEVERAL], f"{FILE_OF_SEVERAL}: {SEVERAL}"),
-}
-
-
-@pytest.mark.parametrize(("words", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_scored_or_compared_is_told(
-    engines: EngineServer,
-    video: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    words: list[object],
-    message: str,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    several = Path(FILE_OF_SEVERAL)
-    several.parent.mkdir(parents=True)
-    for file in (Path("clip.mp4"), several):
-        file.write_bytes(video.read_bytes())
-    Path("data/meta").mkdir()
-    Path("data/meta/info.json").write_text('{"codebase_version": "v3.0", "total_episodes": 10}')
-    np.save("seen.npy", np.zeros((2, 8), np.float32))
-    result = ask(engines, *words, *(() if "--task" in words else ("--task", TASK)))
-    assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
-    assert result.stderr.startswith("rfm-client: ")
-    assert message in result.stderr
-    assert result.stderr.count("\n") == 1
-
-
-def test_compare_asks_both_orders_of_every_two_videos_also_of_several_sizes(
-    engines: EngineServer, video: Path, tmp_path: Path
+def test_compare_asks_both_orders_of_every_two_videos_and_shows_the_scores_of_score(
+    served: Served, video: Path, tmp_path: Path
 ) -> None:
     random = np.random.default_rng(0)
     small, third = tmp_path / "small.npy", tmp_path / "third.npy"
@@ -199,12 +159,13 @@ def test_compare_asks_both_orders_of_every_two_videos_also_of_several_sizes(
     np.save(third, random.integers(0, 256, (3, 40, 30, 3), np.uint8))
     files = [video, small, third]
     target = tmp_path / "scores.json"
-    result = ask(engines, "compare", *files, "--task", TASK, "--json", target, "--plot", tmp_path / "all.svg")
+    asked_of = ("--task", TASK, "--url", served.url("grpc"), "--model", MODEL)
+    result = invoke("compare", *files, *asked_of, "--json", target, "--plot", tmp_path / "all.svg")
     told = f"rfm-client: note: {small}: 16 of 20 frames were scored, evenly spaced\n"
     assert (result.exit_code, result.stderr) == (0, told)
     trajectories = [load_trajectory(video, task=TASK, fps=3), *(load_trajectory(f, task=TASK) for f in files[1:])]
     orders = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
-    with engines.client(MODEL) as client:
+    with served.client("grpc", MODEL) as client:
         asked = {order: client.preference(*(trajectories[i] for i in order), subsample=True) for order in orders}
     document = json.loads(target.read_text())
     assert document.keys() & {"first", "second", "preference"} == set()  # which two videos have
@@ -214,19 +175,15 @@ def test_compare_asks_both_orders_of_every_two_videos_also_of_several_sizes(
     told_preferences = [each["preference"] for each in document["orders"]]
     np.testing.assert_allclose(told_preferences, [each.preference for each in asked.values()], rtol=0, atol=TOLERANCE)
     shares = {(a, b): (asked[a, b].preference + 1 - asked[b, a].preference) / 2 for a, b in orders}
+    scored = json.loads(invoke("score", *files, *asked_of, "--json").stdout)["videos"]
     for index, each in enumerate(document["videos"]):
         wins = np.mean([share for (a, _), share in shares.items() if a == index])
         assert (each["source"], each["wins"]) == (str(files[index]), pytest.approx(wins, abs=TOLERANCE))
-        assert_scores(each, asked[0, 1].first if index == 0 else asked[0, index].second)
+        for name in ("progress", "success"):
+            np.testing.assert_allclose(each[name], scored[index][name], rtol=0, atol=TOLERANCE)
         figures = [f"{figure:.4f}" for figure in (each["wins"], each["progress"][-1], each["success"][-1])]
         assert rows(result.stdout, str(files[index]))[0][2:] == [*figures, str(len(each["progress"]))]
     assert document["videos"][1]["frame_indices"] == np.rint(np.linspace(0, 19, 16)).astype(int).tolist()
-    for pair, (a, b) in zip(document["pairs"], [(0, 1), (0, 2), (1, 2)], strict=True):
-        answers = asked[a, b].preference, 1 - asked[b, a].preference
-        agree = (answers[0] > 0.5) == (answers[1] > 0.5)
-        verdict = ("first" if answers[0] > 0.5 else "second") if agree else None
-        named = {"first": str(files[a]), "second": str(files[b])}
-        assert pair == {**named, "verdict": verdict, "orders_agree": agree}
     assert (tmp_path / "all.svg").read_text().startswith("<?xml")
 
 
@@ -240,9 +197,69 @@ def test_compare_of_two_videos_has_their_preference_and_verdict(engines: EngineS
     with engines.client(MODEL) as client:
         expected = client.preference(first, replace(second, text_embedding=None), both_orders=True)
         once = client.preference(first, second)
+        alone = [client.progress(each) for each in (first, replace(second, text_embedding=first.text_embedding))]
     assert document["preference"] == pytest.approx(once.preference, abs=TOLERANCE)
-    assert_scores(document["first"], expected.first)
-    assert_scores(document["second"], expected.second)
+    assert_scores(document["first"], alone[0])
+    assert_scores(document["second"], alone[1])
     assert (document["verdict"], document["orders_agree"]) == (expected.verdict, expected.orders_agree)
     assert (document["ranking"] is None) == (not expected.orders_agree)
     assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_compare_refuses_the_answers_of_two_versions(tmp_path: Path, video: Path) -> None:
+    np.save(tmp_path / "small.npy", np.zeros((2, 40, 30, 3), np.uint8))  # of another size: a separate request
+    with (
+        RewardClient("", transports=[Shelf(after=1)]) as client,
+        pytest.raises(InferenceFailedError, match=r"^model_version: expected one for all videos, got 1, 2: ask again$"),
+    ):
+        compare(client, [str(video), str(tmp_path / "small.npy")], VideoOptions(task=TASK))
+
+
+def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_path: Path) -> None:
+    told = FrameScores(progress=np.linspace(0, 1, 12, dtype=np.float32), success=np.full(12, np.nan, np.float32))
+    frames = np.random.default_rng(0).integers(0, 256, (12, 8, 8, 3), np.uint8)
+    panels = [Panel.of("costs $5_$ 漢字", told, frames), Panel.of("[embeddings]", told)]
+    plot(tmp_path / "plot.svg", panels, title="both")
+    drawn = (tmp_path / "plot.svg").read_text()
+    corners = re.findall(r'id="image[^>]* x="([\d.]+)" y="[^"]*" width="([\d.]+)"', drawn)
+    middles = np.array([float(x) + float(width) / 2 for x, width in corners])
+    frames_shown = (middles - middles[0]) / (middles[-1] - middles[0]) * 11
+    np.testing.assert_allclose(frames_shown, [0, 2, 4, 7, 9, 11], atol=0.02)  # they stand at their times
+    assert (np.diff(middles) >= float(corners[0][1])).all()
+
+
+ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int] | None, list[str]]] = {
+    "agree": ({(0, 1): 0.4, (1, 0): 0.9}, [2, 1], [1, 0], ["agree"]),
+    "disagree by a hair": ({(0, 1): 0.5001, (1, 0): 0.5001}, [None, None], None, ["no answer"]),
+    "both are even": ({(0, 1): 0.5, (1, 0): 0.5}, [None, None], None, ["no answer"]),
+    "the third loses to either": (
+        {(0, 1): 0.9, (1, 0): 0.9, (0, 2): 0.9, (2, 0): 0.1, (1, 2): 0.8, (2, 1): 0.2},
+        [None, None, 3],
+        None,
+        ["no answer", "agree", "agree"],
+    ),
+    "of three": (
+        {(0, 1): 0.3, (1, 0): 0.9, (0, 2): 0.2, (2, 0): 0.8, (1, 2): 0.6, (2, 1): 0.3},
+        [3, 1, 2],
+        [1, 2, 0],
+        ["agree", "agree", "agree"],
+    ),
+}
+
+
+@pytest.mark.parametrize(("preferences", "ranks", "ranking", "answers"), ORDERS.values(), ids=ORDERS)
+def test_a_comparison_names_no_winner_where_the_orders_disagree(
+    preferences: dict[tuple[int, int], float], ranks: list[int | None], ranking: list[int] | None, answers: list[str]
+) -> None:
+    scores = ProgressResult(progress=np.zeros(2, np.float32), success=np.zeros(2, np.float32))
+    seen = random_trajectory(0, 2, *WIDTHS)
+    comparison = Comparison(
+        [Source(f"{index}.npz", seen, None) for index in range(len(ranks))],
+        [scores] * len(ranks),
+        {order: PreferenceResult(preference=each, first=scores, second=scores) for order, each in preferences.items()},
+    )
+    assert (comparison.ranks, comparison.ranking) == (ranks, ranking)
+    videos, pairs = ([list(column.cells) for column in shown.wide.columns] for shown in comparison.tables()[:2])
+    assert [str(cell) for cell in videos[1]] == [str(ranks[index] or "?") for index in ranking or range(len(ranks))]
+    assert [str(cell) for cell in pairs[-1]] == answers
+    assert comparison.tables()[2:] == [LEGEND] * (ranking is None)

@@ -226,9 +226,7 @@ CALLS: dict[str, tuple[Callable[[RewardClient], object], int]] = {  # and the li
     "subsampled": (lambda client: client.progress(filmed(17), subsample=True), 0),
     "dense": (lambda client: client.progress(filmed(17), frame_steps=4), 0),
     "twice": (lambda client: [client.progress(filmed(17)) for _ in range(2)], 1),
-    "evaluate": (lambda client: client.evaluate([ProgressSample(filmed(3)), ProgressSample(filmed(17))]), 1),
     "submit": (lambda client: [each.result() for each in [client.submit(ProgressSample(filmed(17))) for _ in "ab"]], 1),
-    "preference": (lambda client: client.preference(filmed(3), filmed(17)), 1),
     "a step of an episode": (
         lambda client: client.episode("stack", sampling="linspace_round", frames=17).add(filmed(1).positions[0]),
         1,
@@ -245,14 +243,10 @@ def test_a_client_tells_once_of_more_frames_than_in_training(
     assert [message.startswith(MORE) for message in caplog.messages] == [True] * num_lines
 
 
-@pytest.mark.parametrize(
-    "more", [{"trained_frames": None}, {"needs_whole_episode": True}], ids=["unknown", "whole episodes"]
-)
-def test_a_checkpoint_without_a_limit_of_training_gets_no_line(
-    caplog: pytest.LogCaptureFixture, more: dict[str, Any]
-) -> None:
-    shelf = Described(has_encoder=False)
-    shelf.more = more
-    with RewardClient("", transports=[shelf]) as client:
-        client.progress(filmed(40))
+def test_a_checkpoint_without_a_limit_of_training_gets_no_line(caplog: pytest.LogCaptureFixture) -> None:
+    for unlimited in ({"trained_frames": None}, {"needs_whole_episode": True}):
+        shelf = Described(has_encoder=False)
+        shelf.more = unlimited
+        with RewardClient("", transports=[shelf]) as client:
+            client.progress(filmed(40))
     assert caplog.messages == []

@@ -105,7 +105,8 @@ def test_shared_memory_changes_no_answer(demo_server: Endpoints, protocol: str) 
         for _ in range(3):
             for answer, plain in zip(client.evaluate(samples), expected, strict=True):
                 assert_same(answer, plain)
-        assert len(regions(demo_server) - mapped) == 1  # one, used again and again
+        client.progress(trajectory(0, 9000), frame_steps=2)  # which has no room in the region of the others
+        assert len(regions(demo_server) - mapped) == 1  # one, used again and again, or replaced
         assert ours_in_dev_shm() == named  # the name is gone during use
 
 
@@ -143,6 +144,16 @@ def test_a_server_that_hangs_does_not_hold_what_shares_memory_with_it(demo_serve
         with proxy.held():
             client.close()
             assert ours_in_dev_shm() == before
+
+
+def test_a_server_that_refuses_shared_memory_is_warned_of_once(
+    engines: EngineServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    with RewardClient(engines.url, shared_memory=True) as client:
+        for _ in range(2):
+            client.progress(heavy(), frame_steps=2)
+    (told,) = (record.message for record in caplog.records if record.name == "rfm_client")
+    assert "no shared memory, inputs go through the socket: " in told
 
 
 ASKING = """

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import copy
-import itertools
 import pickle
 import re
 import subprocess
@@ -144,40 +143,23 @@ assert not RewardClient("http://127.0.0.1:1").is_ready()
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("url", ["localhost:8001", "grpc://localhost", "grpc://", "", "ftp://b:2", "grpc://a:70000"])
-def test_a_wrong_url_is_refused_when_the_client_is_made(url: str) -> None:
-    with pytest.raises(ValueError, match="url") as raised:
-        RewardClient(["grpc://a:1", url])
-    forms = "grpc://host:port or http://host:port, or grpcs:// or https://"
-    assert str(raised.value) == f"url: expected {forms}, got {url!r}"
-
-
-def test_a_client_needs_a_url_which_may_be_written_as_grpc_does() -> None:
+def test_a_client_needs_a_right_url_which_may_be_written_as_grpc_does() -> None:
     RewardClient("dns:///rfm-triton-pods:8001").close()
     with pytest.raises(ValueError, match="url: expected at least one, got none"):
         RewardClient([])
+    for url in ("localhost:8001", "grpc://localhost", "", "ftp://b:2", "grpc://a:70000"):
+        with pytest.raises(ValueError, match=f"^url: expected grpc://host:port or .*, got {url!r}$"):
+            RewardClient(["grpc://a:1", url])
 
 
 def test_a_deadline_must_be_within_reach() -> None:
     wanted = r"^timeout_s: expected a number of seconds above 0 and at most 1e\+09, got "
     with RewardClient(NOBODY) as client:
-        calls: list[Callable[[float], object]] = [
-            lambda timeout_s: RewardClient(NOBODY, timeout_s=timeout_s),
-            lambda timeout_s: client.progress(random_trajectory(0, 1), timeout_s=timeout_s),
-            lambda timeout_s: client.model_info(timeout_s=timeout_s),
-            client.wait_ready,
-        ]
-        for call, timeout_s in itertools.product(calls, [float("inf"), 0, -1, 2e9]):
+        for timeout_s in (float("inf"), 0, -1, 2e9):
             with pytest.raises(ValueError, match=wanted):
-                call(timeout_s)
-
-
-def test_an_unknown_option_is_refused() -> None:
-    options: dict[str, Any] = {"sub_sample": True}
-    with RewardClient(NOBODY) as client, pytest.raises(TypeError, match="sub_sample"):
-        client.progress(random_trajectory(0, 1), **options)
-    with pytest.raises(TypeError, match="sub_sample"):
-        RewardClient(NOBODY, **options)
+                client.progress(random_trajectory(0, 1), timeout_s=timeout_s)
+            with pytest.raises(ValueError, match=wanted):
+                client.wait_ready(timeout_s)
 
 
 def test_the_client_imports_no_heavy_package() -> None:

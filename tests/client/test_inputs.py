@@ -19,9 +19,11 @@ from rfm_client import InvalidSampleError, Trajectory, UInt8Array, as_trajectory
 from rfm_client.frames import Correction, Orientation
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (4, 6, 8, 3), np.uint8)
-
-
 SHAPED = "uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W]"
+LFS = "Git LFS's note of where it is; `git lfs pull` fetches it"
+LFS_POINTER = (
+    "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1048576\n"  # git leaves in place of a file
+)
 
 
 def channels_first(frames: UInt8Array) -> torch.Tensor:
@@ -33,7 +35,6 @@ TENSORS: dict[str, Callable[[np.ndarray], Any]] = {
     "plain": torch.from_numpy,
     "with a gradient": lambda array: torch.from_numpy(array).requires_grad_(),
     "bfloat16": lambda array: torch.from_numpy(array).bfloat16(),
-    "float16": lambda array: torch.from_numpy(array).half(),
     "a list of tensors with gradients": lambda array: [torch.from_numpy(row).requires_grad_() for row in array],
 }
 
@@ -67,14 +68,11 @@ def items(**more: Any) -> list[dict[str, Any]]:
 EPISODES: dict[str, Any] = {
     "tensor, channels first": {TOP: channels_first(FRAMES)},
     "tensor, channels last": {TOP: torch.from_numpy(FRAMES) / 255},
-    "uint8 tensor, channels first": {TOP: torch.from_numpy(FRAMES).permute(0, 3, 1, 2)},
-    "float16": {TOP: channels_first(FRAMES).half()},
     "float64 array": {TOP: FRAMES / 255},
     "uint8 array, channels first": {TOP: FRAMES.transpose(0, 3, 1, 2)},
     "list of float tensors": {TOP: list(channels_first(FRAMES))},
     "PIL images": {TOP: [Image.fromarray(frame) for frame in FRAMES]},
     "our own keys": {"frames": FRAMES},
-    "our own keys, float": {"frames": channels_first(FRAMES)},
     "one dict a step": items(),
     "a generator of dicts": (item for item in items()),
 }
@@ -95,18 +93,10 @@ def test_every_grey_level_survives_its_way_through_floats(dtype: torch.dtype) ->
     assert np.abs(read.astype(int) - levels).max() <= (dtype == torch.bfloat16)  # which has too few bits
 
 
-TASKS: dict[str, tuple[Any, str]] = {
-    "text": ("lift", "lift"),
-    "a list of one": (["lift"], "lift"),
-    "one a step": (["lift"] * 4, "lift"),
-    "an array of one a step": (np.array(["lift", "lift"]), "lift"),
-}
-
-
-@pytest.mark.parametrize(("told", "task"), TASKS.values(), ids=TASKS)
-def test_the_task_comes_with_the_episode(told: Any, task: str) -> None:
-    assert as_trajectory({TOP: FRAMES, "task": told}).task == task
-    assert as_trajectory({TOP: FRAMES, "task": told}, task="drop").task == "drop"
+def test_the_task_comes_with_the_episode() -> None:
+    for told in ("lift", ["lift"], ["lift"] * 4, np.array(["lift", "lift"])):
+        assert as_trajectory({TOP: FRAMES, "task": told}).task == "lift"
+        assert as_trajectory({TOP: FRAMES, "task": told}, task="drop").task == "drop"
 
 
 def test_the_camera_is_picked_by_name() -> None:
@@ -120,28 +110,16 @@ def test_the_camera_is_picked_by_name() -> None:
             as_trajectory(episode, camera=camera)
 
 
-def test_steps_beyond_the_episode_s_ends_are_left_out() -> None:
-    episode = {TOP: channels_first(FRAMES), f"{TOP}_is_pad": torch.tensor([True, True, False, False])}
-    np.testing.assert_array_equal(as_trajectory(episode).positions, FRAMES[2:])
-
-
-@pytest.mark.parametrize("key", ["frames", "video_embeddings"])
-def test_padding_is_left_out_under_our_own_keys_too(key: str) -> None:
-    values = FRAMES if key == "frames" else np.ones((4, 5), np.float32) * np.arange(4)[:, None]
-    episode = {key: values, f"{key}_is_pad": [False, False, True, True]}
-    np.testing.assert_array_equal(as_trajectory(episode).positions, values[:2])
-
-
-def test_embeddings_are_read_from_a_dict() -> None:
-    episode = {"video_embeddings": torch.ones(3, 5, requires_grad=True), "text_embedding": torch.ones(2).bfloat16()}
-    trajectory = as_trajectory(episode)
-    np.testing.assert_array_equal(trajectory.positions, np.ones((3, 5), np.float32))
-    np.testing.assert_array_equal(trajectory.text_embedding, np.ones(2, np.float32))
+@pytest.mark.parametrize("key", [TOP, "frames", "video_embeddings"])
+def test_steps_beyond_the_episode_s_ends_are_left_out(key: str) -> None:
+    values = np.ones((4, 5), np.float32) * np.arange(4)[:, None] if key == "video_embeddings" else FRAMES
+    for padding in (torch.tensor([True, True, False, False]), [True, True, False, False]):
+        episode = {key: values, f"{key}_is_pad": padding}
+        np.testing.assert_array_equal(as_trajectory(episode).positions, values[2:])
 
 
 BAD_EPISODES: dict[str, tuple[Any, str]] = {
     "one image": ({TOP: FRAMES[0]}, f"{TOP}: expected {SHAPED}, got uint8 [6, 8, 3]"),
-    "grey images": ({TOP: FRAMES[..., :1]}, f"{TOP}: expected {SHAPED}, got uint8 [4, 6, 8, 1]"),
     "nothing in it": ({TOP: []}, f"{TOP}: expected images of one type and size, got none"),
     "images of several sizes": (
         {TOP: [FRAMES[0], FRAMES[0, :3]]},
@@ -170,16 +148,11 @@ BAD_EPISODES: dict[str, tuple[Any, str]] = {
         [*items(), *items(episode_index=torch.tensor(6))],
         "episode_index: expected the same at all steps, got 5 and 6",
     ),
-    "a step without the camera": (
-        [*items(), {"task": "lift the cup", "episode_index": 5}],
-        f"{TOP}: expected images of one type and size, got float32 [3, 6, 8] and object []",
-    ),
     "marks of another length": (
         {TOP: FRAMES, f"{TOP}_is_pad": np.array([True])},
         f"{TOP}_is_pad: expected bool [4], got bool [1]",
     ),
     "an array": (FRAMES, "episode: expected a dict, or one dict a step, got ndarray"),
-    "no steps": ([], "episode: expected a dict, or one dict a step, got nothing"),
 }
 
 
@@ -215,22 +188,20 @@ def test_views_and_goal_stand_beside_the_frames_of_a_file(tmp_path: Path) -> Non
     np.testing.assert_array_equal(loaded.goal, FRAMES[1])
     with pytest.raises(InvalidSampleError, match=rf"short\.npy: expected {len(FRAMES)} frames, as {front}, got 1$"):
         load_trajectory(front, views=[tmp_path / "short.npy"])
-    with pytest.raises(InvalidSampleError, match=r"front\.npy: expected an image, got "):
-        load_trajectory(front, goal=front)
+    for content, found in (("words", ".*cannot identify"), (LFS_POINTER, re.escape(LFS))):
+        goal.write_text(content)
+        with pytest.raises(InvalidSampleError, match=rf"goal\.png: expected an image, got {found}"):
+            load_trajectory(front, goal=goal)
 
 
 def test_frames_of_files_are_corrected_as_the_caller_says_and_embeddings_are_refused(tmp_path: Path) -> None:
-    stored = FRAMES[..., ::-1]
-    np.save(tmp_path / "video.npy", stored)
-    np.savez(tmp_path / "video.npz", frames=stored, task="lift")
+    np.savez(tmp_path / "video.npz", frames=FRAMES[..., ::-1], task="lift")
     np.save(tmp_path / "seen.npy", np.zeros((2, 3), np.float32))
-    for name in ("video.npy", "video.npz"):
-        upright = load_trajectory(tmp_path / name, channels="bgr", orient="rotate90").positions
-        np.testing.assert_array_equal(upright, np.rot90(FRAMES, -1, axes=(1, 2)))
-    with pytest.raises(InvalidSampleError, match=r"^orient: expected none for embeddings, .*, got rotate180"):
-        load_trajectory(tmp_path / "seen.npy", orient="rotate180")
-    with pytest.raises(InvalidSampleError, match=r"^channels: expected rgb for embeddings, .*, got bgr"):
-        load_trajectory(tmp_path / "seen.npy", channels="bgr")
+    upright = load_trajectory(tmp_path / "video.npz", channels="bgr", orient="rotate90").positions
+    np.testing.assert_array_equal(upright, np.rot90(FRAMES, -1, axes=(1, 2)))
+    for name, value in {"orient": "rotate180", "channels": "bgr"}.items():
+        with pytest.raises(InvalidSampleError, match=rf"^{name}: expected \w+ for embeddings, .*, got {value}"):
+            load_trajectory(tmp_path / "seen.npy", **{name: value})  # type: ignore[arg-type]
 
 
 TURNED: dict[Orientation, Callable[[Any], Any]] = {
@@ -332,12 +303,8 @@ def test_pickled_objects_are_refused_unread(tmp_path: Path, name: str) -> None:
         np.save(file, trap, allow_pickle=True)
     else:
         np.savez(file, frames=trap)
-    with pytest.raises(InvalidSampleError) as refused:
+    with pytest.raises(InvalidSampleError, match=r"none pickled, got Object arrays cannot be loaded when allow_pickle"):
         load_trajectory(file)
-    assert str(refused.value) == (
-        "file: expected arrays of numbers and text, none pickled, got "
-        f"Object arrays cannot be loaded when allow_pickle=False ({file})"
-    )
     assert not sprung.exists()
 
 
@@ -347,7 +314,6 @@ BAD_FILES: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         lambda file: file.write_text("frames"),
         r"^file: expected arrays .*, got a file of another kind \(.*text\.npy\)$",
     ),
-    "an empty file": ("empty.npy", Path.touch, r"^file: expected arrays .*, got No data left in file \(.*\)$"),
     "no file": (
         "nothing.npy",
         lambda file: None,
@@ -362,6 +328,16 @@ BAD_FILES: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         "log.npz",
         lambda file: np.savez(file, actions=np.ones(4)),
         r"^episode: expected .*, got the keys actions \(.*log\.npz\)$",
+    ),
+    "Git LFS's note of a video": (
+        "cup.mp4",
+        lambda file: file.write_text(LFS_POINTER),
+        rf"^video: expected a video file, got {re.escape(LFS)} \(.*cup\.mp4\)$",
+    ),
+    "Git LFS's note of arrays": (
+        "cup.npy",
+        lambda file: file.write_text(LFS_POINTER),
+        rf"^file: expected arrays .*, got {re.escape(LFS)} \(.*cup\.npy\)$",
     ),
 }
 

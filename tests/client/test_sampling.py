@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The sampling rules, against the frames that the original functions took."""
+"""The sampling rules, against the frames that the original functions took; frames as small as the checkpoint reads them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+import torch
 
 import goldens
-from client_commands import MODEL, TASK, ask, assert_scores
-from engine_server import EngineServer
 from every_score import assert_same_scores, every_score
 from paths import GOLDEN
-from rfm_client import FrameScores, ProgressResult, ProgressSample, Trajectory, load_trajectory
-from rfm_client.frames import Rule, Sampling
+from rfm.engine.pixels import Normalisation
+from rfm.rewind.encoders import ImagePreprocessor
+from rfm.vlm.images import QwenImages, fitted_size
+from rfm_client import FrameScores, FrameSize, ProgressResult, ProgressSample, Trajectory, UInt8Array
+from rfm_client.frames import Rule, Sampling, resize_frames
+from rfm_client.frames.fit_to_checkpoint import fitted, snapshot
 from rfm_client.frames.sampling import thinned
 
 VECTORS = GOLDEN / "sampling-vectors.json"
@@ -72,8 +75,6 @@ def test_the_scores_of_prefixes_keep_all_that_the_model_gives(rule: Rule) -> Non
 READ = {
     "linspace_trunc repeats frames and pads none": (Sampling("linspace_trunc", 4), 1, [0, 0, 0, 1], 3),
     "linspace_trunc of one frame shows the first": (Sampling("linspace_trunc", 1), 9, [0], 0),
-    "linspace_round rounds half to even": (Sampling("linspace_round", 3), 5, [0, 2, 5], 2),
-    "rint does not pad": (Sampling("rint", 4), 1, [0, 1], 1),
     "rint of one frame shows the newest": (Sampling("rint", 1), 9, [9], 0),
     "rint_pad reads a padded slot": (Sampling("rint_pad", 4), 1, [0, 1, 1, 1], 3),
     "rewind online reads a padded slot": (Sampling("rewind_pad16_online"), 2, [0, 1, *[2] * 14], 15),
@@ -130,22 +131,68 @@ def test_the_checkpoint_says_how_many_frames_if_the_caller_does_not() -> None:
         Sampling.of("rint_pad", None, None)
 
 
-@pytest.mark.parametrize("rule", ["linspace_trunc", "rewind_pad16_offline"])
-def test_score_scores_each_frame_on_its_prefix(engines: EngineServer, video: Path, rule: Any) -> None:
-    words = ["--frames", 4] if rule == "linspace_trunc" else []
-    result = ask(engines, "score", video, "--task", TASK, "--sampling", rule, *words, "--json")
-    assert (result.exit_code, result.stderr) == (0, "")
-    (scored,) = json.loads(result.stdout)["videos"]
-    trajectory = load_trajectory(video, task=TASK, fps=3.0)
-    assert trajectory.frames is not None
-    sampling = Sampling.of(rule, 4 if words else None, None)
-    with engines.client(MODEL) as client:
-        shown = [sampling.prefix(t) for t in range(trajectory.num_frames)]
-        results = client.evaluate(
-            ProgressSample(Trajectory(frames=trajectory.frames[prefix.indices], task=TASK)) for prefix in shown
-        )
-        if rule == "linspace_trunc":
-            assert_scores(scored, client.progress(trajectory, frame_steps=4))
-    for name in ("progress", "success"):
-        expected = [getattr(each, name)[prefix.read] for each, prefix in zip(results, shown, strict=True)]
-        np.testing.assert_allclose(scored[name], expected, rtol=0, atol=1e-5)
+def test_a_frame_size_is_read_and_written_or_refused() -> None:
+    for text, size in {"shortest 256": ("shortest", (256,)), "exact 224x320": ("exact", (224, 320))}.items():
+        assert (FrameSize.parse(text), str(FrameSize(*size))) == (FrameSize(*size), text)  # type: ignore[arg-type]
+    for text in ("", "256", "shortest 0", "shortest -1", "shortest 2x3", "exact 224", "longest 512", "exact ٣x٣"):
+        with pytest.raises(ValueError) as refused:
+            FrameSize.parse(text)
+        forms = "'shortest PX' or 'exact HEIGHTxWIDTH'"
+        assert str(refused.value) == f"frame_size: expected {forms}, got {text!r}"
+
+
+FITTED = {
+    "landscape": ("shortest 256", (480, 640), (256, 341)),
+    "portrait": ("shortest 256", (640, 480), (341, 256)),
+    "small enough": ("shortest 256", (256, 4000), (256, 4000)),
+    "exact": ("exact 224x320", (480, 640), (224, 320)),
+    "exact of a longer edge": ("exact 224x320", (200, 640), (200, 320)),
+}
+
+
+@pytest.mark.parametrize(("text", "size", "expected"), FITTED.values(), ids=FITTED)
+def test_frames_are_only_ever_made_smaller(text: str, size: tuple[int, int], expected: tuple[int, int]) -> None:
+    frames = np.zeros((1, *size, 3), np.uint8)
+    resized = resize_frames(frames, FrameSize.parse(text))
+    assert (resized.shape, resized.dtype) == ((1, *expected, 3), np.uint8)
+    assert (resized is frames) == (size == expected)
+
+
+def test_views_and_goal_are_fitted_as_the_frames_and_nothing_is_lost() -> None:
+    frames = np.arange(6, dtype=np.uint8).repeat(48 * 64 * 3).reshape(6, 48, 64, 3)
+    given = Trajectory(frames=frames, task="lift", views=(frames + 10, frames[:, :, :40]), goal=frames[5])
+    (fit,) = fitted(snapshot(ProgressSample(given)), 2, FrameSize("exact", (24, 32))).sample.trajectories
+    assert [array.shape for array in (fit.positions, *fit.views)] == [(2, 24, 32, 3)] * 3
+    assert [array[:, 0, 0, 0].tolist() for array in (fit.positions, *fit.views)] == [[0, 5], [10, 15], [0, 5]]
+    assert fit.goal is not None
+    assert fit.goal.shape == (24, 32, 3)
+    assert fit.task == given.task
+
+
+NO_COLOURS = Normalisation((0.0,) * 3, (1 / 255,) * 3)  # so that the network reads grey levels
+SIZES = [(300, 401), (401, 300)]
+
+
+def large(height: int, width: int) -> UInt8Array:
+    """A picture with edges, text-like detail and noise: uint8 [2, H, W, 3]."""
+    rows, columns = np.mgrid[:height, :width]
+    waves = 127 * (1 + np.sin(rows * columns / 900))
+    noise = np.random.default_rng(1).integers(0, 256, (height, width))
+    frames = np.stack([waves, 255 * (columns // 40 % 2), noise], axis=-1)
+    return np.stack([frames, frames[::-1]]).astype(np.uint8)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_rewind_s_encoder_reads_what_it_would_have_read_to_a_grey_level(size: tuple[int, int]) -> None:
+    frames = large(*size)
+    read = ImagePreprocessor(256, (256, 256), (0.0,) * 3, (1 / 255,) * 3)
+    resized = resize_frames(frames, FrameSize.parse("shortest 256"))
+    differences = (read(torch.from_numpy(frames)) - read(torch.from_numpy(resized))).abs()
+    assert differences.max() <= 1
+    assert differences.mean() < 0.01
+
+
+def test_qwen_reads_the_very_pixels_that_it_would_have_read() -> None:
+    frames, size = large(300, 401), FrameSize("exact", fitted_size(224, 320, 28))
+    images = QwenImages(14, NO_COLOURS, (224, 320))
+    assert torch.equal(images.images_to_size(frames), images.images_to_size(resize_frames(frames, size)))

@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Servers that do not answer as they should. Stand-ins on a raw socket: a real Triton does not misbehave on demand."""
+"""Connections, limits of what is sent, and servers that do not answer as they should.
+
+Those are stand-ins on a raw socket: a real Triton does not misbehave on demand.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -23,7 +28,12 @@ from rfm_client import (
     ServerUnavailableError,
     Trajectory,
 )
+from rfm_client.contract.triton import error_of, invalid_sample
 from rfm_client.serving import Credentials, ServerStatus
+from rfm_client.transport.concurrency import MAX_BYTES, ConcurrencyLimiter
+from rfm_client.transport.connection import grpc_options
+from rfm_client.transport.deadline import Deadline
+from rfm_client.transport.request_size import check_size
 from trajectories import random_trajectory
 
 TIMEOUT_S = 1.0
@@ -142,6 +152,20 @@ def test_a_request_over_two_gib_is_refused_before_it_is_copied() -> None:
         "frames: expected at most 2.15 GB in a request, got 6.44 GB; shrink the frames (resize, --resize), score fewer "
         "(subsample, --max-frames), or share memory with a server on this host (shared_memory)"
     )
+    check_size({"frames": frames}, {"frames"})  # which go through shared memory
+
+
+@contextmanager
+def grpc_server(service: str, method: str, handler: grpc.RpcMethodHandler) -> Iterator[int]:
+    """Yield the port of a server with one method."""
+    server = grpc.server(ThreadPoolExecutor(1))
+    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler(service, {method: handler})])
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    try:
+        yield port
+    finally:
+        server.stop(None)
 
 
 def test_triton_is_told_the_time_of_a_call_in_microseconds() -> None:
@@ -152,39 +176,81 @@ def test_triton_is_told_the_time_of_a_call_in_microseconds() -> None:
         told_us.append(request.parameters["timeout"].int64_param)
         context.abort(grpc.StatusCode.INVALID_ARGUMENT, "enough")
 
-    handlers = {
-        "ModelInfer": grpc.unary_unary_rpc_method_handler(
-            infer, request_deserializer=service_pb2.ModelInferRequest.FromString
-        )
-    }
-    server = grpc.server(ThreadPoolExecutor(1))
-    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("inference.GRPCInferenceService", handlers)])
-    port = server.add_insecure_port("127.0.0.1:0")
-    server.start()
-    try:
-        with RewardClient(f"grpc://127.0.0.1:{port}") as client, pytest.raises(InvalidSampleError, match="enough"):
-            client.progress(random_trajectory(0, 2), timeout_s=WITHIN_S)
-    finally:
-        server.stop(None)
+    handler = grpc.unary_unary_rpc_method_handler(infer, service_pb2.ModelInferRequest.FromString)
+    with (
+        grpc_server("inference.GRPCInferenceService", "ModelInfer", handler) as port,
+        RewardClient(f"grpc://127.0.0.1:{port}") as client,
+        pytest.raises(InvalidSampleError, match="enough"),
+    ):
+        client.progress(random_trajectory(0, 2), timeout_s=WITHIN_S)
     (waits_us,) = told_us
     assert 0.5 * WITHIN_S < waits_us / 1e6 <= WITHIN_S
-
-
-def test_a_second_of_silence_costs_a_connection_its_later_calls() -> None:
-    connections: list[socket.socket] = []
-
-    def dumb(connection: socket.socket) -> None:
-        connections.append(connection)
-        silent(connection)
-
-    with listening(dumb) as port, RewardClient(f"grpc://127.0.0.1:{port}", retry=False) as client:
-        for timeout_s in (1.1, 0.2):
-            with pytest.raises(DeadlineExceededError):
-                client.progress(random_trajectory(0, 2), timeout_s=timeout_s)
-        assert len(connections) == 2
 
 
 def test_a_name_that_nobody_knows_is_told() -> None:
     client = RewardClient("grpc://rfm-servers.invalid:8001", retry=False, timeout_s=WITHIN_S)
     with client, pytest.raises(RewardError, match=r"Domain name not found|resol|DNS"):
         client.model_info()
+
+
+@pytest.mark.parametrize(
+    ("message", "may_have_ended"),
+    [
+        ("Stream removed (Socket closed)", True),
+        ("Stream removed (recvmsg:Connection reset by peer (104))", True),
+        ("Stream removed (sendmsg: Broken pipe (32))", True),
+        ("upstream connect error or disconnect/reset before headers. reset reason: connection termination", True),
+        ("upstream connect error or disconnect/reset before headers. reset reason: remote connection failure", False),
+        (
+            "failed to connect to all addresses; last error: UNKNOWN: ipv4:10.0.0.1:8001: Connection reset by peer",
+            False,
+        ),
+        ("connections to all backends failing; last error: UNKNOWN: ipv4:10.0.0.1:1: Connection reset by peer", False),
+        ("the queue is full: 8 requests wait already", False),
+        ("Stub process 'rfm_0_0' is not healthy.", True),
+    ],
+)
+def test_which_errors_a_request_may_have_caused(message: str, may_have_ended: bool) -> None:
+    error = error_of("StatusCode.UNAVAILABLE", message, invalid_sample)
+    assert isinstance(error, ServerUnavailableError)
+    assert error.may_have_ended_server is may_have_ended
+
+
+def test_requests_are_spread_over_the_addresses_of_a_name() -> None:
+    """A list of addresses stands for the name, which would need a DNS server."""
+    counts = [0, 0]
+
+    def echo(number: int) -> grpc.RpcMethodHandler:
+        def answer(content: bytes, _context: grpc.ServicerContext) -> bytes:
+            counts[number] += 1
+            return content
+
+        return grpc.unary_unary_rpc_method_handler(answer)
+
+    with grpc_server("test", "Echo", echo(0)) as one, grpc_server("test", "Echo", echo(1)) as other:
+        target = f"ipv4:127.0.0.1:{one},127.0.0.1:{other}"
+        with grpc.insecure_channel(target, grpc_options("name:8001")) as channel:
+            ask = channel.unary_unary("/test/Echo")
+            end_s = time.monotonic() + WITHIN_S
+            while not all(counts):
+                assert ask(b"once") == b"once"
+                assert time.monotonic() < end_s
+
+
+def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> None:
+    async def ask() -> None:
+        room = ConcurrencyLimiter(10).room
+        async with room(MAX_BYTES // 2, Deadline(1)), room(MAX_BYTES // 2 - 1, Deadline(1)):
+            with pytest.raises(DeadlineExceededError):
+                async with room(2, Deadline(0.05)):
+                    pytest.fail("there was no room")
+            async with room(1, Deadline(1)):
+                pass
+        async with room(3 * MAX_BYTES, Deadline(1)):
+            with pytest.raises(DeadlineExceededError):
+                async with room(0, Deadline(0.05)):
+                    pytest.fail("there was no room")
+        async with room(MAX_BYTES, Deadline(1)):  # a call that gives up returns its bytes
+            pass
+
+    asyncio.run(ask())

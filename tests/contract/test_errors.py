@@ -14,8 +14,7 @@ from rfm.launch.installation import ServerStartError
 from rfm_client import InvalidSampleError
 from rfm_client.contract import triton
 from rfm_client.contract.errors import LocatedError
-from rfm_client.contract.numbers import checked_share
-from rfm_client.options import ConfigError, InvalidValueError, require
+from rfm_client.options import ConfigError, InvalidValueError
 from rfm_export import ExportError
 from rfm_labels import DatasetError
 
@@ -62,14 +61,6 @@ def test_an_object_around_a_field_goes_before_it() -> None:
     assert str(outer) == "samples[3].trajectory.task: expected a sentence, got '' (request id-1)"
     assert (outer.where, outer.expected) == ("samples[3].trajectory.task", "a sentence")
     assert str(InvalidSampleError("no reason given").inside("samples[3]")) == "samples[3]: no reason given"
-
-
-def test_checks_raise_errors_with_fields() -> None:
-    with pytest.raises(InvalidValueError, match=r"^threshold: expected a number from 0 to 1, got 70; for 70 percent"):
-        checked_share("threshold", 70)
-    with pytest.raises(DatasetError, match=r"^a\.h5: expected frames, got none$") as caught:
-        require("a.h5", False, "frames", "none", DatasetError)
-    assert fields(caught.value) == ("a.h5", "frames", "none", "")
 
 
 TEXTS: dict[str, tuple[str, Any]] = {

@@ -1,15 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Results: votes over success, rewards, verdicts."""
+"""Results: votes over success, rewards, verdicts; and the description of a checkpoint as JSON."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from every_score import assert_same_scores, every_score
-from rfm_client import FRAME_SCORES, FrameScores, InferenceFailedError, PreferenceResult, ProgressResult
+from rfm_client import (
+    FRAME_SCORES,
+    FrameScores,
+    FrameSize,
+    InferenceFailedError,
+    ModelInfo,
+    PreferenceResult,
+    ProgressResult,
+)
+from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 
 VOTES: dict[str, tuple[list[float], int, float, bool]] = {
     "the last frame": ([0.1, 0.9], 1, 0.5, True),
@@ -100,25 +110,18 @@ def test_a_named_rule_makes_progress_of_seconds() -> None:
 
 def test_without_seconds_no_rule_makes_progress() -> None:
     with pytest.raises(ValueError, match="remaining_s: expected seconds, got none"):
-        every_seconds_but_none().progress_by("remaining_over_first")
+        replace(every_score(0, 2), remaining_s=None).progress_by("remaining_over_first")
     with pytest.raises(ValueError, match="remaining_s: expected more than 0 at the first frame, got 0"):
         seconds(0, 1).progress_by("remaining_over_first")
     with pytest.raises(ValueError, match="rule: expected one of remaining_over_first, got 'best'"):
         seconds(1).progress_by("best")  # type: ignore[arg-type]
 
 
-def every_seconds_but_none() -> FrameScores:
-    return replace(every_score(0, 2), remaining_s=None)
-
-
 VERDICTS: dict[str, tuple[float, float | None, float, bool | None, str | None]] = {
-    "first, asked once": (0.9, None, 0.9, None, "first"),
     "second, asked once": (0.1, None, 0.1, None, "second"),
     "even, asked once": (0.5, None, 0.5, None, None),
     "first": (0.75, 0.25, 0.75, True, "first"),
-    "second": (0.25, 0.875, 0.1875, True, "second"),
     "disagree": (0.75, 0.75, 0.5, False, None),
-    "disagree, though the mean is high": (1.0, 0.625, 0.6875, False, None),
     "one is even": (0.75, 0.5, 0.625, False, None),
     "both are even": (0.5, 0.5, 0.5, True, None),
 }
@@ -143,3 +146,53 @@ def test_there_is_a_verdict_where_the_orders_agree(
 def test_orders_that_two_versions_answered_are_an_error() -> None:
     with pytest.raises(InferenceFailedError, match=r"^model_version: expected one for both orders, got 1, 2: ask"):
         PreferenceResult.of_both_orders(preferred(0.5), preferred(0.5, "2"))
+
+
+# A value of each field, none of them its default.
+FULL = Description(
+    source="org/name", revision="0123abcd", license="mit", run_config={"data": {"max_frames": 8}},
+    computation="float32, torch 2", weights_difference=0.012, kind="ReWiND", network={"class": "Rewind", "config": {}},
+    video_dim=4, text_dim=2, progress_bins=10, trained_frames=16, trained_padding=False, network_frames=32,
+    frame_size=FrameSize("exact", (224, 320)), frames_per_value=2, has_progress=False, has_preference=True, has_success=True,
+    has_similarity=True, more_scores=("log_prob", "unclear"), scores_whole_prefixes=True, may_not_answer=True, needs_whole_episode=True,
+    asks_in_words=True, reads_views=True, keeps_features=True, uses_graphs=True, is_large=True,
+    weights_digest="12ab", settings_digest="34cd",
+)  # fmt: skip
+CONFIG: dict[str, Any] = {"name": "rfm", "max_batch_size": 64, "input": [], "output": []}
+
+
+def test_a_description_survives_as_json() -> None:
+    assert {
+        each.name for each in fields(Description) if getattr(FULL, each.name) == getattr(Description(), each.name)
+    } == set()
+    assert Description.parse(FULL.to_json()) == FULL
+    assert Description.parse(Description().to_json()) == Description()
+
+
+def test_descriptions_of_older_and_newer_exports_are_read() -> None:
+    assert Description.parse('{"kind": "ReWiND", "a_newer_fact": [1]}') == Description(kind="ReWiND")
+
+
+def test_limits_of_training_and_network_make_one() -> None:
+    assert [replace(FULL, trained_frames=n).max_frames for n in (16, 64, None)] == [16, 32, 32]
+    assert Description().max_frames is None
+
+
+WRONG = {
+    "missing": ("", r"expected the JSON object of an export, got none"),
+    "not JSON": ("{", r"expected the JSON object of an export, got '\{': Expecting property name"),
+    "no object": ("[1]", r"expected the JSON object of an export, got '\[1\]'"),
+    "a text for a number": ('{"text_dim": "32"}', r"text_dim: expected int or null, got '32'"),
+    "a list for an object": ('{"network": []}', r"network: expected Mapping, got \[\]"),
+    "an unknown size": ('{"frame_size": "any"}', r"frame_size: expected 'shortest PX' or .*, got 'any'"),
+}
+
+
+@pytest.mark.parametrize(("text", "expected"), WRONG.values(), ids=WRONG)
+def test_a_client_names_the_fault_of_a_description_and_its_remedy(text: str, expected: str) -> None:
+    config = CONFIG | ({"parameters": {DESCRIPTION_PARAMETER: {"string_value": text}}} if text else {})
+    with pytest.raises(
+        InferenceFailedError,
+        match=rf"^model rfm: config\.pbtxt: parameter description: {expected}.*; export the checkpoint again",
+    ):
+        ModelInfo.from_config(config)

@@ -47,10 +47,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
         "frames: expected uint8 [T, H, W, 3] (see float_frames_to_uint8), got float32 [3, 8, 6, 3]",
     ),
     "one image": (lambda: Trajectory(frames=FRAMES[0]), "frames: expected uint8 [T, H, W, 3], got uint8 [8, 6, 3]"),
-    "channels first": (
-        lambda: Trajectory(frames=FRAMES.transpose(0, 3, 1, 2)),
-        "frames: expected uint8 [T, H, W, 3], got uint8 [3, 3, 8, 6]",
-    ),
     "no frames": (
         lambda: Trajectory(frames=FRAMES[:0]),
         "frames: expected at least one frame of at least one pixel, got uint8 [0, 8, 6, 3]",
@@ -59,10 +55,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: Trajectory(frames=["/etc/passwd"]),  # type: ignore[arg-type]
         "frames: expected uint8 [T, H, W, 3] (see float_frames_to_uint8), got <U11 [1]",
     ),
-    "one embedding": (
-        lambda: Trajectory(video_embeddings=VIDEO[0]),
-        "video_embeddings: expected float32 [T, D], got float32 [5]",
-    ),
     "no embeddings": (
         lambda: Trajectory(video_embeddings=VIDEO[:0]),
         "video_embeddings: expected float32 [T, D] without an empty axis, got float32 [0, 5]",
@@ -70,10 +62,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "rows of unequal length": (
         lambda: Trajectory(video_embeddings=[[1.0], [1.0, 2.0]]),  # type: ignore[arg-type]
         "video_embeddings: expected float32 [T, D], got rows of unequal length",
-    ),
-    "text as embeddings": (
-        lambda: Trajectory(video_embeddings=[["a"]]),  # type: ignore[arg-type]
-        "video_embeddings: expected float32 [T, D], got <U1 [1, 1]",
     ),
     "NaN": (
         lambda: Trajectory(video_embeddings=with_nan),
@@ -106,10 +94,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "one frame step": (
         lambda: ProgressSample(embedded(), frame_steps=1),
         "frame_steps: expected 0 or a whole number from 2 to 4096, got 1",
-    ),
-    "frame steps that are no whole number": (
-        lambda: ProgressSample(embedded(), frame_steps=4.7),  # type: ignore[arg-type]
-        "frame_steps: expected 0 or a whole number from 2 to 4096, got 4.7",
     ),
     "frame steps beyond the wire's type": (
         lambda: ProgressSample(embedded(), frame_steps=2**40),

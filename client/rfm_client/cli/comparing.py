@@ -17,13 +17,12 @@ from typing import cast
 
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel
-from rfm_client.cli.scoring import Source, fitted_to
+from rfm_client.cli.scoring import Source, fitted_to, scores_of
 from rfm_client.cli.show import FittingTable, at_end, number, table
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
-from rfm_client.contract.results import FrameScores, PreferenceResult
+from rfm_client.contract.results import PreferenceResult, ProgressResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Trajectory
-from rfm_client.frames.fit_to_checkpoint import with_frame_indices
 
 LEGEND = (
     "no answer: the orders disagree, or both are exactly 0.5. "
@@ -35,18 +34,15 @@ Order = tuple[int, int]  # numbers of the first and second video of a question
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """N sources, and their preferences by one version of the model.
+    """N sources, their scores, and their preferences by one version of the model.
 
+    scores: of each source alone, as ``score`` gives them; in a preference they depend on the other source
     results: for both orders of every pair
     """
 
     sources: Sequence[Source]
+    scores: Sequence[ProgressResult]
     results: Mapping[Order, PreferenceResult]
-
-    @property
-    def scores(self) -> list[FrameScores]:
-        """Scores of each source in the given order, from its comparison with the first."""
-        return [self.results[0, 1].first, *(self.results[0, other].second for other in self._numbers[1:])]
 
     def pair(self, first: int, second: int) -> PreferenceResult:
         """Return both orders of two sources as one result."""
@@ -80,7 +76,7 @@ class Comparison:
 
     def tables(self) -> list[FittingTable | str]:
         """Return a table of sources, the best first, a table of pairs, and without a ranking a legend."""
-        columns = ("video", "rank", "P(wins)", "its final progress", "its final success", "frames")
+        columns = ("video", "rank", "P(wins)", "final progress", "final success", "frames")
         pairs = ("first", "second", "P(first wins)", "asked second first", "mean", "orders")
         return [
             table("", columns, [self._row(index) for index in self._shown]),
@@ -129,15 +125,11 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
     sent = [fit.sample.trajectories[0] for fit in fits]
     orders = list(itertools.permutations(range(len(sources)), 2))
     answers = client.evaluate([PreferenceSample(sent[first], sent[second]) for first, second in orders])
-    kept = [fit.frame_indices[0] for fit in fits]
-    results = {
-        order: cast(PreferenceResult, with_frame_indices(answer, [kept[index] for index in order]))
-        for order, answer in zip(orders, answers, strict=True)
-    }
-    versions = sorted({str(result.model_version) for result in results.values()})
+    scores = scores_of(client, fits)
+    versions = sorted({str(result.model_version) for result in (*scores, *answers)})
     if len(versions) > 1:
         raise InferenceFailedError(f"model_version: expected one for all videos, got {', '.join(versions)}: ask again")
-    return Comparison(sources, results)
+    return Comparison(sources, scores, dict(zip(orders, cast("list[PreferenceResult]", answers), strict=True)))
 
 
 def _of_one_task(first: Source, other: Source) -> Trajectory:

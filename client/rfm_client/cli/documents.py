@@ -40,7 +40,7 @@ def comparison_document(server: ServerOptions, video: VideoOptions, comparison: 
     """Return the document of ``compare --json``. ``preference`` is the probability that an order's first video wins.
 
     For two videos, the top level also has the ``preference`` in the given order, the verdict of both orders, and scores
-    as ``first`` and ``second``. A missing verdict, rank or ranking is null.
+    as ``first`` and ``second``. Scores are those of ``score``. A missing verdict, rank or ranking is null.
     """
     names = [source.name for source in comparison.sources]
     videos = [

@@ -231,6 +231,16 @@ def fitted_to(
     return fitted(sample, limit, info.frame_size if video.resize else None)
 
 
+def scores_of(client: RewardClient, fits: Sequence[FittedSample], frame_steps: int = 0) -> list[ProgressResult]:
+    """Return the scores of whole trajectories, each alone. frame_steps: as in ProgressSample. Raises RewardError."""
+    asked = [replace(cast(ProgressSample, fit.sample), frame_steps=frame_steps) for fit in fits]
+    results = client.evaluate(asked, all_scores=True)
+    return [
+        cast(ProgressResult, with_frame_indices(result, fit.frame_indices))
+        for result, fit in zip(results, fits, strict=True)
+    ]
+
+
 def _evaluate(
     client: RewardClient, sample: ProgressSample, video: VideoOptions, prefix: PrefixOptions
 ) -> ProgressResult:
@@ -240,9 +250,7 @@ def _evaluate(
     info = client.model_info(frames=sent.trajectory.frames is not None)
     # Of an episode as a whole, all frames are shown at once.
     if prefix.sampling is None or (info.needs_whole_episode and prefix.sampling == "all"):
-        asked = replace(sent, frame_steps=prefix.frame_steps)
-        (result,) = client.evaluate([asked], all_scores=True)
-        return cast(ProgressResult, with_frame_indices(result, fit.frame_indices))
+        return scores_of(client, [fit], prefix.frame_steps)[0]
     try:
         sampling = Sampling.of(prefix.sampling, prefix.frames, info.max_frames)
     except InvalidValueError as error:  # the options are valid: the checkpoint lacks the number

@@ -42,7 +42,7 @@ _ERROR_OF = {status: error for statuses, error in _ERRORS.items() for status in 
 PROCESS_ENDED = "is not healthy"  # "Stub process 'rfm_0_0' is not healthy."
 NO_VERSIONS = "no available versions"  # the model failed, or is being loaded again
 LOST_REGION = "Unable to find shared memory region"  # the server was restarted
-REGION_IN_USE = "it is currently in use"  # a region to unmap: tests/client/test_shared_memory_faults.py
+REGION_IN_USE = "it is currently in use"  # a region to unmap
 RESTRICTED = "is restricted, expecting header"  # the API needs a key
 
 _NO_CONNECTION = re.compile(  # gRPC's own words: nothing was sent

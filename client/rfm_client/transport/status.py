@@ -20,7 +20,7 @@ from tritonclient.utils import InferenceServerException
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
-from rfm_client.contract.names import frames_name
+from rfm_client.contract.names import encoder_name, frames_name
 from rfm_client.contract.proxies import grpc_proxy, open_url
 from rfm_client.transport.connection import grpc_options
 from rfm_client.transport.credentials import Credentials
@@ -276,11 +276,14 @@ def _index_of(ready: Mapping[_Version, bool]) -> list[dict[str, Any]]:
 
 def _models(index: list[dict[str, Any]], statistics: list[dict[str, Any]], metrics: _Metrics) -> list[ModelStatus]:
     done_by = {(entry["name"], entry["version"]): entry for entry in statistics}
+    names = {entry["name"] for entry in index}
     models = []
     for entry in index:
         key = entry["name"], entry.get("version", "")
         done = done_by.get(key, {})
         times = done.get("inference_stats", {})
+        is_ensemble = key[0].endswith(_FRAMES) and encoder_name(key[0].removesuffix(_FRAMES)) in names
+        failures = 2 if is_ensemble else 1  # that Triton counts for a failed request
         models.append(
             ModelStatus(
                 name=key[0],
@@ -288,7 +291,7 @@ def _models(index: list[dict[str, Any]], statistics: list[dict[str, Any]], metri
                 state=entry.get("state", "UNAVAILABLE"),
                 reason=" ".join(entry.get("reason", "").split()),
                 requests_succeeded=_whole(times, "success", "count"),
-                requests_failed=_whole(times, "fail", "count"),
+                requests_failed=_whole(times, "fail", "count") // failures,
                 requests_pending=metrics.pending.get(key),
                 samples=int(done.get("inference_count", 0)),
                 executions=int(done.get("execution_count", 0)),
