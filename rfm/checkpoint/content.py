@@ -16,6 +16,7 @@ import yaml
 from safetensors import SafetensorError, safe_open
 
 from rfm.plain_yaml import read_yaml
+from rfm_client.contract.checks import git_lfs_pointer
 from rfm_client.contract.errors import LocatedError
 
 if TYPE_CHECKING:
@@ -36,8 +37,8 @@ MAX_JSON_BYTES = 2**24
 MAX_HEADER_BYTES = 2**24  # of a safetensors file; a tensor takes about 100 bytes
 
 _LENGTH = struct.Struct("<Q")  # of a safetensors file's header
+_START_BYTES = 64  # enough to tell what a file is instead
 _DTYPES = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
-_LFS_POINTER = b"version https://git-lfs"
 _KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a pipe",
@@ -179,9 +180,9 @@ def _require(file: Path) -> None:
 def _check_header(file: Path) -> None:
     """Check the header beyond the library's offsets and sizes. Raises ValueError, OSError, RecursionError."""
     with file.open("rb") as content:
-        start = content.read(len(_LFS_POINTER))
-        if start == _LFS_POINTER:
-            raise ValueError("Git LFS's note of where it is; `git lfs pull` fetches it")
+        start = content.read(_START_BYTES)
+        if pointer := git_lfs_pointer(start):
+            raise ValueError(pointer)
         if start and not any(start):
             raise ValueError("zeros, as after an unfinished download; fetch or copy it again")
         if len(start) < _LENGTH.size:

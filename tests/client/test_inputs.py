@@ -19,9 +19,11 @@ from rfm_client import InvalidSampleError, Trajectory, UInt8Array, as_trajectory
 from rfm_client.frames import Correction, Orientation
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (4, 6, 8, 3), np.uint8)
-
-
 SHAPED = "uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W]"
+LFS = "Git LFS's note of where it is; `git lfs pull` fetches it"
+LFS_POINTER = (
+    "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1048576\n"  # git leaves in place of a file
+)
 
 
 def channels_first(frames: UInt8Array) -> torch.Tensor:
@@ -215,8 +217,10 @@ def test_views_and_goal_stand_beside_the_frames_of_a_file(tmp_path: Path) -> Non
     np.testing.assert_array_equal(loaded.goal, FRAMES[1])
     with pytest.raises(InvalidSampleError, match=rf"short\.npy: expected {len(FRAMES)} frames, as {front}, got 1$"):
         load_trajectory(front, views=[tmp_path / "short.npy"])
-    with pytest.raises(InvalidSampleError, match=r"front\.npy: expected an image, got "):
-        load_trajectory(front, goal=front)
+    for content, found in (("words", ".*cannot identify"), (LFS_POINTER, re.escape(LFS))):
+        goal.write_text(content)
+        with pytest.raises(InvalidSampleError, match=rf"goal\.png: expected an image, got {found}"):
+            load_trajectory(front, goal=goal)
 
 
 def test_frames_of_files_are_corrected_as_the_caller_says_and_embeddings_are_refused(tmp_path: Path) -> None:
@@ -362,6 +366,16 @@ BAD_FILES: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         "log.npz",
         lambda file: np.savez(file, actions=np.ones(4)),
         r"^episode: expected .*, got the keys actions \(.*log\.npz\)$",
+    ),
+    "Git LFS's note of a video": (
+        "cup.mp4",
+        lambda file: file.write_text(LFS_POINTER),
+        rf"^video: expected a video file, got {re.escape(LFS)} \(.*cup\.mp4\)$",
+    ),
+    "Git LFS's note of arrays": (
+        "cup.npy",
+        lambda file: file.write_text(LFS_POINTER),
+        rf"^file: expected arrays .*, got {re.escape(LFS)} \(.*cup\.npy\)$",
     ),
 }
 

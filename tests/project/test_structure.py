@@ -58,7 +58,7 @@ PUBLIC = {  # modules; each lists the names in __all__
     "rfm_export": {""},
     "rfm": {"config", "engine", "families"},
 }
-MOST_NAMES = 83  # of the client's public modules together
+MOST_NAMES = 84  # of the client's public modules together
 MOST_NAMES_OF_LABELS = 36
 # Part of the client -> the parts below it, which alone it may import.
 CLIENT: dict[str, set[str]] = {

@@ -19,7 +19,7 @@ from zipfile import BadZipFile
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.checks import require
+from rfm_client.contract.checks import git_lfs_pointer, require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import Trajectory, UInt8Array, as_array, with_pictures
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
@@ -158,6 +158,8 @@ def _corrected(trajectory: Trajectory, correction: Correction) -> Trajectory:
 
 def _arrays(file: Path) -> Mapping[str, npt.NDArray[Any]]:
     try:
+        if pointer := git_lfs_pointer(file):
+            raise ValueError(pointer)
         with file.open("rb") as stream:
             loaded = np.load(stream, allow_pickle=False)
             if isinstance(loaded, np.ndarray):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rfm_client.contract.checks import git_lfs_pointer
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.samples import UInt8Array
 
@@ -87,10 +88,12 @@ class Picture:
 def opened_picture(picture: bytes | Path) -> Any:
     """Open a picture of 8-bit colours, or its file, and read only its header. Raises FrameFileError."""
     Picture.decoder()
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     try:
         opened = Image.open(_file_of(picture))
+    except UnidentifiedImageError as error:
+        raise FrameFileError.of("an image", git_lfs_pointer(picture) or error) from error
     except (*_BROKEN, Image.DecompressionBombError) as error:
         raise FrameFileError.of("an image", error) from error
     is_deep = _DEEP in str(opened.tile)

@@ -18,6 +18,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.checks import git_lfs_pointer
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.frames.pictures import FrameFileError
@@ -111,7 +112,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     Raises FrameFileError, also for broken packets, and the errors of PyAV. A Matroska or Ogg file that ends too early
     is read as far as it goes.
     """
-    _check_last_picture(file)
+    _check_ends(file)
     timed: list[tuple[float, int]] = []
     count = num_hidden = 0
     with import_av().open(file, format=container) as opened:
@@ -138,14 +139,19 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     return Packets(count, times_s, tuple(size for _, size in timed), num_hidden, tick_s, fps)
 
 
-def _check_last_picture(file: BinaryIO) -> None:
-    """Raise FrameFileError for a truncated GIF or MPEG-TS file, whose decoders may give part of a picture."""
+def _check_ends(file: BinaryIO) -> None:
+    """Raise FrameFileError for Git LFS's pointer to a video, and a truncated GIF or MPEG-TS file.
+
+    The decoders of those two may give part of a picture.
+    """
     num_bytes = file.seek(0, os.SEEK_END)
     file.seek(max(num_bytes - _HEAD_BYTES, 0))
     tail = file.read()
     file.seek(0)
     head = file.read(_HEAD_BYTES)
     file.seek(0)
+    if pointer := git_lfs_pointer(head):
+        raise FrameFileError.of("a video file", pointer)
     is_cut = head.startswith(b"GIF8") and not tail.rstrip(b"\0").endswith(b";")
     for length, offset in _TS_PACKETS:
         syncs = head[offset::length]
