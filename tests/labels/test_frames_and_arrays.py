@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,8 @@ import pytest
 from PIL import Image
 
 from hdf5_writers import write_robomimic
-from labelling import BrightnessScorer, brightness, command
+from labelling import LEROBOT, BrightnessScorer, brightness, command
+from paths import ROOT
 from pictures import numbered, write_video
 from rfm_client.command_line import ExitCode
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset, read_episode_labels
@@ -219,6 +221,29 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
     "other files": (["a.txt"], "", "got other files: put a video, an array or a folder of pictures for each episode"),
     "another file": (["a.txt"], "a.txt", "or a Hub id org/name[@revision], got another file"),
 }
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:%064d\nsize 1048576\n" % 1
+LEROBOT_FILES = (LEROBOT / "toy_v21", "data/chunk-000/episode_000000.parquet")
+CLONED: dict[str, tuple[Path | None, str]] = {  # a copied dataset, and its file that git-lfs did not fetch
+    "a table of rows": LEROBOT_FILES,
+    "a video": (LEROBOT_FILES[0], "videos/chunk-000/observation.images.wrist/episode_000000.mp4"),
+    "records": (ROOT / "tests/rlds/toy_steps_texts/1.0.0", "toy_steps_texts-train.tfrecord-00000-of-00002"),
+    "an HDF5 file": (None, "a.hdf5"),
+    "a picture": (None, "0/1.png"),
+    "arrays": (None, "a.npy"),
+}
+
+
+@pytest.mark.parametrize(("source", "name"), CLONED.values(), ids=CLONED)
+def test_files_that_git_cloned_without_git_lfs_are_told(tmp_path: Path, source: Path | None, name: str) -> None:
+    root = tmp_path / "data"
+    if source is not None:
+        shutil.copytree(source, root)
+    (root / name).parent.mkdir(parents=True, exist_ok=True)
+    (root / name).write_bytes(POINTER)
+    with pytest.raises(DatasetError, match="got Git LFS's note of where it is; `git lfs pull` fetches it"):
+        label(open_dataset(root / name if name.endswith("5") else root, task=TASK), BrightnessScorer(), LabelOptions())
 
 
 @pytest.mark.parametrize("name", ["/nothing/here", "no dataset"])

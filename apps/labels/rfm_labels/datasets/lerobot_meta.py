@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rfm_client.options import checked_count
-from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.faults import DatasetError, require, unreadable
 
 INFO_FILE = Path("meta", "info.json")
 VERSIONS = ("v2.0", "v2.1", "v3.0")
@@ -170,7 +170,7 @@ def read_table(file: Path, columns: list[str] | None = None, filters: Any = None
     except FileNotFoundError as error:
         raise DatasetError.at(file, "a Parquet file", "none") from error
     except (OSError, pyarrow.ArrowException) as error:
-        raise DatasetError.at(file, "a readable Parquet file", error) from error
+        raise unreadable(file, "a readable Parquet file", error) from error
     for name in columns or []:
         require(file, name in table.column_names, f"the column {name}", ", ".join(table.column_names))
     return table
@@ -183,7 +183,7 @@ def column_types(file: Path) -> Mapping[str, str]:
     try:
         return {field.name: str(field.type) for field in parquet.read_schema(file)}
     except (OSError, ArrowException) as error:
-        raise DatasetError.at(file, "a readable Parquet file", error) from error
+        raise unreadable(file, "a readable Parquet file", error) from error
 
 
 def read_entries(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
