@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -98,6 +99,16 @@ def maniskill(folder: Path) -> Written:
     return Written(file, [(number, TASK, cameras) for number, cameras in frames.items()], task=TASK)
 
 
+def arena(folder: Path) -> Written:
+    """IsaacLab-Arena's recorder: the first picture is the last one of the episode before."""
+    file = hdf5_writers.write_robomimic(folder / "demos.hdf5", [{"front": clip} for clip in CLIPS])
+    with h5py.File(file, "r+") as opened:
+        for number in range(len(CLIPS)):
+            opened.move(f"data/demo_{number}/obs", f"data/demo_{number}/camera_obs")
+            opened[f"data/demo_{number}/obs/joints"] = np.zeros((LENGTHS[number], 54))
+    return Written(file, [(number, TASK, {"front": clip[1:]}) for number, clip in enumerate(CLIPS)])
+
+
 def rlds(folder: Path) -> Written:
     stored = dict(np.load(RLDS / "toy_episode_texts.npz"))
     places = ("train/0", "train/1", "train/2", "val/0", "val/1")
@@ -131,6 +142,23 @@ def pictures(folder: Path) -> Written:
     return Written(folder, episodes, lambda: (folder / "1" / "frame_9.png").write_bytes(b"no picture"), task=TASK)
 
 
+def unitree(folder: Path) -> Written:
+    """xr_teleoperate: the pictures of all cameras in one folder; ``data.json`` names frames, cameras and the task."""
+    episodes: list[Any] = []
+    for number, clip in enumerate(CLIPS):
+        rows, cameras = [], {"color_0": clip, "color_1": clip[:, ::-1]}
+        (folder / f"episode_{number:04d}" / "colors").mkdir(parents=True)
+        for t in range(len(clip)):
+            names = {camera: f"colors/{t:06d}_{camera}.png" for camera in cameras}
+            for camera, name in names.items():
+                Image.fromarray(cameras[camera][t]).save(folder / f"episode_{number:04d}" / name)
+            rows.append({"idx": t, "colors": names, "depths": {}})
+        told = {"text": {"goal": TASK}, "data": rows}
+        (folder / f"episode_{number:04d}" / "data.json").write_text(json.dumps(told))
+        episodes.append((number, TASK, cameras))
+    return Written(folder, episodes, lambda: (folder / "episode_0001" / "data.json").write_text('{"data": [{}'))
+
+
 def arrays(folder: Path) -> Written:
     for number, clip in enumerate(CLIPS):
         np.savez(folder / f"{number}.npz", frames=clip, task=f"task {number}")
@@ -147,9 +175,11 @@ FORMATS: dict[str, Callable[[Path], Written]] = {
     "RoboTwin before its mark": of_files(robotwin),
     "RoboMIND": of_files(hdf5_writers.write_robomind),
     "ManiSkill": maniskill,
+    "IsaacLab-Arena": arena,
     "RLDS": rlds,
     "videos": videos,
     "pictures": pictures,
+    "Unitree": unitree,
     "arrays": arrays,
 }
 every_format = pytest.mark.parametrize("write", FORMATS.values(), ids=FORMATS)
@@ -234,7 +264,7 @@ def test_a_camera_is_turned_and_its_colours_swapped_on_request_and_the_recipe_sa
 
 
 @pytest.mark.parametrize(
-    "write", [FORMATS[name] for name in ("LeRobot v2.1", "robomimic", "videos", "pictures", "arrays")]
+    "write", [FORMATS[name] for name in ("LeRobot v2.1", "robomimic", "videos", "pictures", "Unitree", "arrays")]
 )
 def test_a_broken_episode_is_named_before_a_score_and_lets_the_others_through(
     tmp_path: Path, output: Path, write: Callable[[Path], Written]

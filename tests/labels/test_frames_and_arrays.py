@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import re
+import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +16,9 @@ import pytest
 from PIL import Image
 
 from hdf5_writers import write_robomimic
-from labelling import BrightnessScorer, brightness, command
-from pictures import numbered
+from labelling import LEROBOT, BrightnessScorer, brightness, command
+from paths import ROOT
+from pictures import numbered, write_video
 from rfm_client.command_line import ExitCode
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset, read_episode_labels
 
@@ -40,12 +44,18 @@ def folders(tmp_path: Path) -> Path:
 def test_a_table_names_folders_their_tasks_and_their_order(folders: Path, column: str) -> None:
     for camera in ("front", "wrist"):
         write_frames(folders / "11" / camera, numbered(3))
-    (folders / "tasks.csv").write_text(f"{column},task\n10,open the box\n11/front,{TASK}\n")
+    for t, frame in enumerate(numbered(COUNT)):
+        Image.fromarray(frame[::-1]).save(folders / "2" / f"frame_{t}_left.png")
+    rows = f"10,open the box\n11/front,{TASK}\n2/frame_*_left.png,{TASK}\n"
+    (folders / "tasks.csv").write_text(f"{column},task\n{rows}")
     dataset = open_dataset(folders)
     assert [(e.name, e.task, e.num_frames) for e in dataset.episodes] == [
         ("10", "open the box", COUNT),
         ("11/front", TASK, 3),
+        ("2/frame_*_left.png", TASK, COUNT),
     ]
+    np.testing.assert_array_equal(list(dataset.frames(dataset.episode(2), "frames")), numbered(COUNT)[:, ::-1])
+    assert dataset.notes == ["tasks.csv: 1 folders of pictures beside it are not listed and get no labels: 0"]
 
 
 def depth(root: Path) -> None:
@@ -55,11 +65,11 @@ def depth(root: Path) -> None:
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "an empty folder": (
         lambda root: (root / "3").mkdir(),
-        "3: expected PNG or JPEG files, got an empty folder: remove it, or leave it out (--episodes)",
+        "3: expected PNG or JPEG files, got an empty folder: leave it out (--episodes)",
     ),
     "a folder of other files": (
         lambda root: [(root / "3").mkdir(), (root / "3" / "a.txt").write_text("a")],
-        "3: expected PNG or JPEG files, got other files: remove it, or leave it out (--episodes)",
+        "3: expected PNG or JPEG files, got other files: leave it out (--episodes)",
     ),
     "folders of cameras": (
         lambda root: write_frames(root / "3" / "front", numbered(2)),
@@ -67,7 +77,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "two formats": (
         lambda root: Image.fromarray(numbered(1)[0]).save(root / "2" / "x.jpg"),
-        "2: expected frames of one format, got JPEG (x.jpg) and PNG (frame_0.png): give each format a folder of its own",
+        "got x.jpg (1) and frame_*.png (12): list those of one camera in tasks.csv, as 2/x.jpg",
     ),
     "no picture": (
         lambda root: (root / "2" / "frame_1.png").write_bytes(b"x"),
@@ -180,16 +190,21 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
     "HDF5 files in folders": (["a/x.hdf5"], "", "each a dataset of its own: rfm-client label takes the folder, open_"),
     "pictures": (["1.png", "2.png"], "", "got pictures outside of the folder of an episode"),
     "pictures of cameras": (["a/front/1.jpg"], "", "list the folders of one camera (a/front) in tasks.csv"),
+    "videos of an episode each": (
+        ["a/b/episode_000000.mp4"],
+        "",
+        "those of one camera in tasks.csv (a/b/episode_000000",
+    ),
     "pictures and a video": (
         ["0/1.png", "a.mp4"],
         "",
-        "expected episodes of one kind, got videos (a.mp4) and folders of pictures (0): give each kind a folder of its",
+        "got videos (a.mp4) and folders of pictures (0): list the episodes of one kind in tasks.csv",
     ),
-    "HDF5 files and arrays": (["a.hdf5", "a.npy"], "", "of one kind, got arrays (a.npy) and HDF5 files (a.hdf5): give"),
+    "HDF5 files and arrays": (["a.hdf5", "a.npy"], "", "of one kind, got arrays (a.npy) and HDF5 files (a.hdf5): list"),
     "pictures beside folders": (
         ["0/1.png", "1.png"],
         "",
-        "got folders of pictures (0) and pictures (1.png): give each",
+        "got folders of pictures (0) and pictures (1.png): list the",
     ),
     "folders without a table": (
         ["0/1.png"],
@@ -208,10 +223,46 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
 }
 
 
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:%064d\nsize 1048576\n" % 1
+LEROBOT_FILES = (LEROBOT / "toy_v21", "data/chunk-000/episode_000000.parquet")
+CLONED: dict[str, tuple[Path | None, str]] = {  # a copied dataset, and its file that git-lfs did not fetch
+    "a table of rows": LEROBOT_FILES,
+    "a video": (LEROBOT_FILES[0], "videos/chunk-000/observation.images.wrist/episode_000000.mp4"),
+    "records": (ROOT / "tests/rlds/toy_steps_texts/1.0.0", "toy_steps_texts-train.tfrecord-00000-of-00002"),
+    "an HDF5 file": (None, "a.hdf5"),
+    "a picture": (None, "0/1.png"),
+    "arrays": (None, "a.npy"),
+}
+
+
+@pytest.mark.parametrize(("source", "name"), CLONED.values(), ids=CLONED)
+def test_files_that_git_cloned_without_git_lfs_are_told(tmp_path: Path, source: Path | None, name: str) -> None:
+    root = tmp_path / "data"
+    if source is not None:
+        shutil.copytree(source, root)
+    (root / name).parent.mkdir(parents=True, exist_ok=True)
+    (root / name).write_bytes(POINTER)
+    with pytest.raises(DatasetError, match="got Git LFS's note of where it is; `git lfs pull` fetches it"):
+        label(open_dataset(root / name if name.endswith("5") else root, task=TASK), BrightnessScorer(), LabelOptions())
+
+
 @pytest.mark.parametrize("name", ["/nothing/here", "no dataset"])
 def test_what_is_not_there_is_refused(name: str) -> None:
     with pytest.raises(DatasetError, match=f"^{name}: expected a LeRobot dataset .* got none$"):
         open_dataset(name)
+
+
+def test_videos_of_cameras_in_deeper_folders_are_listed_by_the_command_that_is_printed(tmp_path: Path) -> None:
+    """As AgiBot World has them."""
+    for episode in (2, 10):
+        for camera in ("head_color", "hand_left"):
+            (tmp_path / f"a task/{episode}/videos").mkdir(parents=True, exist_ok=True)
+            write_video(tmp_path / f"a task/{episode}/videos/{camera}.mp4", numbered(episode))
+    with pytest.raises(DatasetError, match=r"got videos in deeper folders: list those of one camera: ") as refused:
+        open_dataset(tmp_path, task=TASK)
+    (command,) = re.findall(r"\(cd .* tasks\.csv\)", str(refused.value))
+    subprocess.run(command, shell=True, check=True)
+    assert [episode.num_frames for episode in open_dataset(tmp_path, task=TASK).episodes] == [10, 2]
 
 
 @pytest.mark.parametrize(("files", "opened", "message"), UNREAD.values(), ids=UNREAD)

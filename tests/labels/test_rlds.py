@@ -93,21 +93,36 @@ def test_a_dataset_whose_cameras_are_all_black_is_refused(copied: Path) -> None:
         label(open_dataset(copied), BrightnessScorer(), LabelOptions())
 
 
-def test_instructions_of_the_steps_come_before_others_with_a_line(copied: Path) -> None:
+def test_a_task_is_the_first_instruction_that_is_not_blank_or_that_of_the_caller_s_choice(copied: Path) -> None:
     def add(features: Any) -> None:
         about = features["featuresDict"]["features"]["episode_metadata"]["featuresDict"]["features"]
         about["natural_language_instruction"] = about["file_path"]
 
     edited("features.json", add)(copied)
     dataset = open_dataset(copied)
-    told = "tasks: from steps/language_instruction, not from episode_metadata/natural_language_instruction"
+    told = (
+        "tasks: from episode_metadata/natural_language_instruction, where it is blank from steps/language_instruction"
+    )
     assert (dataset.notes, dataset.episode(0).task) == ([told], "open the drawer")
+    assert open_dataset(copied, task_column="file_path").episode(0).task.endswith(".hdf5")
+    with pytest.raises(DatasetError, match=r"task_column: expected one of .*, steps/language_instruction, got 'gone'$"):
+        open_dataset(copied, task_column="gone")
+
+
+def test_a_text_named_instruction_is_the_task(copied: Path) -> None:
+    def nest(features: Any) -> None:
+        text = of_steps(features).pop("language_instruction")
+        of_steps(features)["observat"] = {"featuresDict": {"features": {"instruction": text}}}
+
+    edited("features.json", nest)(copied)
+    rewritten(b"language_instruction", b"observat/instruction")(copied)
+    assert open_dataset(copied).episode(0).task == "open the drawer"
 
 
 def test_a_dataset_without_instructions_needs_a_task(copied: Path) -> None:
     edited("features.json", lambda features: of_steps(features).pop("language_instruction"))(copied)
     with pytest.raises(
-        DatasetError, match=r"natural_language_instruction: expected a task as a sentence, got none: add"
+        DatasetError, match=r"language_instruction or instruction: expected a task as a sentence, got none: add"
     ):
         _ = open_dataset(copied).episodes
     assert {episode.task for episode in open_dataset(copied, task="wave").episodes} == {"wave"}

@@ -66,7 +66,7 @@ class EpisodeTexts(Settings):
     task_column: str | None = setting(
         None,
         "LeRobot column with the tasks: sentences, or numbers of sentences. Default: task_index, checked against the "
-        "metadata.",
+        "metadata. RLDS: feature with the tasks.",
         metavar="NAME",
     )
     orient: tuple[str, ...] = setting(

@@ -58,7 +58,7 @@ class TaskOverride:
     text: task of episodes without their own; None: not given
     overrides: True: ``text`` is the task of all episodes
     several: of an episode with several tasks: ``each``: each frame has its own; ``first``: all have the first frame's
-    column: column of a LeRobot dataset's rows that names the tasks; None: ``task_index``, checked against the metadata
+    column: column of a LeRobot dataset's rows, or feature of an RLDS dataset, that names the tasks; None: the usual one
     is_needed: False: an episode without a task has an empty one, and is no error
     """
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 
 from rfm_client import RewardError
-from rfm_client.options import InvalidValueError
+from rfm_client.options import InvalidValueError, git_lfs_pointer
 from rfm_client.options import require as require_that
 
 _MOST_SHOWN = 20
@@ -53,6 +54,11 @@ def fault_lines(faults: Mapping[int, str], numbers: Sequence[int], num_without_t
 
 class DatasetError(RewardError, InvalidValueError):
     """A contradictory or unreadable dataset. where: a file, or a place in it"""
+
+
+def unreadable(file: Path, expected: str, error: object) -> DatasetError:
+    """Return the error of a file that a library cannot read; its ``error`` names no Git LFS."""
+    return DatasetError.at(file, expected, (git_lfs_pointer(file) if file.is_file() else "") or error)
 
 
 class MissingTaskError(DatasetError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A folder with a video, a file of arrays, or a folder of pictures (2.png before 10.png) for each episode.
+"""A folder with a video, a file of arrays, a folder of pictures (2.png before 10.png) or a recording for each episode.
 
 A table of tasks (``task_tables``) orders the episodes. Without a table, the caller names the task, and the order is
 that of the names, with 2 before 10. Videos need PyAV, pictures Pillow.
@@ -7,9 +7,11 @@ that of the names, with 2 before 10. Videos need PyAV, pictures Pillow.
 
 from __future__ import annotations
 
+import json
 import re
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,14 +22,14 @@ from rfm_client.frames import Picture, Video
 from rfm_labels.datasets.cameras import AskedCorrections
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, require
-from rfm_labels.datasets.frame_names import in_order_of_numbers
+from rfm_labels.datasets.frame_names import in_order_of_numbers, is_pattern, matching
 from rfm_labels.datasets.stored_files import Span, digest_of, faults_at, file_identity, turn_mark
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 _FILES_AT_A_TIME = 4
-_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
-_LEAVE_OUT = "remove it, or leave it out (--episodes)"
+_LEAVE_OUT = "leave it out (--episodes)"
+_UNITREE_FILE, _UNITREE_FOLDER = "data.json", "colors"
 
 
 @dataclass(frozen=True)
@@ -205,40 +207,86 @@ def _read(file: Path) -> Trajectory:
 
 
 class FrameFolders(EpisodeFiles):
-    """Episodes in folders of pictures."""
+    """Episodes in folders of pictures, or in some files of a folder (``is_pattern``)."""
 
     kind = "folders of frames"
-    cameras = ("frames",)
+    cameras: Sequence[str] = ("frames",)
 
     def length(self, file: Path) -> int:
-        return len(_pictures_in(file))
+        return len(self.files(file, self.cameras[0]))
+
+    def files(self, place: Path, camera: str) -> Sequence[Path]:
+        """Return the frames of an episode, in order. Raises DatasetError."""
+        return _pictures_in(place)
 
     def decoder(self, camera: str) -> str | None:
         return Picture.decoder()
 
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        files = _pictures_in(self.root / episode.name)
+        files = self.files(self.root / episode.name, camera)
         stored = ((file, file_identity(file, verify=verify)) for file in files)
         return digest_of(f"{file.name} {identity}{turn_mark(file)}".encode() for file, identity in stored)
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
         num_bytes = 0
-        for file in self._files(episode):
+        for file in self._files(episode, camera):
             with faults_at(file):
                 Picture(file).check()
             num_bytes += file.stat().st_size
         return num_bytes
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        for file in self._files(episode):
+        for file in self._files(episode, camera):
             with faults_at(file):
                 yield Picture(file).pixels()
 
-    def _files(self, episode: DatasetEpisode) -> list[Path]:
+    def _files(self, episode: DatasetEpisode, camera: str) -> Sequence[Path]:
         folder = self.root / episode.name
-        files = _pictures_in(folder)
+        files = self.files(folder, camera)
         require(folder, len(files) == episode.num_frames, f"{episode.num_frames} frames", len(files))
         return files
+
+
+def is_of_unitree(folder: Path) -> bool:
+    """True for an episode of Unitree's xr_teleoperate."""
+    return (folder / _UNITREE_FILE).is_file() and (folder / _UNITREE_FOLDER).is_dir()
+
+
+class UnitreeFolders(FrameFolders):
+    """Episodes of Unitree's xr_teleoperate: ``data.json`` names the task, and a picture of each camera by frame."""
+
+    kind = "Unitree"
+
+    def __init__(self, contents: Contents) -> None:
+        self._recording = lru_cache(None)(_recording)
+        for name in contents.tasks:
+            with suppress(DatasetError):  # raised again if this episode is read
+                self.cameras = list(self._recording(contents.root / name)[1])
+                break
+        super().__init__(contents)
+
+    def own_task(self, file: Path) -> str | None:
+        return self._recording(file)[0]
+
+    def files(self, place: Path, camera: str) -> Sequence[Path]:
+        cameras = self._recording(place)[1]
+        got = ", ".join(cameras) or "none"
+        require(place / _UNITREE_FILE, camera in cameras, f"pictures of {camera}", f"{got}: {_LEAVE_OUT}")
+        return cameras[camera]
+
+
+def _recording(folder: Path) -> tuple[str | None, Mapping[str, Sequence[Path]]]:
+    """The task and each camera's pictures. Raises DatasetError, also for a frame without one of the cameras."""
+    file = folder / _UNITREE_FILE
+    try:
+        told = json.loads(file.read_bytes())
+        frames = [frame[_UNITREE_FOLDER] for frame in told["data"]]
+        names = dict.fromkeys(name for frame in frames for name in frame)
+        files = {name: [folder / _UNITREE_FOLDER / Path(frame[name]).name for frame in frames] for name in names}
+        return told.get("text", {}).get("goal"), files
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        expected, got = "a picture of each camera in each frame", f"{type(error).__name__}: {error}; {_LEAVE_OUT}"
+        raise DatasetError.at(file, expected, got) from error
 
 
 def is_picture(file: Path) -> bool:
@@ -246,20 +294,22 @@ def is_picture(file: Path) -> bool:
     return file.suffix.lower() in PICTURE_SUFFIXES and not file.name.startswith(".") and file.is_file()
 
 
-def _pictures_in(folder: Path) -> list[Path]:
-    """The frames of an episode, in order. Raises DatasetError without frames, or for frames of several kinds."""
+def _pictures_in(place: Path) -> list[Path]:
+    """The frames of an episode, in order. Raises DatasetError without frames, or for frames of several kinds.
+
+    place: a folder, or a pattern of file names in it
+    """
+    folder = place.parent if is_pattern(place) else place
     try:
         found = [each for each in folder.iterdir() if not each.name.startswith(".")]
     except OSError as error:
         raise DatasetError.at(folder, "a folder of PNG or JPEG files", error.strerror) from error
-    names = in_natural_order([each.name for each in found if is_picture(each)])
+    names = [each.name for each in found if is_picture(each)]
+    names = matching(place.name, names) if is_pattern(place) else names
     folders = in_natural_order([each.name for each in found if each.is_dir()])
     got = f"an empty folder: {_LEAVE_OUT}" if not found else f"other files: {_LEAVE_OUT}"
     if folders:
         remedy = f"list the folders of one camera in tasks.csv ({folder.name}/{folders[0]})"
-        got = f"the folders {', '.join(folders[:3])}: {remedy}, or leave it out (--episodes)"
-    require(folder, bool(names), "PNG or JPEG files", got)
-    by_format = {_FORMATS[Path(name).suffix.lower()]: name for name in reversed(names)}
-    told = " and ".join(f"{kind} ({name})" for kind, name in sorted(by_format.items()))
-    require(folder, len(by_format) == 1, "frames of one format", f"{told}: give each format a folder of its own")
+        got = f"the folders {', '.join(folders[:3])}: {remedy}, or {_LEAVE_OUT}"
+    require(place, bool(names), "PNG or JPEG files", got)
     return [folder / name for name in in_order_of_numbers(folder, names)]

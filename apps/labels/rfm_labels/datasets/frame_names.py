@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Order the pictures of an episode by the numbers in file names: counts or times (``-1``, ``0.25``, ``2e-05``)."""
+"""Order the pictures of an episode by the numbers in file names: counts or times (``-1``, ``0.25``, ``2e-05``).
+
+In a pattern of names, ``*`` stands for a number: ``*_color_0.jpg``.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +26,20 @@ _LETTERS = 2  # minimum letters of a word before a camera number; a time may hol
 _EXAMPLES = 3  # kinds of names in a message
 
 
+def is_pattern(path: Path) -> bool:
+    """True if the last part of a path is a pattern of file names."""
+    return "*" in path.name
+
+
+def matching(pattern: str, files: Sequence[str]) -> list[str]:
+    """Return the file names that a pattern stands for."""
+    name = re.compile(_NUMBER.pattern.join(map(re.escape, pattern.split("*"))))
+    return list(filter(name.fullmatch, files))
+
+
 @dataclass(frozen=True)
 class _Name:
-    """A file name split into text and numbers. words: the texts, one more than numbers"""
+    """A file name split into text and numbers. words: the texts, one more than numbers, and the format"""
 
     file: str
     words: tuple[str, ...]
@@ -36,12 +50,13 @@ class _Name:
     def of(cls, file: str) -> _Name:
         parts = _NUMBER.split(Path(file).stem)
         digits = tuple(parts[1::2])
-        return cls(file, tuple(parts[::2]), digits, tuple(map(Decimal, digits)))
+        form = Path(file).suffix.lower().replace("jpeg", "jpg")
+        return cls(file, (*parts[::2], form), digits, tuple(map(Decimal, digits)))
 
     def kind(self, place: int | None) -> str:
         """The name with ``*`` for all numbers but the one at ``place``."""
         shown = ["*" if number != place else digits for number, digits in enumerate(self.digits)]
-        parts = [self.words[0], *(part for pair in zip(shown, self.words[1:], strict=True) for part in pair)]
+        parts = [self.words[0], *(part for pair in zip(shown, self.words[1:-1], strict=True) for part in pair)]
         return "".join(parts) + Path(self.file).suffix
 
 
@@ -54,7 +69,7 @@ def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
     if len({name.words for name in names}) > 1:
         raise _several_kinds(folder, names, None)
     for before, name in itertools.pairwise(names):
-        got = f"{before.file} and {name.file}: remove one of them, or rename it"
+        got = f"{before.file} and {name.file}: leave the episode out (--episodes)"
         require(folder, before.numbers != name.numbers, "each number once", got)
     places = range(len(names[0].numbers)) if names else ()
     num_cameras = {place: _num_cameras(names, place) for place in places}
@@ -84,6 +99,7 @@ def _several_kinds(folder: Path, names: Sequence[_Name], place: int | None) -> D
     shortest = sorted(kinds, key=lambda kind: (len(kind), kind))
     told = " and ".join(f"{kind} ({kinds[kind]})" for kind in shortest[:_EXAMPLES])
     if max(kinds.values()) == 1:
-        return DatasetError.at(folder, "names that differ in a number", f"{told}: rename them, as in 0.png and 1.png")
-    got = f"{told}: give each kind a folder of its own, and list those of one camera in tasks.csv"
+        remedy = "copy them to a folder of their own, as 0.png and 1.png"
+        return DatasetError.at(folder, "names that differ in a number", f"{told}: {remedy}")
+    got = f"{told}: list those of one camera in tasks.csv, as {folder.name}/{shortest[0]}"
     return DatasetError.at(folder, "pictures of one camera, whose names differ in a number", got)

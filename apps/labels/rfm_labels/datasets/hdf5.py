@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 files of robomimic and LIBERO (``data/demo_<i>/obs/<camera>``), ALOHA, RoboTwin, RoboMIND and ManiSkill.
+"""HDF5 files of robomimic and LIBERO (``data/demo_<i>/obs/<camera>``), of IsaacLab-Arena, ALOHA, RoboTwin and others.
 
 Needs ``rfm-labels[hdf5]``. An episode's name is ``demo_<i>`` in all layouts.
 
@@ -87,24 +87,25 @@ class Hdf5Dataset(Dataset):
             self._demos = {index: name for index, (name, _) in demos.items()}
             self._pictures = pictures_in(demos, self._layout.are_pictures)
             self._forms = forms_in(demos)
-            attributes = (opened["data"] if self._is_robomimic else opened).attrs
+            attributes = (opened["data"] if self._layout.is_in_data else opened).attrs
             self._tasks = {index: self._task_in(opened, demo, attributes) for index, (_, demo) in demos.items()}
             self.filter_keys, notes = filter_keys(opened, self._demos)
             self.cameras, self.left_out = self._shared(list(demos))
             self._lengths = {
-                index: _lengths_of(demo, self.cameras or self._cameras_of(index)) for index, (_, demo) in demos.items()
+                index: self._lengths_of(demo, self.cameras or self._cameras_of(index))
+                for index, (_, demo) in demos.items()
             }
             self._broken = unread_documents(attributes)
-            others = unread(opened, self._demos.values()) if self._is_robomimic else []
-            notes = [*others, *notes, *_notes_on_lengths(demos, self._lengths)]
+            others = unread(opened, self._demos.values()) if self._layout.is_in_data else []
+            notes = [*others, *notes, *_notes_on_lengths(demos, self._lengths, self._layout.skipped)]
             notes += [
                 f"data: {name} is not a JSON object, so it states neither a task nor LIBERO" for name in self._broken
             ]
-            is_libero = self._is_robomimic and is_of_libero(attributes)
+            is_libero = self._layout is ROBOMIMIC and is_of_libero(attributes)
             self.fps = self._layout.fps or fps_of(attributes)
             self._firsts = first_files(demos, self._pictures, self._layout.are_pictures)
             is_upright = "opencv" in str(attribute(attributes, "macros_image_convention"))  # robosuite then does
-        self.kind = "HDF5" if self._is_robomimic else f"HDF5 ({self._layout.name})"
+        self.kind = "HDF5" if self._layout is ROBOMIMIC else f"HDF5 ({self._layout.name})"
         self.numbers = list(demos)
         known = [camera for camera in self._pictures if any(camera in self._cameras_of(each) for each in self.numbers)]
         if not known:
@@ -117,19 +118,25 @@ class Hdf5Dataset(Dataset):
         self.notes = [*notes, *([] if is_upright else _notes(untold, is_libero))]
         self.notes += self._notes_on_colours(corrections, unmarked) + self._notes_on_layout()
 
-    @property
-    def _is_robomimic(self) -> bool:
-        """True for robomimic's layout, which LIBERO's files have, too."""
-        return self._layout is ROBOMIMIC
-
     def _task_in(self, opened: Any, demo: Any, attributes: Mapping[str, Any]) -> Any:
-        return own_task_of(demo) or task_of(attributes) if self._is_robomimic else task_in(self.file, opened, demo)
+        return own_task_of(demo) or task_of(attributes) if self._layout.is_in_data else task_in(self.file, opened, demo)
+
+    def _lengths_of(self, demo: Any, cameras: Sequence[str]) -> Mapping[str, int]:
+        """Number of frames of each camera, and of actions, if present."""
+        skipped = self._layout.skipped
+        lengths = {f"obs/{camera}": len(demo["obs"][camera]) - skipped for camera in cameras}
+        shape = getattr(demo.get(_ACTIONS), "shape", None) if lengths else None
+        return lengths | ({_ACTIONS: shape[0] - skipped} if shape else {})
 
     def _notes_on_layout(self) -> list[str]:
-        if self._is_robomimic:
+        if self._layout is ROBOMIMIC:
             return []
         forms = [f"{camera}{' (JPEG or PNG)' * (camera in self._firsts)}" for camera in self.cameras]
         notes = [f"layout: {self._layout.name}, cameras {', '.join(forms)}"]
+        if self._layout.skipped:
+            notes.append(
+                "left out: each first picture, which shows the end of the episode before; frame 0 is the second"
+            )
         told = instructions_of(self.file) if self._layout is ROBOTWIN else []
         if told and self._tasks[0] == told[0] and self.given_task.text is None:
             notes.append(f"task: the first of {len(told)} sentences in instructions/{self.file.stem}.json")
@@ -148,7 +155,7 @@ class Hdf5Dataset(Dataset):
     def read_episode(self, number: int) -> DatasetEpisode:
         where = f"{self.file}: {self._layout.group_of(self._demos[number])}".removesuffix(": ")
         told = " or ".join(name + " (no JSON object)" * (name in self._broken) for name in DOCUMENTS)
-        places = f"ep_meta, or data: {told}" if self._is_robomimic else task_places(self.file)
+        places = f"ep_meta, or data: {told}" if self._layout.is_in_data else task_places(self.file)
         task = self.given_task.of(f"{where}: {places}", self._tasks[number])
         lengths = self._lengths[number]
         got = ", ".join(f"{key} {length}" for key, length in lengths.items()) or self._forms[number]
@@ -209,7 +216,7 @@ class Hdf5Dataset(Dataset):
             if encoded := self._encoded(video, episode, camera):
                 yield from encoded.pixels()
                 return
-            for start in range(0, episode.num_frames, _FRAMES_AT_A_TIME):
+            for start in range(self._layout.skipped, len(video), _FRAMES_AT_A_TIME):
                 try:
                     yield from video[start : start + _FRAMES_AT_A_TIME]
                 except OSError as error:
@@ -217,28 +224,24 @@ class Hdf5Dataset(Dataset):
 
     def _encoded(self, video: Any, episode: DatasetEpisode, camera: str) -> EncodedFrames | None:
         """The frames as files; None: they are pixels."""
-        is_file = is_encoded(video, self._layout.are_pictures)
-        return EncodedFrames(video, self._where(episode, camera)) if is_file else None
+        if not is_encoded(video, self._layout.are_pictures):
+            return None
+        stored = video[self._layout.skipped :] if self._layout.skipped else video
+        return EncodedFrames(stored, self._where(episode, camera))
 
     def _video(self, opened: Any, episode: DatasetEpisode, camera: str) -> Any:
         video = opened.get(self._layout.path_of(episode.name, camera))
         is_whole = video is not None and not fault_of(video, self._layout.are_pictures)
-        is_video = is_whole and len(video) == episode.num_frames
+        num_pictures = episode.num_frames + self._layout.skipped
+        is_video = is_whole and len(video) == num_pictures
         got = "none" if video is None else form_of(video)
-        require(self._where(episode, camera), is_video, f"uint8 [{episode.num_frames}, H, W, 3]", got)
+        require(self._where(episode, camera), is_video, f"uint8 [{num_pictures}, H, W, 3]", got)
         lacks = lacking(video)
         require(self._where(episode, camera), not lacks, f"{lacks}, a source of this virtual dataset", "none")
         return video
 
     def _where(self, episode: DatasetEpisode, camera: str) -> str:
         return f"{self.file}: {self._layout.path_of(episode.name, camera)}"
-
-
-def _lengths_of(demo: Any, cameras: Sequence[str]) -> Mapping[str, int]:
-    """Number of frames of each camera, and of actions, if present."""
-    lengths = {f"obs/{camera}": len(demo["obs"][camera]) for camera in cameras}
-    shape = getattr(demo.get(_ACTIONS), "shape", None) if lengths else None
-    return lengths | ({_ACTIONS: shape[0]} if shape else {})
 
 
 def _one_length(lengths: Mapping[str, int]) -> int:
@@ -251,7 +254,9 @@ def _one_length(lengths: Mapping[str, int]) -> int:
     return length if lengths.get(_ACTIONS, length) in (length, length - 1) else 0
 
 
-def _notes_on_lengths(demos: Mapping[int, tuple[str, Any]], lengths: Mapping[int, Mapping[str, int]]) -> list[str]:
+def _notes_on_lengths(
+    demos: Mapping[int, tuple[str, Any]], lengths: Mapping[int, Mapping[str, int]], skipped: int
+) -> list[str]:
     """Notes on demonstrations with more frames than actions, or another length than ``num_samples``."""
     longer, others = [], []
     for number, (name, demo) in demos.items():
@@ -259,7 +264,7 @@ def _notes_on_lengths(demos: Mapping[int, tuple[str, Any]], lengths: Mapping[int
         if length and lengths[number].get(_ACTIONS, length) < length:
             longer.append(name)
         told = attribute(demo.attrs, "num_samples") if length else None
-        if told is not None and told not in lengths[number].values():
+        if told is not None and told - skipped not in lengths[number].values():
             others.append(f"{name} ({told}, has {length})")
     every = "each observation gets a label"
     notes = [f"lengths: {first_names(longer)}: one observation more than actions: {every}"] if longer else []

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from rfm_client.options import first_names
-from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.faults import DatasetError, require, unreadable
 
 DOCUMENTS = ("problem_info", "env_args")  # attributes of ``data`` with a JSON object
 
@@ -43,7 +43,7 @@ def opened_hdf5(file: Path) -> Iterator[Any]:
         expected = "a file that no other program has open for writing"
         raise DatasetError.at(file, expected, "an open one: close it there, and run the same command") from error
     except OSError as error:
-        raise DatasetError.at(file, "an HDF5 file", error) from error
+        raise unreadable(file, "an HDF5 file", error) from error
     with opened:
         try:
             yield opened

@@ -29,6 +29,7 @@ class Layout:
     actions: in the group; empty: not compared with the frames
     are_pictures: True: whatever is at ``pictures`` is a camera; False: the observations hold other arrays, too
     fps: the writer's default; None: in the attributes
+    skipped: number of pictures before the first frame
     without_pictures: remedy for a file without pictures
     colours: note on the order of colours in encoded frames
     """
@@ -39,8 +40,14 @@ class Layout:
     actions: str = ""
     are_pictures: bool = True
     fps: float | None = None
+    skipped: int = 0
     without_pictures: str = "record the episode with its cameras"
     colours: str = ""
+
+    @property
+    def is_in_data(self) -> bool:
+        """True for demonstrations in ``data``, with robomimic's attributes and filter keys."""
+        return self.group == "data/{demo}"
 
     def group_of(self, demo: str) -> str:
         """Return the path of the group of ``demo_<number>``; empty: the file."""
@@ -59,8 +66,11 @@ class Layout:
 
         Raises DatasetError.
         """
-        if self is ROBOMIMIC:
-            return demonstrations(file, opened)
+        if self.is_in_data:
+            demos = demonstrations(file, opened)
+            if self is ROBOMIMIC:
+                return demos
+            return {n: (name, None if demo is None else self._episode(demo)) for n, (name, demo) in demos.items()}
         found = {0: opened} if not self.group else _trajectories(file, opened)
         return {n: (f"demo_{n}", None if group is None else self._episode(group)) for n, group in sorted(found.items())}
 
@@ -87,6 +97,15 @@ ROBOMIMIC = Layout(
     "actions",
     are_pictures=False,
     without_pictures="robomimic's dataset_states_to_obs.py renders the pictures of a low-dimensional file",
+)
+ARENA = Layout(
+    "IsaacLab-Arena",
+    ROBOMIMIC.group,
+    "camera_obs/{camera}",
+    "actions",
+    are_pictures=False,
+    fps=50.0,
+    skipped=1,  # the last render of the episode before; IsaacLab-Arena's converter to LeRobot leaves it out, too
 )
 ROBOTWIN = Layout("RoboTwin", "", "observation/{camera}/rgb")
 _OTHERS = (
@@ -124,6 +143,8 @@ def layout_of(opened: Any) -> Layout:
         nested = layout is not ROBOTWIN or any(hasattr(each, "keys") and "rgb" in each for each in above.values())
         if above and nested:
             return layout
+    if any("camera_obs" in members_of(demo) for demo in members_of(opened.get("data")).values()):
+        return ARENA
     return _MANISKILL if "data" not in opened and any(map(_TRAJECTORY.fullmatch, opened)) else ROBOMIMIC
 
 

@@ -20,12 +20,21 @@ from rfm_labels.datasets.cameras import AskedCorrections
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
-from rfm_labels.datasets.lerobot_meta import Entry, Info, column_types, read_entries, read_table
+from rfm_labels.datasets.lerobot_meta import (
+    EPISODES_FILE,
+    EPISODES_FOLDER,
+    Entry,
+    Info,
+    column_types,
+    read_entries,
+    read_table,
+)
 from rfm_labels.datasets.lerobot_rows import TASK_COLUMN, RowReader, Sentences, has_numbers, read_sentences, table_of
 from rfm_labels.datasets.stored_files import Span, Times, digest_of, faults_at, file_identity, turn_mark
 
 _VIDEOS_AT_A_TIME = 4  # whose packets stay in memory, or one of each camera
 _CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
+_LISTED_IN = dict.fromkeys(("v2.0", "v2.1"), EPISODES_FILE) | {"v3.0": EPISODES_FOLDER}
 _BY_PLACE = "LeRobot finds a sentence by position, so it may read a different one"
 
 
@@ -57,26 +66,26 @@ class LeRobotDataset(Dataset):
         self.info = info = Info.read(root)
         self.kind = f"LeRobot {info.version}"
         self.cameras = (*info.videos, *info.images)
-        self.depth_cameras = info.depth
+        self.depth_cameras, self.left_out, self.notes = info.depth, info.left_out, list(info.notes)
         self.corrections = corrections.of_cameras(self.cameras)
         entries = list(read_entries(info))
         self._entries = dict(entries)
         self.numbers = sorted(self._entries)  # may have gaps, where episodes were deleted
         self.given_task = task
-        self._rows = RowReader(self._sentences(), task)
+        self._rows = RowReader(root / "data", self._sentences(), task)
         self._rows_in = lru_cache(max(_VIDEOS_AT_A_TIME, len(info.videos)))(self._read_video)
         self._clocks: dict[int, str] = {}  # of the episodes that are read
         self._without_rows: dict[str, dict[Path, tuple[int, int]]] = {}  # frames without rows, all frames
         numbers = Counter(number for number, _ in entries)
         twice = [number for number in self.numbers if numbers[number] > 1]
         require(root / "meta", not twice, "each episode once", f"{listed(twice)} several times")
-        got = f"{len(self.numbers)}: correct total_episodes, or restore the others"
-        is_whole = len(self.numbers) == info.total_episodes
-        require(root / "meta", is_whole, f"{info.total_episodes} episodes, as info.json says", got)
         lengths = [entry.length for entry in self._entries.values() if isinstance(entry, Entry)]
-        num_frames = sum(lengths)
-        is_whole = num_frames == info.total_frames or len(lengths) < len(self._entries)
-        require(root / "meta", is_whole, f"{info.total_frames} frames, as info.json says", num_frames)
+        counts = {"episodes": (len(self.numbers), info.total_episodes)}
+        if len(lengths) == len(self._entries):
+            counts["frames"] = (sum(lengths), info.total_frames)
+        for name, (count, told) in counts.items():
+            if count != told:
+                self.notes.append(f"{name}: {count}, as {_LISTED_IN[info.version]} lists them; info.json says {told}")
 
     def _sentences(self) -> Sentences:
         """The meaning of the task column. Raises DatasetError for an unknown column or a broken task table."""
@@ -89,7 +98,7 @@ class LeRobotDataset(Dataset):
         table, name = table_of(self.info, column)
         sentences, shown = read_sentences(table, name), table.relative_to(self.root)
         if list(sentences) != list(range(len(sentences))) and table.suffix == ".parquet":
-            self.notes = [f"tasks: {shown} is not in the order of {name}_index: {_BY_PLACE}"]
+            self.notes.append(f"tasks: {shown} is not in the order of {name}_index: {_BY_PLACE}")
         return Sentences(column, str(shown.with_suffix("")), sentences)
 
     def _types_of_rows(self) -> tuple[Path | None, Mapping[str, str]]:
@@ -115,7 +124,7 @@ class LeRobotDataset(Dataset):
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         if camera not in self.info.videos:
             return digest_of(image + turn_mark(image).encode() for image in self._images(episode, camera))
-        video, from_s = self._entry(episode.index).videos[camera]
+        video, from_s = self._entry(episode.index).video(camera)
         clock = self._clocks[episode.index]
         return f"{file_identity(video, verify=verify, revision=self.revision)} {from_s}{clock}"
 
@@ -146,7 +155,10 @@ class LeRobotDataset(Dataset):
             names = first_names([file.relative_to(self.root).as_posix() for file in videos], 3)
             of = f"{num_left_out} of the {num_frames} frames in {len(videos)} videos ({names})"
             lines.append(f"left out: {camera}: {of}, because no row has their times")
-        return lines
+        moved = (
+            f"rows: found by episode_index: {EPISODES_FOLDER} names another file for {listed(sorted(self._rows.moved))}"
+        )
+        return [*lines, moved] if self._rows.moved else lines
 
     def times_s(self, episode: DatasetEpisode) -> Times:
         """Return float64 [T], each frame's time from the start of the episode. Raises DatasetError."""
@@ -166,7 +178,7 @@ class LeRobotDataset(Dataset):
 
     def _frames_of(self, episode: DatasetEpisode, camera: str) -> tuple[VideoRows, Frames]:
         """An episode's video, and the numbers of its frames in it."""
-        rows = self._rows_in(camera, self._entry(episode.index).videos[camera][0])
+        rows = self._rows_in(camera, self._entry(episode.index).video(camera)[0])
         frames = rows.frames[episode.index]
         if isinstance(frames, DatasetError):
             raise frames
@@ -176,7 +188,8 @@ class LeRobotDataset(Dataset):
         """Keep the number of frames without rows if the rows of all episodes in the video are known."""
         is_known = len(rows.parts) == len(self._in_video[camera, rows.video.file])
         if self.info.version == "v3.0":  # an episode whose metadata are broken may lie in any video
-            is_known = is_known and all(isinstance(entry, Entry) for entry in self._entries.values())
+            entries = self._entries.values()
+            is_known = is_known and all(isinstance(e, Entry) and isinstance(e.videos[camera], tuple) for e in entries)
         if is_known and rows.num_without_rows:
             counts = (rows.num_without_rows, len(rows.video.packets.times_s))
             self._without_rows.setdefault(camera, {})[rows.video.file] = counts
@@ -185,8 +198,9 @@ class LeRobotDataset(Dataset):
     def _in_video(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
         found: dict[tuple[str, Path], list[Entry]] = {}
         for entry in [each for each in self._entries.values() if isinstance(each, Entry)]:
-            for camera, (file, _) in entry.videos.items():
-                found.setdefault((camera, file), []).append(entry)
+            for camera, place in entry.videos.items():
+                if isinstance(place, tuple):
+                    found.setdefault((camera, place[0]), []).append(entry)
         return found
 
     def _read_video(self, camera: str, file: Path) -> VideoRows:
@@ -197,12 +211,12 @@ class LeRobotDataset(Dataset):
         parts = []
         for entry in self._in_video[camera, file]:
             with suppress(DatasetError):  # raised again if that episode is read
-                times_s = entry.videos[camera][1] + self._rows.read(entry).times_s
+                times_s = entry.video(camera)[1] + self._rows.read(entry).times_s
                 parts.append(Part(entry.index, entry.where, times_s))
         return VideoRows(camera, video, parts, self.info.fps, self._tolerance_s)
 
     def _images(self, episode: DatasetEpisode, camera: str) -> list[bytes]:
-        file = self._entry(episode.index).data_file
+        file = self._rows.file_of(self._entry(episode.index))
         stored = read_table(file, [camera], filters=[("episode_index", "=", episode.index)])[camera].to_pylist()
         require(f"{file}: {camera}", len(stored) == episode.num_frames, f"{episode.num_frames} images", len(stored))
         return [self._image_bytes(_where(episode, camera, t), image) for t, image in enumerate(stored)]

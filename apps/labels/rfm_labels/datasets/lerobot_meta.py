@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rfm_client.options import checked_count
-from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.faults import DatasetError, require, unreadable
 
 INFO_FILE = Path("meta", "info.json")
 VERSIONS = ("v2.0", "v2.1", "v3.0")
@@ -24,6 +24,7 @@ EPISODES_FOLDER = Path("meta", "episodes")
 
 _OF_PICTURES = ("info", "video_info")  # keys in a feature of a camera, by version of the writer
 _DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
+_CAMERA_KINDS = ("video", "image")
 _OF_AN_EPISODE = (
     *("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"),
     *("data/chunk_index", "data/file_index"),
@@ -37,8 +38,10 @@ class Info:
 
     videos, images: keys of cameras with frames in video files, and in tables
     depth: keys of the depth cameras in both
+    left_out: other cameras, with the reason
     total_frames: of all episodes
     data_path, video_path: templates of file paths
+    notes: lines for the caller
     """
 
     root: Path
@@ -47,11 +50,13 @@ class Info:
     videos: tuple[str, ...]
     images: tuple[str, ...]
     depth: tuple[str, ...]
+    left_out: Mapping[str, str]
     total_episodes: int
     total_frames: int
     chunks_size: int
     data_path: str
     video_path: str | None
+    notes: Sequence[str]
 
     @classmethod
     def read(cls, root: Path) -> Info:
@@ -62,6 +67,10 @@ class Info:
         except (OSError, ValueError, RecursionError) as error:
             raise DatasetError.at(file, "a readable JSON file", error) from error
         require(file, isinstance(document, dict), "a JSON object", type(document).__name__)
+        notes = []
+        if "codebase_version" not in document:
+            document["codebase_version"] = version = "v3.0" if (root / EPISODES_FOLDER).is_dir() else "v2.1"
+            notes = [f"version: {version}, by the files of meta, since info.json has no codebase_version"]
 
         def field(name: str, *kinds: type) -> Any:
             value = document.get(name)
@@ -71,9 +80,10 @@ class Info:
             return value
 
         features = {key: feature for key, feature in field("features", dict).items() if isinstance(feature, dict)}
+        left_out = {key: reason for key, feature in features.items() if (reason := _no_colours(feature))}
         videos, images = (
-            tuple(key for key, feature in features.items() if feature.get("dtype") == kind)
-            for kind in ("video", "image")
+            tuple(key for key, feature in features.items() if feature.get("dtype") == kind and key not in left_out)
+            for kind in _CAMERA_KINDS
         )
         version, fps = field("codebase_version", str), float(field("fps", int, float))
         require(f"{file}: codebase_version", version in VERSIONS, f"one of {', '.join(VERSIONS)}", repr(version))
@@ -85,11 +95,13 @@ class Info:
             videos,
             images,
             depth=tuple(key for key in (*videos, *images) if _is_depth(features[key])),
+            left_out=left_out,
             total_episodes=field("total_episodes", int),
             total_frames=field("total_frames", int),
             chunks_size=field("chunks_size", int),
             data_path=field("data_path", str),
             video_path=field("video_path", str) if videos else None,
+            notes=notes,
         )
 
     def path(self, template: str | None, **values: Any) -> Path:
@@ -108,14 +120,22 @@ def _is_depth(feature: Mapping[str, Any]) -> bool:
     return any(each.get(mark) is True for each in told for mark in _DEPTH_MARKS)
 
 
+def _no_colours(feature: Mapping[str, Any]) -> str:
+    """Why nothing can show a camera: it stores distances in a single channel; empty: it has colours."""
+    shape = feature.get("shape")
+    is_flat = isinstance(shape, list) and shape[-1:] == [1]
+    is_map = feature.get("dtype") in _CAMERA_KINDS and is_flat and _is_depth(feature)
+    return f"a depth map, {shape}: expected 3 channels of colours" if is_map else ""
+
+
 @dataclass(frozen=True)
 class Entry:
     """Metadata of one episode, in the same form for all versions.
 
     tasks: sentences in the metadata
     first_index: the dataset's number of its first frame; None: only the rows have it
-    data_file: Parquet file with its rows
-    videos: by camera, the video file and the episode's start in it, in seconds
+    data_file: Parquet file with its rows, as the metadata say
+    videos: by camera, the video file and the episode's start in it, in seconds, or the fault of their metadata
     """
 
     index: int
@@ -123,12 +143,19 @@ class Entry:
     length: int
     first_index: int | None
     data_file: Path
-    videos: Mapping[str, tuple[Path, float]]
+    videos: Mapping[str, tuple[Path, float] | DatasetError]
 
     @property
     def where(self) -> str:
         """The episode's name in messages."""
         return f"episode {self.index}"
+
+    def video(self, camera: str) -> tuple[Path, float]:
+        """Return the camera's video, and the episode's start in it. Raises DatasetError for faulty metadata."""
+        found = self.videos[camera]
+        if isinstance(found, DatasetError):
+            raise found
+        return found
 
 
 def read_table(file: Path, columns: list[str] | None = None, filters: Any = None) -> Any:
@@ -143,7 +170,7 @@ def read_table(file: Path, columns: list[str] | None = None, filters: Any = None
     except FileNotFoundError as error:
         raise DatasetError.at(file, "a Parquet file", "none") from error
     except (OSError, pyarrow.ArrowException) as error:
-        raise DatasetError.at(file, "a readable Parquet file", error) from error
+        raise unreadable(file, "a readable Parquet file", error) from error
     for name in columns or []:
         require(file, name in table.column_names, f"the column {name}", ", ".join(table.column_names))
     return table
@@ -156,7 +183,7 @@ def column_types(file: Path) -> Mapping[str, str]:
     try:
         return {field.name: str(field.type) for field in parquet.read_schema(file)}
     except (OSError, ArrowException) as error:
-        raise DatasetError.at(file, "a readable Parquet file", error) from error
+        raise unreadable(file, "a readable Parquet file", error) from error
 
 
 def read_entries(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
@@ -203,8 +230,8 @@ def _entries_v30(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
 def _entry_v30(info: Info, file: Path, row: dict[str, Any]) -> Entry:
     index, length = row["episode_index"], row["length"]
     where = f"episode {index}: {file}"
-    for name, value in row.items():
-        require(f"{where}: {name}", value is not None, "a value", "none")
+    for name in _OF_AN_EPISODE:
+        require(f"{where}: {name}", row[name] is not None, "a value", "none")
     first, end = row["dataset_from_index"], row["dataset_to_index"]
     require(f"{where}: length", end - first == length, f"{end - first}, from {first} to {end}", length)
     data = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
@@ -218,7 +245,19 @@ def _entry_v30(info: Info, file: Path, row: dict[str, Any]) -> Entry:
     )
 
 
-def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
+def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float] | DatasetError:
+    """A camera's video, and the episode's start in it, or a fault, which counts if the camera is asked for."""
+    names = [f"videos/{key}/{name}" for name in _OF_A_VIDEO]
+    try:
+        for name in names:
+            got = "none: leave this camera out (--cameras), or the episode (--episodes)"
+            require(f"{where}: {name}", row[name] is not None, "a value", got)
+        return _place(info, where, row, key)
+    except DatasetError as error:
+        return error
+
+
+def _place(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
     chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _OF_A_VIDEO)
     lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
     is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: with frames of a discarded take

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -58,21 +59,26 @@ class EpisodeRows:
 class RowReader:
     """Reads and checks rows. Keeps the columns of the latest files.
 
+    data: folder of all rows
     tasks: sentences by number
     given: the caller's task
+    moved: numbers of the episodes whose rows were found in another file than their metadata say
     """
 
-    def __init__(self, tasks: Sentences, given: TaskOverride) -> None:
+    def __init__(self, data: Path, tasks: Sentences, given: TaskOverride) -> None:
+        self._data = data
         self._tasks = tasks
         self._given = given
         self._columns = lru_cache(_FILES_AT_A_TIME)(_read_columns)
+        self.moved: set[int] = set()
 
     def read(self, entry: Entry) -> EpisodeRows:
         """Return the episode's rows. Raises DatasetError if they contradict its metadata."""
-        columns = self._columns(entry.data_file, self._tasks.column)
+        file = self.file_of(entry)
+        columns = self._columns(file, self._tasks.column)
         own = np.flatnonzero(columns["episode_index"] == entry.index)
         rows = {name: columns[name][own] for name in _ROW_COLUMNS}
-        where, num_rows = f"{entry.where}: {entry.data_file}", len(own)
+        where, num_rows = f"{entry.where}: {file}", len(own)
         is_whole = num_rows == entry.length and num_rows > 0
         require(where, is_whole, f"{max(entry.length, 1)} rows, as its metadata say", num_rows)
         first = int(rows["index"][0]) if entry.first_index is None else entry.first_index
@@ -89,6 +95,28 @@ class RowReader:
         return EpisodeRows(
             first, times_s, self._tasks_of(entry, where, values_in(where, columns[_TASKS], own, times_s))
         )
+
+    def file_of(self, entry: Entry) -> Path:
+        """Return the file with the episode's rows. Raises DatasetError if that of its metadata cannot be read.
+
+        LeRobot reads all files and selects by ``episode_index``, so the converter of LeRobot 0.4.0 could name the file
+        before.
+        """
+        stored = self._columns(entry.data_file, self._tasks.column)["episode_index"]
+        file = entry.data_file if (stored == entry.index).any() else self._files.get(entry.index, entry.data_file)
+        if file != entry.data_file:
+            self.moved.add(entry.index)
+        return file
+
+    @cached_property
+    def _files(self) -> Mapping[int, Path]:
+        """The file of each episode's rows. A broken file has none."""
+        found: dict[int, Path] = {}
+        for file in sorted(self._data.rglob("*.parquet")):
+            with suppress(DatasetError):
+                numbers = read_table(file, ["episode_index"])["episode_index"]
+                found |= dict.fromkeys(numbers.unique().to_pylist(), file)
+        return found
 
     def _tasks_of(self, entry: Entry, where: str, values: Any) -> Sequence[tuple[int, str]]:
         if self._given.overrides:

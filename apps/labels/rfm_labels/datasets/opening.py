@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,10 +20,13 @@ from rfm_labels.datasets.folders import (
     Contents,
     EpisodeFiles,
     FrameFolders,
+    UnitreeFolders,
     VideoFolder,
     in_natural_order,
+    is_of_unitree,
     is_picture,
 )
+from rfm_labels.datasets.frame_names import is_pattern
 from rfm_labels.datasets.hdf5 import SUFFIXES, Hdf5Dataset, is_hdf5
 from rfm_labels.datasets.lerobot import LeRobotDataset
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
@@ -54,7 +58,9 @@ _KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and the name of
     "videos": (VideoFolder, "video"),
     "folders of pictures": (FrameFolders, "folder"),
     "arrays": (ArrayFiles, "file"),
+    "recordings of Unitree": (UnitreeFolders, "folder"),
 }
+_OWN_TASKS = ("arrays", "recordings of Unitree")
 _FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside episodes with labels; of 0.4
 
 
@@ -76,7 +82,8 @@ def open_dataset(
     several_tasks: of a LeRobot episode with several tasks: ``each``: each frame has its own; ``first``: all frames have
         the first frame's, as in LeRobot's own scripts
     task_column: column of a LeRobot dataset's rows that names the tasks: sentences, numbers of sentences in
-        ``meta/tasks``, or LeRobot's ``language_persistent``; None: ``task_index``, checked against the metadata
+        ``meta/tasks``, or LeRobot's ``language_persistent``; None: ``task_index``, checked against the metadata. Of an
+        RLDS dataset: feature with the sentences
     orient: turn of the frames: one for all cameras, or a dict by camera, in which "" stands for the others; None: as
         stored, but HDF5 files marked as LIBERO's are turned
     channels: order in which the colours are stored, ``rgb`` or ``bgr``: one, or a dict; None: ``rgb``
@@ -86,14 +93,14 @@ def open_dataset(
     """
     path, given = Path(source), TaskOverride(task, override_task, several_tasks, task_column)
     corrections = AskedCorrections.of(orient, channels)
-    has_rows = not path.exists() or (path / INFO_FILE).is_file()
-    require("task_column", task_column is None or has_rows, f"none, since {path} is no LeRobot dataset", task_column)
-    if is_hdf5(path):
-        return Hdf5Dataset(path, task=given, corrections=corrections)
     if (path / INFO_FILE).is_file():
         return LeRobotDataset(path, task=given, corrections=corrections, tolerance_s=tolerance_s)
     if folder := rlds_folder(path):
         return RldsDataset(folder, task=given, corrections=corrections)
+    has_columns = task_column is None or not path.exists()
+    require("task_column", has_columns, f"none, since {path} is no LeRobot or RLDS dataset", task_column)
+    if is_hdf5(path):
+        return Hdf5Dataset(path, task=given, corrections=corrections)
     if path.exists():
         return _open_files(path, given, corrections)
     match = _HUB_ID.fullmatch(str(source))
@@ -162,7 +169,7 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         return dataset
     kind, names = _listed(path)
     reader, episode = _KINDS[kind]
-    is_told = task.text is not None or kind == "arrays"
+    is_told = task.text is not None or kind in _OWN_TASKS
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
     require(path, is_told, f"one of {' and '.join(TABLES)} with the task of each {episode}", got)
     return reader(Contents(path, dict.fromkeys(names), path, task, corrections))
@@ -170,9 +177,10 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
 
 def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
     """A line about episodes beside those of a table that the table lacks; empty: it has all."""
+    names = {str(Path(name).parent) if is_pattern(Path(name)) else name for name in names}
     beside = {table.parent, *((table.parent / name).parent for name in names)} if kind in _SUFFIXES else {table.parent}
     found = [folder / name for folder in sorted(beside) if folder.is_dir() for name in _found(folder).get(kind, ())]
-    if kind not in _SUFFIXES:  # ``_found`` has folders without pictures, too
+    if kind == "folders of pictures":  # ``_found`` has those without pictures, too
         found = [each for each in found if any(_is_frame(file) for file in each.iterdir())]
     gone = in_natural_order({Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names))
     told = f"{table.name}: {len(gone)} {kind} beside it are not listed and get no labels: {first_names(gone)}"
@@ -180,8 +188,8 @@ def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
 
 
 def _kind_of(path: Path) -> str:
-    if path.is_dir():
-        return "folders of pictures"
+    if path.is_dir() or is_pattern(path):
+        return "recordings of Unitree" if is_of_unitree(path) else "folders of pictures"
     return "arrays" if path.suffix.lower() in ARRAY_SUFFIXES else "videos"
 
 
@@ -189,7 +197,7 @@ def _listed(folder: Path) -> tuple[str, list[str]]:
     """The kind of a folder's episodes, and their names. Raises DatasetError for several kinds, or none."""
     found = _found(folder)
     told = " and ".join(f"{kind} ({names[0]})" for kind, names in found.items())
-    got = f"{told}: give each kind a folder of its own, or list the episodes of one kind in tasks.csv"
+    got = f"{told}: list the episodes of one kind in tasks.csv"
     require(folder, len(found) < 2, "episodes of one kind", got)
     if not any(kind in _KINDS for kind in found):
         other = f"{'other files' if _names_in(folder) else 'an empty folder'}: {_FILL}"
@@ -206,6 +214,9 @@ def _found(folder: Path) -> dict[str, list[str]]:
         kind: [each.name for each in files if each.suffix.lower() in suffixes]
         for kind, suffixes in (*_SUFFIXES.items(), ("HDF5 files", SUFFIXES))
     }
+    of_unitree = [each for each in folders if is_of_unitree(each)]
+    folders = [each for each in folders if each not in of_unitree]
+    found["recordings of Unitree"] = [each.name for each in of_unitree]
     has_frames = any(_is_frame(file) for each in folders for file in each.iterdir())
     found["folders of pictures"] = [each.name for each in folders] if has_frames else []
     if has_frames or not any(found.values()):  # elsewhere a picture is no frame
@@ -236,6 +247,16 @@ def _unread(path: Path) -> str | None:
         return f"a folder of HDF5 files, each a dataset of its own: {remedy}"
     if any(_is_frame(file) for file in path.iterdir()):
         return "pictures outside of the folder of an episode"
-    deeper = next((file for file in path.glob("*/*/*") if is_picture(file)), None)
-    listed = deeper and deeper.parent.relative_to(path)
-    return f"pictures two levels down: list the folders of one camera ({listed}) in tasks.csv" if deeper else None
+    deeper = next(
+        (file for file in path.rglob("*") if is_picture(file) or file.suffix.lower() in _VIDEO_SUFFIXES), None
+    )
+    if deeper is None:
+        return None
+    if is_picture(deeper):
+        listed = deeper.parent.relative_to(path)
+        return f"pictures in deeper folders: list the folders of one camera ({listed}) in tasks.csv"
+    remedy = f"list those of one camera in tasks.csv ({deeper.relative_to(path)})"
+    if not re.search(r"\d", deeper.stem):  # the name of a camera, not the number of an episode
+        find = f"find . -name {shlex.quote(deeper.name)} | sort"
+        remedy = f"list those of one camera: (cd {shlex.quote(str(path))} && (echo video; {find}) > tasks.csv)"
+    return f"videos in deeper folders: {remedy}; with {_GIVE_TASK}, or a column task"

@@ -15,6 +15,7 @@ from typing import Any
 
 from rfm_client import RewardError, UInt8Array
 from rfm_client.frames import BlankFrames, FrameFileError, Picture
+from rfm_client.options import is_blank
 from rfm_labels.datasets.cameras import AskedCorrections
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, require
@@ -49,9 +50,14 @@ class _Pictures:
 
 @dataclass(frozen=True)
 class _Record:
-    """What the dataset keeps of a record. texts: first step and instruction of each stretch of steps with one"""
+    """What the dataset keeps of a record.
+
+    instruction: name of the feature with the texts
+    texts: first step and instruction of each stretch of steps with one
+    """
 
     num_steps: int
+    instruction: str
     texts: Sequence[tuple[int, bytes]]
     pictures: Mapping[str, _Pictures]
 
@@ -70,7 +76,7 @@ class RldsDataset(Dataset):
     ) -> None:
         check_packages()
         self.root = root
-        self._info = info = RldsInfo.read(root)
+        self._info = info = RldsInfo.read(root, task.column)
         self.source, self.given_task, self.notes = info.source, task, info.notes
         self.cameras, self.left_out = tuple(info.cameras), info.left_out
         self.corrections = corrections.of_cameras(self.cameras)
@@ -131,16 +137,17 @@ class RldsDataset(Dataset):
         if number not in self._records:
             features, where = self._features(number), self._where(number)
             stored = {camera: self._values(features, name) for camera, name in self._info.cameras.items()}
-            texts = self._values(features, self._info.instruction or "")
+            instruction = self._instruction(features)
+            texts = self._values(features, instruction)
             num_steps = len(stored[self.cameras[0]])
             counts = {name: len(each) for name, each in stored.items()}
-            if self._has_step_texts:
-                counts[str(self._info.instruction)] = len(texts)
+            if instruction.startswith("steps/"):
+                counts[instruction] = len(texts)
             told = ", ".join(f"{name} {count}" for name, count in counts.items())
             require(where, num_steps > 0 and len({*counts.values()}) == 1, "one number of steps, above 0", told)
             pictures = {camera: _pictures(f"{where}: {camera}", each) for camera, each in stored.items()}
             changes = [(t, text) for t, text in enumerate(texts) if t == 0 or text != texts[t - 1]]
-            self._records[number] = _Record(num_steps, changes, pictures)
+            self._records[number] = _Record(num_steps, instruction, changes, pictures)
         return self._records[number]
 
     def _readable(self, number: int) -> _Record | None:
@@ -154,13 +161,15 @@ class RldsDataset(Dataset):
         record = self._readable(number)
         return record.num_steps if record else 0
 
-    @property
-    def _has_step_texts(self) -> bool:
-        return (self._info.instruction or "").startswith("steps/")
+    def _instruction(self, features: Mapping[str, Any]) -> str:
+        """The first feature with an instruction that is not blank; else the first of all, or none."""
+        known = self._info.instructions
+        said = (name for name in known if any(not is_blank(_shown(text)) for text in self._values(features, name)))
+        return next(said, known[0] if known else "")
 
     def _tasks(self, number: int, record: _Record) -> list[tuple[int, str]]:
         """First frame and task of each stretch of frames with one task. Raises DatasetError."""
-        where = f"{self._where(number)}: {self._info.instruction or ' or '.join(INSTRUCTIONS)}"
+        where = f"{self._where(number)}: {record.instruction or ' or '.join(INSTRUCTIONS)}"
         texts = record.texts if record.texts and not self.given_task.overrides else [(0, b"")]
         texts = texts[:1] if self.given_task.several == "first" else texts
         return [(t, self.given_task.of(where, _decoded(where, text))) for t, text in texts]
@@ -195,6 +204,10 @@ def _pictures(where: str, stored: Sequence[bytes]) -> _Pictures:
         with suppress(FrameFileError):  # raised again by the frames
             blank = BlankFrames([Picture(stored[0]).pixels()]).told
     return _Pictures(digest, num_bytes, blank, None)
+
+
+def _shown(text: bytes) -> str:
+    return text.decode(errors="replace")
 
 
 def _decoded(where: str, text: bytes) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +14,13 @@ from rfm_labels.datasets.cameras import LEAST_SIZE_PX
 from rfm_labels.datasets.faults import DatasetError, require
 
 FEATURES_FILE = "features.json"
-INSTRUCTIONS = ("language_instruction", "natural_language_instruction")
+INSTRUCTIONS = ("natural_language_instruction", "language_instruction", "instruction")  # as upstream's guide reads them
 
 _INFO_FILE = "dataset_info.json"
 _OBSERVATION = "steps/observation/"
 _TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 _COLOURS = "3 channels of uint8"
+_INSTRUCTION = re.compile(rf"({'|'.join(INSTRUCTIONS)})(?:_(\d+))?")  # DROID numbers further sentences
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class RldsInfo:
     shards: in the order of the splits
     cameras: features of pictures with 8-bit colours, by the names below ``steps/observation``
     left_out: other pictures there, with the reason
-    instruction: feature with the task, of each step or of the episode; None: the dataset has none
+    instructions: features with the task, of each step or of the episode, best first
     notes: lines for the caller
     """
 
@@ -46,12 +48,15 @@ class RldsInfo:
     shards: Sequence[Shard]
     cameras: Mapping[str, str]
     left_out: Mapping[str, str]
-    instruction: str | None
+    instructions: Sequence[str]
     notes: Sequence[str]
 
     @classmethod
-    def read(cls, root: Path) -> RldsInfo:
-        """Return the information in ``root``. Raises DatasetError."""
+    def read(cls, root: Path, task_column: str | None = None) -> RldsInfo:
+        """Return the information in ``root``. Raises DatasetError.
+
+        task_column: feature with the task, or the last part of its path; None: those in ``INSTRUCTIONS``
+        """
         info = _document(root / _INFO_FILE)
         features = _features(root / FEATURES_FILE)
         shown = {name.removeprefix(_OBSERVATION): each for name, each in features.items() if _shown(name, each)}
@@ -59,15 +64,19 @@ class RldsInfo:
         cameras = {name: _OBSERVATION + name for name, fault in faults.items() if not fault}
         told = "; ".join(f"{name}: {fault}" for name, fault in faults.items()) or "none"
         require(f"{root / FEATURES_FILE}: {_OBSERVATION}", bool(cameras), f"a picture with {_COLOURS}", told)
-        texts = [name for name, each in features.items() if name.split("/")[-1] in INSTRUCTIONS and _is_text(each)]
-        texts.sort(key=lambda name: (not name.startswith("steps/"), name.count("/")))
+        texts = [name for name, each in features.items() if _is_text(each)]
+        instructions = sorted(filter(_rank, texts), key=_rank)
+        if task_column is not None:
+            instructions = [name for name in texts if task_column in (name, name.split("/")[-1])][:1]
+            require("task_column", bool(instructions), f"one of {', '.join(texts)}", repr(task_column))
+        first, *others = instructions or [""]
         return cls(
             source=f"{info.get('name')}/{info.get('version')}",
             shards=_shards(root, info),
             cameras=cameras,
             left_out={name: fault for name, fault in faults.items() if fault},
-            instruction=texts[0] if texts else None,
-            notes=[f"tasks: from {texts[0]}, not from {', '.join(texts[1:])}"] if len(texts) > 1 else [],
+            instructions=instructions,
+            notes=[f"tasks: from {first}, where it is blank from {', '.join(others)}"] if others else [],
         )
 
 
@@ -152,6 +161,14 @@ def _fault(feature: Mapping[str, Any]) -> str:
     kind, shape = image.get("dtype", "uint8"), _shape(image)
     is_colour = kind == "uint8" and shape[-1:] == [3]
     return "" if is_colour else f"{kind} {shape}: expected {_COLOURS}"
+
+
+def _rank(name: str) -> tuple[int, ...]:
+    """Sorts features with instructions, best first; empty for another feature."""
+    match = _INSTRUCTION.fullmatch(name.split("/")[-1])
+    if match is None:
+        return ()
+    return int(match[2] or 0), INSTRUCTIONS.index(match[1]), not name.startswith("steps/"), name.count("/")
 
 
 def _is_text(feature: Mapping[str, Any]) -> bool:

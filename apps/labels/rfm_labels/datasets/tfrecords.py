@@ -13,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from rfm_client.options import git_lfs_pointer
 from rfm_labels.datasets.faults import DatasetError, require
 
 NEEDED = 'RLDS datasets need google-crc32c and protobuf: pip install ./client "./apps/labels[rlds]"'
@@ -78,8 +79,9 @@ class RecordFile:
         where = f"{self.file}: record {number}"
         require(where, len(head) == _HEAD.size, "a record", f"the end of the file: {_AGAIN}")
         length, crc = _HEAD.unpack(head)
-        is_whole = crc == _masked_crc(head[:8])
-        require(where, is_whole, "a length of the stored CRC", f"another: the file is damaged; {_AGAIN}")
+        if crc != _masked_crc(head[:8]):
+            got = git_lfs_pointer(self.file) or f"another: the file is damaged; {_AGAIN}"
+            raise DatasetError.at(where, "a length of the stored CRC", got)
         return int(length)
 
 
