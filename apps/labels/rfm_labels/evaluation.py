@@ -21,7 +21,7 @@ from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
 from rfm_labels.label_files import read_cost, read_label_table, reward_name
 from rfm_labels.metadata import PROGRESS, SUCCESS
-from rfm_labels.summary import BACKWARDS_BY
+from rfm_labels.summary import BACKWARDS_BY, voted_success
 
 Floats = npt.NDArray[np.floating[Any]]
 
@@ -52,8 +52,8 @@ class Evaluation:
     spearman, kendall: mean VOC, as Spearman's rho and Kendall's tau-b, over the known successes, or over all episodes
         if outcomes are unknown; None: progress is constant in each
     num_constant: episodes with constant progress, which have no VOC
-    by_success, by_progress: how success and progress at the last frame tell successes from failures; None: outcomes are
-        unknown or all alike, or success is not predicted
+    by_success, by_progress: how ``voted_success`` and progress at the last frame tell successes from failures; None:
+        outcomes are unknown or all alike, or success is not predicted
     final_of_successes, final_of_failures: mean progress at the last frame; None: no such episode
     final: mean progress at the last frame of all episodes
     backwards: mean share of steps on which progress falls by more than 0.01
@@ -232,7 +232,7 @@ def _evaluation(
     final = np.array([each.progress[-1] for each in scores], np.float64)
     orders = [_order(each.progress) for index, each in enumerate(scores) if is_success is None or is_success[index]]
     known = [order for order in orders if order is not None]
-    last = np.array([each.success[-1] for each in scores if each.success is not None], np.float64)
+    voted = np.array([voted_success(each.success) for each in scores if each.success is not None], np.float64)
     falls = [float((np.diff(each.progress) < -BACKWARDS_BY).sum()) / max(len(each.progress) - 1, 1) for each in scores]
     return Evaluation(
         name=name,
@@ -241,7 +241,7 @@ def _evaluation(
         spearman=_mean([rho for rho, _ in known]),
         kendall=_mean([tau for _, tau in known]),
         num_constant=len(orders) - len(known),
-        by_success=_ranking(last, is_success) if len(last) == len(scores) else None,
+        by_success=_ranking(voted, is_success) if len(voted) == len(scores) else None,
         by_progress=_ranking(final, is_success),
         final_of_successes=None if is_success is None else _mean(final[is_success]),
         final_of_failures=None if is_success is None else _mean(final[~is_success]),
