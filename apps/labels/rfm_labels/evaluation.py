@@ -26,6 +26,7 @@ from rfm_labels.summary import BACKWARDS_BY, voted_success
 Floats = npt.NDArray[np.floating[Any]]
 
 _OUTCOMES = {"1": True, "0": False, "true": True, "false": False, "1.0": True, "0.0": False}
+_UNKNOWN = ("", "nan")
 _EPISODE, _SUCCESS = "episode", "success"  # columns of a CSV file of outcomes
 _ROUNDING = 1e-12  # of a balanced accuracy
 
@@ -98,6 +99,7 @@ class LabelComparison:
     episodes: numbers of these episodes
     is_success: bool [E]; None: outcomes are unknown
     num_left_out: episodes that only some files have
+    num_without_outcome: episodes of all files that are left out, since theirs is None
     """
 
     evaluations: Sequence[Evaluation]
@@ -105,6 +107,7 @@ class LabelComparison:
     episodes: Sequence[int]
     is_success: npt.NDArray[np.bool_] | None
     num_left_out: int
+    num_without_outcome: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +119,10 @@ class _Scores:
     success: Floats | None
 
 
-def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool] | None = None) -> LabelComparison:
+def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] | None = None) -> LabelComparison:
     """Return the evaluations of label files of one dataset.
 
-    outcomes: True for each successful episode, by its number; None: unknown
+    outcomes: True for each successful episode, by its number, and None for each to leave out; None: unknown
 
     Raises DatasetError for an unreadable file, files without a common episode, or an episode without an outcome.
     """
@@ -129,9 +132,12 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool] | None =
     common = sorted(set.intersection(*(set(episodes) for episodes in read.values())))
     everywhere = set.union(*(set(episodes) for episodes in read.values()))
     require("labels", len(common) > 0, "an episode that all files have", "none")
+    in_all = len(common)
     if outcomes is not None:
         missing = [episode for episode in common if episode not in outcomes]
         require("outcome", not missing, "one for each labelled episode", f"none for episode {missing[:1]}")
+        common = [episode for episode in common if outcomes[episode] is not None]
+        require("outcome", len(common) > 0, "one that is known", f"none for {in_all} episodes")
     is_success = None if outcomes is None else np.array([outcomes[episode] for episode in common])
     evaluations = [
         _evaluation(name, file, [read[name][each] for each in common], is_success)
@@ -139,11 +145,11 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool] | None =
     ]
     pairs = [(first, second) for index, first in enumerate(names) for second in names[index + 1 :]]
     agreements = [_agreement(first, second, read[first], read[second], common) for first, second in pairs]
-    return LabelComparison(evaluations, agreements, common, is_success, len(everywhere) - len(common))
+    return LabelComparison(evaluations, agreements, common, is_success, len(everywhere) - in_all, in_all - len(common))
 
 
-def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool]:
-    """Return each episode's outcome by its number. Raises DatasetError.
+def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | None]:
+    """Return each episode's outcome by its number; None: null, NaN or an empty cell. Raises DatasetError.
 
     source: a CSV file with the columns ``episode`` and ``success``, or the name of a column of a LeRobot dataset: of
         its frames, whose last value counts, or of its episodes. Values: true, false, 1 or 0
@@ -172,7 +178,7 @@ def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool]:
     return {line["episode_index"]: _outcome(f"{where}: {source}", line.get(source)) for where, line in told}
 
 
-def _of_csv(file: Path) -> dict[int, bool]:
+def _of_csv(file: Path) -> dict[int, bool | None]:
     try:
         with file.open(newline="", encoding="utf-8-sig") as content:
             rows = list(csv.DictReader(content))
@@ -180,7 +186,7 @@ def _of_csv(file: Path) -> dict[int, bool]:
         raise DatasetError.at(file, "a CSV file", error) from error
     got = ", ".join(rows[0]) if rows else "no rows"
     require(file, bool(rows) and {_EPISODE, _SUCCESS} <= rows[0].keys(), f"the columns {_EPISODE} and {_SUCCESS}", got)
-    outcomes: dict[int, bool] = {}
+    outcomes: dict[int, bool | None] = {}
     for number, row in enumerate(rows, 2):
         where, text = f"{file}: line {number}", (row[_EPISODE] or "").strip()
         require(f"{where}: {_EPISODE}", text.isdecimal(), "the number of an episode", repr(text))
@@ -189,13 +195,14 @@ def _of_csv(file: Path) -> dict[int, bool]:
     return outcomes
 
 
-def _outcome(where: str, value: Any) -> bool:
+def _outcome(where: str, value: Any) -> bool | None:
     while isinstance(value, list) and len(value) == 1:
         (value,) = value
-    outcome = _OUTCOMES.get(str(value).strip().lower())
-    if outcome is None:
-        raise DatasetError.at(where, "true, false, 1 or 0", repr(value))
-    return outcome
+    text = "" if value is None else str(value).strip().lower()
+    if text in _UNKNOWN:
+        return None
+    require(where, text in _OUTCOMES, "true, false, 1 or 0", repr(value))
+    return _OUTCOMES[text]
 
 
 def _names(files: Sequence[Path]) -> list[str]:
