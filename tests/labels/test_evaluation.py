@@ -56,8 +56,9 @@ def test_rank_correlations_are_those_of_slow_formulas(seed: int) -> None:
 
 def test_successes_are_told_from_failures(tmp_path: Path) -> None:
     final = {0: 0.9, 1: 0.8, 2: 0.8, 3: 0.1}  # the last of each episode; a success ties with a failure
-    success = {0: [0.0, 0.7], 1: [0.0, 0.4], 2: [0.9, 0.3], 3: [0.0, 0.1]}
-    file = labels(tmp_path / "good_progress.parquet", {each: [0.0, value] for each, value in final.items()}, success)
+    success = {0: [0.9, 0.0, 0.7, 0.7], 1: [0.4, 0.4], 2: [0.9, 0.9, 0.3, 0.3, 0.9], 3: [0.1] * 4}  # the last 3 vote
+    curves = {each: [*[0.0] * (len(success[each]) - 1), value] for each, value in final.items()}
+    file = labels(tmp_path / "good_progress.parquet", curves, success)
     comparison = evaluate_labels([file], {0: True, 1: True, 2: False, 3: False})
     (found,) = comparison.evaluations
     assert found.name == "good"

@@ -151,7 +151,8 @@ def test_the_table_has_the_numbers_of_the_labels_and_is_sorted_by_what_one_wants
     dataset = page.choose(BRIGHT)
     summary = summarise(page.folders[BRIGHT] / "rfm_progress.parquet")
     assert summary.best_success is not None and summary.last_success is not None
-    assert summary.disagreement is not None and summary.never_succeed is not None
+    assert summary.disagreement is not None
+    succeed, undone, never = summary.outcomes.values()
     scores = (summary.final_progress, summary.best_success, summary.last_success)
     columns = (*scores, summary.backwards, summary.disagreement)
     for row in page.rows:
@@ -159,17 +160,19 @@ def test_the_table_has_the_numbers_of_the_labels_and_is_sorted_by_what_one_wants
         assert (row[2], int(row[3])) == (told.task, told.num_frames)
         numbers = [*map(float, row[4:7]), float(row[7].removesuffix(" %")) / 100, float(row[8])]
         assert numbers == pytest.approx([values[int(row[1])] for values in columns], abs=SHOWN)
-    assert page.browser["ends-told"].text.startswith(f"{len(summary.never_succeed)} of {len(page.rows)} episodes never")
+    told = page.browser["ends-told"].text
+    assert told.startswith(f"{never.sum()} of {len(page.rows)} episodes never")
+    assert (f" {undone.sum()} succeed" in told) == (undone.sum() > 1)
     bars = (
         page.browser["histogram"].get_attribute("aria-label").removeprefix("Episodes by final progress: ").split(", ")
     )
     good = [int(bar.split()[5]) if "which" in bar else 0 for bar in bars]
     for counts, progress in (
         ([int(bar.split()[0]) for bar in bars], summary.final_progress),
-        (good, summary.final_progress[summary.best_success >= 0.5]),
+        (good, summary.final_progress[succeed]),
     ):
         assert counts == np.histogram(progress, bins=20, range=(0, 1))[0].tolist()
-    never, backwards, apart = summary.best_success < 0.5, -summary.backwards, -summary.disagreement
+    backwards, apart = -summary.backwards, -summary.disagreement
     worst = episodes_by(-never.astype(int), backwards, apart)
     assert page.episodes == worst
     expected = {
@@ -199,8 +202,9 @@ def episodes_by(*keys: np.ndarray[Any, Any]) -> list[int]:
 
 def test_the_threshold_moves_counts_and_histogram_and_is_dragged_in_the_chart(page: Page) -> None:
     page.choose(BRIGHT)
-    best = summarise(page.folders[BRIGHT] / "rfm_progress.parquet").best_success
-    assert best is not None
+    summary = summarise(page.folders[BRIGHT] / "rfm_progress.parquet")
+    best, voted = summary.best_success, summary.voted_success
+    assert best is not None and voted is not None
     for threshold in (0.0, float(np.float32(np.median(best))), 1.0):
         page.browser.run(
             "const slider = document.getElementById('cutoff'); slider.value = arguments[0]; "
@@ -212,7 +216,7 @@ def test_the_threshold_moves_counts_and_histogram_and_is_dragged_in_the_chart(pa
         assert page.browser["ends-told"].text.startswith(f"{never} of {len(best)} episodes never succeed")
         assert page.browser["count-never"].text == f"{never}"
         told = page.browser["histogram"].get_attribute("aria-label")
-        assert sum(int(part.split()[0]) for part in told.split("of which ")[1:]) == len(best) - never
+        assert sum(int(part.split()[0]) for part in told.split("of which ")[1:]) == (voted >= cut).sum()
     page.at_rest(0)
     (line,) = page.browser.all("#episode-chart .threshold")
     ActionChains(page.browser.driver).move_to_element(line).click_and_hold().move_by_offset(0, 30).release().perform()
@@ -283,9 +287,8 @@ def test_two_label_files_are_overlaid_and_their_differences_listed(page: Page) -
     Select(page.browser["others"]).select_by_visible_text(f"{OTHER}_progress.parquet")
     page.browser.until("document.getElementById('filter-differ').hidden === false")
     ours, theirs = (summarise(page.folders[DEMO] / f"{name}_progress.parquet") for name in ("rfm", OTHER))
-    assert ours.best_success is not None and theirs.best_success is not None
     apart = np.abs(ours.final_progress - theirs.final_progress)
-    differs = (ours.best_success >= 0.5) != (theirs.best_success >= 0.5)
+    differs = ours.outcomes["succeed"] != theirs.outcomes["succeed"]
     page.browser.until("document.querySelector('#episodes tr td:last-child').textContent !== '-'")
     for row in page.rows:
         episode = int(row[1])

@@ -76,6 +76,7 @@ def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: 
             "final_progress": columns["progress_sparse"][-1],
             "best_success": columns["success"].max(),
             "last_success": columns["success"][-1],
+            "voted_success": np.median(columns["success"][-3:]),
             "backwards": (np.diff(columns["progress_sparse"]) < -0.01).mean(),
             "disagreement": apart.mean(),
         }

@@ -21,11 +21,12 @@ from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
 from rfm_labels.label_files import read_cost, read_label_table, reward_name
 from rfm_labels.metadata import PROGRESS, SUCCESS
-from rfm_labels.summary import BACKWARDS_BY
+from rfm_labels.summary import BACKWARDS_BY, voted_success
 
 Floats = npt.NDArray[np.floating[Any]]
 
 _OUTCOMES = {"1": True, "0": False, "true": True, "false": False, "1.0": True, "0.0": False}
+_UNKNOWN = ("", "nan")
 _EPISODE, _SUCCESS = "episode", "success"  # columns of a CSV file of outcomes
 _ROUNDING = 1e-12  # of a balanced accuracy
 
@@ -52,8 +53,8 @@ class Evaluation:
     spearman, kendall: mean VOC, as Spearman's rho and Kendall's tau-b, over the known successes, or over all episodes
         if outcomes are unknown; None: progress is constant in each
     num_constant: episodes with constant progress, which have no VOC
-    by_success, by_progress: how success and progress at the last frame tell successes from failures; None: outcomes are
-        unknown or all alike, or success is not predicted
+    by_success, by_progress: how ``voted_success`` and progress at the last frame tell successes from failures; None:
+        outcomes are unknown or all alike, or success is not predicted
     final_of_successes, final_of_failures: mean progress at the last frame; None: no such episode
     final: mean progress at the last frame of all episodes
     backwards: mean share of steps on which progress falls by more than 0.01
@@ -98,6 +99,7 @@ class LabelComparison:
     episodes: numbers of these episodes
     is_success: bool [E]; None: outcomes are unknown
     num_left_out: episodes that only some files have
+    num_without_outcome: episodes of all files that are left out, since theirs is None
     """
 
     evaluations: Sequence[Evaluation]
@@ -105,6 +107,7 @@ class LabelComparison:
     episodes: Sequence[int]
     is_success: npt.NDArray[np.bool_] | None
     num_left_out: int
+    num_without_outcome: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +119,10 @@ class _Scores:
     success: Floats | None
 
 
-def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool] | None = None) -> LabelComparison:
+def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] | None = None) -> LabelComparison:
     """Return the evaluations of label files of one dataset.
 
-    outcomes: True for each successful episode, by its number; None: unknown
+    outcomes: True for each successful episode, by its number, and None for each to leave out; None: unknown
 
     Raises DatasetError for an unreadable file, files without a common episode, or an episode without an outcome.
     """
@@ -129,9 +132,12 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool] | None =
     common = sorted(set.intersection(*(set(episodes) for episodes in read.values())))
     everywhere = set.union(*(set(episodes) for episodes in read.values()))
     require("labels", len(common) > 0, "an episode that all files have", "none")
+    in_all = len(common)
     if outcomes is not None:
         missing = [episode for episode in common if episode not in outcomes]
         require("outcome", not missing, "one for each labelled episode", f"none for episode {missing[:1]}")
+        common = [episode for episode in common if outcomes[episode] is not None]
+        require("outcome", len(common) > 0, "one that is known", f"none for {in_all} episodes")
     is_success = None if outcomes is None else np.array([outcomes[episode] for episode in common])
     evaluations = [
         _evaluation(name, file, [read[name][each] for each in common], is_success)
@@ -139,11 +145,11 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool] | None =
     ]
     pairs = [(first, second) for index, first in enumerate(names) for second in names[index + 1 :]]
     agreements = [_agreement(first, second, read[first], read[second], common) for first, second in pairs]
-    return LabelComparison(evaluations, agreements, common, is_success, len(everywhere) - len(common))
+    return LabelComparison(evaluations, agreements, common, is_success, len(everywhere) - in_all, in_all - len(common))
 
 
-def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool]:
-    """Return each episode's outcome by its number. Raises DatasetError.
+def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | None]:
+    """Return each episode's outcome by its number; None: null, NaN or an empty cell. Raises DatasetError.
 
     source: a CSV file with the columns ``episode`` and ``success``, or the name of a column of a LeRobot dataset: of
         its frames, whose last value counts, or of its episodes. Values: true, false, 1 or 0
@@ -172,7 +178,7 @@ def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool]:
     return {line["episode_index"]: _outcome(f"{where}: {source}", line.get(source)) for where, line in told}
 
 
-def _of_csv(file: Path) -> dict[int, bool]:
+def _of_csv(file: Path) -> dict[int, bool | None]:
     try:
         with file.open(newline="", encoding="utf-8-sig") as content:
             rows = list(csv.DictReader(content))
@@ -180,7 +186,7 @@ def _of_csv(file: Path) -> dict[int, bool]:
         raise DatasetError.at(file, "a CSV file", error) from error
     got = ", ".join(rows[0]) if rows else "no rows"
     require(file, bool(rows) and {_EPISODE, _SUCCESS} <= rows[0].keys(), f"the columns {_EPISODE} and {_SUCCESS}", got)
-    outcomes: dict[int, bool] = {}
+    outcomes: dict[int, bool | None] = {}
     for number, row in enumerate(rows, 2):
         where, text = f"{file}: line {number}", (row[_EPISODE] or "").strip()
         require(f"{where}: {_EPISODE}", text.isdecimal(), "the number of an episode", repr(text))
@@ -189,13 +195,14 @@ def _of_csv(file: Path) -> dict[int, bool]:
     return outcomes
 
 
-def _outcome(where: str, value: Any) -> bool:
+def _outcome(where: str, value: Any) -> bool | None:
     while isinstance(value, list) and len(value) == 1:
         (value,) = value
-    outcome = _OUTCOMES.get(str(value).strip().lower())
-    if outcome is None:
-        raise DatasetError.at(where, "true, false, 1 or 0", repr(value))
-    return outcome
+    text = "" if value is None else str(value).strip().lower()
+    if text in _UNKNOWN:
+        return None
+    require(where, text in _OUTCOMES, "true, false, 1 or 0", repr(value))
+    return _OUTCOMES[text]
 
 
 def _names(files: Sequence[Path]) -> list[str]:
@@ -232,7 +239,7 @@ def _evaluation(
     final = np.array([each.progress[-1] for each in scores], np.float64)
     orders = [_order(each.progress) for index, each in enumerate(scores) if is_success is None or is_success[index]]
     known = [order for order in orders if order is not None]
-    last = np.array([each.success[-1] for each in scores if each.success is not None], np.float64)
+    voted = np.array([voted_success(each.success) for each in scores if each.success is not None], np.float64)
     falls = [float((np.diff(each.progress) < -BACKWARDS_BY).sum()) / max(len(each.progress) - 1, 1) for each in scores]
     return Evaluation(
         name=name,
@@ -241,7 +248,7 @@ def _evaluation(
         spearman=_mean([rho for rho, _ in known]),
         kendall=_mean([tau for _, tau in known]),
         num_constant=len(orders) - len(known),
-        by_success=_ranking(last, is_success) if len(last) == len(scores) else None,
+        by_success=_ranking(voted, is_success) if len(voted) == len(scores) else None,
         by_progress=_ranking(final, is_success),
         final_of_successes=None if is_success is None else _mean(final[is_success]),
         final_of_failures=None if is_success is None else _mean(final[~is_success]),

@@ -13,10 +13,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
 from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.label_files import LabelFile
-from rfm_labels.metadata import SCORES, Cost, blank_from_metadata, blank_lines
+from rfm_labels.metadata import PROGRESS, SCORES, Cost, blank_from_metadata, blank_lines
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
 from rfm_labels.plan import Plan, all_faults, plan_labels
 from rfm_labels.scorer import Scorer
@@ -26,6 +28,7 @@ from rfm_labels.writing import (
     IDENTITY,
     PROGRESS_ENDING,
     Parts,
+    is_filled,
     progress_file,
     signals_file,
     with_totals,
@@ -126,6 +129,9 @@ def put_together(
     for name, score in SCORES.items():
         if name in labels.column_names and (told := score.told(labels[name].to_numpy())):
             watch.note(f"{told}; the column {name} marks them")
+    if outputs.progress and is_filled(labels.column_names, outputs.options.fill):
+        skipped = np.isnan(labels[PROGRESS].to_numpy()).sum()
+        watch.note(f"progress_sparse: filled at the {skipped} of {len(labels)} frames that the model skipped (--fill)")
     num_episodes = len(dataset.numbers)
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
@@ -190,10 +196,11 @@ class Outputs:
         cost: for the metadata; None: unknown
         """
         columns = [name for name in labels.column_names if name not in IDENTITY]
-        sidecars = [progress_file(path, plan, columns, cost) for path in self.progress]
+        fill = self.options.fill
+        sidecars = [progress_file(path, plan, columns, cost, fill) for path in self.progress]
         sidecars += [signals_file(path, plan, columns, self.options.name, cost) for path in self.signals]
         try:
-            write_sidecars(with_totals(labels, plan), sidecars)
+            write_sidecars(with_totals(labels, plan, fill), sidecars)
         except OSError as error:
             remedy = f"make room, or name another folder with --output and this one's --parts {self.parts.url}"
             raise OSError(f"{self.folder}: expected to write the labels, got {error}: {remedy}") from error

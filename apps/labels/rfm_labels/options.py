@@ -19,6 +19,7 @@ from rfm_labels.datasets.faults import listed, require
 
 Mode: TypeAlias = Literal["prefix", "whole"]
 ProgressRule: TypeAlias = Literal["remaining_over_first"]
+Fill: TypeAlias = Literal["linear", "none"]
 Format: TypeAlias = Literal["progress", "signals"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_WORKERS = 4
@@ -122,6 +123,11 @@ class LabelOptions(Settings):
         None,
         "How progress is made of remaining seconds, for a model without progress: "
         "remaining_over_first: 1 - the seconds / those of the episode's first frame.",
+    )
+    fill: Fill = setting(
+        "linear",
+        "progress_sparse at frames that the model skipped. linear: on the line between its answers, as LeRobot's "
+        "--stride does. none: NaN.",
     )
     mode: Mode = setting("prefix", "prefix: frame t is scored on the frames up to t. whole: all frames together.")
     resize: bool = setting(False, "Downscale frames to the model's input size before sending.")

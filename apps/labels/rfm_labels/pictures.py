@@ -31,7 +31,7 @@ SUMMARY_IN, EVALUATION_IN = 1.9, 1.3  # heights of axes
 HEADLINE_IN = 0.5
 BINS = 20
 STYLE = "rfm_client.figure"  # the style file of all figures says what each colour means
-SUCCESS_COLOUR, FAILURE_COLOUR = "C2", "C6"  # the first colour, of progress, is matplotlib's choice
+SUCCESS_COLOUR, UNDONE_COLOUR, FAILURE_COLOUR = "C2", "C1", "C6"  # the first, of progress, is matplotlib's choice
 
 
 def draw_summary(file: Path, summary: Summary, labels: Path) -> None:
@@ -47,20 +47,17 @@ def draw_summary(file: Path, summary: Summary, labels: Path) -> None:
     with matplotlib.style.context(STYLE, after_reset=True):
         figure = Figure(figsize=(WIDTH_IN, HEADLINE_IN + SUMMARY_IN), layout="constrained")
         final, by_success, backwards = figure.subplots(1, 3)
-        succeeds = None
+        coloured = dict(zip(summary.outcomes, (SUCCESS_COLOUR, UNDONE_COLOUR, FAILURE_COLOUR), strict=False))
         if summary.best_success is None:
             by_success.text(0.5, 0.5, "success is not predicted", ha="center")
         else:
-            succeeds = summary.best_success >= SuccessRule.threshold
-            colours = np.where(succeeds, SUCCESS_COLOUR, FAILURE_COLOUR)
-            by_success.scatter(
-                summary.final_progress, summary.best_success, s=10, c=colours, alpha=0.6, lw=0, clip_on=False
-            )
+            for outcome, has_it in summary.outcomes.items():
+                ends = summary.final_progress[has_it], summary.best_success[has_it]
+                by_success.scatter(*ends, s=10, c=coloured[outcome], alpha=0.6, lw=0, clip_on=False)
             by_success.axhline(
                 SuccessRule.threshold, color=matplotlib.rcParams["axes.edgecolor"], linestyle=":", lw=0.9
             )
-        names = {True: "succeed", False: "never succeed"}
-        _draw_ends(final, summary.final_progress, succeeds, names)
+        _draw_ends(final, summary.final_progress, summary.outcomes, coloured)
         final.set_xlabel("final progress")
         by_success.set(xlabel="final progress", ylabel="best success", xlim=(0, 1), ylim=(-0.03, 1.03))
         by_success.set_yticks((0, 0.5, 1))
@@ -71,8 +68,8 @@ def draw_summary(file: Path, summary: Summary, labels: Path) -> None:
             ax.yaxis.get_major_locator().set_params(integer=True)
         dataset, checkpoint = _origin(labels)
         _head(figure, f"{dataset}: {len(summary.episodes)} episodes", checkpoint)
-        if succeeds is not None:
-            figure.legend(*final.get_legend_handles_labels(), loc="outside lower left", ncols=2)
+        if coloured:
+            figure.legend(*final.get_legend_handles_labels(), loc="outside lower left", ncols=len(coloured))
         save(figure, file)
 
 
@@ -88,9 +85,10 @@ def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Pa
     with matplotlib.style.context(STYLE, after_reset=True):
         figure = Figure(figsize=(WIDTH_IN, HEADLINE_IN + EVALUATION_IN * count), layout="constrained")
         axes = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-        origins = [_origin(each) for each in labels]
+        origins, known = [_origin(each) for each in labels], comparison.is_success
+        outcomes = {} if known is None else {"successes": known, "failures": ~known}
         for ax, each, (_, checkpoint) in zip(axes, comparison.evaluations, origins, strict=True):
-            _draw_ends(ax, each.final_progress, comparison.is_success, {True: "successes", False: "failures"})
+            _draw_ends(ax, each.final_progress, outcomes, {"successes": SUCCESS_COLOUR, "failures": FAILURE_COLOUR})
             measures = {
                 "VOC": each.spearman,
                 "AUROC of progress": each.by_progress and each.by_progress.auroc,
@@ -110,15 +108,18 @@ def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Pa
 
 
 def _draw_ends(
-    ax: Axes, final: npt.NDArray[Any], is_success: npt.NDArray[np.bool_] | None, names: Mapping[bool, str]
+    ax: Axes,
+    final: npt.NDArray[Any],
+    outcomes: Mapping[str, npt.NDArray[np.bool_]],
+    colours: Mapping[str, str],
 ) -> None:
-    """Draw a histogram of final progress; with outcomes, successes stand on failures."""
-    if is_success is None:
+    """Draw a histogram of final progress; if outcomes are known, the last of them, a failure, stands below."""
+    if not outcomes:
         ax.hist(final, bins=BINS, range=(0, 1))
     else:
-        parts = {names[outcome]: final[is_success == outcome] for outcome in (False, True)}
-        colours = [FAILURE_COLOUR, SUCCESS_COLOUR]
-        ax.hist([*parts.values()], bins=BINS, range=(0, 1), color=colours, label=[*parts], stacked=True)
+        names = [*reversed(outcomes)]
+        shares, shown = [final[outcomes[name]] for name in names], [colours[name] for name in names]
+        ax.hist(shares, bins=BINS, range=(0, 1), color=shown, label=names, stacked=True)
     ax.set(ylabel="episodes", xlim=(0, 1))
 
 

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client import Float32Array
 from rfm_client.episodes import SuccessRule
 from rfm_labels.datasets.faults import require
 from rfm_labels.label_files import read_label_table
 from rfm_labels.metadata import PROGRESS, SUCCESS
 
 BACKWARDS_BY = 0.01  # kappa of reward-aligned behaviour cloning; a smaller fall is noise
+VOTING_FRAMES = 3  # at an episode's end: a single frame may be an accident
 _MOST_LISTED = 12
 
 
@@ -27,6 +29,7 @@ class Summary:
     final_progress: float32 [E], at the last frame
     best_success: float32 [E], highest success; None: the checkpoint does not predict success
     last_success: float32 [E], success at the last frame; None as ``best_success``
+    voted_success: float32 [E], as ``voted_success`` returns it; None as ``best_success``
     backwards: float64 [E], share of steps on which progress falls by more than 0.01
     disagreement: float64 [E], range of the cameras' progress, mean over frames; None: no scores of several cameras
     num_frames: of all episodes
@@ -36,31 +39,44 @@ class Summary:
     final_progress: npt.NDArray[np.float32]
     best_success: npt.NDArray[np.float32] | None
     last_success: npt.NDArray[np.float32] | None
+    voted_success: npt.NDArray[np.float32] | None
     backwards: npt.NDArray[np.float64]
     disagreement: npt.NDArray[np.float64] | None
     num_frames: int
 
     @property
-    def never_succeed(self) -> npt.NDArray[np.int64] | None:
-        """int64 [N], episodes in which no frame has a success of 0.5 or more; None: success is not predicted."""
-        return None if self.best_success is None else self.episodes[self.best_success < SuccessRule.threshold]
+    def outcomes(self) -> dict[str, npt.NDArray[np.bool_]]:
+        """bool [E] for each outcome, True at the episodes that have it; empty: success is not predicted.
+
+        An episode succeeds if most of its last three frames have a success of 0.5 or more.
+        """
+        if self.best_success is None or self.voted_success is None:
+            return {}
+        succeeds, ever = (each >= SuccessRule.threshold for each in (self.voted_success, self.best_success))
+        return {"succeed": succeeds, "succeed, then undo it": ever & ~succeeds, "never succeed": ~ever}
 
     def rows(self) -> list[tuple[str, str]]:
         """Return name and value of each row of a table."""
         quantiles = np.quantile(self.final_progress, [0, 0.25, 0.5, 0.75, 1])
         names = ("lowest", "lower quarter", "median", "upper quarter", "highest")
-        failing = "-"
-        if self.never_succeed is not None:
-            numbers = self.never_succeed.tolist()
+        told = {}
+        for outcome, has_it in self.outcomes.items():
+            numbers = self.episodes[has_it].tolist()
             more = " ..." if len(numbers) > _MOST_LISTED else ""
-            failing = f"{len(numbers)}: {', '.join(map(str, numbers[:_MOST_LISTED]))}{more}"
+            told[outcome] = f"{len(numbers)}: {', '.join(map(str, numbers[:_MOST_LISTED]))}{more}"
         return [
             ("episodes", str(len(self.episodes))),
             ("frames", str(self.num_frames)),
             *((f"final progress: {name}", f"{value:.4f}") for name, value in zip(names, quantiles, strict=True)),
-            ("episodes that never succeed", failing),
+            *((f"episodes that {outcome}", numbers) for outcome, numbers in (told or {"succeed": "-"}).items()),
             ("steps on which progress falls", f"{self.backwards.mean():.1%}"),
         ]
+
+
+def voted_success(success: Float32Array) -> float:
+    """Return the success, [T], that most of the last three frames reach: an episode succeeds at thresholds up to it."""
+    voters = np.sort(success[-VOTING_FRAMES:])
+    return float(voters[(len(voters) - 1) // 2])
 
 
 def summarise(file: Path) -> Summary:
@@ -74,7 +90,7 @@ def summary_of(labels: Any) -> Summary:
     """Return the summary of labels, a pyarrow Table with the parts' column names."""
     episodes = labels["episode_index"].to_numpy()
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1)).tolist()
-    numbers, final, best, last, backwards, apart = [], [], [], [], [], []
+    numbers, final, best, last, voted, backwards, apart = [], [], [], [], [], [], []
     for start, end in zip(starts, [*starts[1:], len(labels)], strict=True):
         table = labels.slice(start, end - start)
         progress = table[PROGRESS].to_numpy()
@@ -88,6 +104,7 @@ def summary_of(labels: Any) -> Summary:
             success = table[SUCCESS].to_numpy()
             best.append(success.max())
             last.append(success[-1])
+            voted.append(voted_success(success))
         if cameras:
             apart.append(np.ptp(np.stack(cameras), axis=0).mean(dtype=np.float64))
     return Summary(
@@ -95,6 +112,7 @@ def summary_of(labels: Any) -> Summary:
         final_progress=np.array(final, np.float32),
         best_success=np.array(best, np.float32) if best else None,
         last_success=np.array(last, np.float32) if last else None,
+        voted_success=np.array(voted, np.float32) if voted else None,
         backwards=np.array(backwards, np.float64),
         disagreement=np.array(apart, np.float64) if apart else None,
         num_frames=len(labels),

@@ -7,7 +7,7 @@ everything that decides its labels, so any run may use it.
 ``<name>_progress.parquet``: the format of LeRobot's reward-aligned behaviour cloning and of the Hub's visualizer.
 Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and those
 of each camera. If an episode has several tasks, ``progress`` is each frame's own, and ``progress_sparse`` the sum of
-what all tasks have gained.
+what all tasks have gained. If the model skips frames, ``progress`` is NaN there, and ``progress_sparse`` filled.
 
 ``reward_signals/<name>.parquet``: LeRobot's frame signals (schema version 1), as its open pull requests propose them.
 Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and
@@ -20,13 +20,14 @@ import io
 import os
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rfm_client import Float32Array
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.metadata import (
     PROGRESS,
@@ -41,6 +42,7 @@ from rfm_labels.metadata import (
     canonical_json,
     skipping_in,
 )
+from rfm_labels.options import Fill
 from rfm_labels.plan import Item, Plan
 
 IDENTITY = ("index", "episode_index", "frame_index")  # columns of every table of labels
@@ -48,6 +50,7 @@ PROGRESS_ENDING = "_progress.parquet"
 PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run sees if its labels still hold
+FILL_KEY = b"rfm.progress_sparse_fill"  # rule of the frames that the model skipped, if it skipped any
 COST_KEY = b"rfm.cost"  # apart from the provenance, which is equal for equal runs
 SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability", REMAINING: "remaining_time_s"}
 _POTENTIAL, _IS_SCORED = "potential", "is_inference_frame"
@@ -105,7 +108,7 @@ class Parts:
         parquet.write_table(table, content)
         with self._writing():
             if self._is_local:
-                with whole_file(Path(self._path(item))) as file:
+                with whole_files(Path(self._path(item))) as (file,):
                     file.write_bytes(content.getvalue())
             else:
                 self._fs.pipe_file(self._path(item), content.getvalue())  # object stores show only whole objects
@@ -166,16 +169,22 @@ class Parts:
 
 
 @contextmanager
-def whole_file(target: Path) -> Iterator[Path]:
-    """Yield a file to write, which replaces ``target`` in one step after the block, but not after an exception."""
-    written = target.with_name(f".tmp-{uuid.uuid4().hex}")
+def whole_files(*targets: Path) -> Iterator[list[Path]]:
+    """Yield a file to write for each target. After the block, once all are on the disk, each replaces its target.
+
+    After an exception in the block, or a failed write, no target has changed.
+    """
+    written = [target.with_name(f".tmp-{uuid.uuid4().hex}") for target in targets]
     try:
         yield written
-        with written.open("rb") as whole:
-            os.fsync(whole.fileno())
-        written.replace(target)
+        for file in written:
+            with file.open("rb") as whole:
+                os.fsync(whole.fileno())
+        for file, target in zip(written, targets, strict=True):
+            file.replace(target)
     finally:
-        written.unlink(missing_ok=True)
+        for file in written:
+            file.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -191,8 +200,8 @@ class Sidecar:
     metadata: Mapping[bytes, bytes]
 
 
-def progress_file(path: Path, plan: Plan, columns: Sequence[str], cost: Cost | None) -> Sidecar:
-    """Return the progress file for these columns of the parts. cost: None: unknown"""
+def progress_file(path: Path, plan: Plan, columns: Sequence[str], cost: Cost | None, fill: Fill) -> Sidecar:
+    """Return the progress file for these columns of the parts. cost: None: unknown; fill: as in ``LabelOptions``"""
     checkpoint = plan.recipe.checkpoint
     model = checkpoint.source or checkpoint.weights_digest
     metadata = {
@@ -201,16 +210,26 @@ def progress_file(path: Path, plan: Plan, columns: Sequence[str], cost: Cost | N
         **_of_run(plan, cost),
     }
     named = {name: name for name in columns}
-    if _has_several_tasks(plan):
+    if is_filled(columns, fill):
+        metadata[FILL_KEY] = fill.encode()
+    if is_filled(columns, fill) or _has_several_tasks(plan):
         return Sidecar(path, {_TOTAL: "progress_sparse", **named}, metadata)
     return Sidecar(path, {**named, PROGRESS: "progress_sparse"}, metadata)
 
 
-def with_totals(labels: Any, plan: Plan) -> Any:
-    """Return the labels with all columns that the label files need. labels: table of ``Parts.read_all``
+def is_filled(columns: Sequence[str], fill: Fill) -> bool:
+    """True if the model skipped frames, at which ``progress_sparse`` is filled. columns: of the parts"""
+    return fill == "linear" and skipping_in(columns) is not None
+
+
+def with_totals(labels: Any, plan: Plan, fill: Fill) -> Any:
+    """Return the labels with all columns that the label files need.
+
+    labels: table of ``Parts.read_all``; fill: as in ``LabelOptions``
 
     Reward-aligned behaviour cloning weights a frame by the difference of two frames' progress, and 0 if it falls. Where
-    an episode's task changes, progress begins anew, so the sum of all tasks' gains takes its place.
+    an episode's task changes, progress begins anew, so the sum of all tasks' gains takes its place. A frame without
+    progress gets the weight 1 from it, so the frames that the model skipped are filled.
     """
     import pyarrow as pa
 
@@ -223,7 +242,7 @@ def with_totals(labels: Any, plan: Plan) -> Any:
         derived[_IS_SCORED] = np.isfinite(labels[skipping].to_numpy()).astype(np.float32)
     for name, values in derived.items():
         labels = labels.append_column(name, pa.array(values))
-    if not _has_several_tasks(plan):
+    if not (is_filled(labels.column_names, fill) or _has_several_tasks(plan)):
         return labels
     progress = labels[PROGRESS].to_numpy()
     total, begin = progress.copy(), 0
@@ -233,8 +252,21 @@ def with_totals(labels: Any, plan: Plan) -> Any:
             own = slice(begin + first, end)
             begun = np.nan_to_num(progress[own.start])  # of a model that compares frames: 0, before its first answer
             total[own] = progress[own] - begun + total[own.start - 1]
+        if is_filled(labels.column_names, fill):
+            total[begin:end] = _filled(total[begin:end])
         begin = end
     return labels.append_column(_TOTAL, pa.array(total))
+
+
+def _filled(progress: Float32Array) -> Float32Array:
+    """Return an episode's progress, [T], with lines between the answers, as LeRobot's ``interpolate_progress``.
+
+    The model measures its first answer from the first frame, whose progress is 0.
+    """
+    known = np.isfinite(progress)
+    known[0], frames = True, np.arange(len(progress))
+    filled: Float32Array = np.interp(frames, frames[known], np.nan_to_num(progress[known])).astype(np.float32)
+    return filled
 
 
 def _has_several_tasks(plan: Plan) -> bool:
@@ -296,14 +328,14 @@ def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    with ExitStack() as whole:
-        for sidecar in sidecars:
+    for sidecar in sidecars:
+        sidecar.path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_files(*(sidecar.path for sidecar in sidecars)) as files:
+        for file, sidecar in zip(files, sidecars, strict=True):
             own = labels.select([*IDENTITY, *sidecar.columns])
             own = own.rename_columns([*IDENTITY, *sidecar.columns.values()])
             fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
             schema = pa.schema(fields, metadata={**sidecar.metadata, **(labels.schema.metadata or {})})
-            sidecar.path.parent.mkdir(parents=True, exist_ok=True)
-            file = whole.enter_context(whole_file(sidecar.path))
             table = own.cast(schema)
             parquet.write_table(table, file, row_group_size=_ROWS_AT_A_TIME)
             if not _holds(file, table):

@@ -246,11 +246,9 @@ def _rows(summary: Summary) -> list[dict[str, Any]]:
         "final_progress": summary.final_progress.tolist(),
         "backwards": summary.backwards.tolist(),
     }
-    if summary.best_success is not None and summary.last_success is not None:
-        columns["best_success"] = summary.best_success.tolist()
-        columns["last_success"] = summary.last_success.tolist()
-    if summary.disagreement is not None:
-        columns["disagreement"] = summary.disagreement.tolist()
+    for name in ("best_success", "last_success", "voted_success", "disagreement"):
+        if (values := getattr(summary, name)) is not None:
+            columns[name] = values.tolist()
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 

@@ -83,20 +83,52 @@ class ShortName:
 
 @dataclass(frozen=True)
 class FittingTable:
-    """A table whose headers stand on one line where they fit.
+    """A table whose headers stand on one line where they fit. Of too many columns, some stand in tables below.
 
-    wide, narrow: the table with each header on one line, and with headers as narrow as their columns
+    wide, narrow: headers on one line, and as narrow as their columns
+    names, are_short: as ``table`` makes them of its arguments
     """
 
-    wide: Table
-    narrow: Table
+    title: str
+    wide: Sequence[str]
+    narrow: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    names: int
+    are_short: Sequence[bool]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the wide table if it fits, else the narrow one."""
+        """Yield the table with wide headers if it fits, else with narrow ones, in parts if a cell were cut."""
         from rich.measure import Measurement
 
-        width = Measurement.get(console, options.update(max_width=UNLIMITED), self.wide).maximum
-        yield self.wide if width <= options.max_width else self.narrow
+        def measured(shown: Table) -> Measurement:
+            return Measurement.get(console, options.update(max_width=UNLIMITED), shown)
+
+        begin, end = self.names, len(self.wide)
+        if measured(whole := self._part(self.wide, begin, end)).maximum <= options.max_width:
+            yield whole
+            return
+        while True:
+            parts = (self._part(self.narrow, begin, last) for last in range(end, begin, -1))
+            fitting = (each for each in parts if measured(each).minimum <= options.max_width)
+            yield (part := next(fitting, self._part(self.narrow, begin, begin + 1)))
+            begin += len(part.columns) - self.names
+            if begin >= end:
+                return
+
+    def _part(self, headers: Sequence[str], begin: int, end: int) -> Table:
+        """Return a table of the names and these columns; the title stands above the first."""
+        from rich import box
+        from rich.table import Table
+        from rich.text import Text
+
+        title = Text(self.title) if self.title and begin == self.names else None
+        shown = Table(box=box.SIMPLE_HEAD, collapse_padding=True, title=title, title_justify="left")
+        columns = [*range(self.names), *range(begin, min(end, len(headers)))]
+        for column in columns:
+            shown.add_column(Text(headers[column]), overflow="fold", no_wrap=self.are_short[column])
+        for row in self.rows:
+            shown.add_row(*(ShortName(row[each]) if each < self.names else Text(row[each]) for each in columns))
+        return shown
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> FittingTable:
@@ -111,24 +143,7 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
         textwrap.fill(column, max(width, *map(len, column.split()))) if is_short and column else column
         for column, width, is_short in zip(columns, widest, are_short, strict=True)
     ]
-    return FittingTable(*(_table(title, headers, rows, names, are_short) for headers in (columns, folded)))
-
-
-def _table(
-    title: str, headers: Sequence[str], rows: Sequence[Sequence[str]], names: int, are_short: Sequence[bool]
-) -> Table:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    shown = Table(
-        box=box.SIMPLE_HEAD, collapse_padding=True, title=Text(title) if title else None, title_justify="left"
-    )
-    for header, is_short in zip(headers, are_short, strict=True):
-        shown.add_column(Text(header), overflow="fold", no_wrap=is_short)
-    for row in rows:
-        shown.add_row(*map(ShortName, row[:names]), *map(Text, row[names:]))
-    return shown
+    return FittingTable(title, columns, folded, rows, names, are_short)
 
 
 def print_tables(*tables: object) -> None:

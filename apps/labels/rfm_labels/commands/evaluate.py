@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from rfm_labels import LabelComparison
 
 LEGEND = (
-    "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, and of progress, at the last frame; "
-    "0.5 is chance. Threshold: of success at the last frame, with the best balanced accuracy. Falls: steps on which "
-    "progress falls by more than 0.01. Frames/s: of the run that labelled, with decoding."
+    "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, by the vote of the last three frames, "
+    "and of progress at the last frame; 0.5 is chance. Threshold: of the vote, with the best balanced accuracy. Falls: "
+    "steps on which progress falls by more than 0.01. Frames/s: of the run that labelled, with decoding."
 )
 
 
@@ -98,6 +98,8 @@ def _print_tables(comparison: LabelComparison) -> None:
         counts += f": {int(known.sum())} successes, {int((~known).sum())} failures"
     if comparison.num_left_out:
         counts += f"; {comparison.num_left_out} left out, which not all files have"
+    if comparison.num_without_outcome:
+        counts += f"; {comparison.num_without_outcome} left out, whose outcome is empty"
     print_table(counts, columns, rows)
     if comparison.agreements:
         pairs = [
@@ -117,6 +119,7 @@ def document(comparison: LabelComparison) -> dict[str, Any]:
         "episodes": list(comparison.episodes),
         "is_success": None if comparison.is_success is None else comparison.is_success.tolist(),
         "num_left_out": comparison.num_left_out,
+        "num_without_outcome": comparison.num_without_outcome,
         "evaluations": evaluations,
         "agreements": [asdict(each) for each in comparison.agreements],
     }

@@ -3,7 +3,7 @@
 
 import { curvesOf, datasets, episodesOf, faultsOf, previewOf, videoOf } from "./api.js";
 import { Asking } from "./asking.js";
-import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, WORST_FIRST } from "./episodes.js";
+import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, UNDONE, WORST_FIRST } from "./episodes.js";
 import { deadLink, failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
@@ -390,12 +390,14 @@ export class DatasetTab {
     const labelled = this.#episodes.filter(({ final_progress: final }) => final !== undefined && final !== null);
     const judgedOnes = labelled.filter(({ never_succeeds: never }) => never !== null);
     const never = judgedOnes.filter(({ never_succeeds: each }) => each).length;
+    const undone = judgedOnes.filter(({ verdict }) => verdict === UNDONE).length;
     const [numAll, isWhole] = [this.#episodes.length, labelled.length === this.#episodes.length];
     const told = isWhole ? [] : [`${labelled.length} of ${numAll} episodes are labelled.`];
     const verb = never === 1 ? "succeeds" : "succeed";
     const broken = this.#episodes.filter(({ fault }) => fault).length;
     if (broken) told.push(`${broken} cannot be labelled now: see their tasks.`);
     if (judgedOnes.length) told.push(`${never} of ${judgedOnes.length} ${isWhole ? "episodes" : "of them"} never ${verb}.`);
+    if (undone) told.push(`${undone} ${undone === 1 ? "succeeds, then undoes" : "succeed, then undo"} it.`);
     this.#page["ends-told"].textContent = told.join(" ");
     this.#histogram.show(labelled);
   }

@@ -7,6 +7,7 @@ import { shown, shownBelow } from "./text.js";
 import { VirtualRows } from "./virtual.js";
 
 export const WORST_FIRST = "worst first";
+export const [SUCCEEDS, UNDONE, NEVER] = ["succeeds", "succeeds, then undoes it", "never succeeds"];
 export const PLAIN_ORDER = "episode"; // of episodes that nothing is known of
 
 /** By name: what an order compares; true: the highest value comes first. */
@@ -40,14 +41,16 @@ export const FILTER_NAMES = Object.keys(FILTERS);
 /** The episodes with what follows from a threshold, and from other labels: rows by episode, or null. */
 export function judged(episodes, threshold, others) {
   return episodes.map((episode) => {
-    const never = neverSucceeds(episode, threshold);
+    const verdict = verdictOf(episode, threshold);
     const other = others?.get(episode.episode);
+    const theirs = other && verdictOf(other, threshold);
     const isBoth = isKnown(episode.final_progress) && isKnown(other?.final_progress);
     return {
       ...episode,
-      never_succeeds: never,
+      verdict,
+      never_succeeds: verdict && verdict === NEVER,
       difference: isBoth ? Math.abs(episode.final_progress - other.final_progress) : null,
-      verdict_differs: other && never !== null ? neverSucceeds(other, threshold) === !never : null,
+      verdict_differs: verdict && theirs ? (verdict === SUCCEEDS) !== (theirs === SUCCEEDS) : null,
     };
   });
 }
@@ -168,8 +171,11 @@ export class EpisodeTable {
   }
 }
 
-function neverSucceeds({ best_success: best }, threshold) {
-  return isKnown(best) ? best < threshold : null;
+/** By the vote of the last frames, as in the labels' summary; null: success is not predicted. */
+function verdictOf({ best_success: best, voted_success: voted }, threshold) {
+  if (!isKnown(best)) return null;
+  if (voted >= threshold) return SUCCEEDS;
+  return best >= threshold ? UNDONE : NEVER;
 }
 
 function isKnown(value) {

@@ -2,12 +2,13 @@
 // How many episodes end with which progress, and how many of them succeed, as bars drawn by uPlot.
 
 import { MARK_PX, themed } from "./chart.js";
+import { SUCCEEDS, UNDONE } from "./episodes.js";
 import uPlot from "./uplot/uPlot.esm.js";
 
 const NUM_BINS = 20;
 const COUNTS = [1, 2, 5].flatMap((digit) => [1, 10, 100, 1e3, 1e4, 1e5].map((power) => digit * power)).sort((a, b) => a - b);
 
-/** Bars in `host`: what succeeds below, what does not above. */
+/** Bars in `host`: what succeeds below, what is undone above it, what never succeeds on top. */
 export class Histogram {
   #host;
   #plot = null;
@@ -19,19 +20,21 @@ export class Histogram {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#plot?.redraw());
   }
 
-  /** Draws episodes: each with a `final_progress`; of some it is known whether they never succeed. */
+  /** Draws episodes: each with a `final_progress`, and a `verdict` or null. */
   show(episodes) {
-    const [all, good] = [new Array(NUM_BINS).fill(0), new Array(NUM_BINS).fill(0)];
-    for (const { final_progress: final, never_succeeds: never } of episodes) {
+    const [all, ever, good] = [0, 1, 2].map(() => new Array(NUM_BINS).fill(0));
+    for (const { final_progress: final, verdict } of episodes) {
       const bin = Math.min(Math.floor(Math.min(Math.max(final, 0), 1) * NUM_BINS), NUM_BINS - 1);
       all[bin] += 1;
-      if (never === false) good[bin] += 1;
+      if (verdict === SUCCEEDS || verdict === UNDONE) ever[bin] += 1;
+      if (verdict === SUCCEEDS) good[bin] += 1;
     }
     const edges = all.map((_, index) => index / NUM_BINS);
     this.#most = Math.max(1, ...all);
-    const told = edges.map((edge, bin) => `${all[bin]} from ${edge.toFixed(2)}${good[bin] ? ` of which ${good[bin]} succeed` : ""}`);
+    const undone = (bin) => ever[bin] > good[bin] ? ` and ${ever[bin] - good[bin]} succeed but undo it` : "";
+    const told = edges.map((edge, bin) => `${all[bin]} from ${edge.toFixed(2)}${ever[bin] ? ` of which ${good[bin]} succeed${undone(bin)}` : ""}`);
     this.#host.setAttribute("aria-label", `Episodes by final progress: ${told.join(", ")}`);
-    const data = [edges, all, good];
+    const data = [edges, all, ever, good];
     if (this.#plot) this.#plot.setData(data);
     else this.#plot = this.#newPlot(data);
   }
@@ -52,7 +55,7 @@ export class Histogram {
       cursor: { show: false },
       scales: { x: { time: false, range: [0, 1] }, y: { range: () => [0, this.#most * 1.05] } },
       axes: [{ ...axis, size: 24, space: MARK_PX, label: "final progress" }, { ...axis, size: 36, label: "episodes", incrs: COUNTS }],
-      series: [{}, bars("--bad-bar"), bars("--line")],
+      series: [{}, bars("--bad-bar"), bars("--undone-bar"), bars("--line")],
     }, data, this.#host);
   }
 
