@@ -38,9 +38,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from rfm_client import InvalidSampleError
 from rfm_client.options import InvalidValueError, require
 from rfm_rl.envs import INFO, ClientSource, RewardedEnvs
+from rfm_rl.own_resets import HAS_RESET, check_observes_its_end, check_renders_its_end, watched_resets
 from rfm_rl.own_rewards import (
     RETURNS,
     WritingMonitor,
@@ -52,8 +52,6 @@ from rfm_rl.own_rewards import (
 from rfm_rl.rewards import Info, RewardOptions
 
 DEFAULTS = RewardOptions()
-_ENDS = "final_obs", "final_observation", "terminal_observation"  # in info, if the last step also reset
-_RESETS = "final_info"  # in info, if the last step of LeRobot's environments reset; the observation is from before
 _ALL = np.ones(1, np.bool_)
 _REMEDY = "call reset, or wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
 _UNBATCH = (
@@ -107,12 +105,13 @@ class RewardModelWrapper(gymnasium.Wrapper):
         """Step the environment; return the reward model's reward. Raises RewardError, ResetNeeded."""
         resets = any(wrapper.autoreset for wrapper in self._autoresets)
         self._envs.check_step(_ALL & resets)
-        observation, env_reward, terminated, truncated, info = self.env.step(action)
+        with watched_resets(self.env) as own_resets:
+            observation, env_reward, terminated, truncated, info = self.env.step(action)
         if resets:
             self._set_task(info)
         elif terminated or truncated:
-            _check_shows_its_end(info)
-            check_renders_its_end(self._options, info)
+            check_observes_its_end(info)
+            check_renders_its_end(self._options, "info", bool(own_resets) or HAS_RESET in info)
         said = [float(env_reward)], [bool(terminated)], [bool(truncated)]
         (reward,), _ = self._envs.keep(lambda _: self._frame(observation), *said)
         episode = self._envs.episodes[0]
@@ -157,22 +156,6 @@ def _is_batch(env: gymnasium.Env[Any, Any]) -> bool:
     """True for an environment of ManiSkill or Isaac Lab, unless a wrapper picks the only environment of its batch."""
     single = getattr(env.unwrapped, "single_observation_space", None)
     return single is not None and all(layer.observation_space != single for layer in _layers(env))
-
-
-def _check_shows_its_end(info: Info) -> None:
-    found = [key for key in _ENDS if key in info]
-    if found:
-        expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"
-        remedy = "turn off its own reset, and wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
-        raise InvalidSampleError.at("info", expected, f"{', '.join(found)}; {remedy}")
-
-
-def check_renders_its_end(options: RewardOptions, info: Info, where: str = "info") -> None:
-    """Raise InvalidSampleError if ``render()`` already shows the next episode. info: of an episode's last step."""
-    if options.renders and _RESETS in info:
-        expected = f"no {_RESETS} with frames from render(), which must show the last frame of the episode"
-        remedy = "it has reset in this step: take frames from the observation, frames_from='pixels'"
-        raise InvalidSampleError.at(where, expected, f"{_RESETS}; {remedy}")
 
 
 def _check_statistics(env: gymnasium.Env[Any, Any], options: RewardOptions) -> None:
