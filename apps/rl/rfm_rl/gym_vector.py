@@ -21,7 +21,7 @@ from rfm_client.options import InvalidValueError, require
 from rfm_rl.envs import INFO, ClientSource, Mask, RewardedEnvs
 from rfm_rl.gym import DEFAULTS, check_frame_source, check_kind, tasks_of
 from rfm_rl.own_resets import HAS_RESET, check_renders_its_end, watched_resets
-from rfm_rl.own_rewards import RETURNS, correct_statistics, refuse_statistics
+from rfm_rl.own_rewards import RETURNS, correct_statistics
 from rfm_rl.rewards import Info, RewardOptions
 
 _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
@@ -50,8 +50,7 @@ class RewardModelVectorWrapper(VectorWrapper):
     Raises ValueError if ``options`` names a source of frames that ``env`` lacks; for SAME_STEP with frames from
     ``render()``, which never shows an episode's last frame; and for ``terminate_on_success`` unless DISABLED, because
     an environment that resets by itself does not know of the success. In these two cases, wrap each sub-environment in
-    RewardModelWrapper instead. Raises ValueError, too, for ``terminate_on_success`` with a RecordEpisodeStatistics
-    inside, which would miss that end; TypeError if ``env`` is no ``gymnasium.vector.VectorEnv``.
+    RewardModelWrapper instead. Raises TypeError if ``env`` is no ``gymnasium.vector.VectorEnv``.
     """
 
     def __init__(
@@ -65,8 +64,6 @@ class RewardModelVectorWrapper(VectorWrapper):
         check_frame_source(options, env.render_mode, env.single_observation_space)
         _check_tells_resets(env, options)
         autoreset_mode = _checked_autoreset_mode(env, options)
-        if options.terminate_on_success is not None and _has_statistics(env):
-            refuse_statistics(options.terminate_on_success, "RecordEpisodeStatistics(RewardModelVectorWrapper(...))")
         tasks = tasks_of(task, env.num_envs)
         super().__init__(env)  # after the checks: a refused wrapper must not close the environments when collected
         has_copies = _of_each(env, "has_wrapper_attr", "copies_observations") or [hasattr(env, "auto_reset")]
@@ -75,6 +72,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         )
         self._options = options
         self._autoreset_mode = autoreset_mode
+        self._told_of_ends = _has_statistics(env)
         is_here = options.renders and isinstance(env.unwrapped, SyncVectorEnv)
         self._rendered_here = list(env.unwrapped.envs) if is_here else []
 
@@ -116,8 +114,8 @@ class RewardModelVectorWrapper(VectorWrapper):
         shown = partial(self._frame, self._shown(observations))
         rewards, stepped = self._envs.keep(shown, as_array(env_rewards), terminated, truncated, final=final)
         for index, episode in stepped.items():
-            correct_statistics(infos, index, episode)
-            scores: Info = {INFO: episode.info()}
+            missed = correct_statistics(infos, index, episode, told_of_ends=self._told_of_ends)
+            scores: Info = {INFO: episode.info(), **missed}
             has_reset = resets_at_once and ended[index]
             infos = self._add_info(infos, {"final_info": scores} if has_reset else scores, index)
         infos = self._with_scores(infos, resetting | (ended & resets_at_once))
