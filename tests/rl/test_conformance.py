@@ -15,12 +15,11 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 
-from coded_env import Code, CodedEnv, CodeReader, Recorder, frame_of
+from coded_env import Code, CodedEnv, CodeReader, Recorder, ReturningEnv, frame_of
 from reward_doors import (
     BY_CALLER,
     DOORS,
     ENDED_BY_SUCCESS,
-    SAME_STEP,
     TASKS,
     VECTORS,
     AutoresetAbove,
@@ -253,10 +252,10 @@ SENT = [
     for door, kind in DOORS.items()
     for name, source in SOURCES.items()
     for reuse in (False, True)
-    if kind.resets != SAME_STEP or (not (reuse and source) and (door == "VecEnv" or source))  # refused, see below
+    if kind is not VECTORS["SAME_STEP"] or source  # which renders no frames
 ]
 SENT += [
-    pytest.param(kind, "pixels", kind.resets != SAME_STEP, call, id=f"{door}-fails at {call}")
+    pytest.param(kind, "pixels", True, call, id=f"{door}-fails at {call}")
     for door, kind in DOORS.items()
     for call in range(CALLS - 1)
     if not (kind is AutoresetAbove and call in RESETS)  # Gymnasium's wrapper then resets once more
@@ -306,8 +305,8 @@ def test_each_question_has_the_frames_of_its_own_episode(
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "source"), [(InProcesses, "pixels"), (Sb3InProcesses, None)])
 def test_environments_in_processes_send_their_own_frames(recorder: Recorder, kind: type[Door], source: Any) -> None:
-    makers = [partial(CodedEnv, number, lengths, reuse=source is None) for number, lengths in enumerate(LENGTHS)]
-    with kind(makers, recorder, options(frames_from=source)) as door:
+    envs = [CopiedObservation(CodedEnv(number, lengths, reuse=True)) for number, lengths in enumerate(LENGTHS)]
+    with opened(kind, recorder, envs, options(frames_from=source)) as door:
         door.reset()
         for _ in range(CALLS):
             door.step()
@@ -355,42 +354,23 @@ def test_a_vector_goes_on_after_a_reset_of_the_environment_that_lost_a_frame(rec
     assert recorder.calls[-1] == [up_to((0, 0, 2), TASKS[0]), up_to((1, 1, 1), TASKS[1])]
 
 
-class ReturningEnv(CodedEnv):
-    """Every episode begins in one pose; from a number on, it also ends there. since: that number"""
-
-    since = 0
-
-    @property
-    def code(self) -> Code:
-        return self.number, 0, 0 if self.episode >= self.since and self.has_ended else self.t
-
-
-@pytest.mark.parametrize(
-    ("env", "last"),
-    [pytest.param(CodedEnv(reuse=True), 3, id="drawn over"), pytest.param(ReturningEnv(), 0, id="the same pose")],
-)
-@pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if kind.resets == SAME_STEP])
-def test_a_last_frame_that_equals_the_next_first_is_refused_unless_it_is_a_copy(
-    judge: Recorder, kind: type[Door], env: CodedEnv, last: int
-) -> None:
-    expected = r"^(final_obs\[0\]|infos\[0\]\['terminal_observation'\]): expected the last frame .*CopiedObservation"
-    with opened(kind, judge, [env], options()) as door, pytest.raises(InvalidSampleError, match=expected):
-        played(door, 3)
-    with opened(kind, judge, [CopiedObservation(env)], options()) as door:
-        first, *_ = played(door, 3)[0]
-    assert first.rewards == pytest.approx([*PROGRESS[1:3], PROGRESS[last]])
-
-
 @at_each_door
-def test_an_episode_that_ends_where_the_next_begins_is_paid_once_frames_have_differed(
-    judge: Recorder, kind: type[Door]
-) -> None:
-    env = ReturningEnv(TERMINATES, (2,))
-    env.since = 1
-    with opened(kind, judge, [env], options()) as door:
-        first, second, *_ = (episode for episode in played(door, 8)[0] if episode.terminated)
-    assert first.rewards == pytest.approx(PROGRESS[1:3])
-    assert second.rewards == pytest.approx([PROGRESS[1], PROGRESS[0]])
+def test_an_episode_that_ends_where_the_next_begins_is_paid(judge: Recorder, kind: type[Door]) -> None:
+    with opened(kind, judge, [ReturningEnv()], options()) as door:
+        ended = [episode for episode in played(door, 8)[0] if episode.terminated]
+    assert len(ended) >= 2
+    for episode in ended:
+        assert episode.rewards == pytest.approx([PROGRESS[1], PROGRESS[0]])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("since", [0, 1])
+def test_a_process_that_may_have_drawn_over_a_last_frame_is_refused(judge: Recorder, since: int) -> None:
+    """Until an episode's last frame differs from the next one's first."""
+    expected = r"^final_obs\[0\]: expected the last frame .*, got the first frame .*rfm_rl\.CopiedObservation"
+    refused = pytest.raises(InvalidSampleError, match=expected) if since == 0 else nullcontext()
+    with opened(InProcesses, judge, [ReturningEnv(since)], options()) as door, refused:
+        assert len(played(door, 4)[0]) == 3
 
 
 @pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if kind is not VECTORS["SAME_STEP"]])

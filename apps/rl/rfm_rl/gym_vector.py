@@ -20,7 +20,7 @@ from rfm_client import InvalidSampleError, as_array
 from rfm_client.options import InvalidValueError, require
 from rfm_rl.envs import INFO, ClientSource, Mask, RewardedEnvs
 from rfm_rl.gym import DEFAULTS, check_frame_source, check_kind, tasks_of
-from rfm_rl.own_resets import HAS_RESET, check_renders_its_end, watched_resets
+from rfm_rl.own_resets import HAS_RESET, check_renders_its_end, copied_steps, watched_resets
 from rfm_rl.own_rewards import RETURNS, correct_statistics
 from rfm_rl.rewards import Info, RewardOptions
 
@@ -66,15 +66,17 @@ class RewardModelVectorWrapper(VectorWrapper):
         autoreset_mode = _checked_autoreset_mode(env, options)
         tasks = tasks_of(task, env.num_envs)
         super().__init__(env)  # after the checks: a refused wrapper must not close the environments when collected
-        has_copies = _of_each(env, "has_wrapper_attr", "copies_observations") or [hasattr(env, "auto_reset")]
+        here = list(env.unwrapped.envs) if isinstance(env.unwrapped, SyncVectorEnv) else []
+        is_mani_skill = hasattr(env, "auto_reset")  # which keeps copies of last frames
+        in_processes = _of_each(env, "has_wrapper_attr", "copies_observations")
+        has_copies = bool(here) or is_mani_skill or (bool(in_processes) and all(in_processes))
         self._envs = RewardedEnvs(
-            client, options, tasks, remedy=_REMEDY, final="final_obs[{}]", returns_copies=all(has_copies)
+            client, options, tasks, remedy=_REMEDY, final="final_obs[{}]", returns_copies=has_copies
         )
         self._options = options
         self._autoreset_mode = autoreset_mode
         self._told_of_ends = _has_statistics(env)
-        is_here = options.renders and isinstance(env.unwrapped, SyncVectorEnv)
-        self._rendered_here = list(env.unwrapped.envs) if is_here else []
+        self._here = here if options.renders or autoreset_mode is AutoresetMode.SAME_STEP else []  # in this process
 
     @property
     def autoreset_mode(self) -> AutoresetMode:
@@ -101,13 +103,12 @@ class RewardModelVectorWrapper(VectorWrapper):
         resetting = self._resetting
         self._envs.check_step(resetting)
         with ExitStack() as stack:
-            own_resets = [stack.enter_context(watched_resets(env)) for env in self._rendered_here]
+            watch = watched_resets if self._options.renders else copied_steps
+            watched = [stack.enter_context(watch(env)) for env in self._here]
             observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
         terminated, truncated = (as_array(each).astype(np.bool_) for each in (terminations, truncations))
         ended, resets_at_once = terminated | truncated, self._autoreset_mode is AutoresetMode.SAME_STEP
-        have_reset = as_array(infos.get(f"_{HAS_RESET}", False)) | np.array(
-            [bool(each) for each in own_resets] or False
-        )
+        have_reset = as_array(infos.get(f"_{HAS_RESET}", False)) | ([bool(resets) for resets in watched] or False)
         for index in np.flatnonzero(ended & have_reset).tolist():
             check_renders_its_end(self._options, f"infos[{index}]", True)
         final = partial(self._frame, self._final_observations(infos, ended)) if resets_at_once else None

@@ -18,10 +18,9 @@ HAS_RESET = "final_info"  # in info of LeRobot's environments, whose observation
 
 
 class CopiedObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """An environment that returns copies of its observations, for vectors that reset it in the last step.
+    """An environment that returns copies of its observations, for vectors that reset it in another process.
 
-    Such a vector has only the returned array of the last frame. An environment that draws all frames into one array
-    would draw over it.
+    Such a vector keeps the array of an episode's last frame and resets the environment, which may draw over it.
     """
 
     copies_observations = True
@@ -34,20 +33,39 @@ class CopiedObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
 @contextmanager
 def watched_resets(env: gymnasium.Env[Any, Any]) -> Iterator[list[Any]]:
     """Yield a list that grows with each reset in the meantime."""
-    base: Any = env.unwrapped
-    before, resets = vars(base).copy(), []
-    reset = base.reset
+    resets: list[Any] = []
+    reset = env.unwrapped.reset
 
     def watched(*args: Any, **options: Any) -> Any:
         resets.append(options)
         return reset(*args, **options)
 
-    base.reset = watched
-    try:
+    with _replaced(env.unwrapped, "reset", watched):
         yield resets
+
+
+@contextmanager
+def copied_steps(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
+    """Let steps return copies of their observations in the meantime."""
+    step = env.step
+
+    def copied(action: Any) -> Any:
+        observation, *told = step(action)
+        return deepcopy(observation), *told
+
+    with _replaced(env, "step", copied):
+        yield
+
+
+@contextmanager
+def _replaced(owner: Any, name: str, method: Any) -> Iterator[None]:
+    own = {name: vars(owner)[name]} if name in vars(owner) else {}  # else the method is the class's
+    setattr(owner, name, method)
+    try:
+        yield
     finally:
-        del base.reset
-        vars(base).update({name: value for name, value in before.items() if name == "reset"})
+        delattr(owner, name)
+        vars(owner).update(own)
 
 
 def check_observes_its_end(info: Info) -> None:

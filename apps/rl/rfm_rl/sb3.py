@@ -11,6 +11,7 @@ of that episode is then in the info: ``terminal_observation``, or the frame of R
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import gymnasium
@@ -20,7 +21,7 @@ from rfm_client import InvalidSampleError
 from rfm_client.options import require
 from rfm_rl.envs import INFO, ClientSource, RewardedEnvs
 from rfm_rl.gym import DEFAULTS, check_frame_source, tasks_of
-from rfm_rl.own_resets import HAS_RESET, CopiedObservation, check_renders_its_end, watched_resets
+from rfm_rl.own_resets import HAS_RESET, CopiedObservation, check_renders_its_end, copied_steps, watched_resets
 from rfm_rl.own_rewards import (
     RELABELS,
     WritingMonitor,
@@ -103,7 +104,10 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         _check_own_rewards(venv)
         tasks = tasks_of(task, venv.num_envs)
         final = "infos[{}]['terminal_observation']"
-        copies = options.renders or (_has_own_envs(venv) and all(venv.env_is_wrapped(CopiedObservation)))
+        is_here = isinstance(venv.unwrapped, DummyVecEnv) and not options.renders
+        self._here = list(venv.unwrapped.envs) if is_here else []  # environments in this process
+        in_processes = _has_own_envs(venv) and all(venv.env_is_wrapped(CopiedObservation))
+        copies = options.renders or is_here or in_processes
         self._envs = RewardedEnvs(client, options, tasks, remedy="call reset", final=final, returns_copies=copies)
         self._reward_options = options
         super().__init__(venv)  # which reads attributes
@@ -124,7 +128,10 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
 
     def step_wait(self) -> tuple[Any, Any, Any, list[Info]]:
         """End the step; return the model's rewards, float32 [num_envs]. Raises RewardError."""
-        observations, env_rewards, dones, told = self.venv.step_wait()
+        with ExitStack() as stack:
+            for env in self._here:
+                stack.enter_context(copied_steps(env))
+            observations, env_rewards, dones, told = self.venv.step_wait()
         infos = [dict(info) for info in told]  # a list in one ``VecEnv``, a tuple in another
         ended = np.flatnonzero(dones).tolist()
         for index in ended:
