@@ -140,6 +140,18 @@ def test_a_vector_that_does_not_tell_the_last_frame_is_refused(recorder: Recorde
 
 
 @pytest.mark.slow
+def test_rendered_frames_of_lerobot_s_environments_in_processes_are_refused(recorder: Recorder) -> None:
+    """Its VLABench resets in the successful step without a sign, which no other process sees."""
+    env = CodedEnv()
+    env.__module__ = "lerobot.envs.vlabench"
+    with (
+        closing(AsyncVectorEnv([lambda: env], autoreset_mode=NEXT_STEP)) as workers,
+        pytest.raises(ValueError, match=r"^frames_from: expected a source .* 'pixels', for LeRobot's .*, got render"),
+    ):
+        RewardModelVectorWrapper(workers, recorder, TASK, options(frames_from=None))
+
+
+@pytest.mark.slow
 def test_a_reset_that_workers_would_do_twice_is_refused(recorder: Recorder) -> None:
     makers = [partial(CodedEnv, number, (1,)) for number in range(2)]
     workers = AsyncVectorEnv(makers, autoreset_mode=NEXT_STEP, shared_memory=False, context="spawn")
