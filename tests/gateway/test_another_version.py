@@ -8,8 +8,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from gateway_requests import answered, ask_json, failure, filmed, progress
+from gateway_requests import FIRST, Json, answered, ask_json, failure, filmed, progress
 from gateways import StandIn, TestClient, inside
 from rfm_client import ModelInfo
 from shelves import V2
@@ -54,3 +55,22 @@ def test_prefixes_that_several_versions_scored_are_no_curve() -> None:
         assert message.startswith("model_version: expected one for all frames, got ")
         (values,) = answered(ask_json(client, [SAMPLE], use_frame_steps=True))["outputs_progress"]["progress_pred"]
         assert len(values) == 4
+
+
+LOST = {"rfm": FIRST, "rfm_encoder": {**FIRST, "text_embedding": None}, "rfm_frames": SAMPLE["trajectory"]}
+
+
+@pytest.mark.parametrize(("model", "trajectory"), LOST.items(), ids=LOST)
+def test_a_model_that_is_missing_after_a_restart_is_no_fault_of_the_caller(model: str, trajectory: Json) -> None:
+    """Triton loads one model after another. /health asks anew, so that no description is from memory."""
+    triton = StandIn()
+    triton.is_open.set()
+    with inside(triton=triton, metrics_url="http://127.0.0.1:1/metrics") as client:
+        assert client.get("/health").status_code == 200
+        answered(ask_json(client, [progress(trajectory)]))
+        triton.served = {"rfm", "rfm_encoder", "rfm_frames"} - {model}
+        if model != "rfm_encoder":
+            assert model in failure(client.get("/model_info"), 503)
+        response = ask_json(client, [progress(trajectory)])
+        assert failure(response, 503).startswith(model)
+        assert response.headers["Retry-After"] == "1"

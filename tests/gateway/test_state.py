@@ -42,7 +42,7 @@ from gateways import WITHIN_S, Gateway, StandIn, answers, free_port, inside, pol
 from rfm_client import AsyncRewardClient, InvalidSampleError, ModelNotFoundError, ServerUnavailableError, Trajectory
 from rfm_client.serving import ServerStatus
 from rfm_gateway import GatewayConfig
-from rfm_gateway.state import STALL_S, TritonState
+from rfm_gateway.state import STALL_S, ServedParts, TritonState
 from servers import Endpoints
 from tolerances import TOLERANCE
 
@@ -101,7 +101,7 @@ def test_a_model_that_works_is_healthy_until_it_finishes_nothing_for_long(triton
         nonlocal now_s
         late = StandIn(served=["rfm"])
         async with AsyncRewardClient("", transports=[late], retry=False) as client:
-            state = TritonState(client, config, clock_s=lambda: now_s)
+            state = TritonState(client, config, ServedParts(), clock_s=lambda: now_s)
             assert (await state.health()).status == "healthy"
             now_s += STALL_S
             hangs = r"rfm: no answer within 1\.5 s, and nothing finished for 30 s"

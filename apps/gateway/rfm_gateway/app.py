@@ -43,9 +43,9 @@ from rfm_gateway.observe import (
     RequestMiddleware,
     while_connected,
 )
-from rfm_gateway.refusals import Refusals, asked
+from rfm_gateway.refusals import LingerMiddleware, Refusals, asked
 from rfm_gateway.scoring import Evaluator
-from rfm_gateway.state import TritonState, message_of
+from rfm_gateway.state import ServedParts, TritonState, message_of
 
 _REFERENCE = "#/components/schemas/{model}"
 _MODELS = (schema.EvaluateBatchRequest, schema.InvalidRequest, schema.Failure)
@@ -78,7 +78,8 @@ def create_app(
     folder = config.resolved_folder
     client, metrics = client or config.client(), GatewayMetrics()
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
-    state, refusals = TritonState(client, config), Refusals()
+    parts, refusals = ServedParts(), Refusals()
+    state = TritonState(client, config, parts)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -105,10 +106,11 @@ def create_app(
             allow_headers=["*"],
             expose_headers=[REQUEST_ID_HEADER, WARNING_HEADER],
         )
+    app.add_middleware(LingerMiddleware)  # the outermost: the answer is counted before
     guards = [] if api_key is None else [Depends(key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
     evaluator = Evaluator(
-        client, limits, folder, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
+        client, limits, parts, folder, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
     )
     place = Depends(Places(config, metrics).taken)
     _add_evaluations(guarded, limits, evaluator, metrics, place)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answer requests that are refused or fail, and log why, since many callers never show the text of an answer."""
+"""Answer requests that are refused or fail so that callers see it, and log why, since many never show the text."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import anyio
 from starlette.datastructures import Headers
 from starlette.responses import JSONResponse
-from starlette.types import Scope
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+LINGER_S = 10.0  # as aiohttp
 PERIOD_S = 10.0
 MOST_LINES = 20  # in PERIOD_S
 _MOST_LETTERS = 500  # of a reason
@@ -57,6 +59,43 @@ class Refusals:
         """Return the answer. detail: text, or errors at fields as ``field_errors.invalid`` makes them"""
         self._log.write(f"{code} {asked(scope)}: {_reason(detail)}")
         return JSONResponse({"detail": detail}, code, headers)
+
+
+class LingerMiddleware:
+    """ASGI middleware that goes on reading a body after the answer, for at most LINGER_S, and drops it.
+
+    Closing a connection with unread bytes resets it. Callers that send all before they read, such as urllib, would get
+    that instead of the refusal.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request. The answer ends, and with it the connection, when the body has ended."""
+        is_read = is_answered = False
+
+        async def receive_to_the_end() -> Message:
+            nonlocal is_read
+            message = await receive()
+            is_read = not message.get("more_body", False)
+            return message
+
+        async def send_without_end(message: Message) -> None:
+            nonlocal is_answered
+            is_last = message["type"] == "http.response.body" and not message.get("more_body", False)
+            is_answered = is_last and not is_read
+            await send({**message, "more_body": True} if is_answered else message)
+
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        await self._app(scope, receive_to_the_end, send_without_end)
+        if is_answered:
+            with anyio.move_on_after(LINGER_S):
+                while not is_read:
+                    await receive_to_the_end()
+            await send({"type": "http.response.body"})
 
 
 def asked(scope: Scope) -> str:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -20,7 +19,6 @@ from rfm_client import (
     Float32Array,
     InvalidSampleError,
     ModelInfo,
-    ModelNotFoundError,
     PreferenceResult,
     PreferenceSample,
     ProgressResult,
@@ -41,6 +39,7 @@ from rfm_gateway.field_errors import refused
 from rfm_gateway.folder import RequestFiles
 from rfm_gateway.observe import within
 from rfm_gateway.refusals import LimitedLog
+from rfm_gateway.state import ServedParts
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 FRAME_STEPS_OF_SECONDS = 8  # the same, for a model of remaining seconds
@@ -56,6 +55,7 @@ Text: TypeAlias = Float32Array | InvalidSampleError  # the embedding of a task, 
 class Evaluator:
     """Scores batches with the server behind ``client``.
 
+    parts: that were served: one that is missing now is an error of the server
     folder: folder of files that samples may name, with links resolved; None: no files
     use_frame_steps: for requests that do not say
     refuse_blank: True: black and single-colour frames are invalid
@@ -65,6 +65,7 @@ class Evaluator:
         self,
         client: AsyncRewardClient,
         limits: BodyLimits,
+        parts: ServedParts,
         folder: Path | None = None,
         *,
         use_frame_steps: bool = False,
@@ -72,6 +73,7 @@ class Evaluator:
     ) -> None:
         self._client = client
         self._limits = limits
+        self._parts = parts
         self._folder = folder
         self._use_frame_steps = use_frame_steps
         self._refuse_blank = refuse_blank
@@ -139,7 +141,7 @@ class Evaluator:
         return embeddings, frames
 
     async def _model_info(self, *, frames: bool) -> ModelInfo | None:
-        with suppress(ModelNotFoundError):
+        with self._parts.asking("frames" if frames else "embeddings"):
             return await self._client.model_info(frames=frames)
         return None
 
@@ -148,10 +150,12 @@ class Evaluator:
         firsts = [next(iter(sample.named_trajectories.values())) for sample in samples]
         unread = [first.task for first in firsts if first.has_embeddings and first.text_embedding is None]
         tasks = {task for task in unread if task and task.strip()}
-        with suppress(ModelNotFoundError):
-            texts = await asyncio.gather(*(self._text(task, request_id) for task in tasks))
-            return dict(zip(tasks, texts, strict=True))
-        return {}
+        texts: dict[str, Text] = {}
+        if tasks:
+            with self._parts.asking("encoder"):
+                found = await asyncio.gather(*(self._text(task, request_id) for task in tasks))
+                texts = dict(zip(tasks, found, strict=True))
+        return texts
 
     async def _text(self, task: str, request_id: str) -> Text:
         try:

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from rfm_client import (
     AccessDeniedError,
@@ -32,7 +33,7 @@ MS_PER_S = 1e3
 
 _REMEDIES = {  # for callers over HTTP, who have no option of the client
     AccessDeniedError: "whoever runs the gateway sets --triton-ca-file, --triton-certificate and --triton-key",
-    ModelNotFoundError: "whoever runs the gateway names a served model with --model",
+    ModelNotFoundError: "retry if the server restarts; else whoever runs the gateway names a served model with --model",
     ServerUnavailableError: "whoever runs the gateway starts Triton there (rfm serve does so by itself: retry), or "
     "names another with --triton",
 }
@@ -47,14 +48,43 @@ def message_of(error: RewardError) -> str:
     return str(for_callers)
 
 
+class ServedParts:
+    """The parts of the checkpoint (embeddings, frames, encoder) that were served since the gateway began.
+
+    A part that is missing now is missing for a while: a server that restarts loads one model after another.
+    """
+
+    def __init__(self) -> None:
+        self._seen: set[str] = set()
+
+    @contextmanager
+    def asking(self, part: str) -> Iterator[None]:
+        """Ask about a part. Suppresses ModelNotFoundError for a part that was never served."""
+        try:
+            yield
+            self._seen.add(part)
+        except ModelNotFoundError:
+            if part in self._seen:
+                raise
+
+
 class TritonState:
-    """The state of the client's checkpoint. clock_s: returns the time in seconds"""
+    """The state of the client's checkpoint.
+
+    parts: that must be served for ``/health``
+    clock_s: returns the time in seconds
+    """
 
     def __init__(
-        self, client: AsyncRewardClient, config: GatewayConfig, clock_s: Callable[[], float] = time.monotonic
+        self,
+        client: AsyncRewardClient,
+        config: GatewayConfig,
+        parts: ServedParts,
+        clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._client = client
         self._config = config
+        self._parts = parts
         self._clock_s = clock_s
         self._refreshing = asyncio.Lock()
         self._refreshed_s = float("-inf")
@@ -111,18 +141,12 @@ class TritonState:
             return None
 
     async def _infos(self) -> list[ModelInfo]:
-        """Return facts about the models for embeddings and for raw frames that are served now."""
+        """Return facts about the models for embeddings and for raw frames. Raises ServerError, also for a lost one."""
         infos = []
-        missing = None
-        for frames in (False, True):
-            try:
-                infos.append(await self._client.model_info(frames=frames, refresh=True))
-            except ModelNotFoundError as error:
-                missing = error
-        if not infos:
-            assert missing is not None
-            raise missing
-        return infos
+        for part in ("embeddings", "frames"):
+            with self._parts.asking(part):
+                infos.append(await self._client.model_info(frames=part == "frames", refresh=True))
+        return infos or [await self._client.model_info(frames=True)]
 
     async def _probe_all(self) -> schema.Health | str:
         """Probe every model. Returns a text with the reason if a model neither answers nor is busy."""
