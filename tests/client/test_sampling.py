@@ -16,8 +16,8 @@ import goldens
 from every_score import assert_same_scores, every_score
 from paths import GOLDEN
 from rfm.engine.pixels import Normalisation
-from rfm.rewind.encoders import ImagePreprocessor
-from rfm.vlm.images import QwenImages, fitted_size
+from rfm.families.rewind.encoders import ImagePreprocessor
+from rfm.qwen.images import QwenImages, fitted_size
 from rfm_client import FrameScores, FrameSize, ProgressResult, ProgressSample, Trajectory, UInt8Array
 from rfm_client.frames import Rule, Sampling, resize_frames
 from rfm_client.frames.fit_to_checkpoint import fitted, snapshot

@@ -92,8 +92,8 @@ def proxy(nginx: str, folder: Path, ports: dict[str, int]) -> Iterator[None]:
         process.wait(60)
 
 
+@pytest.mark.nightly
 @pytest.mark.triton
-@pytest.mark.slow
 def test_nginx_passes_on_what_scoring_needs_with_a_key_and_nothing_else(nginx: str, papers: Path) -> None:
     repository = shutil.copytree(ROOT / "model_repository", papers / "my_models")
     gateway, authority = Endpoints.free().http_port, papers / "keys" / "ca.pem"

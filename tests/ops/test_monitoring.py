@@ -21,10 +21,12 @@ import pytest
 import torch
 import yaml
 
+from gateways import inside
 from paths import ROOT
 from repositories import kill_model
+from rfm.supervise.status import Status
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
-from servers import MODEL, Endpoints, serving, wait_for
+from servers import MODEL, Endpoints, Served, serving, wait_for
 from trajectories import random_trajectory
 
 PROMETHEUS = ROOT / "docker" / "prometheus"
@@ -59,6 +61,19 @@ def test_every_alert_says_what_to_do() -> None:
         assert {"summary", "description", "runbook_url"} == rule["annotations"].keys()
         assert rule["annotations"]["runbook_url"] == f"{{{{ $externalURL }}}}/user/operate.md#:~:text={rule['alert']}"
         assert f"\n### {rule['alert']}\n" in RUNBOOKS.read_text()
+
+
+def test_every_metric_of_the_rules_and_the_dashboard_is_told(served: Served) -> None:
+    """By Triton with the models, ``rfm serve`` or the gateway."""
+    with inside() as gateway:
+        told = httpx.get(served.endpoints.metrics_url).text + Status().metrics().decode() + gateway.get("/metrics").text
+    families = {re.sub("_total$", "", name) for name in re.findall(r"^# TYPE (\S+) ", told, re.MULTILINE)}
+    named = {name for text in (*QUERIES, *(rule["expr"] for rule in RULES)) for name in METRIC.findall(text)}
+    recorded = {rule["record"] for rule in RULES if "record" in rule}
+    assert named - {"up"} - recorded > {"nv_inference_request_success", "rfm_serve_ready"}
+    for name in named - {"up"} - recorded:
+        family = re.sub("_(total|bucket|sum|count)$", "", name)
+        assert family in families or name in families or name.startswith(NEEDS_GPU), name
 
 
 def load(url: str, gateway: str, is_over: threading.Event) -> None:
@@ -117,8 +132,8 @@ def loaded(url: str, gateway: str) -> Iterator[None]:
             loading.result()  # its error is the cause of others
 
 
+@pytest.mark.nightly
 @pytest.mark.triton
-@pytest.mark.slow
 def test_prometheus_gets_every_series_of_the_rules_and_the_dashboard_and_notices_a_dead_model(
     prometheus: str, tmp_path: Path
 ) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -112,7 +111,8 @@ def test_a_name_is_loaded_listed_and_unloaded_beside_the_others(running: Running
     running.models("unload", "listed")
 
 
-@pytest.mark.parametrize("family", ["rynnvalue", pytest.param("robodopamine", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("family", ["rynnvalue", "robodopamine"])
 def test_a_model_whose_progress_may_be_missing_is_rolled_out(running: Running, family: str) -> None:
     """The small Robo-Dopamine also writes answers without a score."""
     checkpoint = {"rynnvalue": "bro_symlog_bf16_tied", "robodopamine": "grm_qwen3vl_bf16_tied"}[family]
@@ -195,34 +195,22 @@ def test_another_url_than_a_server_s_for_grpc_is_refused(url: str, message: str)
         assert message in done.stderr.splitlines()[-1]
 
 
-def break_settings(checkpoint: Path) -> None:
-    (checkpoint / "config.json").write_text("{")
-
-
-def break_weights(checkpoint: Path) -> None:
-    shutil.copy(PLAIN.checkpoint / "config.json", checkpoint)
-    weights = safetensors.torch.load_file(checkpoint / "model.safetensors")
-    weights["progress_head.4.weight"] *= 1.5  # numbers all the same
-    safetensors.torch.save_file(weights, checkpoint / "model.safetensors", {"format": "pt"})
-
-
 def test_a_broken_version_is_never_asked_and_the_old_one_stays(running: Running, tmp_path: Path) -> None:
     name, sample = "fragile", ProgressSample(random_trajectory(1, 5))
     running.export_plain(name)
     running.models("load", name)
     running.export_plain(name, rollout.other_checkpoint(tmp_path / "other", PLAIN.checkpoint))
     expected = load_engine(PLAIN.name).evaluate([sample])
+    weights = running.repository / name / "2" / "checkpoint" / "model.safetensors"
+    changed = safetensors.torch.load_file(weights)
+    changed["progress_head.4.weight"] *= 1.5  # numbers all the same
+    safetensors.torch.save_file(changed, weights, {"format": "pt"})
     with callers(running.served.endpoints.grpc_url, [sample], {"1": expected}, model=name) as tally:
-        for damage, reason in (
-            (break_settings, "/2/checkpoint/config.json: expected JSON, got Expecting property"),
-            (break_weights, "/2: expected the weights that were exported ("),
-        ):
-            damage(running.repository / name / "2" / "checkpoint")
-            line = running.refused("rollout", name, "2")
-            assert line.startswith(f"rfm: {name} version 2: ")
-            assert reason in line
-            assert line.endswith(f"(served as before: {name}: version 1)")
-            assert (running.served_by_restart(name), running.ready(name)) == ([1], ["1"])
+        line = running.refused("rollout", name, "2")
+        assert line.startswith(f"rfm: {name} version 2: ")
+        assert "/2: expected the weights that were exported (" in line
+        assert line.endswith(f"(served as before: {name}: version 1)")
+        assert (running.served_by_restart(name), running.ready(name)) == ([1], ["1"])
         (running.repository / name / "2" / "model.py").unlink()  # as in a folder that was copied in part
         assert f"/{name}/2/model.py: expected the model's program, got none" in running.refused("rollout", name, "2")
         assert (running.served_by_restart(name), running.ready(name)) == ([1], ["1"])

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""TOPReward and RoboReward behind Triton: both protocols, the gateway, episodes and labels."""
+"""Vision-language reward models behind Triton: protocols, the gateway, the page, the command line, steps and labels.
+
+tests/families compares each model with the original code in more settings.
+"""
 
 from __future__ import annotations
 
@@ -8,32 +11,33 @@ import io
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import requests
+from PIL import Image
 from pyarrow import parquet
 from selenium.webdriver.support.select import Select
 
 import fake_lerobot
 import rfm_export
+import robodopamine
 import rynnvalue
 from browsers import Browser
+from encoding import encode_here
 from environments import cart_pole, play
 from faulty_servers import url_of
-from gateways import metric_at, poll, running
+from gateways import TestClient, inside, running
 from in_process import rfm_client
 from paths import VIDEOS
-from reward_models import BASE, ROOT, Reference, as_before_marks, references
+from reward_models import ROOT, Reference, references
 from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm_client import (
     InvalidSampleError,
-    ModelInfo,
     ModelNotFoundError,
     PreferenceSample,
     ProgressResult,
@@ -42,9 +46,9 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_rl import RewardModelWrapper, RewardOptions
+from robodopamine import case_named
 from servers import Endpoints, start_triton
-from transports import Connection
-from viewer_requests import SCORE, curve_of, events, post
+from viewer_requests import SCORE, SERVED, curve_of, events
 
 fake_lerobot.provide()
 
@@ -54,10 +58,15 @@ pytestmark = pytest.mark.triton
 
 TOP, ROBO = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied", ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint"
 RYNN = ROOT / "rynnvalue" / "bro_symlog_bf16_tied" / "checkpoint"
-LEROBOT = ROOT / "lerobot_robometer" / "tok_disc10" / "checkpoint"
 DATASET = ROOT / "lerobot_rabc" / "home" / "golden" / "tiny_shared"
-NAMES = {"top": (TOP, "topreward"), "baseline": (TOP, "topreward-robometer"), "robo": (ROBO, "roboreward")}
+MODELS: dict[str, tuple[Path, dict[str, Any]]] = {
+    "top": (TOP, {"reward_model": "topreward"}),
+    "robo": (ROBO, {"reward_model": "roboreward"}),
+    "rynn": (RYNN, rynnvalue.said(rynnvalue.USUAL)),
+    "forward": (robodopamine.CHECKPOINT, {"reward_model": "robodopamine,mode=forward"}),
+}
 TASK = "put the red block in the bowl"
+VIDEO = VIDEOS / "jaco_play_pick_up_green_cup.mp4"
 
 
 @dataclass(frozen=True)
@@ -67,19 +76,22 @@ class Served:
     def client(self, model: str, protocol: str = "grpc") -> RewardClient:
         return RewardClient(url_of(self.endpoints, protocol), model=model)
 
+    def gateway(self, model: str) -> Any:
+        """A gateway for the model, inside this process."""
+        return inside(triton=self.endpoints.grpc_url, metrics_url=self.endpoints.metrics_url, model=model)
+
+    def command(self, *words: object, model: str, fails: bool = False) -> str:
+        """Run a command of ``rfm-client``. Return what it printed, in one line."""
+        done = rfm_client(*words, "--url", self.endpoints.grpc_url, "--model", model)
+        assert (done.exit_code != 0) is fails, done.output + done.stderr
+        return " ".join((done.output + done.stderr).replace("│", "").split())
+
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    folder = tmp_path_factory.mktemp("language_models")
-    repository = folder / "model_repository"
-    for name, (checkpoint, reward_model) in NAMES.items():
-        rfm_export.export(checkpoint, repository, ExportConfig(name=name, num_gpus=0, reward_model=reward_model))
-    rynn: Any = rynnvalue.said(rynnvalue.USUAL)
-    rfm_export.export(RYNN, repository, ExportConfig(name="rynn", num_gpus=0, **rynn))
-    of_lerobot = ExportConfig(name="lerobot", num_gpus=0, base_model=str(BASE))
-    rfm_export.export(LEROBOT, repository, of_lerobot)
-    rfm_export.export(ROBO, repository, ExportConfig(name="robo_old", num_gpus=0, reward_model="roboreward"))
-    as_before_marks(repository / "robo_old_frames" / "config.pbtxt")
+    repository = tmp_path_factory.mktemp("language_models") / "model_repository"
+    for name, (checkpoint, settings) in MODELS.items():
+        rfm_export.export(checkpoint, repository, ExportConfig(name=name, num_gpus=0, **settings))
     with start_triton(repository) as server:
         yield Served(server.endpoints)
 
@@ -88,11 +100,20 @@ def case(section: str, name: str) -> Reference:
     return next(each for each in references(section) if each.file.stem == name)
 
 
-@pytest.mark.parametrize("model", ["top", "baseline"])
-def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str, model: str) -> None:
+def rynnvalue_case(name: str) -> Any:
+    return next(each for each in rynnvalue.CASES if each.checkpoint == RYNN and each.file.stem == name)
+
+
+def body(samples: list[ProgressSample], **more: bool) -> dict[str, Any]:
+    """A request to the gateway."""
+    told = [{"task": sample.trajectory.task, "frames": sample.trajectory.positions.tolist()} for sample in samples]
+    return {"samples": [{"sample_type": "progress", "trajectory": each} for each in told], **more}
+
+
+def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str) -> None:
     samples = [sample for name in ("T8_48x80", "B2_T4") for sample in case("topreward", name).samples()]
-    engine = Engine.of(published.load(str(TOP), reward_model=NAMES[model][1]))
-    with asked.client(model, protocol) as client:
+    engine = Engine.of(published.load(str(TOP), reward_model="topreward"))
+    with asked.client("top", protocol) as client:
         results = client.evaluate(samples, log_prob=True)
         plain, full = client.evaluate(samples), client.evaluate(samples, all_scores=True)
     for result, without, every, expected in zip(results, plain, full, engine.evaluate(samples), strict=True):
@@ -109,14 +130,12 @@ def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str, mo
         assert np.isnan(result.success).all()
 
 
-def test_remaining_seconds_are_those_of_the_original(asked: Served, protocol: str) -> None:
-    told = next(each for each in rynnvalue.CASES if each.checkpoint == RYNN and each.file.stem == "B3_ragged")
+def test_remaining_seconds_are_those_of_the_original(asked: Served) -> None:
+    told = rynnvalue_case("B3_ragged")
     samples = told.asked()
-    with asked.client("rynn", protocol) as client:
+    with asked.client("rynn") as client:
         results = client.evaluate([each.sample for each in samples])
         (dense,) = client.evaluate([ProgressSample(samples[1].sample.trajectory, 8)])
-        info = client.model_info(frames=True)
-    assert info.scores == ("remaining_s", "relative_s", "entropy")
     for each, result in zip(samples, results, strict=True):
         assert isinstance(result, ProgressResult)
         seconds = told.expected(each.prefix, "value.pred_value")
@@ -133,6 +152,107 @@ def test_remaining_seconds_are_those_of_the_original(asked: Served, protocol: st
     assert isinstance(dense, ProgressResult)
     assert dense.remaining_s is not None
     assert len(dense.remaining_s) == 3
+
+
+def test_samples_with_and_without_views_are_answered_as_by_the_engine(asked: Served, protocol: str) -> None:
+    names = ("forward_T5", "forward_T4_odd_size", "baseline_T3_forward")
+    samples = [case_named(name).sample for name in names]
+    with asked.client("forward", protocol) as client:
+        together, alone = client.evaluate(samples), [client.progress(each.trajectory) for each in samples]
+    for expected, *results in zip(case_named(names[0]).engine().evaluate(samples), together, alone, strict=True):
+        assert isinstance(expected, ProgressResult), expected
+        for result in results:
+            assert isinstance(result, ProgressResult), result
+            np.testing.assert_array_equal(result.progress, expected.progress)
+            np.testing.assert_array_equal(result.hop, expected.hop)
+            assert result.is_answered.tolist() == [False, *[True] * (len(result.progress) - 1)]
+            assert result.last_progress == expected.progress[-1]
+            with pytest.raises(
+                ValueError, match=r"progress: expected a score of each frame, got NaN: the model answered"
+            ):
+                _ = result.progress_deltas
+
+
+def test_roboreward_is_answered_as_by_the_original(asked: Served) -> None:
+    told, steps_told = case("roboreward", "batch_B3"), case("roboreward", "steps_T4_T1")
+    task, frames = steps_told.samples()[0].trajectory.task, steps_told.samples()[0].trajectory.positions
+    with asked.client("robo") as client, client.episode(task, sampling="all") as episode:
+        results = client.evaluate(told.samples(), logits=True)
+        steps = [episode.add(frame).progress for frame in frames]
+    for result, progress, text in zip(
+        results, told.content["compute_progress"], told.content["generations"], strict=True
+    ):
+        assert isinstance(result, ProgressResult)
+        assert result.progress_logits is not None
+        np.testing.assert_array_equal(result.progress, np.float32(progress))
+        np.testing.assert_allclose(result.progress_logits[0], text["digit_logits_at_answer"], rtol=0, atol=0.3)
+    assert steps == steps_told.content["response"]["outputs_progress"]["progress_pred"][0]
+
+
+UNCLEAR, CLEAR = "fallback_digits_T2", "score5_T4"  # answers: 'Score 2 of 5', 'ANSWER: 5'
+SAID = "2 of 2 frames: the model's written answer states no single whole score"
+
+
+def test_an_answer_without_a_score_fails_alone_and_unclear_answers_are_marked(asked: Served) -> None:
+    none, unclear, clear = (case("roboreward", name).samples()[0] for name in ("unparsable_T3", UNCLEAR, CLEAR))
+    with asked.client("robo") as client:
+        first = client.progress(unclear.trajectory)
+        failed, *results = client.evaluate([none, unclear, clear], return_errors=True)
+    assert isinstance(failed, InvalidSampleError)
+    assert "answer: expected a score from 1 to 5 in the model's answer, got 'no idea'" in str(failed)
+    marks = [each.unclear if each.unclear is None else each.unclear.tolist() for each in (first, *results)]  # type: ignore[union-attr]
+    assert marks == [[True] * 2, [True] * 2, [False] * 4]
+    assert (first.last_progress, results[1].last_progress) == (1.0, 1.0)  # type: ignore[union-attr]
+
+
+def test_the_description_tells_what_is_given(asked: Served) -> None:
+    infos = {}
+    for name in MODELS:
+        with asked.client(name) as client:
+            infos[name] = client.model_info(frames=True)
+            remedy = r"give frames, and ask model_info\(frames=True\)$"
+            with pytest.raises(ModelNotFoundError, match=remedy):
+                client.model_info()
+    assert {name: info.kind for name, info in infos.items()} == {
+        "top": "TOPReward, as LeRobot computes it", "robo": "RoboReward", "rynn": "RynnValue",
+        "forward": "Robo-Dopamine, forward",
+    }  # fmt: skip
+    assert {name: info.scores for name, info in infos.items()} == {
+        "top": ("progress", "log_prob"),
+        "robo": ("progress", "progress_logits", "unclear"),
+        "rynn": ("remaining_s", "relative_s", "entropy"),
+        "forward": ("progress", "hop"),
+    }
+    assert [name for name, info in infos.items() if info.needs_whole_episode] == ["top", "forward"]
+    assert [name for name, info in infos.items() if info.reads_views] == ["forward"]
+    assert [name for name, info in infos.items() if not info.has_progress] == ["rynn"]
+    assert infos["robo"].progress_bins == 5
+    assert infos["top"].lacks == ("preference", "similarity", "success")
+
+
+def test_what_has_no_meaning_is_refused_by_name(asked: Served) -> None:
+    frames = np.zeros((3, 64, 96, 3), np.uint8)
+    trajectory = Trajectory(frames=frames, task=TASK)
+    with asked.client("top") as client:
+        dense, preference = client.evaluate(
+            [ProgressSample(trajectory, frame_steps=2), PreferenceSample(trajectory, trajectory)], return_errors=True
+        )
+        with (
+            pytest.raises(InvalidSampleError, match="relative to the whole episode: score it at its end"),
+            client.episode(TASK) as episode,
+        ):
+            episode.add(frames[0])
+    assert "frame_steps: expected 0 (TOPReward's progress" in str(dense)
+    assert "this checkpoint has no preference head" in str(preference)
+    views = Trajectory(frames=frames, task=TASK, views=(frames, frames), goal=frames[0])
+    expected = "expected a model that reads views and a goal"
+    with asked.client("robo") as client, pytest.raises(InvalidSampleError, match=expected):
+        client.progress(views)
+    with asked.client("forward") as client:
+        with pytest.raises(InvalidSampleError, match="num_frames: expected at least 2"):
+            client.progress(Trajectory(frames=frames[:1], task="t"))
+        with pytest.raises(InvalidSampleError, match="frame_steps: expected 0"):
+            client.progress(trajectory, frame_steps=2)
 
 
 def test_steps_and_rewards_are_made_of_remaining_seconds(asked: Served) -> None:
@@ -161,270 +281,56 @@ def test_steps_and_rewards_are_made_of_remaining_seconds(asked: Served) -> None:
     np.testing.assert_allclose(rewards, -np.diff(seconds), rtol=0, atol=1e-4)
 
 
-def test_the_gateway_answers_as_rynnvalue_s_server(asked: Served, tmp_path: Path) -> None:
-    told = next(each for each in rynnvalue.CASES if each.checkpoint == RYNN and each.file.stem == "steps_B2_T10_T3")
-    samples = [
-        {
-            "sample_type": "progress",
-            "trajectory": {
-                "task": each.sample.trajectory.task,
-                "frames": each.sample.trajectory.positions.tolist(),
-            },
-        }
-        for each in told.asked()
-    ]
-    with running(asked.endpoints, tmp_path, "rynn") as gateway:
-        url = f"{gateway.url}/evaluate_batch"
-        answer = requests.post(url, json={"samples": samples, "use_frame_steps": True}, timeout=60).json()
+def test_the_gateway_answers_as_the_servers_of_the_originals(asked: Served) -> None:
+    told = rynnvalue_case("steps_B2_T10_T3")
+    with asked.gateway("rynn") as gateway:
+        request = body([each.sample for each in told.asked()], use_frame_steps=True)
+        answer = gateway.post("/evaluate_batch", json=request).json()
     for each, values in zip(told.asked(), answer["outputs_progress"]["progress_pred"], strict=True):
         (expected,) = each.engine.evaluate([each.sample])
         assert isinstance(expected, ProgressResult)
         assert expected.remaining_s is not None
         np.testing.assert_allclose(values, -expected.remaining_s, rtol=1e-4, atol=1e-4)
     assert "outputs_success" not in answer
-
-
-def test_lerobot_s_robometer_is_answered_as_by_lerobot(asked: Served) -> None:
-    told = next(each for each in references("lerobot_robometer") if each.config == LEROBOT.parent)
-    with asked.client("lerobot") as client:
-        results = client.evaluate(told.samples(told.content.get("cropped_to_last")))
-    for result, progress in zip(results, told.content["decoded"]["progress_pred"], strict=True):
-        assert isinstance(result, ProgressResult)
-        np.testing.assert_allclose(result.progress, progress, rtol=0, atol=2e-5)
-
-
-def test_roboreward_is_answered_as_by_the_original(asked: Served, protocol: str) -> None:
-    told = case("roboreward", "batch_B3")
-    with asked.client("robo", protocol) as client:
-        results = client.evaluate(told.samples(), logits=True)
-    for result, progress, text in zip(
-        results, told.content["compute_progress"], told.content["generations"], strict=True
-    ):
-        assert isinstance(result, ProgressResult)
-        assert result.progress_logits is not None
-        np.testing.assert_array_equal(result.progress, np.float32(progress))
-        np.testing.assert_allclose(result.progress_logits[0], text["digit_logits_at_answer"], rtol=0, atol=0.3)
-
-
-def test_an_answer_without_a_score_fails_alone(asked: Served) -> None:
-    samples = [*case("roboreward", "unparsable_T3").samples(), *case("roboreward", "score5_T4").samples()]
-    with asked.client("robo") as client:
-        failed, result = client.evaluate(samples, return_errors=True)
-    assert isinstance(failed, InvalidSampleError)
-    assert "answer: expected a score from 1 to 5 in the model's answer, got 'no idea'" in str(failed)
-    assert isinstance(result, ProgressResult)
-    assert result.last_progress == 1.0
-
-
-UNCLEAR, CLEAR = "fallback_digits_T2", "score5_T4"  # answers: 'Score 2 of 5', 'ANSWER: 5'
-SAID = "2 of 2 frames: the model's written answer states no single whole score"
-
-
-def test_unclear_answers_are_marked(asked: Served) -> None:
-    unclear, clear = (case("roboreward", name).samples()[0] for name in (UNCLEAR, CLEAR))
-    with asked.client("robo") as client:
-        first = client.progress(unclear.trajectory)
-        results = client.evaluate([unclear, clear])
-        marks = [each.unclear if each.unclear is None else each.unclear.tolist() for each in (first, *results)]
-        assert marks == [[True] * 2, [True] * 2, [False] * 4]
-        assert "unclear" in client.model_info(frames=True).scores
-    assert first.last_progress == 1.0
-
-
-class Newer(Connection):
-    """Claims marks that the server's export lacks, like a description from before a rollback."""
-
-    async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        info = await super().model_info(model, timeout_s)
-        return replace(info, more_scores=(*info.more_scores, "unclear"))
-
-
-def test_a_client_goes_on_when_an_older_export_takes_the_place_of_a_newer(asked: Served) -> None:
-    (sample,) = case("roboreward", UNCLEAR).samples()
-    newer = Newer(asked.endpoints.grpc_url)
-    with RewardClient("", transports=[newer], model="robo_old") as client:
-        result = client.progress(sample.trajectory)
-        with client.episode(sample.trajectory.task, sampling="all") as episode:
-            steps = [episode.add(frame) for frame in sample.trajectory.positions]
-    assert (result.last_progress, result.unclear) == (1.0, None)
-    assert (steps[-1].progress, steps[-1].unclear) == (1.0, False)
-
-
-def test_a_step_tells_that_its_answer_is_unclear(asked: Served) -> None:
-    (sample,) = case("roboreward", UNCLEAR).samples()
-    with (
-        asked.client("robo") as client,
-        client.episode(sample.trajectory.task, sampling="all") as episode,
-        client.episodes(2, sample.trajectory.task, sampling="all") as episodes,
-    ):
-        steps = [episode.add(frame) for frame in sample.trajectory.positions]
-        for frame in sample.trajectory.positions:
-            scores = episodes.add([frame, frame])
-    assert steps[-1].unclear
-    assert scores.unclear.tolist() == [True, True]
-
-
-def test_unclear_answers_are_counted_by_a_metric(asked: Served) -> None:
-    (sample,) = case("roboreward", UNCLEAR).samples()
-
-    def count() -> float:
-        return metric_at(asked.endpoints.metrics_url, "rfm_unclear_answers_total", model="robo_frames")
-
-    with asked.client("robo") as client:
-        client.progress(sample.trajectory)
-        poll(lambda: count() > 0)
-        before = count()
-        client.progress(sample.trajectory)
-    poll(lambda: count() > before)
-
-
-def test_score_says_how_many_answers_are_unclear(asked: Served, tmp_path: Path) -> None:
-    files = []
-    for name in (UNCLEAR, CLEAR):
-        sample = case("roboreward", name).samples()[0]
-        files.append(tmp_path / f"{name}.npy")
-        np.save(files[-1], sample.trajectory.positions)
-        task = sample.trajectory.task
-    words = [*files, "--task", task, "--url", asked.endpoints.grpc_url, "--model", "robo"]
-    done = rfm_client("score", *words, "--json", str(tmp_path / "scores.json"))
-    assert done.exit_code == 0, done.output
-    told = [video["unclear"] for video in json.loads((tmp_path / "scores.json").read_text())["videos"]]
-    lines = " ".join(done.stderr.split())
-    assert told[0] == [True, True]
-    assert f"note: {files[0]}: {SAID}" in lines
-    assert lines.count("no single whole score") == sum(map(any, told))
-
-
-def test_labels_mark_unclear_answers(asked: Served, tmp_path: Path) -> None:
-    (sample,) = case("roboreward", UNCLEAR).samples()
-    data = tmp_path / "data"
-    data.mkdir()
-    for name in ("a", "b"):
-        np.save(data / f"{name}.npy", sample.trajectory.positions)
-    words = ["label", data, "--task", sample.trajectory.task, "--url", asked.endpoints.grpc_url, "--model", "robo"]
-    words += ["--sampling", "all", "--no-picture"]
-    done = rfm_client(*words)
-    assert done.exit_code == 0, done.output + done.stderr
-    marks = parquet.read_table(data / "rfm_progress.parquet")["unclear"].to_numpy()
-    assert marks.tolist()[1::2] == [1.0, 1.0]
-    assert f"{int(marks.sum())} of 4 frames: the model's written answer" in " ".join(done.stderr.split())
-    signals = parquet.read_table(data / "reward_signals" / "rfm.parquet")
-    np.testing.assert_array_equal(signals["reward.rfm.unclear"].to_numpy(), marks)
-    shutil.rmtree(data / ".rfm_parts")  # restored from the file, with all columns
-    np.save(data / "c.npy", sample.trajectory.positions)
-    again = rfm_client(*words)
-    assert again.exit_code == 0, again.output + again.stderr
-    assert len(parquet.read_table(data / "rfm_progress.parquet")["unclear"]) == 6
-
-
-def test_labels_of_seconds_name_the_rule_that_makes_progress(asked: Served, tmp_path: Path) -> None:
-    data = tmp_path / "data"
-    data.mkdir()
-    frames = np.random.default_rng(1).integers(0, 256, (5, 48, 80, 3), np.uint8)
-    np.save(data / "a.npy", frames)
-    words = ["label", data, "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "rynn", "--no-picture"]
-    words += ["--name", "rynnvalue"]
-    refused = rfm_client(*words)
-    assert refused.exit_code != 0
-    told = " ".join((refused.output + refused.stderr).split())
-    assert "predicts remaining seconds and no progress, got none; give --progress-rule remaining_over_first" in told
-    done = rfm_client(*words, "--progress-rule", "remaining_over_first")
-    assert done.exit_code == 0, done.output + done.stderr
-    with asked.client("rynn") as client:
-        expected = client.progress(Trajectory(frames=frames, task=TASK))
-    assert expected.remaining_s is not None
-    signals = parquet.read_table(data / "reward_signals" / "rynnvalue.parquet")
-    seconds = signals["reward.rynnvalue.remaining_time_s"].to_numpy()
-    np.testing.assert_allclose(seconds, expected.remaining_s, rtol=1e-4, atol=1e-4)
-    np.testing.assert_array_equal(signals["reward.rynnvalue.potential"].to_numpy(), -seconds)
-    assert signals["reward.rynnvalue.is_inference_frame"].to_pylist() == [1] * 5
-    progress = signals["reward.rynnvalue.progress"].to_numpy()
-    np.testing.assert_allclose(progress, expected.progress_by("remaining_over_first"), rtol=0, atol=1e-3)
-    provenance = json.loads(signals.schema.metadata[b"lerobot.reward_scoring.provenance"])
-    assert "remaining_over_first" in json.dumps(provenance)
-    again = rfm_client(*words, "--progress-rule", "remaining_over_first")
-    assert again.exit_code == 0, again.output + again.stderr
-
-
-def test_the_description_tells_what_is_given(asked: Served) -> None:
-    infos = {}
-    for name in (*NAMES, "rynn"):
-        with asked.client(name) as client:
-            infos[name] = client.model_info(frames=True)
-    assert infos["rynn"].kind == "RynnValue"
-    assert not infos["rynn"].has_progress
-    assert infos["top"].kind == "TOPReward, as LeRobot computes it"
-    assert infos["robo"].kind == "RoboReward"
-    assert {name: info.needs_whole_episode for name, info in infos.items()} == {
-        "top": True, "baseline": True, "robo": False, "rynn": False,
-    }  # fmt: skip
-    assert infos["top"].scores == ("progress", "log_prob")
-    assert infos["robo"].scores == ("progress", "progress_logits", "unclear")
-    assert infos["robo"].progress_bins == 5
-    assert infos["baseline"].max_frames == 64
-    assert infos["top"].lacks == ("preference", "similarity", "success")
-
-
-def test_a_model_for_frames_alone_says_how_to_ask_for_its_description(asked: Served) -> None:
-    remedy = r"give frames, and ask model_info\(frames=True\)$"
-    with asked.client("robo") as client, pytest.raises(ModelNotFoundError, match=remedy):
-        client.model_info()
-
-
-def test_what_has_no_meaning_is_refused_by_name(asked: Served) -> None:
-    frames = np.zeros((3, 64, 96, 3), np.uint8)
-    trajectory = Trajectory(frames=frames, task=TASK)
-    with asked.client("top") as client:
-        dense, preference = client.evaluate(
-            [ProgressSample(trajectory, frame_steps=2), PreferenceSample(trajectory, trajectory)], return_errors=True
-        )
-        with (
-            pytest.raises(InvalidSampleError, match="relative to the whole episode: score it at its end"),
-            client.episode(TASK) as episode,
-        ):
-            episode.add(frames[0])
-    assert "frame_steps: expected 0 (TOPReward's progress" in str(dense)
-    assert "this checkpoint has no preference head" in str(preference)
-
-
-def test_roboreward_scores_an_episode_step_by_step(asked: Served) -> None:
-    told = case("roboreward", "steps_T4_T1")
-    frames = told.samples()[0].trajectory.positions
-    with asked.client("robo") as client, client.episode(told.samples()[0].trajectory.task, sampling="all") as episode:
-        steps = [episode.add(frame).progress for frame in frames]
-    assert steps == told.content["response"]["outputs_progress"]["progress_pred"][0]
-
-
-def test_the_gateway_answers_as_robometer_s_baseline_server(asked: Served, tmp_path: Path) -> None:
-    with running(asked.endpoints, tmp_path, "robo") as gateway:
+    with asked.gateway("robo") as gateway:
         for name in ("batch_B3", "steps_T4_T1"):
             told = case("roboreward", name)
-            samples = [
-                {
-                    "sample_type": "progress",
-                    "trajectory": {
-                        "task": sample.trajectory.task,
-                        "frames": sample.trajectory.positions.tolist(),
-                    },
-                }
-                for sample in told.samples()
-            ]
-            body = {"samples": samples, "use_frame_steps": told.content["use_frame_steps"]}
-            answer = requests.post(f"{gateway.url}/evaluate_batch", json=body, timeout=60).json()
+            request = body(told.samples(), use_frame_steps=told.content["use_frame_steps"])
+            answer = gateway.post("/evaluate_batch", json=request).json()
             assert answer["outputs_progress"] == told.content["response"]["outputs_progress"]
             assert answer["outputs_preference"] is None
             assert "outputs_success" not in answer
 
 
+def by_page(gateway: TestClient, video: Path, **fields: object) -> Any:
+    with video.open("rb") as file:
+        return gateway.post(f"/{SCORE}", data=fields, files={"video": (video.name, file)})
+
+
+def test_the_gateway_and_the_page_answer_null_at_frames_without_an_answer(asked: Served, tmp_path: Path) -> None:
+    case, video = case_named("baseline_T3_forward"), tmp_path / "video.mp4"
+    encode_here(video, case.sample.trajectory.positions, "libx264rgb", {"qp": "0"}, pixels="rgb24")
+    (expected,) = case.engine().evaluate([case.sample])
+    assert isinstance(expected, ProgressResult)
+    with asked.gateway("forward") as gateway:
+        answer = gateway.post("/evaluate_batch", json=body([case.sample])).json()
+        served = gateway.get(f"/{SERVED}").json()["models"]
+        _, (_, points), _ = events(by_page(gateway, video, task=case.sample.trajectory.task, fps="10"))
+    about = next(model for model in served if model["name"] == "forward")
+    assert (about["rule"], about["reads_views"]) == ("all", True)
+    assert (points["progress"][0], points["answered"]) == (None, [False, True, True])
+    np.testing.assert_allclose(points["progress"][1:], expected.progress[1:], rtol=0, atol=1e-6)
+    (values,) = answer["outputs_progress"]["progress_pred"]
+    assert values[0] is None
+    np.testing.assert_allclose(values[1:], expected.progress[1:], rtol=0, atol=1e-6)
+
+
 def test_the_page_shows_the_whole_episode_s_curve(asked: Served, tmp_path: Path) -> None:
-    video = VIDEOS / "jaco_play_pick_up_green_cup.mp4"
-    words = [video, "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "top", "--fps", "0.5"]
-    done = rfm_client("score", *words, "--json", str(tmp_path / "scores.json"))
-    assert done.exit_code == 0, done.output
+    asked.command("score", VIDEO, "--task", TASK, "--fps", "0.5", "--json", tmp_path / "scores.json", model="top")
     (told,) = json.loads((tmp_path / "scores.json").read_text())["videos"]
-    with running(asked.endpoints, tmp_path, "top") as gateway:
-        curve = curve_of(events(post(gateway.url, SCORE, {"video": video}, task=TASK, fps=0.5)))
-        refused = post(gateway.url, SCORE, {"video": video}, task=TASK, sampling="rint", frames=4)
+    with asked.gateway("top") as gateway:
+        curve = curve_of(events(by_page(gateway, VIDEO, task=TASK, fps=0.5)))
+        refused = by_page(gateway, VIDEO, task=TASK, sampling="rint", frames=4)
     np.testing.assert_allclose(curve["progress"], told["progress"], rtol=0, atol=1e-4)
     assert len(told["log_prob"]) == len(told["progress"])
     assert {*curve["success"]} == {None}
@@ -432,35 +338,23 @@ def test_the_page_shows_the_whole_episode_s_curve(asked: Served, tmp_path: Path)
     assert "relative to the whole episode" in refused.text
 
 
-ROBOT_VIDEO = VIDEOS / "jaco_play_pick_up_green_cup.mp4"
-
-
-def scored(asked: Served, folder: Path, *more: object) -> tuple[list[float], str]:
-    """The remaining seconds of a video by ``rfm-client score``, and what it printed."""
-    words = [ROBOT_VIDEO, "--task", TASK, "--url", asked.endpoints.grpc_url, "--model", "rynn", "--fps", "0.5"]
-    rule = ["--sampling", "rint_pad", "--frames", "4", "--json", folder / "scores.json"]
-    done = rfm_client("score", *words, *rule, *more)
-    assert done.exit_code == 0, done.output
-    (told,) = json.loads((folder / "scores.json").read_text())["videos"]
-    return told["remaining_s"], done.output
-
-
-def test_tables_and_pictures_show_remaining_seconds(asked: Served, tmp_path: Path) -> None:
-    seconds, output = scored(asked, tmp_path, "--plot", tmp_path / "plot.svg", "--strips", tmp_path / "strips.svg")
-    (row,) = (line for line in output.splitlines() if ROBOT_VIDEO.name[-10:] in line)
-    assert f"{seconds[-1]:.2f} s" in row
-    assert "In s, in place of progress: seconds that remain until the task is done." in " ".join(output.split())
-
-
-def test_the_page_shows_remaining_seconds(asked: Served, tmp_path: Path, quiet_browser: Browser) -> None:
-    page, (seconds, _) = quiet_browser, scored(asked, tmp_path)
+def test_remaining_seconds_are_shown_in_tables_pictures_and_on_the_page(
+    asked: Served, tmp_path: Path, quiet_browser: Browser
+) -> None:
+    rule = ["--fps", "0.5", "--sampling", "rint_pad", "--frames", "4", "--json", tmp_path / "scores.json"]
+    pictures = ["--plot", tmp_path / "plot.svg", "--strips", tmp_path / "strips.svg"]
+    output = asked.command("score", VIDEO, "--task", TASK, *rule, *pictures, model="rynn")
+    (told,) = json.loads((tmp_path / "scores.json").read_text())["videos"]
+    seconds, page = told["remaining_s"], quiet_browser
+    assert f"{seconds[-1]:.2f} s" in output
+    assert "In s, in place of progress: seconds that remain until the task is done." in output
     with running(asked.endpoints, tmp_path, "rynn") as gateway:
         page.open(gateway.url)
         page.run("document.getElementById('advanced').open = true")
         Select(page["rule"]).select_by_visible_text("rint_pad")
         for name, text in {"tasks": TASK, "fps": "0.5", "frames": "4"}.items():
             page.write(name, text)
-        page.drop([ROBOT_VIDEO])
+        page.drop([VIDEO])
         page.until_text("scored", "1 of 1 scored")
         assert page.cells("#curves tr")[0][5:7] == [f"{seconds[-1]:.1f}", "-"]
         assert page.all("#numbers .leading")[0].text == "Final time remaining (s)"
@@ -478,30 +372,106 @@ def test_the_page_shows_remaining_seconds(asked: Served, tmp_path: Path, quiet_b
         assert not page["threshold"].is_displayed()
 
 
+def test_score_says_how_many_answers_are_unclear(asked: Served, tmp_path: Path) -> None:
+    files = []
+    for name in (UNCLEAR, CLEAR):
+        sample = case("roboreward", name).samples()[0]
+        files.append(tmp_path / f"{name}.npy")
+        np.save(files[-1], sample.trajectory.positions)
+        task = sample.trajectory.task
+    lines = asked.command("score", *files, "--task", task, "--json", tmp_path / "scores.json", model="robo")
+    told = [video["unclear"] for video in json.loads((tmp_path / "scores.json").read_text())["videos"]]
+    assert told[0] == [True, True]
+    assert f"note: {files[0]}: {SAID}" in lines
+    assert lines.count("no single whole score") == sum(map(any, told))
+
+
+def test_the_command_line_sends_views_and_a_goal_and_only_where_they_are_read(asked: Served, tmp_path: Path) -> None:
+    case = case_named("forward_T5")
+    given, (expected,) = case.sample.trajectory, case.engine().evaluate([case.sample])
+    files = {name: tmp_path / f"{name}.npy" for name in ("front", "left", "right")}
+    for file, frames in zip(files.values(), (given.positions, *given.views), strict=True):
+        np.save(file, frames)
+    assert given.goal is not None
+    Image.fromarray(given.goal).save(tmp_path / "goal.png")
+    words = ["score", files["front"], "--task", given.task]
+    views = ["--view", files["left"], "--view", files["right"]]
+    more = ["--goal", tmp_path / "goal.png", "--json", tmp_path / "scores.json", "--plot", tmp_path / "plot.png"]
+    asked.command(*words, *views, *more, model="forward")
+    assert isinstance(expected, ProgressResult)
+    told = json.loads((tmp_path / "scores.json").read_text())
+    assert told["videos"][0]["progress"] == [None, *expected.progress[1:].tolist()]
+    assert told["videos"][0]["hop"][0] is None
+    assert told["views"] == [str(files["left"]), str(files["right"])]
+    for wrong, fault in (
+        (["--view", files["left"]], "--view: expected none with this model, which reads one camera and no goal"),
+        ([files["left"], *views], "'--view': expected a single VIDEO, of which they are views, got 2"),
+    ):
+        assert fault in asked.command(*words, *wrong, model="robo", fails=True)
+
+
+def labelled(asked: Served, folder: Path, sample: ProgressSample, model: str, *words: object) -> Any:
+    """Label a folder of two equal videos, the second after the first. Return the columns of the signals."""
+    folder.mkdir()
+    command = ["label", folder, "--task", sample.trajectory.task, "--no-picture", "--name", "own", *words]
+    np.save(folder / "a.npy", sample.trajectory.positions)
+    asked.command(*command, model=model)
+    shutil.rmtree(folder / ".own_parts")  # restored from the file, with all columns
+    np.save(folder / "b.npy", sample.trajectory.positions)
+    asked.command(*command, model=model)
+    return parquet.read_table(folder / "reward_signals" / "own.parquet")
+
+
+def test_labels_are_nan_at_frames_without_an_answer(asked: Served, tmp_path: Path) -> None:
+    case = case_named("baseline_T3_forward")
+    (expected,) = case.engine().evaluate([case.sample])
+    assert isinstance(expected, ProgressResult)
+    signals = labelled(asked, tmp_path / "data", case.sample, "forward", "--mode", "whole")
+    for column, values in (("progress", expected.progress), ("hop", expected.hop)):
+        np.testing.assert_array_equal(signals[f"reward.own.{column}"].to_numpy(), np.tile(values, 2))
+    assert signals["reward.own.is_inference_frame"].to_pylist() == [0, 1, 1] * 2
+
+
+def test_labels_mark_unclear_answers(asked: Served, tmp_path: Path) -> None:
+    (sample,) = case("roboreward", UNCLEAR).samples()
+    signals = labelled(asked, tmp_path / "data", sample, "robo", "--sampling", "all")
+    marks = signals["reward.own.unclear"].to_numpy()
+    assert marks.tolist()[1::2] == [1.0, 1.0]
+    np.testing.assert_array_equal(parquet.read_table(tmp_path / "data" / "own_progress.parquet")["unclear"], marks)
+
+
+def test_labels_of_seconds_name_the_rule_that_makes_progress(asked: Served, tmp_path: Path) -> None:
+    frames = np.random.default_rng(1).integers(0, 256, (5, 48, 80, 3), np.uint8)
+    trajectory = Trajectory(frames=frames, task=TASK)
+    np.save(tmp_path / "a.npy", frames)
+    told = asked.command("label", tmp_path / "a.npy", "--task", TASK, model="rynn", fails=True)
+    assert "predicts remaining seconds and no progress, got none; give --progress-rule remaining_over_first" in told
+    rule = ("--progress-rule", "remaining_over_first")
+    signals = labelled(asked, tmp_path / "data", ProgressSample(trajectory), "rynn", *rule)
+    with asked.client("rynn") as client:
+        expected = client.progress(trajectory)
+    assert expected.remaining_s is not None
+    seconds = signals["reward.own.remaining_time_s"].to_numpy()
+    np.testing.assert_allclose(seconds, np.tile(expected.remaining_s, 2), rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(signals["reward.own.potential"].to_numpy(), -seconds)
+    assert signals["reward.own.is_inference_frame"].to_pylist() == [1] * 10
+    progress = signals["reward.own.progress"].to_numpy()
+    expected_progress = np.tile(expected.progress_by("remaining_over_first"), 2)
+    np.testing.assert_allclose(progress, expected_progress, rtol=0, atol=1e-3)
+    provenance = json.loads(signals.schema.metadata[b"lerobot.reward_scoring.provenance"])
+    assert "remaining_over_first" in json.dumps(provenance)
+
+
 def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path) -> None:
-    words = [
-        "label",
-        DATASET,
-        "--url",
-        asked.endpoints.grpc_url,
-        "--model",
-        "top",
-        "--output",
-        tmp_path,
-        "--no-picture",
-    ]
-    refused = rfm_client(*words)
-    assert refused.exit_code != 0
+    words = ["label", DATASET, "--output", tmp_path, "--no-picture"]
     expected = "whole of this model, whose scores are relative to the whole episode, got prefix; give --mode whole"
-    assert f"mode: expected {expected}" in refused.output + refused.stderr
-    unknown = rfm_client(*["robo" if word == "top" else str(word) for word in words])
-    assert unknown.exit_code != 0
-    assert "name them (--frames), or show all (--sampling all)" in " ".join((unknown.output + unknown.stderr).split())
-    done = rfm_client(*words, "--mode", "whole")
-    assert done.exit_code == 0, done.output
+    assert f"mode: expected {expected}" in asked.command(*words, model="top", fails=True)
+    unknown = asked.command(*words, model="robo", fails=True)
+    assert "name them (--frames), or show all (--sampling all)" in unknown
+    asked.command(*words, "--mode", "whole", model="top")
     labels = parquet.read_table(tmp_path / "rfm_progress.parquet")
-    expected = parquet.read_table(ROOT / "lerobot_rabc" / "topreward_progress.parquet")
+    original = parquet.read_table(ROOT / "lerobot_rabc" / "topreward_progress.parquet")
     np.testing.assert_allclose(
-        labels["progress_sparse"].to_numpy(), expected["progress_sparse"].to_numpy(), rtol=0, atol=2e-5
+        labels["progress_sparse"].to_numpy(), original["progress_sparse"].to_numpy(), rtol=0, atol=2e-5
     )
     assert np.isfinite(labels["log_prob"].to_numpy()).all()
