@@ -169,7 +169,7 @@ class TritonTransport:
     ) -> Answered:
         """Return the answer to ``request`` within ``timeout_s``; ``bad_request`` as in ``triton.error_from``."""
         try:
-            # Not gRPC's deadline: Triton 2.51 overlooks a deadline that has passed, but not a cancelled call.
+            # One limit for gRPC and HTTP. It cancels a call over gRPC, which Triton then drops unless scoring has begun.
             async with timeout(timeout_s):
                 return await self._answer(request)
         except errors.RewardError:
