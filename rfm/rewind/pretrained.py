@@ -16,7 +16,7 @@ from rfm.checkpoint.content import MAX_UINT8, PIL_BICUBIC, PREPROCESSOR_CONFIG, 
 from rfm.checkpoint.hub import local_copy
 from rfm.checkpoint.weights import check_one_form, check_values
 from rfm.engine.pixels import Normalisation
-from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.description import FrameSize
 
 IMAGE_MODELS = ("dinov2", "dinov2_with_registers")  # types whose pooled output is that of the class token
 TEXT_MODELS = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta")  # types of sentence encoders
