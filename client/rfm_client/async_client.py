@@ -11,7 +11,8 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 from rfm_client.client_options import ClientOptions
-from rfm_client.contract.checks import require
+from rfm_client.contract.checks import checked_count, require
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
     ClientClosedError,
     DeadlineExceededError,
@@ -20,9 +21,7 @@ from rfm_client.contract.errors import (
     ModelNotFoundError,
     RewardError,
 )
-from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import PROBE_PREFIX, Part, encoder_name, frames_name
-from rfm_client.contract.numbers import checked_count
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.synthetic import blank_trajectory
@@ -34,11 +33,10 @@ from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.call import Call, CallOptions
 from rfm_client.scoring.samples import SampleScorer, results_of
 from rfm_client.transport.calls import connect
-from rfm_client.transport.concurrency import ConcurrencyLimiter
 from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.deadline import Deadline, check_timeout
-from rfm_client.transport.lifetime import AsyncClosing, OneProcess
+from rfm_client.transport.limits import ConcurrencyLimiter, Deadline, check_timeout
 from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
+from rfm_client.transport.threads import AsyncClosing, OneProcess
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

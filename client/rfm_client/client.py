@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.client_options import ClientOptions
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import RewardError
-from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import Part
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
@@ -21,8 +21,7 @@ from rfm_client.episodes.options import StepKeywords, StepScore
 from rfm_client.frames.fit_to_checkpoint import snapshot
 from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.call import CallOptions
-from rfm_client.transport.lifetime import Closing, OneProcess
-from rfm_client.transport.loop_thread import LoopThread
+from rfm_client.transport.threads import Closing, LoopThread, OneProcess
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

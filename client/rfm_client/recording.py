@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.results import FrameScores
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.transport.lifetime import Closing
+from rfm_client.transport.threads import Closing
 
 __all__ = ["Recording"]
 

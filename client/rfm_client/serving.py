@@ -7,8 +7,8 @@ from rfm_client.contract.listening import ListenAddress
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.process_log import begin_request, write_log
 from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.off_loop import off_loop
 from rfm_client.transport.status import ServerStatus
+from rfm_client.transport.threads import off_loop
 
 __all__ = [
     "DEFAULT_MODEL",

@@ -22,7 +22,7 @@ from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.triton_server import TritonServer, short_spin
 from rfm.supervise.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm_client.cli.command import Given, add_missing, with_options
-from rfm_client.cli.help_sections import MOST_COLUMNS
+from rfm_client.cli.messages import MOST_COLUMNS
 from rfm_client.contract.descriptors import raise_limit
 from rfm_client.contract.listening import from_here
 from rfm_client.contract.process_log import write_log

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""rfm-client status, wait, sample and bench-input; wrong usage and exit codes."""
+"""rfm-client status, wait, sample and bench-input; exit codes; servers that go away, and URLs with a wrong port."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,12 @@ from typer.main import get_command
 import clip
 from client_commands import MODEL, RFM_CLIENT, WIDTHS, ask, columns, invoke, rows
 from engine_server import EngineServer
+from gateways import running
 from in_process import rfm_client_app
-from rfm_client import InvalidSampleError, Trajectory
+from proxies import Proxy
+from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError, Trajectory
 from rfm_client.command_line import ExitCode
-from servers import RepositoryApi, Served, folder_server, wait_for
+from servers import Endpoints, RepositoryApi, Served, folder_server, wait_for
 from trajectories import random_trajectory
 from vlm import PLAIN as VLM
 
@@ -223,16 +225,93 @@ def test_exit_codes_are_documented_with_every_command() -> None:
     for code in ExitCode:
         assert re.search(rf"\b{code.value} ", exit_codes), code
     commands = get_command(rfm_client_app).commands  # type: ignore[attr-defined]
-    assert commands.keys() >= {
-        "score",
-        "compare",
-        "status",
-        "wait",
-        "sample",
-        "bench-input",
-        "gateway",
-        "label",
-        "evaluate",
-    }
+    assert len(commands) == 9
     for name in commands:
         assert exit_codes in " ".join(invoke(name, "--help").stdout.split())
+
+
+NUM_SOURCES = 1000  # more than are scored before the server is gone
+NOT_ASKED = "not asked, since no server answers any more"
+
+
+PORTS = {
+    "gRPC to HTTP": ("grpc", "http_port", "Triton's gRPC port, got its HTTP port: use http://{address}"),
+    "HTTP to gRPC": ("http", "grpc_port", "Triton's HTTP port, got its gRPC port: use grpc://{address}"),
+    "gRPC to metrics": (
+        *("grpc", "metrics_port"),
+        "Triton's gRPC port, got its metrics port: use grpc://127.0.0.1:8001, unless the server was given another",
+    ),
+    "HTTP to metrics": (
+        *("http", "metrics_port"),
+        "Triton's HTTP port, got its metrics port: use http://127.0.0.1:8000, unless the server was given another",
+    ),
+}
+
+
+@pytest.mark.parametrize(("scheme", "port", "told"), PORTS.values(), ids=PORTS)
+def test_a_wrong_port_is_told_with_the_right_one(demo_server: Endpoints, scheme: str, port: str, told: str) -> None:
+    address = f"127.0.0.1:{getattr(demo_server, port)}"
+    expected = f"{scheme}://{address}: expected {told.format(address=address)}"
+    for command in ("sample", "status", "wait"):
+        result = invoke(command, "--url", f"{scheme}://{address}")
+        assert result.exit_code == ExitCode.UNAVAILABLE
+        assert result.stderr.splitlines()[-1] == f"rfm-client: {expected}"
+    with RewardClient(f"{scheme}://{address}", retry=False) as client, pytest.raises(ServerUnavailableError) as caught:
+        client.model_info()
+    assert str(caught.value) == expected
+
+
+def test_tls_where_there_is_none_is_told(demo_server: Endpoints) -> None:
+    for url in (demo_server.grpc_url, demo_server.http_url):
+        secure = url.replace("://", "s://")
+        with RewardClient(secure, retry=False) as client, pytest.raises(ServerUnavailableError) as caught:
+            client.model_info()
+        assert " with TLS, got its " in str(caught.value)
+        assert str(caught.value).endswith(f" without: use {url}")
+
+
+def test_a_gateway_is_no_triton(demo_server: Endpoints, tmp_path: Path) -> None:
+    with running(demo_server, tmp_path) as gateway:
+        for url in (gateway.url, gateway.url.replace("http", "grpc")):
+            result = invoke("sample", "--url", url)
+            assert result.exit_code == ExitCode.UNAVAILABLE
+            assert "got a gateway's: use that of the Triton behind it, by default 800" in result.stderr
+
+
+def test_the_port_of_something_else_is_not_told_wrong(tmp_path: Path) -> None:
+    with folder_server(tmp_path) as url:
+        result = invoke("sample", "--url", url)
+    assert result.exit_code != ExitCode.OK
+    assert "expected Triton's" not in result.stderr
+
+
+ENDS = {"has gone": ExitCode.UNAVAILABLE, "hangs": ExitCode.DEADLINE}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ENDS)
+def test_a_server_that_goes_away_is_not_asked_any_more(engines: EngineServer, tmp_path: Path, how: str) -> None:
+    random = np.random.default_rng(0)
+    source, target = tmp_path / "episode.npz", tmp_path / "scores.json"
+    shown, told = tmp_path / "stdout", tmp_path / "stderr"
+    embeddings = {"video_embeddings": random.random((8, 64)), "text_embedding": random.random(32)}
+    np.savez(source, **{name: array.astype(np.float32) for name, array in embeddings.items()})
+    with ExitStack() as proxies:
+        proxy = proxies.enter_context(Proxy(int(engines.url.rpartition(":")[2])))
+        url = f"grpc://127.0.0.1:{proxy.port}"
+        words = ("score", *[source] * NUM_SOURCES, "--timeout", 1, "--json", target, "--url", url)
+        with shown.open("w") as out, told.open("w") as err:
+            process = subprocess.Popen([str(RFM_CLIENT), *map(str, words)], stdout=out, stderr=err)
+            wait_for(lambda: len(rows(shown.read_text(), str(source))) >= 5)  # they come while others are asked
+            if how == "hangs":
+                proxies.enter_context(proxy.held())
+            else:
+                proxies.close()
+            assert process.wait(timeout=60) == ENDS[how], told.read_text()
+    scored = rows(shown.read_text(), str(source))
+    outcomes = json.loads(target.read_text())["videos"]
+    failures = [outcome for outcome in outcomes if "error" in outcome]
+    assert len(outcomes) == NUM_SOURCES == len(scored) + len(failures)
+    not_asked = [failure for failure in failures if failure["error"] == NOT_ASKED]
+    assert 0 < len(failures) - len(not_asked) <= 8
+    assert len(re.findall(f"^rfm-client: {source}: {NOT_ASKED}$", told.read_text(), re.MULTILINE)) == len(not_asked) > 0

@@ -4,17 +4,14 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
-import matplotlib.style
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
-from PIL import Image
 
 from paths import ROOT
 from rfm_client import FrameScores
-from rfm_client.plot import plot_scores, save
+from rfm_client.plot import plot_scores
 
 
 def scores(num_frames: int, *, success: float = 0.5, frame_indices: list[int] | None = None) -> FrameScores:
@@ -61,18 +58,6 @@ def test_a_model_of_remaining_seconds_has_an_axis_in_seconds_beside_that_of_prog
     assert of_seconds.get_ylim()[1] > 30
     assert len(progress.get_lines()) == 1
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b"]
-
-
-def test_forty_curves_differ_and_the_figure_stays_light_in_a_dark_style(tmp_path: Path) -> None:
-    with matplotlib.style.context("dark_background"):
-        figure = plot_scores([scores(3)] * 40, [f"{index}" for index in range(40)])
-        save(figure, tmp_path / "curves.png")
-    styles = {(line.get_color(), line.get_linestyle()) for line in figure.axes[0].get_lines()}
-    assert len(styles) == 40
-    assert to_hex(figure.get_facecolor()) == to_hex(figure.axes[0].get_facecolor()) == "#ffffff"
-    with Image.open(tmp_path / "curves.png") as picture:
-        assert picture.width == 700
-        assert picture.convert("RGB").getpixel((0, 0)) == (255, 255, 255)
 
 
 def test_the_colours_are_those_of_the_page_and_no_axes_are_boxed() -> None:

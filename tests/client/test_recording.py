@@ -6,12 +6,10 @@ from __future__ import annotations
 import io
 import json
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import rerun
 from PIL import Image
 
@@ -88,12 +86,3 @@ def test_a_score_that_is_not_predicted_has_no_curve_and_nothing_makes_no_file(tm
     with Recording(tmp_path / "none.rrd"):
         pass
     assert not (tmp_path / "none.rrd").exists()
-
-
-def test_a_missing_package_is_told_with_the_command_that_installs_it(
-    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    result = invoke("score", video, "--task", TASK, "--url", "grpc://localhost:1", "--rrd", tmp_path / "out.rrd")
-    assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
-    assert result.stderr == 'rfm-client: recordings need rerun-sdk: pip install "./client[rerun]"\n'

@@ -30,10 +30,8 @@ from rfm_client import (
 )
 from rfm_client.contract.triton import error_of, invalid_sample
 from rfm_client.serving import Credentials, ServerStatus
-from rfm_client.transport.concurrency import MAX_BYTES, ConcurrencyLimiter
 from rfm_client.transport.connection import grpc_options
-from rfm_client.transport.deadline import Deadline
-from rfm_client.transport.request_size import check_size
+from rfm_client.transport.limits import MAX_BYTES, ConcurrencyLimiter, Deadline, check_size
 from trajectories import random_trajectory
 
 TIMEOUT_S = 1.0

@@ -110,13 +110,7 @@ USAGE = {
         "--allow-folder", "expected a folder, got nope: No such file or directory"
     ),
     f"rfm-client gateway --triton {NOBODY} --dataset file.txt": bad("--dataset", f"{SHOWN} file.txt"),
-    "rfm-client label dataset --episodes 5:2": bad(
-        "--episodes", "expected numbers and ranges such as 0:100,205, got '5:2'"
-    ),
-    "rfm-client label dataset --format csv": bad("--format", "expected some of progress, signals, got csv"),
-    "rfm-client label dataset --shard 3": bad("--shard", "expected i/n, for example 0/8, got '3'"),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
-    "rfm-client label dataset --name a/b": bad("--name", "expected 1 to 64 letters, digits, _ or -, got 'a/b'"),
     "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
     "rfm demo": "No such command 'demo': it is now `rfm try`",
     "rfm try a.mp4": "Missing option '--task'.",
@@ -147,25 +141,9 @@ FAILURES = {
         )
     },
     "rfm-client evaluate nope": (1, "nope: expected a labelled dataset, got no file or folder of this name"),
-    "rfm-client evaluate dataset": (
-        1,
-        "dataset: expected label files, NAME_progress.parquet (rfm-client label), or --labels, got none",
-    ),
     "rfm-client label nope": (1, f"nope: {DATASET} none"),
     "rfm-client label file.txt": (1, f"file.txt: {DATASET} another file"),
-    "rfm-client label dataset --orient top=rotate180": (
-        1,
-        "--orient: expected one of the cameras observation.images.front, observation.images.wrist, got 'top'",
-    ),
-    "rfm serve nope": (
-        *(1, "repository: expected a folder of models, got nope, which is not there: "),
-        "rfm export --checkpoint CHECKPOINT --repository nope writes one",
-    ),
     "rfm serve repository --http-port 0": (1, "--http-port: expected at least 1, got 0"),
-    "rfm serve repository --host here": (
-        1,
-        "--host: expected an IP address without a port, such as 127.0.0.1, ::1, 0.0.0.0 or ::, got 'here'",
-    ),
     "rfm serve repository --grpc-key key.pem": (1, "--grpc-key needs --grpc-certificate"),
     "rfm serve repository --grpc-certificate key.pem --grpc-key key.pem": (
         1,
@@ -203,10 +181,6 @@ AT_SERVER = {
         *(1, "clip.npy and seen.npy: second: expected frames, as the first trajectory, got video_embeddings"),
     ),
     "compare clip.npy nope.npy --task x": (1, "file: expected a file of arrays, got no file of this name (nope.npy)"),
-    "label dataset --episodes 100:200": (
-        1,
-        "--episodes: expected some of the dataset's 8 episodes, got 100:200; it has 0:8",
-    ),
     "label dataset --cameras top": (
         1,
         "--cameras: expected some of observation.images.front, observation.images.wrist, got 'top'",

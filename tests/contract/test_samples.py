@@ -148,30 +148,6 @@ def test_float_frames_that_would_turn_black_are_refused(frames: np.ndarray) -> N
         float_frames_to_uint8(frames)
 
 
-def test_pairs_of_two_frame_sizes_arrive_as_they_were() -> None:
-    samples: list[Sample] = [
-        PreferenceSample(filmed(4), filmed(1, height=9)),
-        SimilaritySample(filmed(2), filmed(3, height=9)),
-    ]
-    tensors = wire.encode_samples(samples)
-    assert tensors[wire.FRAMES].shape == (2, 4, 8, 6, 3)
-    assert tensors[wire.SECOND_FRAMES].shape == (2, 3, 9, 6, 3)
-    assert wire.num_positions(tensors) == 4 + 3
-    of_encoder = {spec.name: tensors[spec.name] for spec in wire.encoder_inputs()}
-    for decoded in (wire.decode_samples(tensors), wire.decode_trajectories(of_encoder)):
-        for sample, its_copy in zip(samples, decoded, strict=True):
-            for trajectory, other in zip(sample.trajectories, its_copy.trajectories, strict=True):
-                np.testing.assert_array_equal(other.positions, trajectory.positions)  # type: ignore[union-attr]
-    assert wire.SECOND_FRAMES not in wire.encode_samples([PreferenceSample(filmed(1), filmed(3))])
-
-
-def test_a_sample_of_a_larger_request_is_named_in_its_error() -> None:
-    tensors = wire.encode_samples([ProgressSample(embedded(1)), PreferenceSample(embedded(2), embedded(5))])
-    tensors[wire.SAMPLE_TYPE][1] = 9
-    with pytest.raises(InvalidSampleError, match=r"^samples\[1\]\.sample_type: expected"):
-        wire.decode_samples(tensors)
-
-
 def test_requests_of_two_frame_sizes_are_bounded_by_what_is_sent() -> None:
     """The longest first and second trajectories may belong to different samples."""
     small, large = (np.zeros((9, height, 400, 3), np.uint8) for height in (100, 400))

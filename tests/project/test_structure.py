@@ -107,8 +107,8 @@ LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last fo
 # Packages that only an extra brings, and the files that need them.
 EXTRAS = {
     "av": {"video_decoding.py"},
-    "async_timeout": {"deadline.py"},  # Python 3.10 only
-    "PIL": {"pictures.py", "resize.py"},
+    "async_timeout": {"limits.py"},  # Python 3.10 only
+    "PIL": {"pictures.py", "fit_to_checkpoint.py"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"cli", "plot.py"},

@@ -16,8 +16,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import OptionInfo
 
-from rfm_client.cli.help_sections import argument_name, write_options
-from rfm_client.cli.messages import UsageError, in_plain_words, same_words, told
+from rfm_client.cli.messages import UsageError, argument_name, in_plain_words, same_words, told, write_options
 from rfm_client.contract import errors
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of
 

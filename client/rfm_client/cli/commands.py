@@ -26,8 +26,7 @@ from rfm_client.cli.command import (
     usage_errors,
     with_options,
 )
-from rfm_client.cli.help_sections import MOST_COLUMNS
-from rfm_client.cli.messages import with_remedy
+from rfm_client.cli.messages import MOST_COLUMNS, with_remedy
 from rfm_client.cli.next_steps import steps_with_server
 from rfm_client.cli.options import (
     CredentialFiles,

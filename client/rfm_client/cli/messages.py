@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Messages in the words of the command line: no text of libraries, no arguments of Python functions."""
+"""Messages in the words of the command line, and the sections of a command's help.
+
+No text of libraries, no arguments of Python functions.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,9 @@ import typer
 from rfm_client.contract.errors import LocatedError
 from rfm_client.contract.triton import FEWER_FRAMES
 
+MOST_COLUMNS = 110  # of a help text, in a terminal as wide
+
+_FIRST, _LAST = ("Arguments", "Options"), ("Server", "Credentials")  # sections of a help text
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # click's, or that of typer's own copy of click
 _EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number", "float_parsing": "a number"}
 
@@ -42,3 +48,25 @@ def same_words(option: str, options: Sequence[str]) -> list[str]:
     """Return the options with the words of this one in another order."""
     words = sorted(option.strip("-").split("-"))
     return [each for each in options if sorted(each.strip("-").split("-")) == words]
+
+
+def write_options(command: Any, ctx: Any, formatter: Any) -> None:
+    """Write a section for each group of parameters; required ones stand first in a section."""
+    sections: dict[str, list[tuple[str, str]]] = {title: [] for title in _FIRST}
+    for parameter in sorted(command.get_params(ctx), key=lambda each: not each.required):
+        record = parameter.get_help_record(ctx)
+        if record is not None:
+            is_argument = parameter.param_type_name == "argument"
+            record = (argument_name(parameter), record[1]) if is_argument else record
+            title = "Arguments" if is_argument else getattr(parameter, "rich_help_panel", None) or "Options"
+            sections.setdefault(title, []).append(record)
+    last = [title for title in _LAST if title in sections]
+    for title in [*(title for title in sections if title not in last), *last]:
+        if sections[title]:
+            with formatter.section(title):
+                formatter.write_dl(sections[title])
+
+
+def argument_name(parameter: Any) -> str:
+    """Return an argument's name as the usage line and the help write it."""
+    return str(parameter.metavar or parameter.name.upper())

@@ -22,6 +22,7 @@ from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.show import at_end, number
 from rfm_client.client import RewardClient
+from rfm_client.contract.checks import is_blank
 from rfm_client.contract.errors import (
     DeadlineExceededError,
     InvalidSampleError,
@@ -32,7 +33,6 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.contract.results import FrameScores, ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
-from rfm_client.contract.tasks import is_blank
 from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, with_frame_indices
 from rfm_client.frames.sampling import Sampling
 from rfm_client.plot import plot_scores

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Samples, results, errors, names and tensors that client and server share."""
 
+from rfm_client.contract.description import FrameSize, ModelInfo
 from rfm_client.contract.errors import (
     AccessDeniedError,
     ClientClosedError,
@@ -13,8 +14,6 @@ from rfm_client.contract.errors import (
     ServerError,
     ServerUnavailableError,
 )
-from rfm_client.contract.frame_size import FrameSize
-from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import (
     FRAME_SCORES,
     BatchTiming,

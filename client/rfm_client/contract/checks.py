@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Checks of values and files, and lists of names for messages."""
+"""Checks of values from callers, of numbers, tasks and files; lists of names for messages."""
 
 from __future__ import annotations
 
+import math
+import numbers
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 from rfm_client.contract.errors import InvalidValueError, LocatedError
 
+_PLACEHOLDERS = {"none", "null", "nan", "n/a", "n.a.", "na", "todo", "tbd", "unknown"}  # for a task
 _LFS_POINTER = b"version https://git-lfs"  # how each begins
 
 
@@ -35,3 +39,45 @@ def git_lfs_pointer(content: Path | bytes) -> str:
             content = file.read(len(_LFS_POINTER))
     is_pointer = content.startswith(_LFS_POINTER)
     return "Git LFS's note of where it is; `git lfs pull` fetches it" if is_pointer else ""
+
+
+def is_blank(task: Any) -> bool:
+    """True for a task without a value, letter or digit, and for a placeholder such as ``N/A``."""
+    if isinstance(task, str):
+        text = task.strip().casefold()
+        return text in _PLACEHOLDERS or not any(map(str.isalnum, text))
+    return not task or task != task  # NaN differs from itself
+
+
+def checked_count(
+    where: str, value: Any, *, least: int | None = 1, error: type[LocatedError] = InvalidValueError
+) -> int:
+    """Return a whole number of at least ``least``. Raises ``error``."""
+    is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    require(where, is_whole, "a whole number", repr(value), error)
+    require(where, least is None or value >= least, f"at least {least}", value, error)
+    return int(value)
+
+
+def checked_finite(where: str, value: Any, expected: str = "a number") -> float:
+    """Return a finite number. Raises InvalidValueError, whose message says ``expected``."""
+    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    require(where, is_number and math.isfinite(value), expected, value if is_number else repr(value))
+    return float(value)
+
+
+def checked_positive(where: str, value: Any, expected: str = "a number above 0", *, most: float = math.inf) -> float:
+    """Return a number above 0 and at most ``most``. Raises InvalidValueError, whose message says ``expected``."""
+    number = checked_finite(where, value, expected)
+    require(where, 0 < number <= most, expected, value)
+    return number
+
+
+def checked_share(where: str, value: Any) -> float:
+    """Return a number from 0 to 1. Raises InvalidValueError."""
+    expected = "a number from 0 to 1"
+    number = checked_finite(where, value, expected)
+    if not 0 <= number <= 1:
+        remedy = f"for {number:g} percent give {number / 100:g}" if 1 < number <= 100 else ""
+        raise InvalidValueError.at(where, expected, value, remedy)
+    return number

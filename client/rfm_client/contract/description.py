@@ -4,18 +4,60 @@
 from __future__ import annotations
 
 import json
+import re
 import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, TypeAlias, cast
 
+from rfm_client.contract import wire
 from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InvalidValueError
-from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, InvalidValueError
 
 DESCRIPTION_PARAMETER = "description"  # of config.pbtxt
 _WHERE = f"parameter {DESCRIPTION_PARAMETER}"
+
+Rule: TypeAlias = Literal["shortest", "exact"]
+
+_FORMS = "'shortest PX' or 'exact HEIGHTxWIDTH'"
+_TEXT = re.compile(r"(?:(shortest) ([1-9][0-9]*))|(?:(exact) ([1-9][0-9]*)x([1-9][0-9]*))")
+
+
+@dataclass(frozen=True)
+class FrameSize:
+    """The size to which a served checkpoint resizes every frame.
+
+    rule: ``shortest`` (ReWiND's encoders): the shorter edge becomes px pixels, the other in proportion, rounded down;
+        ``exact``: the frame gets this height and width
+    edges_px: (px,), or (height, width) for ``exact``
+    """
+
+    rule: Rule
+    edges_px: tuple[int, ...]
+
+    @classmethod
+    def parse(cls, text: str) -> FrameSize:
+        """Parse ``shortest 256`` or ``exact 224x320``, as ``str`` writes them. Raises ValueError."""
+        match = _TEXT.fullmatch(text)
+        if match is None:
+            raise InvalidValueError.at("frame_size", _FORMS, repr(text))
+        rule, *edges = (part for part in match.groups() if part)
+        return cls(cast(Rule, rule), tuple(map(int, edges)))
+
+    def __str__(self) -> str:
+        return f"{self.rule} {'x'.join(map(str, self.edges_px))}"
+
+    def fitted(self, height: int, width: int) -> tuple[int, int]:
+        """Return (height, width) to shrink frames of this size to; never larger, since the server enlarges frames."""
+        if self.rule == "exact":
+            return min(height, self.edges_px[0]), min(width, self.edges_px[1])
+        (px,) = self.edges_px
+        edge = min(height, width)
+        if edge <= px:
+            return height, width
+        other = int(px * max(height, width) / edge)  # as by the server, which would resize again after other rounding
+        return (px, other) if height <= width else (other, px)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,3 +197,55 @@ def _read(name: str, value: Any, kind: Any) -> Any:
         expected = " or ".join("null" if part is types.NoneType else part.__name__ for part in parts)
         raise InvalidValueError.at(f"{_WHERE}: {name}", expected, f"{value!r:.80}")
     return read
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelInfo(Description):
+    """A served model. Facts of its checkpoint: as in ``Description`` and ``Origin``.
+
+    versions: versions that its configuration demands; empty: the latest
+    max_batch_size: most samples in a request
+    by_digest: True if the model accepts frame references
+    instances: number on a server; 0: an ensemble, whose parts have instances
+    """
+
+    name: str
+    versions: tuple[str, ...]
+    max_batch_size: int
+    by_digest: bool = False
+    instances: int = 1
+
+    def check_scores_prefixes(self) -> None:
+        """Raise InvalidSampleError for a model that cannot score while an episode runs."""
+        if self.needs_whole_episode:
+            expected = "a model that scores an episode while it runs"
+            got = f"{self.kind}, whose progress is relative to the whole episode: score it at its end"
+            raise InvalidSampleError.at(f"model {self.name}", expected, got)
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
+        """Read Triton's model configuration, in the form of its HTTP API.
+
+        Raises InferenceFailedError for a model without the description of an export, ValueError, LookupError or
+        TypeError for an answer that is no configuration.
+        """
+        stored = config.get("parameters", {}).get(DESCRIPTION_PARAMETER, {})
+        try:
+            description = Description.parse(stored.get("string_value", ""))
+        except ValueError as error:
+            remedy = "export the checkpoint again with the version of rfm that serves it"
+            raise InferenceFailedError(f"model {config['name']}: config.pbtxt: {error}; {remedy}") from error
+        versions = config.get("version_policy", {}).get("specific", {}).get("versions", [])
+        return cls(
+            **vars(description),
+            name=config["name"],
+            versions=tuple(str(version) for version in versions),
+            max_batch_size=int(config["max_batch_size"]),
+            by_digest=any(tensor["name"] == wire.FRAME_DIGESTS for tensor in config["input"]),
+            instances=sum(map(_num_instances, config.get("instance_group", []))),
+        )
+
+
+def _num_instances(group: Mapping[str, Any]) -> int:
+    """Instances of a group: ``count`` on each of its GPUs, or on the CPU."""
+    return int(group.get("count", 1)) * max(len(group.get("gpus", [])), 1)

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, 
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.checks import require
+from rfm_client.contract.checks import checked_count, checked_share, require
 from rfm_client.contract.errors import InferenceFailedError
-from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import Float32Array
 
 if TYPE_CHECKING:

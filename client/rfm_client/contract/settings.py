@@ -11,9 +11,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
 
-from rfm_client.contract.checks import require
+from rfm_client.contract.checks import checked_count, checked_finite, require
 from rfm_client.contract.errors import InvalidValueError
-from rfm_client.contract.numbers import checked_count, checked_finite
 
 Texts: TypeAlias = tuple[str, ...]
 

@@ -15,16 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.checks import require
+from rfm_client.contract.description import FrameSize
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.samples import checked_mask
 from rfm_client.episodes.options import StepScore, StepScores
 from rfm_client.episodes.scorer import Asked, StepScorer
 from rfm_client.episodes.steps import Frame, Steps, check_cameras, copied
 from rfm_client.scoring.call import Call, CallOptions
-from rfm_client.transport.lifetime import AsyncClosing, Closing, OneProcess
-from rfm_client.transport.loop_thread import LoopThread
+from rfm_client.transport.threads import AsyncClosing, Closing, LoopThread, OneProcess
 
 
 class AsyncEpisodes(AsyncClosing, OneProcess):

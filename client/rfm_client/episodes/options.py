@@ -10,9 +10,8 @@ from typing import Any, Literal, TypeAlias, TypedDict, get_args
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.checks import require
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.numbers import checked_count, checked_share
+from rfm_client.contract.checks import checked_count, checked_share, require
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.contract.samples import Float32Array
 from rfm_client.frames.camera_fusion import FUSES, Fuse

@@ -18,8 +18,8 @@ from typing import TypeAlias
 from weakref import WeakKeyDictionary
 
 from rfm_client.contract import wire
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
-from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array
@@ -28,7 +28,7 @@ from rfm_client.episodes.steps import Steps, Window
 from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW
 from rfm_client.scoring.call import Call
 from rfm_client.scoring.samples import SampleScorer, for_each
-from rfm_client.transport.off_loop import off_loop
+from rfm_client.transport.threads import off_loop
 
 MAX_NEW_BYTES = 3 * 2**20  # of a request's frames: the server prepares a request while the next is sent
 MAX_REMEMBERED = 2**17  # digests of sent frames; the oldest are forgotten

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Fit a sample to its checkpoint: fewer frames, smaller frames."""
+"""Fit a sample to its checkpoint: fewer frames, and frames no larger than it reads them.
+
+Shrinking needs Pillow: ``rfm-client[resize]``.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +13,37 @@ from typing import Any
 
 import numpy as np
 
+from rfm_client.contract.description import FrameSize
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.results import ProgressResult, Result, trajectory_scores
-from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, with_pictures, with_trajectories
-from rfm_client.frames.resize import resize_frames
+from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, UInt8Array, with_pictures, with_trajectories
 from rfm_client.frames.sampling import FrameIndices, taken, thinned
+
+
+def load_pillow() -> Any:
+    """Return Pillow's ``Image``. Raises ImportError with the extra to install."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError('making frames smaller needs Pillow: pip install "./client[resize]"') from error
+    return Image
+
+
+def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:
+    """Return frames, uint8 [T, H, W, 3], no larger than the checkpoint reads them; the same array if they fit.
+
+    Pillow resizes, bicubic. The network's input stays within a grey level or two for ReWiND. For Qwen's backbones it
+    stays identical if they read the size ``exact``. If they round it to whole patches, frames are resized twice, and
+    single pixels differ by up to 15.
+    """
+    Image = load_pillow()  # noqa: N806  Pillow's spelling
+    height, width = size.fitted(frames.shape[1], frames.shape[2])
+    if (height, width) == frames.shape[1:3]:
+        return frames
+    resized = np.empty((len(frames), height, width, 3), np.uint8)
+    for frame, smaller in zip(frames, resized, strict=True):
+        smaller[:] = Image.fromarray(frame).resize((width, height), Image.Resampling.BICUBIC)
+    return resized
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.checks import require
-from rfm_client.contract.numbers import checked_count
+from rfm_client.contract.checks import checked_count, require
 from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
 

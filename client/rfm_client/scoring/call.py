@@ -10,7 +10,7 @@ from typing import TypedDict
 
 from rfm_client.contract import wire
 from rfm_client.contract.errors import InvalidValueError
-from rfm_client.transport.deadline import Deadline
+from rfm_client.transport.limits import Deadline
 
 _ID_BYTES = 8  # random bytes in the ids of a call's requests
 

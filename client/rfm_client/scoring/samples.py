@@ -12,8 +12,8 @@ from functools import partial
 from typing import Any, TypeAlias, TypeVar, cast
 
 from rfm_client.contract import wire
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, ModelNotFoundError, RewardError
-from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import encoder_name
 from rfm_client.contract.results import Result
 from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, UInt8Array
@@ -22,10 +22,9 @@ from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, whole, wit
 from rfm_client.scoring.batching import groups, model_of, padded_bytes, parts
 from rfm_client.scoring.call import Call
 from rfm_client.transport.calls import Answer
-from rfm_client.transport.concurrency import ConcurrencyLimiter
-from rfm_client.transport.deadline import Deadline
-from rfm_client.transport.off_loop import off_loop
+from rfm_client.transport.limits import ConcurrencyLimiter, Deadline
 from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
+from rfm_client.transport.threads import off_loop
 
 Answered = TypeVar("Answered")
 Outcome: TypeAlias = Result | RewardError

@@ -17,16 +17,15 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client.contract import errors, triton
 from rfm_client.contract.addresses import split_url
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidValueError
-from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.proxies import grpc_proxy
 from rfm_client.contract.wire import Tensors
 from rfm_client.transport.connection import Connection, grpc_options
 from rfm_client.transport.credentials import SECURE_SCHEMES, Credentials
-from rfm_client.transport.deadline import timeout
-from rfm_client.transport.off_loop import off_loop
-from rfm_client.transport.request_size import check_size
+from rfm_client.transport.limits import check_size, timeout
 from rfm_client.transport.shared_memory import Region, SharedMemory
+from rfm_client.transport.threads import off_loop
 
 Answered = TypeVar("Answered")
 
@@ -169,7 +168,7 @@ class TritonTransport:
     ) -> Answered:
         """Return the answer to ``request`` within ``timeout_s``; ``bad_request`` as in ``triton.error_from``."""
         try:
-            # Not gRPC's deadline: Triton 2.51 overlooks a deadline that has passed, but not a cancelled call.
+            # One limit for gRPC and HTTP. Triton drops a call over gRPC that it cancels, unless scoring has begun.
             async with timeout(timeout_s):
                 return await self._answer(request)
         except errors.RewardError:

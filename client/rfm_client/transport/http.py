@@ -19,7 +19,7 @@ from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import triton
 from rfm_client.transport.credentials import SECURE_SCHEMES, Credentials
-from rfm_client.transport.off_loop import MIN_BYTES
+from rfm_client.transport.threads import MIN_BYTES
 
 _AS_IT_IS = {"Accept-Encoding": "identity"}  # else aiohttp asks for gzip, which hardly shrinks floats
 _HEADER_LENGTH = "Inference-Header-Content-Length"  # of the JSON before the arrays

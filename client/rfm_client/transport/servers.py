@@ -23,6 +23,7 @@ from collections.abc import Awaitable, Callable, Collection, Sequence
 from typing import TypeVar
 
 from rfm_client.contract.checks import require
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
     AccessDeniedError,
     ClientClosedError,
@@ -34,10 +35,9 @@ from rfm_client.contract.errors import (
     ServerUnavailableError,
     clear_variables,
 )
-from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.wire import Tensors
 from rfm_client.transport.calls import Answer, Transport, TritonTransport
-from rfm_client.transport.deadline import Deadline
+from rfm_client.transport.limits import Deadline
 from rfm_client.transport.ports import OF_A_PORT, wrong_port
 
 Answered = TypeVar("Answered")

@@ -26,8 +26,8 @@ import numpy.typing as npt
 from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import triton
-from rfm_client.transport.deadline import timeout
-from rfm_client.transport.off_loop import off_loop
+from rfm_client.transport.limits import timeout
+from rfm_client.transport.threads import off_loop
 
 FOLDER = Path("/dev/shm")
 MIN_SHARED_BYTES = 64 * 2**10  # smaller inputs are faster in the request itself

@@ -15,7 +15,7 @@ from torch import Tensor
 from rfm.engine.pixels import Normalisation
 from rfm.files import MAX_UINT8, PIL_BICUBIC, PREPROCESSOR_CONFIG, check_one_form, is_there, local_copy, read_json
 from rfm.weights import check_values
-from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.description import FrameSize
 
 IMAGE_MODELS = ("dinov2", "dinov2_with_registers")  # types whose pooled output is that of the class token
 TEXT_MODELS = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta")  # types of sentence encoders

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An event loop in a thread of its own, for blocking callers."""
+"""Threads and event loops of a client; bases of objects with connections."""
 
 from __future__ import annotations
 
@@ -8,11 +8,64 @@ import os
 import threading
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TypeVar
 
 from rfm_client.contract.errors import ClientClosedError, clear_variables
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+Arguments = ParamSpec("Arguments")
 Returned = TypeVar("Returned")
+
+MIN_BYTES = 2**20  # a smaller copy takes no longer than a change of thread
+
+
+class OneProcess:
+    """An object with a connection, which cannot be pickled or copied."""
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            f"{type(self).__name__}: expected an object without a connection to pickle or copy: pass "
+            "functools.partial(RewardClient, url) instead, and call that in each process"
+        )
+
+
+class Closing:
+    """A context manager that closes itself."""
+
+    def close(self) -> None:
+        """Release the resources of this object."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_raised: object) -> None:
+        self.close()
+
+
+class AsyncClosing:
+    """An async context manager that closes itself."""
+
+    async def close(self) -> None:
+        """Release the resources of this object."""
+        raise NotImplementedError
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_raised: object) -> None:
+        await self.close()
+
+
+async def off_loop(
+    num_bytes: int | None, work: Callable[Arguments, Returned], *arguments: Arguments.args, **options: Arguments.kwargs
+) -> Returned:
+    """Return the result of ``work``, which handles ``num_bytes``. From MIN_BYTES, or for None, it runs in a thread."""
+    if num_bytes is not None and num_bytes < MIN_BYTES:
+        return work(*arguments, **options)
+    return await asyncio.to_thread(work, *arguments, **options)
 
 
 class LoopThread:

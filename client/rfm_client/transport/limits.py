@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: MIT
+"""Limits of calls: their time, the size of a request, and what is on its way at a time."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from collections.abc import AsyncIterator, Collection
+from contextlib import asynccontextmanager
+
+import numpy as np
+
+if sys.version_info >= (3, 11):
+    from asyncio import timeout as timeout
+else:
+    from async_timeout import timeout as timeout
+
+from rfm_client.contract.checks import checked_count, checked_positive
+from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError
+from rfm_client.contract.wire import Tensors
+
+MAX_REQUEST_BYTES = 2**31 - 2**16  # gRPC and Triton's HTTP server count a message's bytes in 32 bits; rest: headers
+_BYTES_PER_GB = 1e9
+_LENGTH_BYTES = 4  # before each text
+MAX_BYTES = 256 * 2**20  # of inputs; writing to a socket holds several copies of them
+MAX_TIMEOUT_S = 1e9  # more than 30 years; Triton counts nanoseconds, and not many more
+
+
+def check_timeout(timeout_s: float) -> None:
+    """Raise ValueError for an invalid time limit. Infinity is invalid, because servers can hang."""
+    expected = f"a number of seconds above 0 and at most {MAX_TIMEOUT_S:g}"
+    checked_positive("timeout_s", timeout_s, expected, most=MAX_TIMEOUT_S)
+
+
+class Deadline:
+    """A moment ``timeout_s`` seconds from now, for all steps of a call. at_s: the moment (monotonic clock)"""
+
+    def __init__(self, timeout_s: float) -> None:
+        check_timeout(timeout_s)
+        self.timeout_s = timeout_s
+        self.at_s = time.monotonic() + timeout_s
+
+    def ends_within(self, seconds: float) -> bool:
+        """True if at most ``seconds`` are left."""
+        return time.monotonic() + seconds >= self.at_s
+
+    def remaining_s(self) -> float:
+        """Return the seconds left, above 0. Raises DeadlineExceededError if none are left."""
+        remaining_s = self.at_s - time.monotonic()
+        if remaining_s <= 0:
+            raise self.exceeded()
+        return remaining_s
+
+    def exceeded(self, where: str = "") -> DeadlineExceededError:
+        """Return the error of a call that ran out of time at the server ``where``."""
+        return DeadlineExceededError(f"{where}{': ' if where else ''}no answer within {self.timeout_s:g} s")
+
+
+def check_size(inputs: Tensors, shared: Collection[str]) -> None:
+    """Raise InvalidSampleError if the inputs outside of shared memory do not fit into one request.
+
+    shared: names of the inputs in shared memory
+    """
+    sizes = {name: _num_bytes(inputs, name) for name in inputs if name not in shared}
+    if sum(sizes.values()) <= MAX_REQUEST_BYTES:
+        return
+    raise InvalidSampleError.at(
+        max(sizes, key=lambda name: sizes[name]),
+        f"at most {MAX_REQUEST_BYTES / _BYTES_PER_GB:.2f} GB in a request",
+        f"{sum(sizes.values()) / _BYTES_PER_GB:.2f} GB",
+        "shrink the frames (resize, --resize), score fewer (subsample, --max-frames), or share memory with a server on "
+        "this host (shared_memory)",
+    )
+
+
+def _num_bytes(inputs: Tensors, name: str) -> int:
+    array = inputs[name]
+    if array.dtype != np.object_:
+        return array.nbytes
+    return sum(len(text) + _LENGTH_BYTES for text in array.ravel())
+
+
+class ConcurrencyLimiter:
+    """A limit of ``max_requests`` requests and MAX_BYTES at a time, for one event loop. First come, first served."""
+
+    def __init__(self, max_requests: int) -> None:
+        self._free_requests = checked_count("max_in_flight", max_requests)
+        self._free_bytes = MAX_BYTES
+        self._turn = asyncio.Lock()  # held by the request that enters next
+        self._left = asyncio.Event()  # set when a request ends
+
+    @asynccontextmanager
+    async def room(self, num_bytes: int, deadline: Deadline) -> AsyncIterator[None]:
+        """Context manager for a request of ``num_bytes``. A request over MAX_BYTES runs alone.
+
+        Raises DeadlineExceededError if there is no room in time.
+        """
+        num_bytes = min(max(num_bytes, 1), MAX_BYTES)
+        if self._turn.locked() or not self._fits(num_bytes):
+            await self._wait_for_room(num_bytes, deadline)
+        self._free_requests -= 1
+        self._free_bytes -= num_bytes
+        try:
+            yield
+        finally:
+            self._free_requests += 1
+            self._free_bytes += num_bytes
+            self._left.set()
+
+    def _fits(self, num_bytes: int) -> bool:
+        return self._free_requests > 0 and self._free_bytes >= num_bytes
+
+    async def _wait_for_room(self, num_bytes: int, deadline: Deadline) -> None:
+        try:
+            async with timeout(deadline.remaining_s()), self._turn:
+                while not self._fits(num_bytes):
+                    self._left.clear()
+                    await self._left.wait()
+        except asyncio.TimeoutError:  # not the built-in class in Python 3.10
+            raise deadline.exceeded() from None
