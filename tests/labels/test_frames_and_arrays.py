@@ -67,6 +67,10 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda root: (root / "3").mkdir(),
         "3: expected PNG or JPEG files, got an empty folder: leave it out (--episodes)",
     ),
+    "a listed folder that is not there": (
+        lambda root: (root / "tasks.csv").write_text(f"episode,task\n11,{TASK}\n10,{TASK}\n"),
+        "11: expected a folder of PNG or JPEG files, got No such file",
+    ),
     "a folder of other files": (
         lambda root: [(root / "3").mkdir(), (root / "3" / "a.txt").write_text("a")],
         "3: expected PNG or JPEG files, got other files: leave it out (--episodes)",
@@ -120,15 +124,6 @@ def test_a_table_lists_episodes_of_one_kind(folders: Path) -> None:
         DatasetError, match=r"got arrays \(a\.npy\) and folders of pictures \(0\): write a table for each"
     ):
         open_dataset(folders)
-
-
-def test_a_table_of_folders_tells_what_it_lacks_and_what_is_missing(folders: Path) -> None:
-    (folders / "notes").mkdir()
-    (folders / "tasks.csv").write_text(f"episode,task\n11,{TASK}\n10,{TASK}\n")
-    dataset = open_dataset(folders)
-    assert dataset.notes == ["tasks.csv: 2 folders of pictures beside it are not listed and get no labels: 0, 2"]
-    with pytest.raises(DatasetError, match=r"11: expected a folder of PNG or JPEG files, got No such file"):
-        _ = dataset.episodes
 
 
 def write_demos(file: Path, task: str) -> None:

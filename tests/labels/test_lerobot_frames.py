@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
-from pyarrow import parquet
 
 from client_commands import invoke
 from encoding import encode_here
-from labelling import FRONT, LEROBOT, BrightnessScorer, Notes
+from labelling import FRONT, LEROBOT, BrightnessScorer, Notes, change_column
 from pictures import write_video
 from rfm_client import UInt8Array
 from rfm_client.frames import video_file
@@ -115,13 +113,9 @@ RECORDINGS = {
 
 
 def change(file: Path, columns: dict[str, Sequence[float]]) -> None:
-    """Replaces the first values of columns."""
-    table = parquet.read_table(file, partitioning=None)
-    for name, values in columns.items():
-        field = table.schema.field(name)
-        new = [*values, *table[name].to_pylist()[len(values) :]]
-        table = table.set_column(table.schema.get_field_index(name), field, pa.array(new, field.type))
-    parquet.write_table(table, file)
+    """Replace the first values of columns."""
+    for name, new in columns.items():
+        change_column(file, name, lambda values, new=new: [*new, *values[len(new) :]])  # type: ignore[misc]
 
 
 def written(folder: Path, recording: Recording) -> Path:
@@ -176,21 +170,6 @@ def test_other_row_times_are_another_episode(tmp_path: Path, output: Path) -> No
     change(root / ROWS, {"timestamp": later})
     with pytest.raises(DatasetError, match="labels of the episodes as they are now, got others for 0, whose frames or"):
         label(open_dataset(root, **CLOCK), BrightnessScorer(), options(output))
-
-
-def test_a_video_of_version_2_1_may_hold_a_discarded_take(tmp_path: Path, output: Path) -> None:
-    root = Path(shutil.copytree(LEROBOT / "toy_v21", tmp_path / "toy"))
-    lengths = [open_dataset(root).episode(number).num_frames for number in EPISODES]
-    for number, length in zip(EPISODES, lengths, strict=True):
-        numbers = [*range(length), *[DISCARDED] * TAKES[number]]
-        write_video(root / f"videos/chunk-000/{FRONT}/episode_{number:06d}.mp4", coded(numbers))
-    dataset, notes = open_dataset(root), Notes()
-    assert not label(dataset, BrightnessScorer(), options(output), notes).failures
-    for number, length in zip(EPISODES, lengths, strict=True):
-        assert shown(list(dataset.frames(dataset.episode(number), FRONT))) == list(range(length))
-    names = ", ".join(f"videos/chunk-000/{FRONT}/episode_00000{number}.mp4" for number in (0, 2, 3))
-    of_all = f"22 of the {sum(lengths) - lengths[1] + 22} frames in 3 videos ({names})"
-    assert f"left out: {FRONT}: {of_all}, because no row has their times" in notes.lines
 
 
 def test_times_late_in_a_long_video_are_those_of_a_float32(tmp_path: Path) -> None:

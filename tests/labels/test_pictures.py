@@ -89,15 +89,15 @@ SEVERAL_KINDS = {
 def test_several_kinds_of_names_are_refused(tmp_path: Path, names: Sequence[str], told: str) -> None:
     with pytest.raises(DatasetError) as refused:
         in_order_of_numbers(tmp_path, names)
-    remedy = "give each kind a folder of its own, and list those of one camera in tasks.csv"
+    remedy = f"list those of one camera in tasks.csv, as {tmp_path.name}/{told.partition(' (')[0]}"
     assert str(refused.value) == f"{tmp_path}: {SEVERAL}{told}: {remedy}"
 
 
 TWICE = {
-    "leading zeros": (["001.png", "1.png"], "expected each number once, got 001.png and 1.png: remove one of them"),
-    "two endings": (["1.jpeg", "1.jpg", "2.jpg"], "expected each number once, got 1.jpeg and 1.jpg: remove one of"),
-    "a decimal more": (["1.1.png", "1.10.png"], "expected each number once, got 1.1.png and 1.10.png: remove one of"),
-    "no number": (["a.png", "b.png"], "expected names that differ in a number, got a.png (1) and b.png (1): rename"),
+    "leading zeros": (["001.png", "1.png"], "expected each number once, got 001.png and 1.png: leave the episode"),
+    "two endings": (["1.jpeg", "1.jpg", "2.jpg"], "expected each number once, got 1.jpeg and 1.jpg: leave the ep"),
+    "a decimal more": (["1.1.png", "1.10.png"], "expected each number once, got 1.1.png and 1.10.png: leave the e"),
+    "no number": (["a.png", "b.png"], "expected names that differ in a number, got a.png (1) and b.png (1): copy t"),
 }
 
 

@@ -32,9 +32,9 @@ def copied(tmp_path: Path) -> Path:
     return shutil.copytree(RLDS / "toy_steps_texts" / "1.0.0", tmp_path / "1.0.0")
 
 
-def decoded(name: str = "toy_steps_texts") -> Mapping[str, Any]:
+def decoded() -> Mapping[str, Any]:
     """Frames and tasks as TensorFlow decodes them."""
-    return dict(np.load(RLDS / f"{name}.npz"))
+    return dict(np.load(RLDS / "toy_steps_texts.npz"))
 
 
 def tasks_of(episode: Any) -> list[str]:
@@ -51,12 +51,6 @@ def test_frames_and_tasks_equal_those_that_tensorflow_decodes() -> None:
         assert tasks_of(episode) == expected[f"{place}/task"].tolist()
         for camera in CAMERAS:
             np.testing.assert_array_equal(list(dataset.frames(episode, camera)), expected[f"{place}/{camera}"])
-
-
-def test_an_instruction_of_the_episode_is_the_task_of_all_its_frames() -> None:
-    dataset, expected = open_dataset(RLDS / "toy_episode_texts"), decoded("toy_episode_texts")
-    assert [[e.task] for e in dataset.episodes] == [expected[f"{place}/task"].tolist() for place in PLACES]
-    assert not any(episode.tasks for episode in dataset.episodes)
 
 
 def test_a_missing_package_is_named_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, tasks_of
+from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, change_column, tasks_of
 from rfm_client import ProgressResult, ProgressSample, Trajectory, UInt8Array
-from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, label, open_dataset, read_episode_labels
+from rfm_labels import CheckpointFacts, LabelOptions, label, open_dataset, read_episode_labels
 
 CUTS = (0, 20, 30)  # first frames of the stretches of episode 0
 TASKS = (0, 4, 0)  # and numbers
@@ -61,22 +60,15 @@ def root(tmp_path: Path) -> Path:
     """Episode 0 has two tasks in three stretches, all other episodes have one."""
     root = shutil.copytree(LEROBOT / "toy_v30_many", tmp_path / "toy")
     rows = root / "data" / "chunk-000" / "file-000.parquet"
-    change(rows, "task_index", lambda values: [*numbers(58), *values[58:]])
+    change_column(rows, "task_index", lambda values: [*numbers(58), *values[58:]])
     sentences = tasks_of(root)
     episodes = root / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
-    change(episodes, "tasks", lambda values: [[sentences[0], sentences[4]], *values[1:]])
+    change_column(episodes, "tasks", lambda values: [[sentences[0], sentences[4]], *values[1:]])
     return root
 
 
 def numbers(count: int) -> list[int]:
     return [TASKS[max(k for k, cut in enumerate(CUTS) if cut <= t)] for t in range(count)]
-
-
-def change(file: Path, column: str, change: Any) -> None:
-    table = parquet.read_table(file, partitioning=None)
-    place = table.column_names.index(column)
-    values = pa.array(change(table[column].to_pylist()), table.schema.field(column).type)
-    parquet.write_table(table.set_column(place, table.schema.field(column), values), file)
 
 
 def options(output: Path, **more: Any) -> LabelOptions:
@@ -138,22 +130,3 @@ def test_frames_before_a_change_of_tasks_keep_their_weight_in_behaviour_cloning(
     shown = read_episode_labels(report.files[0], 0)
     assert shown is not None
     np.testing.assert_array_equal(shown.fused.progress, own)
-
-
-def test_all_frames_have_the_first_task_by_choice(root: Path, output: Path) -> None:
-    dataset, scorer = open_dataset(root, several_tasks="first"), SinceTheFirst()
-    assert dataset.episode(0).tasks == ()
-    report = label(dataset, scorer, options(output))
-    means = np.array([frame.mean() / 255 for frame in dataset.frames(dataset.episode(0), WRIST)], np.float32)
-    progress = parquet.read_table(report.files[0])["progress_sparse"].to_numpy()[: len(means)]
-    np.testing.assert_allclose(progress, means - means[0], atol=1e-5)
-    assert tasks_of(root)[4] not in scorer.asked
-    with pytest.raises(DatasetError, match="labels of the episodes as they are now, got others for 0, whose frames or"):
-        label(open_dataset(root), scorer, options(output))
-    with pytest.raises(DatasetError, match="several_tasks: expected one of each, first, got 'last'"):
-        open_dataset(root, several_tasks="last")  # type: ignore[arg-type]
-
-
-def test_a_task_of_the_caller_is_that_of_all_frames(root: Path) -> None:
-    episode = open_dataset(root, task="open the box", override_task=True).episode(0)
-    assert (episode.task, episode.tasks) == ("open the box", ())

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from labelling import FEW, FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, tasks_of
+from labelling import FEW, LEROBOT, WRIST, BrightnessScorer, Notes, change_column, change_info, tasks_of
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 from rfm_labels.datasets.lerobot_rows import read_sentences
 
@@ -51,23 +51,16 @@ def in_two(episode: int, frame: int) -> int:
     return int(frame >= CUT)
 
 
-def write_subtasks(root: Path, table: pa.Table) -> None:
-    parquet.write_table(table, root / "meta" / "subtasks.parquet")
-
-
-def sentences() -> dict[int, str | None]:
-    return tasks_of(V30)
-
-
+SENTENCES = tasks_of(V30)
 ANNOTATION = "annotation.human.action.task_description"
 IN_TWO = ((0, SUBTASKS[0]), (CUT, SUBTASKS[1]))
 COLUMNS: dict[str, tuple[str, Callable[[int, int], Any], Any]] = {
     "sentences": ("annotation.human.coarse_action", lambda *place: SUBTASKS[in_two(*place)], IN_TWO),
-    "numbers of tasks": (ANNOTATION, lambda *place: 1 + in_two(*place), ((0, sentences()[1]), (CUT, sentences()[2]))),
+    "numbers of tasks": (ANNOTATION, lambda *place: 1 + in_two(*place), ((0, SENTENCES[1]), (CUT, SENTENCES[2]))),
     "numbers with a gap in another episode": (
         ANNOTATION,
         lambda episode, frame: None if episode else 1 + in_two(episode, frame),
-        ((0, sentences()[1]), (CUT, sentences()[2])),
+        ((0, SENTENCES[1]), (CUT, SENTENCES[2])),
     ),
     "numbers of subtasks": ("subtask_index", in_two, IN_TWO),
     "LeRobot's persistent subtasks": (
@@ -83,13 +76,16 @@ def test_a_column_names_the_tasks(
     tmp_path: Path, output: Path, name: str, value: Callable[[int, int], Any], expected: Any
 ) -> None:
     root = with_columns(tmp_path, **{name: value})
-    write_subtasks(root, pa.table({"subtask_index": [0, 1], "__index_level_0__": list(SUBTASKS)}))
+    subtasks = pa.table({"subtask_index": [0, 1], "__index_level_0__": list(SUBTASKS)})
+    parquet.write_table(subtasks, root / "meta" / "subtasks.parquet")
     dataset, scorer = open_dataset(root, task_column=name), BrightnessScorer()
     assert dataset.episode(0).tasks == expected
     report = label(dataset, scorer, LabelOptions(output=output, episodes=[0], **FEW))
     assert scorer.tasks == {sentence for _, sentence in expected}
     first = open_dataset(root, task_column=name, several_tasks="first").episode(0)
     assert (first.task, first.tasks) == (expected[0][1], ())
+    with pytest.raises(DatasetError, match="several_tasks: expected one of each, first, got 'last'"):
+        open_dataset(root, several_tasks="last")  # type: ignore[arg-type]
     own = label(open_dataset(root), scorer, LabelOptions(output=output, name="own", episodes=[0], **FEW))
     assert own.plan.items[0].digest != report.plan.items[0].digest
 
@@ -134,7 +130,7 @@ def test_a_column_without_tasks_is_refused(tmp_path: Path, name: str, message: s
         "language_events": lambda *_: [{"role": "user", "content": "stop", "style": "interjection"}],
     }
     root = with_columns(tmp_path, **columns)
-    change(rows_of(root)[0], "task_index", lambda values: [9] * LENGTH + values[LENGTH:])
+    change_column(rows_of(root)[0], "task_index", lambda values: [9] * LENGTH + values[LENGTH:])
     with pytest.raises(DatasetError) as caught:
         _ = open_dataset(root, task_column=name).episodes
     assert message in str(caught.value)
@@ -142,17 +138,10 @@ def test_a_column_without_tasks_is_refused(tmp_path: Path, name: str, message: s
 
 def test_a_column_is_no_task_of_another_dataset_or_of_an_override(tmp_path: Path) -> None:
     (tmp_path / "tasks.csv").write_text("video,task\na.mp4,stack the cups\n")
-    with pytest.raises(DatasetError, match=r"task_column: expected none, since .* is no LeRobot dataset, got task"):
+    with pytest.raises(DatasetError, match=r"task_column: expected none, since .* is no LeRobot or RLDS dataset, "):
         open_dataset(tmp_path, task_column="task")
     with pytest.raises(DatasetError, match="task_column: expected none with --override-task, which reads no tasks"):
         open_dataset(V21, task="stack the cups", override_task=True, task_column="task_index")
-
-
-def change(file: Path, column: str, change: Callable[[list[Any]], list[Any]]) -> None:
-    table = parquet.read_table(file, partitioning=None)
-    place = table.column_names.index(column)
-    values = pa.array(change(table[column].to_pylist()), table.schema.field(column).type)
-    parquet.write_table(table.set_column(place, table.schema.field(column), values), file)
 
 
 def rename_tasks(root: Path, *texts: str) -> None:
@@ -209,80 +198,21 @@ def test_an_override_is_told_to_be_the_task_of_all(output: Path) -> None:
     assert [line for line in notes.lines if line.startswith("tasks:")] == ["tasks: all 3 episodes get --task"]
 
 
-def renumbered(folder: Path, numbers: dict[int, int]) -> Path:
-    """A v2.1 dataset of these episodes alone, with other numbers."""
-    root = Path(shutil.copytree(V21, folder / "toy"))
-    lines = [json.loads(line) for line in (root / "meta" / "episodes.jsonl").read_text().splitlines()]
-    kept = [
-        {**line, "episode_index": numbers[line["episode_index"]]} for line in lines if line["episode_index"] in numbers
-    ]
-    (root / "meta" / "episodes.jsonl").write_text("\n".join(map(json.dumps, kept)))
-    info = json.loads((root / "meta" / "info.json").read_text())
-    info |= {"total_episodes": len(kept), "total_frames": sum(line["length"] for line in kept)}
-    (root / "meta" / "info.json").write_text(json.dumps(info))
-    for old, new in numbers.items():
-        paths = (
-            "data/chunk-{:03d}/episode_{:06d}.parquet",
-            *(f"videos/chunk-{{:03d}}/{c}/episode_{{:06d}}.mp4" for c in (FRONT, WRIST)),
-        )
-        for path in paths:
-            target = root / path.format(new // 1000, new)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            (root / path.format(0, old)).rename(target)
-        change(root / paths[0].format(new // 1000, new), "episode_index", lambda values, new=new: [new] * len(values))  # type: ignore[misc]
-    return root
-
-
-SPARSE = {0: 10, 1: 20, 2: 340_020}
-
-
-def test_episode_numbers_may_have_gaps(tmp_path: Path, output: Path) -> None:
-    root = renumbered(tmp_path, SPARSE)
+def test_episode_numbers_may_have_gaps_and_lie_in_several_chunks(tmp_path: Path) -> None:
+    root, whole = Path(shutil.copytree(V21, tmp_path / "toy")), open_dataset(V21)
+    lines = (root / "meta" / "episodes.jsonl").read_text().splitlines()
+    (root / "meta" / "episodes.jsonl").write_text("\n".join(lines[number] for number in (0, 2, 7)))
+    change_info(root, lambda info: info.update(chunks_size=5))
+    for name in ("data/chunk-{}/episode_000007.parquet", f"videos/chunk-{{}}/{WRIST}/episode_000007.mp4"):
+        target = root / name.format("001")
+        target.parent.mkdir(parents=True)
+        (root / name.format("000")).rename(target)
     dataset = open_dataset(root)
-    report = label(dataset, BrightnessScorer(), LabelOptions(output=output, **FEW))
-    table, whole = parquet.read_table(report.files[0]), open_dataset(V21)
-    assert table["episode_index"].unique().to_pylist() == list(SPARSE.values())
-    for old, new in SPARSE.items():
-        told, first = dataset.episode(new), whole.episode(old)
-        assert (told.task, told.num_frames, told.first_index) == (first.task, first.num_frames, first.first_index)
-        np.testing.assert_array_equal(list(dataset.frames(told, WRIST)), list(whole.frames(first, WRIST)))
-    with pytest.raises(DatasetError, match="expected some of the dataset's 3 episodes, got 11; it has 10,20,340020"):
-        label(dataset, BrightnessScorer(), LabelOptions(output=output, episodes=[10, 11]))
-
-
-def test_another_number_of_episodes_is_told_as_it_is(tmp_path: Path) -> None:
-    root = renumbered(tmp_path, SPARSE)
-    file = root / "meta" / "episodes.jsonl"
-    lines = file.read_text().splitlines()
-    for text, message in (
-        ("\n".join(lines[:2]), "meta: expected 3 episodes, as info.json says, got 2: correct total_episodes, or"),
-        ("\n".join([*lines, lines[1]]), "meta: expected each episode once, got 20 several times"),
-    ):
-        file.write_text(text)
-        with pytest.raises(DatasetError) as caught:
-            open_dataset(root)
-        assert message in str(caught.value)
-
-
-def test_two_sentences_for_one_number_are_refused(tmp_path: Path) -> None:
-    root = Path(shutil.copytree(V21, tmp_path / "toy"))
-    with (root / "meta" / "tasks.jsonl").open("a") as file:
-        file.write('\n{"task_index": 0, "task": "open the box"}\n')
-    with pytest.raises(
-        DatasetError, match=r"tasks\.jsonl: expected one sentence for the number 0, got 'put .* and 'open"
-    ):
-        open_dataset(root)
-
-
-def test_a_table_of_tasks_out_of_order_is_told_since_lerobot_counts_its_rows(tmp_path: Path, output: Path) -> None:
-    root = Path(shutil.copytree(V30, tmp_path / "toy"))
-    file = root / "meta" / "tasks.parquet"
-    table = parquet.read_table(file)
-    parquet.write_table(table.take(list(reversed(range(len(table))))), file)
-    dataset, notes = open_dataset(root), Notes()
-    assert dataset.episode(0).task == open_dataset(V30).episode(0).task
-    label(dataset, BrightnessScorer(), LabelOptions(output=output, limit=1, **FEW), notes)
-    assert any("meta/tasks.parquet is not in the order of task_index: LeRobot finds" in line for line in notes.lines)
+    assert dataset.episodes == [whole.episode(number) for number in (0, 2, 7)]
+    last = dataset.episode(7)
+    np.testing.assert_array_equal(list(dataset.frames(last, WRIST)), list(whole.frames(last, WRIST)))
+    with pytest.raises(DatasetError, match="expected some of the dataset's 3 episodes, got 1; it has 0,2,7"):
+        label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path, episodes=[0, 1]))
 
 
 TABLES: dict[str, tuple[dict[str, list[Any]], list[str]]] = {

@@ -7,6 +7,7 @@ python tests/support/labelling.py DATASET OUTPUT SECONDS_A_REQUEST
 from __future__ import annotations
 
 import io
+import json
 import sys
 import threading
 import time
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from pyarrow import parquet
 
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory, UInt8Array
@@ -114,6 +116,22 @@ def command(
 
     texts, options = EpisodeTexts(task=task), RunOptions(**run)
     return LabelCommand(str(source), texts, labels, options, RayOptions(), lambda: nullcontext(scorer), say).run()
+
+
+def change_column(file: Path, column: str, change: Callable[[list[Any]], list[Any]]) -> None:
+    """Change the values of a column of a Parquet file."""
+    table = parquet.read_table(file, partitioning=None)
+    place, kind = table.column_names.index(column), table.schema.field(column)
+    values = pa.array(change(table[column].to_pylist()), kind.type)
+    parquet.write_table(table.set_column(place, kind, values), file)
+
+
+def change_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change ``meta/info.json`` of a LeRobot dataset."""
+    file = root / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    change(info)
+    file.write_text(json.dumps(info))
 
 
 def tasks_of(root: Path) -> dict[int, str]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -58,7 +59,9 @@ class DatasetError(RewardError, InvalidValueError):
 
 def unreadable(file: Path, expected: str, error: object) -> DatasetError:
     """Return the error of a file that a library cannot read; its ``error`` names no Git LFS."""
-    return DatasetError.at(file, expected, (git_lfs_pointer(file) if file.is_file() else "") or error)
+    with suppress(OSError):
+        error = (git_lfs_pointer(file) if file.is_file() else "") or error
+    return DatasetError.at(file, expected, error)
 
 
 class MissingTaskError(DatasetError):

@@ -66,7 +66,7 @@ class LeRobotDataset(Dataset):
         self.info = info = Info.read(root)
         self.kind = f"LeRobot {info.version}"
         self.cameras = (*info.videos, *info.images)
-        self.depth_cameras, self.left_out, self.notes = info.depth, info.left_out, list(info.notes)
+        self.depth_cameras, self.left_out, self.notes = info.depth, info.left_out, info.notes
         self.corrections = corrections.of_cameras(self.cameras)
         entries = list(read_entries(info))
         self._entries = dict(entries)
@@ -85,7 +85,8 @@ class LeRobotDataset(Dataset):
             counts["frames"] = (sum(lengths), info.total_frames)
         for name, (count, told) in counts.items():
             if count != told:
-                self.notes.append(f"{name}: {count}, as {_LISTED_IN[info.version]} lists them; info.json says {told}")
+                note = f"{name}: {count}, as {_LISTED_IN[info.version]} lists them; info.json says {told}"
+                self.notes = [*self.notes, note]
 
     def _sentences(self) -> Sentences:
         """The meaning of the task column. Raises DatasetError for an unknown column or a broken task table."""
@@ -98,7 +99,7 @@ class LeRobotDataset(Dataset):
         table, name = table_of(self.info, column)
         sentences, shown = read_sentences(table, name), table.relative_to(self.root)
         if list(sentences) != list(range(len(sentences))) and table.suffix == ".parquet":
-            self.notes.append(f"tasks: {shown} is not in the order of {name}_index: {_BY_PLACE}")
+            self.notes = [*self.notes, f"tasks: {shown} is not in the order of {name}_index: {_BY_PLACE}"]
         return Sentences(column, str(shown.with_suffix("")), sentences)
 
     def _types_of_rows(self) -> tuple[Path | None, Mapping[str, str]]:

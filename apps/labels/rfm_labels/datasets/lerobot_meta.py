@@ -67,7 +67,7 @@ class Info:
         except (OSError, ValueError, RecursionError) as error:
             raise DatasetError.at(file, "a readable JSON file", error) from error
         require(file, isinstance(document, dict), "a JSON object", type(document).__name__)
-        notes = []
+        notes: list[str] = []
         if "codebase_version" not in document:
             document["codebase_version"] = version = "v3.0" if (root / EPISODES_FOLDER).is_dir() else "v2.1"
             notes = [f"version: {version}, by the files of meta, since info.json has no codebase_version"]
