@@ -16,6 +16,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 
 from coded_env import Code, CodedEnv, CodeReader, Recorder, ReturningEnv, frame_of
+from environments import assert_close, progress
 from reward_doors import (
     BY_CALLER,
     DOORS,
@@ -31,7 +32,7 @@ from reward_doors import (
     makers_of,
     played,
 )
-from rfm_client import InvalidSampleError, ServerUnavailableError
+from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError
 from rfm_rl import CopiedObservation, RewardOptions, SuccessRule
 
 PROGRESS = (0.1, 0.4, 0.3, 0.3, 0.8)  # of an episode's frames
@@ -72,7 +73,7 @@ def options(**more: Any) -> RewardOptions:
     return RewardOptions(**{"sampling": "all", "frames_from": "pixels", **more})
 
 
-def opened(kind: type[Door], client: Recorder, envs: Sequence[gym.Env[Any, Any]], asked: RewardOptions) -> Door:
+def opened(kind: type[Door], client: RewardClient, envs: Sequence[gym.Env[Any, Any]], asked: RewardOptions) -> Door:
     return kind(makers_of(envs), client, asked)
 
 
@@ -115,6 +116,10 @@ PAID: dict[str, tuple[dict[str, Any], list[float]]] = {
         {"mode": "delta", "success_bonus": 10.0, "success": SuccessRule(0.65)},
         [0.3, -0.1, 0, 10.5],
     ),
+    "a bonus that most of the last frames would have to earn": (
+        {"mode": "delta", "success_bonus": 10.0, "success": SuccessRule(0.65, last=3)},
+        [0.3, -0.1, 0, 0.5],
+    ),
     "a bonus at the end alone": (
         {"mode": "final", "success_bonus": 2.0, "success": SuccessRule(0.65)},
         [0, 0, 0, 2.8],
@@ -138,7 +143,11 @@ PAID_AT = [
 
 @pytest.mark.parametrize(("kind", "asked", "expected"), PAID_AT)
 def test_an_episode_is_paid_by_its_mode(
-    judge: Recorder, kind: type[Door], asked: dict[str, Any], expected: list[float]
+    judge: Recorder,
+    warnings: Callable[[], list[str]],
+    kind: type[Door],
+    asked: dict[str, Any],
+    expected: list[float],
 ) -> None:
     envs = [CodedEnv(TERMINATES, (LAST,)), CodedEnv(TERMINATES, (2,))]
     with opened(kind, judge, envs, options(**asked)) as door:
@@ -146,6 +155,19 @@ def test_an_episode_is_paid_by_its_mode(
     assert len(episodes) >= 2
     for episode in episodes:
         np.testing.assert_allclose(episode.rewards, expected, atol=1e-6)
+    assert warnings() == []
+
+
+@pytest.mark.triton
+@at_each_door
+def test_the_scores_of_a_server_are_paid(client: RewardClient, kind: type[Door]) -> None:
+    envs = [CodedEnv(number, (length,)) for number, length in enumerate((3, 2))]
+    with opened(kind, client, envs, RewardOptions(mode="delta", frames_from="pixels")) as door:
+        firsts = [episodes[0] for episodes in played(door, 3)]
+    for number, episode in enumerate(firsts):
+        video = [frame_of(number, 0, step) for step in range(len(episode.rewards) + 1)]
+        expected = np.diff(progress(client, video, range(len(video)), task=TASKS[number]))
+        assert_close(episode.rewards, expected)
 
 
 @at_each_door
@@ -550,16 +572,6 @@ def test_resets_after_an_error_are_silent(
             recorder.server.failing = len(recorder.calls)
             with pytest.raises(ServerUnavailableError):
                 door.step()
-
-
-@at_each_door
-def test_ends_are_no_early_resets(recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]) -> None:
-    with opened(kind, recorder, [CodedEnv(0, (2,))], options(**FINAL)) as door:
-        episodes = played(door, 12)[0]
-    ended = [episode for episode in episodes if episode.terminated]
-    assert len(ended) >= 4
-    assert all(episode.rewards[-1] > 0 for episode in ended)
-    assert warnings() == []
 
 
 REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {

@@ -17,7 +17,6 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorSta
 
 from coded_env import Code, CodedEnv, CodeReader, Recorder
 from environments import TASK
-from goal_env import LENGTH, Reach
 from rfm_client import RewardClient
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 from rfm_rl.own_rewards import WritingMonitor
@@ -34,6 +33,29 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMoni
 from rfm_rl.sb3 import RenderedFrame, RewardModelVecEnv
 
 ALL = RewardOptions(sampling="all")
+LENGTH = 5  # steps of an episode
+
+
+class Reach(CodedEnv):
+    """An environment with goals, whose rewards no reward model would give."""
+
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self) -> None:
+        super().__init__(1, (LENGTH,))
+        point = gym.spaces.Box(-1, 1, (2,), np.float32)
+        self.observation_space = gym.spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), point))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        _, _, *told = super().step(action)
+        return self.observation_space.sample(), -100.0, *told
+
+    def compute_reward(self, achieved: Any, desired: Any, infos: Any) -> Any:
+        return np.full(np.shape(achieved)[:-1], -100.0)
 
 
 def vector(client: RewardClient, venv: Any) -> Any:

@@ -61,7 +61,9 @@ def two_cameras(observation: dict[str, Any]) -> dict[str, UInt8Array]:
     return {"front": front, "wrist": 255 - front[::2, ::2], "state": np.zeros(1, np.uint8)}
 
 
-def scores(client: RewardClient, video: Video, step: int, max_frames: int | None = MAX_FRAMES) -> ProgressResult:
+def scores(
+    client: RewardClient, video: Video, step: int, max_frames: int | None = MAX_FRAMES, task: str = TASK
+) -> ProgressResult:
     """Score the frames up to a step as upstream's RL loop does, cut or padded to ``max_frames``; None: all frames.
 
     Without the padded slots but the last, which is the newest frame's.
@@ -70,15 +72,15 @@ def scores(client: RewardClient, video: Video, step: int, max_frames: int | None
     count = min(step + 1, slots)
     picked = np.rint(np.linspace(0, step, count)).astype(int)
     padded = [*picked, *[step] * (slots - count)]
-    result = client.progress(Trajectory(frames=np.stack([video[index] for index in padded]), task=TASK))
+    result = client.progress(Trajectory(frames=np.stack([video[index] for index in padded]), task=task))
     shown = [*range(count - 1), slots - 1]
     return replace(result, progress=result.progress[shown], success=result.success[shown])
 
 
 def progress(
-    client: RewardClient, video: Video, steps: Sequence[int], max_frames: int | None = MAX_FRAMES
+    client: RewardClient, video: Video, steps: Sequence[int], max_frames: int | None = MAX_FRAMES, task: str = TASK
 ) -> list[float]:
-    return [float(scores(client, video, step, max_frames).progress[-1]) for step in steps]
+    return [float(scores(client, video, step, max_frames, task).progress[-1]) for step in steps]
 
 
 def play(env: gym.Env[Any, Any], seed: int = 0) -> tuple[list[float], list[dict[str, Any]]]:
