@@ -6,7 +6,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from functools import partial
 from itertools import cycle, islice, pairwise
 from typing import Any
 
@@ -18,12 +17,10 @@ from gymnasium.error import ResetNeeded
 from coded_env import Code, CodedEnv, CodeReader, Recorder, ReturningEnv, frame_of
 from environments import assert_close, progress
 from reward_doors import (
-    BY_CALLER,
     DOORS,
     ENDED_BY_SUCCESS,
     TASKS,
     VECTORS,
-    AutoresetAbove,
     Door,
     InProcesses,
     Sb3InProcesses,
@@ -41,7 +38,6 @@ LAST = len(PROGRESS) - 1
 GAMMA = 0.9
 LENGTHS = (3, 1), (4, 1, 2)  # steps of the episodes by environment, in turn
 CALLS = 10
-RESETS = (4, 6)  # calls that reset a single environment of these lengths
 TERMINATES, TRUNCATES = 0, 1  # numbers of environments
 
 at_each_door = pytest.mark.parametrize("kind", DOORS.values(), ids=DOORS)
@@ -280,7 +276,6 @@ SENT += [
     pytest.param(kind, "pixels", True, call, id=f"{door}-fails at {call}")
     for door, kind in DOORS.items()
     for call in range(CALLS - 1)
-    if not (kind is AutoresetAbove and call in RESETS)  # Gymnasium's wrapper then resets once more
 ]
 
 
@@ -313,13 +308,8 @@ def test_each_question_has_the_frames_of_its_own_episode(
     envs = envs if kind.asks_once else envs[:1]
     with Recorder(failing) as client, opened(kind, client, envs, options(frames_from=source)) as door:
         for call in range(CALLS):
-            act: Any = partial(go_on, door, envs) if call else door.reset
-            if kind is AutoresetAbove and envs[0].has_ended and call - 1 == failing:  # which was not told of the end
-                with pytest.raises(ResetNeeded):
-                    door.step()
-                act = door.reset
             with pytest.raises(ServerUnavailableError) if call == failing else nullcontext():
-                act()
+                go_on(door, envs) if call else door.reset()
     assert len(client.calls) == CALLS
     check_asked(client, len(envs), CALLS - 3)
 
@@ -668,9 +658,7 @@ def test_a_door_refuses_what_it_cannot_pay(
         opened(kind, recorder, [CodedEnv()], options(**asked))
 
 
-@pytest.mark.parametrize(
-    "kind", [each for each in DOORS.values() if each.resets == BY_CALLER or each is AutoresetAbove]
-)
+@pytest.mark.parametrize("kind", ENDED_BY_SUCCESS.values())
 def test_a_success_ends_an_episode_and_a_step_after_it_is_refused(judge: Recorder, kind: type[Door]) -> None:
     envs = [CodedEnv(TERMINATES, (LAST,)) for _ in range(2)]
     with opened(kind, judge, envs, options(terminate_on_success=ENDS)) as door:
@@ -679,14 +667,11 @@ def test_a_success_ends_an_episode_and_a_step_after_it_is_refused(judge: Recorde
         assert [said.ends for said in (first, second)] == [False, True]
         assert (second.terminated, second.truncated) == (True, False)
         assert [said.info["reward_model"]["succeeded"] for said in (first, second)] == [False, True]
-        if door.resets == BY_CALLER:
-            with pytest.raises(ResetNeeded, match=r"^step: expected a reset.*(has|have) ended, got another step; call"):
-                door.step()
-            assert envs[0].code == (TERMINATES, 0, 2)  # it was not stepped
-            assert list(door.reset([True, False])) == [0]
-            with pytest.raises(ResetNeeded, match=r"^step: expected a reset(,| of the environments \[1\],) since"):
-                door.step()
-            door.reset([False, True])
-        else:
-            assert door.step()[0].reward == 0
+        with pytest.raises(ResetNeeded, match=r"^step: expected a reset.*(has|have) ended, got another step; call"):
+            door.step()
+        assert envs[0].code == (TERMINATES, 0, 2)  # it was not stepped
+        assert list(door.reset([True, False])) == [0]
+        with pytest.raises(ResetNeeded, match=r"^step: expected a reset(,| of the environments \[1\],) since"):
+            door.step()
+        door.reset([False, True])
         assert judge.calls[-1][0][0] == [(TERMINATES, 1, 0)]

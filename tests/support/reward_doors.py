@@ -86,13 +86,10 @@ class Single(Door):
 
     resets, asks_once = BY_CALLER, False
     inside: Callable[[Any], Any] = staticmethod(lambda env: env)
-    outside: Callable[[Any], Any] = staticmethod(lambda env: env)
 
     def wrap(self, makers: Sequence[Maker], client: RewardClient, tasks: list[str], options: RewardOptions) -> None:
         pairs = zip(makers, tasks, strict=True)
-        self.envs = [
-            self.outside(RewardModelWrapper(self.inside(make()), client, task, options)) for make, task in pairs
-        ]
+        self.envs = [RewardModelWrapper(self.inside(make()), client, task, options) for make, task in pairs]
 
     def reset(self, mask: Sequence[bool] | None = None) -> dict[int, Info]:
         return {index: env.reset()[1] for index, env in enumerate(self.envs) if mask is None or mask[index]}
@@ -107,10 +104,6 @@ class Single(Door):
 
 class AutoresetBelow(Single):
     resets, inside = NEXT_STEP, Autoreset
-
-
-class AutoresetAbove(Single):
-    resets, outside = NEXT_STEP, Autoreset
 
 
 class Vector(Door):
@@ -207,9 +200,8 @@ def info_of(infos: Mapping[str, Any], index: int) -> Info:
 
 
 VECTORS: dict[str, type[Door]] = {"NEXT_STEP": NextStep, "SAME_STEP": SameStep, "DISABLED": Disabled, "VecEnv": Sb3}
-DOORS: dict[str, type[Door]] = {"single": Single, "Autoreset below": AutoresetBelow, "Autoreset above": AutoresetAbove}
-DOORS |= VECTORS
-ENDED_BY_SUCCESS = {"single": Single, "Autoreset above": AutoresetAbove, "DISABLED": Disabled}
+DOORS: dict[str, type[Door]] = {"single": Single, "Autoreset below": AutoresetBelow, **VECTORS}
+ENDED_BY_SUCCESS = {"single": Single, "DISABLED": Disabled}
 
 
 def makers_of(envs: Sequence[gym.Env[Any, Any]]) -> list[Maker]:
