@@ -423,15 +423,15 @@ def test_an_observation_without_the_frame_is_refused(
 class ResettingEnv(CodedEnv):
     """Resets in the step that ends an episode, and returns the observation from before, as LeRobot's environments do.
 
-    tells: True: the info has final_info; LeRobot's VLABench has none
+    tells: a key in the info of this step; None, as in LeRobot's VLABench: none
     """
 
-    tells = True
+    tells: str | None = "final_info"
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = super().step(action)
         if terminated:
-            info = {"final_info": {"is_success": True}} if self.tells else {}
+            info = {self.tells: {"is_success": True}} if self.tells else {}
             self.reset()
         return observation, reward, terminated, truncated, info
 
@@ -447,10 +447,10 @@ def test_an_environment_that_resets_in_its_last_step_is_paid_by_its_observation(
         assert episode.rewards == pytest.approx(PROGRESS[1:3])
 
 
-@pytest.mark.parametrize("tells", [True, False])
+@pytest.mark.parametrize("tells", ["final_info", None])
 @pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if kind is not VECTORS["SAME_STEP"]])
 def test_an_environment_that_resets_in_its_last_step_is_not_rendered(
-    recorder: Recorder, kind: type[Door], tells: bool
+    recorder: Recorder, kind: type[Door], tells: str | None
 ) -> None:
     expected = r"^(info|infos\[0\]): expected no reset in the last step .* frames_from='pixels'$"
     env = ResettingEnv(TERMINATES, (2,))
@@ -461,6 +461,17 @@ def test_an_environment_that_resets_in_its_last_step_is_not_rendered(
         with pytest.raises(InvalidSampleError, match=expected):
             door.step()
     assert [codes[-1] for call in recorder.calls for codes, _ in call] == [(0, 0, 0), (0, 0, 1)]
+
+
+def test_an_environment_that_returns_the_next_observation_in_its_last_step_is_refused(recorder: Recorder) -> None:
+    env = ResettingEnv(TERMINATES, (1,))
+    env.tells = "final_observation"
+    with opened(DOORS["single"], recorder, [env], options()) as door:
+        door.reset()
+        with pytest.raises(InvalidSampleError, match=r"^info: expected none of .*, got final_observation; .*Autoreset"):
+            door.step()
+        with pytest.raises(ResetNeeded):
+            door.step()
 
 
 @pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if issubclass(kind, Vector)])

@@ -215,20 +215,6 @@ def test_an_error_comes_out_at_the_latest_where_the_episode_ends(client: RewardC
             env.step(step % 2)
 
 
-def test_a_reset_while_a_score_is_open_warns(late: LateClient, caplog: pytest.LogCaptureFixture) -> None:
-    env = RewardModelWrapper(cart_pole(), late, TASK, RewardOptions(sampling="all", blocking=False))
-    env.reset(seed=0)
-    late.hold(1, 2)
-    env.step(0)
-    env.step(0)
-    env.reset(seed=0)
-    env.close()
-    (record,) = caplog.records
-    assert record.message.startswith(
-        "reset: expected the end of the episode before it, got one after 2 steps, whose reward"
-    )
-
-
 # What only a wrapper of one environment has to do.
 
 
@@ -266,23 +252,6 @@ def test_a_step_after_an_end_that_an_autoreset_below_does_not_learn_of_is_refuse
     assert any(outside.step(0)[2:4])
     assert outside.step(0)[1] == 0
     assert recorder.calls[-1] == [([(0, 2, 0)], TASKS[0])]
-
-
-def test_an_environment_that_resets_in_its_last_step_is_refused(recorder: Recorder) -> None:
-    class Resetting(CodedEnv):
-        def step(self, action: Any) -> Any:
-            observation, reward, terminated, truncated, info = super().step(action)
-            if terminated:
-                return self.reset()[0], reward, terminated, truncated, {"final_observation": observation}
-            return observation, reward, terminated, truncated, info
-
-    env = RewardModelWrapper(Resetting(0, (1,)), recorder, TASKS[0], options("pixels"))
-    env.reset()
-    with pytest.raises(InvalidSampleError, match=r"^info: expected none of .*, got final_observation; .*Autoreset"):
-        env.step(0)
-    with pytest.raises(ResetNeeded):
-        env.step(0)
-    assert len(recorder.calls) == 1
 
 
 @pytest.mark.parametrize("wrapper", [RewardModelWrapper, RewardModelVectorWrapper])
