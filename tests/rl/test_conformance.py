@@ -15,7 +15,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 
 from coded_env import Code, CodedEnv, CodeReader, Recorder, ReturningEnv, frame_of
-from environments import assert_close, progress
+from environments import MAX_FRAMES, assert_close, progress
 from reward_doors import (
     DOORS,
     ENDED_BY_SUCCESS,
@@ -155,15 +155,17 @@ def test_an_episode_is_paid_by_its_mode(
 
 
 @pytest.mark.triton
+@pytest.mark.parametrize("max_frames", [None, 3])
 @at_each_door
-def test_the_scores_of_a_server_are_paid(client: RewardClient, kind: type[Door]) -> None:
-    envs = [CodedEnv(number, (length,)) for number, length in enumerate((3, 2))]
-    with opened(kind, client, envs, RewardOptions(mode="delta", frames_from="pixels")) as door:
-        firsts = [episodes[0] for episodes in played(door, 3)]
+def test_the_scores_of_a_server_are_paid(client: RewardClient, kind: type[Door], max_frames: int | None) -> None:
+    envs = [CodedEnv(number, (length,)) for number, length in enumerate((5, 4))]
+    asked = RewardOptions(mode="delta", frames_from="pixels", max_frames=max_frames)
+    with opened(kind, client, envs, asked) as door:
+        firsts = [episodes[0] for episodes in played(door, 5)]
     for number, episode in enumerate(firsts):
         video = [frame_of(number, 0, step) for step in range(len(episode.rewards) + 1)]
-        expected = np.diff(progress(client, video, range(len(video)), task=TASKS[number]))
-        assert_close(episode.rewards, expected)
+        scores = progress(client, video, range(len(video)), max_frames or MAX_FRAMES, TASKS[number])
+        assert_close(episode.rewards, np.diff(scores))
 
 
 @at_each_door

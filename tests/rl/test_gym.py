@@ -40,39 +40,6 @@ def options(source: Any, **more: Any) -> RewardOptions:
     return RewardOptions(sampling="all", frames_from=source, **more)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"mode": "delta"},
-        {"scale": 10.0, "add_to_env_reward": True},
-        {"every": 3},
-        {"every": 3, "mode": "delta"},
-        {"max_frames": 3},
-    ],
-    ids=str,
-)
-def test_each_step_is_paid_by_the_scores_of_its_episode(client: RewardClient, options: dict[str, Any]) -> None:
-    camera = Camera(cart_pole())
-    env = RewardModelWrapper(camera, client, TASK, RewardOptions(**options))
-    every, max_frames = options.get("every", 1), options.get("max_frames", MAX_FRAMES)
-    for seed in range(2):
-        rewards, infos = play(env, seed)
-        video, last = camera.videos[seed], len(rewards)
-        assert last >= 8
-        assert every == 1 or seed or last % every != 0  # the last step is scored nevertheless
-        newest = [step if step == last else step - step % every for step in range(last + 1)]
-        answers = {step: scores(client, video, step, max_frames) for step in newest}
-        values = np.array([answers[step].progress[-1] for step in newest])
-        expected = np.diff(values) if options.get("mode") == "delta" else values[1:]
-        assert_close(rewards, options.get("scale", 1) * expected + options.get("add_to_env_reward", False))
-        for step, (known, info) in enumerate(zip(newest, infos, strict=True)):
-            told = info["reward_model"]
-            assert_close([told["progress"], told["success"]], [answers[known].progress[-1], answers[known].success[-1]])
-            assert (told["step"], told["lag"], told["skipped"]) == (known, step - known, 0)
-            np.testing.assert_equal(told["env_reward"], 1.0 if step else np.nan)
-
-
 def test_gymnasium_s_own_check_passes_and_close_closes_only_a_client_that_it_made(served: Served) -> None:
     made: list[RewardClient] = []
 

@@ -43,17 +43,6 @@ def test_a_reset_of_a_vector_takes_back_what_is_open_about_what_it_resets(late: 
     assert [answer.cancelled() for answer in late.submitted] == [True, True]
 
 
-def test_a_mask_of_a_reset_may_be_a_list(recorder: Recorder) -> None:
-    env = RewardModelVectorWrapper(SyncVectorEnv([CodedEnv] * 2, autoreset_mode=DISABLED), recorder, TASK, options())
-    env.reset(seed=0)
-    given = {"reset_mask": [True, False]}
-    infos = env.reset(options=given)[1]
-    assert infos["reward_model"]["_progress"].tolist() == [True, False]
-    assert given == {"reset_mask": [True, False]}
-    with pytest.raises(ValueError, match=r"^reset_mask: expected bool \[2\], got int64 \[1\]$"):
-        env.reset(options={"reset_mask": [0]})
-
-
 @pytest.mark.slow
 def test_wrapped_environments_work_in_processes_of_their_own(served: Served, client: RewardClient) -> None:
     connect = partial(RewardClient, served.url("grpc"), model=MODEL)
@@ -216,6 +205,8 @@ def test_a_partial_reset_that_a_vector_does_not_read_is_refused(recorder: Record
     with pytest.raises(ValueError, match=r"^options: expected a reset of all environments, got env_idx; ManiSkill"):
         env.reset(options={"env_idx": torch.tensor([0])})
     env.step(on_device([0, 0]))
+    with pytest.raises(ValueError, match=r"^reset_mask: expected bool \[2\], got int64 \[1\]$"):
+        env.reset(options={"reset_mask": [0]})
     with pytest.raises(ValueError, match=r"^reset_mask: expected a vector that takes it .*; reset all environments$"):
         env.reset(options={"reset_mask": [True, False]})
     with pytest.raises(ResetNeeded):

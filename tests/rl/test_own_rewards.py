@@ -237,6 +237,30 @@ def test_statistics_inside_a_vector_tell_of_ends_by_success(inside: Callable[[Au
     assert [infos["episode"][key].tolist() for key in "rl"] == [[1, 1], [1, 1]]
 
 
+REFUSED: dict[str, tuple[Any, type[Exception], str]] = {
+    "no VecEnv": (Reach, TypeError, "^venv: expected a VecEnv of stable_baselines3, got .*Reach"),
+    "no pictures": (
+        lambda: DummyVecEnv([Reach]),
+        ValueError,
+        r"^venv: expected each environment in RenderedFrame, .*: make_vec_env\(..., wrapper_class=RenderedFrame\)$",
+    ),
+    "a normalization": (
+        lambda: VecMonitor(VecNormalize(DummyVecEnv([lambda: RenderedFrame(Reach())]), norm_obs=False)),
+        ValueError,
+        r"^venv: expected no VecNormalize inside.*; wrap in the other order: VecNormalize\(RewardModelVecEnv",
+    ),
+}
+
+
+@pytest.mark.parametrize(("make", "error", "message"), REFUSED.values(), ids=REFUSED)
+def test_a_vector_that_cannot_be_paid_is_refused(
+    recorder: Recorder, make: Any, error: type[Exception], message: str
+) -> None:
+    """Off-policy algorithms look for a ``VecNormalize`` and store the rewards that it got."""
+    with pytest.raises(error, match=message):
+        vector(recorder, make())
+
+
 def test_a_subprocess_gets_the_class_of_a_monitor_that_writes() -> None:
     """A SubprocVecEnv pickles it."""
     assert pickle.loads(pickle.dumps(WritingMonitor)) is WritingMonitor

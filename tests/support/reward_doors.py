@@ -116,7 +116,7 @@ class Vector(Door):
         self.env = RewardModelVectorWrapper(self.kind(makers, autoreset_mode=self.mode), client, tasks, options)
 
     def reset(self, mask: Sequence[bool] | None = None) -> dict[int, Info]:
-        infos = self.env.reset(options=None if mask is None else {"reset_mask": np.array(mask)})[1]
+        infos = self.env.reset(options=None if mask is None else {"reset_mask": list(mask)})[1]
         return {index: info_of(infos, index) for index in range(self.num_envs) if mask is None or mask[index]}
 
     def step(self) -> list[Said]:
@@ -166,12 +166,14 @@ class Sb3(Door):
 
     def reset(self, mask: Sequence[bool] | None = None) -> dict[int, Info]:
         self.env.reset()
+        assert not [key for info in self.env.reset_infos for key in info if "frame" in key]  # those of RenderedFrame
         return dict(enumerate(self.env.reset_infos))
 
     def step(self) -> list[Said]:
         _, rewards, dones, infos = self.env.step(np.zeros(self.num_envs, int))
         assert (rewards.dtype, rewards.shape) == (np.float32, (self.num_envs,))
         said = []
+        assert not [key for info in (*infos, *self.env.reset_infos) for key in info if "frame" in key]
         for index, (done, info) in enumerate(zip(dones.tolist(), infos, strict=True)):
             truncated = done and info["TimeLimit.truncated"]
             begun = self.env.reset_infos[index] if done else None
