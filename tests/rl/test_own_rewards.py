@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import json
 import pickle
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorSta
 
 from coded_env import Code, CodedEnv, CodeReader, Recorder
 from environments import TASK
+from paths import ROOT
 from rfm_client import RewardClient
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 from rfm_rl.own_rewards import WritingMonitor
@@ -27,6 +30,7 @@ from stable_baselines3 import PPO, SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
@@ -164,6 +168,19 @@ class Pleased(CodeReader):
 
     def scores(self, codes: list[Code]) -> dict[str, Any]:
         return {"progress": 1.0, "success": 1.0}
+
+
+def test_the_callback_of_the_guide_logs_rewards_progress_and_success(tmp_path: Path) -> None:
+    guide = (ROOT / "docs" / "guides" / "reward_an_rl_loop.md").read_text()
+    (code,) = (each for each in re.findall(r"^```python\n(.*?)^```", guide, re.M | re.S) if "class LogRewards" in each)
+    shown: dict[str, Any] = {}
+    exec(code, shown)
+    with Recorder(server=Pleased()) as client:
+        model = PPO("MultiInputPolicy", single(client, Reach()), n_steps=4, batch_size=4, device="cpu")
+        model.set_logger(configure(str(tmp_path), ["json"]))
+        model.learn(4, shown["LogRewards"]())
+    logged = json.loads((tmp_path / "progress.json").read_text())
+    assert [logged[f"reward_model/{key}"] for key in ("reward", "progress", "success")] == [1, 1, 1]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import AddRenderObservation
 
 from rfm_client import ProgressResult, RewardClient, Trajectory, UInt8Array
 from rfm_client.episodes import Episode, StepScore
@@ -27,38 +26,10 @@ SIZE = 240, 160  # pixels; fewer would not show the cart
 Video = list[UInt8Array]
 
 
-class Camera(gym.Wrapper[Any, Any, Any, Any]):
-    """Records each episode: ``videos[-1][t]`` is the frame after step t."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.videos: list[Video] = []
-
-    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        answer = self.env.reset(**options)
-        self.videos.append([np.array(self.env.render())])
-        return answer
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        answer = self.env.step(action)
-        self.videos[-1].append(np.array(self.env.render()))
-        return answer
-
-
 def cart_pole(**options: Any) -> gym.Env[Any, Any]:
     env = gym.make("CartPole-v1", render_mode="rgb_array", **options)
     env.unwrapped.screen_width, env.unwrapped.screen_height = SIZE  # type: ignore[attr-defined]
     return env
-
-
-def cart_pole_with_pixels() -> gym.Env[Any, Any]:
-    return AddRenderObservation(cart_pole(), render_only=False, render_key="pixels", obs_key="state")
-
-
-def two_cameras(observation: dict[str, Any]) -> dict[str, UInt8Array]:
-    """Return frames of two cameras with different sizes, and an entry without a frame."""
-    front = np.asarray(observation["pixels"], np.uint8)
-    return {"front": front, "wrist": 255 - front[::2, ::2], "state": np.zeros(1, np.uint8)}
 
 
 def scores(
