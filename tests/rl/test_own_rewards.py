@@ -178,7 +178,7 @@ def test_the_callback_of_the_guide_logs_rewards_progress_and_success(tmp_path: P
     with Recorder(server=Pleased()) as client:
         model = PPO("MultiInputPolicy", single(client, Reach()), n_steps=4, batch_size=4, device="cpu")
         model.set_logger(configure(str(tmp_path), ["json"]))
-        model.learn(4, shown["LogRewards"]())
+        model.learn(4, shown["LogRewards"]()).logger.close()
     logged = json.loads((tmp_path / "progress.json").read_text())
     assert [logged[f"reward_model/{key}"] for key in ("reward", "progress", "success")] == [1, 1, 1]
 
