@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import json
 import pickle
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorSta
 
 from coded_env import Code, CodedEnv, CodeReader, Recorder
 from environments import TASK
-from goal_env import LENGTH, Reach
+from paths import ROOT
 from rfm_client import RewardClient
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 from rfm_rl.own_rewards import WritingMonitor
@@ -28,12 +30,36 @@ from stable_baselines3 import PPO, SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 from rfm_rl.sb3 import RenderedFrame, RewardModelVecEnv
 
 ALL = RewardOptions(sampling="all")
+LENGTH = 5  # steps of an episode
+
+
+class Reach(CodedEnv):
+    """An environment with goals, whose rewards no reward model would give."""
+
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self) -> None:
+        super().__init__(1, (LENGTH,))
+        point = gym.spaces.Box(-1, 1, (2,), np.float32)
+        self.observation_space = gym.spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), point))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        _, _, *told = super().step(action)
+        return self.observation_space.sample(), -100.0, *told
+
+    def compute_reward(self, achieved: Any, desired: Any, infos: Any) -> Any:
+        return np.full(np.shape(achieved)[:-1], -100.0)
 
 
 def vector(client: RewardClient, venv: Any) -> Any:
@@ -144,6 +170,19 @@ class Pleased(CodeReader):
         return {"progress": 1.0, "success": 1.0}
 
 
+def test_the_callback_of_the_guide_logs_rewards_progress_and_success(tmp_path: Path) -> None:
+    guide = (ROOT / "docs" / "guides" / "reward_an_rl_loop.md").read_text()
+    (code,) = (each for each in re.findall(r"^```python\n(.*?)^```", guide, re.M | re.S) if "class LogRewards" in each)
+    shown: dict[str, Any] = {}
+    exec(code, shown)
+    with Recorder(server=Pleased()) as client:
+        model = PPO("MultiInputPolicy", single(client, Reach()), n_steps=4, batch_size=4, device="cpu")
+        model.set_logger(configure(str(tmp_path), ["json"]))
+        model.learn(4, shown["LogRewards"]()).logger.close()
+    logged = json.loads((tmp_path / "progress.json").read_text())
+    assert [logged[f"reward_model/{key}"] for key in ("reward", "progress", "success")] == [1, 1, 1]
+
+
 @pytest.mark.parametrize(
     "inside", [lambda env: env, Monitor, RecordEpisodeStatistics], ids=["none", "Monitor", "Record"]
 )
@@ -213,6 +252,30 @@ def test_statistics_inside_a_vector_tell_of_ends_by_success(inside: Callable[[Au
         infos = env.step(np.zeros(2, int))[4]
     assert infos["_episode"].tolist() == [True, True]
     assert [infos["episode"][key].tolist() for key in "rl"] == [[1, 1], [1, 1]]
+
+
+REFUSED: dict[str, tuple[Any, type[Exception], str]] = {
+    "no VecEnv": (Reach, TypeError, "^venv: expected a VecEnv of stable_baselines3, got .*Reach"),
+    "no pictures": (
+        lambda: DummyVecEnv([Reach]),
+        ValueError,
+        r"^venv: expected each environment in RenderedFrame, .*: make_vec_env\(..., wrapper_class=RenderedFrame\)$",
+    ),
+    "a normalization": (
+        lambda: VecMonitor(VecNormalize(DummyVecEnv([lambda: RenderedFrame(Reach())]), norm_obs=False)),
+        ValueError,
+        r"^venv: expected no VecNormalize inside.*; wrap in the other order: VecNormalize\(RewardModelVecEnv",
+    ),
+}
+
+
+@pytest.mark.parametrize(("make", "error", "message"), REFUSED.values(), ids=REFUSED)
+def test_a_vector_that_cannot_be_paid_is_refused(
+    recorder: Recorder, make: Any, error: type[Exception], message: str
+) -> None:
+    """Off-policy algorithms look for a ``VecNormalize`` and store the rewards that it got."""
+    with pytest.raises(error, match=message):
+        vector(recorder, make())
 
 
 def test_a_subprocess_gets_the_class_of_a_monitor_that_writes() -> None:

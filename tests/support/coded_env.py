@@ -34,7 +34,7 @@ class CodedEnv(gym.Env[Any, Any]):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
-    action_space = gym.spaces.Discrete(2)
+    action_space: gym.spaces.Space[Any] = gym.spaces.Discrete(2)
 
     def __init__(self, number: int = 0, lengths: Sequence[int] = (3,), *, reuse: bool = False, bad: Code | None = None):
         self.render_mode = "rgb_array"

@@ -68,8 +68,8 @@ class RewardModelWrapper(gymnasium.Wrapper):
 
     A step after an episode's end raises ResetNeeded. With ``Autoreset(RewardModelWrapper(env, ...))`` of
     ``gymnasium.wrappers``, this step begins a new episode instead, with reward 0. An ``Autoreset`` among the wrappers
-    of ``env`` does the same, but does not see an end by ``terminate_on_success``. ``env`` itself must not reset in the
-    step that ends an episode.
+    of ``env`` does the same, but does not see an end by ``terminate_on_success``. If ``env`` itself resets in the step
+    that ends an episode, that step raises InvalidSampleError, unless frames come from an observation before the reset.
 
     Raises ValueError if ``options`` names a source of frames that ``env`` lacks; TypeError if ``env`` is no
     ``gymnasium.Env``.
@@ -90,7 +90,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._envs = RewardedEnvs(client, options, [""], remedy=_REMEDY, is_only=True)
         self._options = options
         self._task = task
-        self._told_of_ends = env.has_wrapper_attr(RETURNS)
+        self._has_statistics = env.has_wrapper_attr(RETURNS)
         self._autoresets = [layer for layer in _layers(env) if isinstance(layer, gymnasium.wrappers.Autoreset)]
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
@@ -115,7 +115,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         said = [float(env_reward)], [bool(terminated)], [bool(truncated)]
         (reward,), _ = self._envs.keep(lambda _: self._frame(observation), *said)
         episode = self._envs.episodes[0]
-        info = {**with_statistics(info, episode, told_of_ends=self._told_of_ends), INFO: episode.info()}
+        info = {**with_statistics(info, episode, has_statistics=self._has_statistics), INFO: episode.info()}
         return observation, float(reward), bool(terminated or episode.succeeded), truncated, info
 
     compute_reward = refuse_relabelling

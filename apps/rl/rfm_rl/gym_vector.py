@@ -67,7 +67,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         tasks = tasks_of(task, env.num_envs)
         super().__init__(env)  # after the checks: a refused wrapper must not close the environments when collected
         here = list(env.unwrapped.envs) if isinstance(env.unwrapped, SyncVectorEnv) else []
-        is_mani_skill = hasattr(env, "auto_reset")  # which keeps copies of last frames
+        is_mani_skill = type(env).__module__.startswith("mani_skill.")  # which keeps copies of last frames
         in_processes = _of_each(env, "has_wrapper_attr", "copies_observations")
         has_copies = bool(here) or is_mani_skill or (bool(in_processes) and all(in_processes))
         self._envs = RewardedEnvs(
@@ -75,7 +75,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         )
         self._options = options
         self._autoreset_mode = autoreset_mode
-        self._told_of_ends = _has_statistics(env)
+        self._has_statistics = _has_statistics(env)
         self._here = here if options.renders or autoreset_mode is AutoresetMode.SAME_STEP else []  # in this process
 
     @property
@@ -115,7 +115,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         shown = partial(self._frame, self._shown(observations))
         rewards, stepped = self._envs.keep(shown, as_array(env_rewards), terminated, truncated, final=final)
         for index, episode in stepped.items():
-            missed = correct_statistics(infos, index, episode, told_of_ends=self._told_of_ends)
+            missed = correct_statistics(infos, index, episode, has_statistics=self._has_statistics)
             scores: Info = {INFO: episode.info(), **missed}
             has_reset = resets_at_once and ended[index]
             infos = self._add_info(infos, {"final_info": scores} if has_reset else scores, index)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import numpy as np
@@ -23,21 +22,21 @@ def refuse_relabelling(*_args: object, **_kwargs: object) -> NoReturn:
     raise NotImplementedError(f"{RELABELS}: expected {expected}, got a call; {remedy}")
 
 
-def with_statistics(info: Info, episode: RewardedEpisode, *, told_of_ends: bool = False) -> Info:
+def with_statistics(info: Info, episode: RewardedEpisode, *, has_statistics: bool = False) -> Info:
     """Return the info of a step. Statistics from a Monitor inside the wrapper show the model's rewards.
 
-    told_of_ends: True: a Monitor inside tells of other ends, but does not see an end by ``terminate_on_success``
+    has_statistics: True: a Monitor inside tells of ends, but does not see one by ``terminate_on_success``
     """
     told = info.get(_STATISTICS)
     if isinstance(told, dict) and "r" in told:
         return {**info, _STATISTICS: {**told, **_statistics(episode)}}
-    return {**info, _STATISTICS: _statistics(episode)} if told_of_ends and episode.succeeded else info
+    return {**info, _STATISTICS: _statistics(episode)} if has_statistics and episode.succeeded else info
 
 
-def correct_statistics(infos: Info, index: int, episode: RewardedEpisode, *, told_of_ends: bool) -> Info:
+def correct_statistics(infos: Info, index: int, episode: RewardedEpisode, *, has_statistics: bool) -> Info:
     """Return what to add to the infos of a Gymnasium vector, whose statistics now show the model's rewards."""
-    told = [infos, infos.get("final_info")]
-    told = [info for info in told if isinstance(info, Mapping) and f"_{_STATISTICS}" in info]
+    places: list[Any] = [infos, infos.get("final_info")]
+    told = [info for info in places if isinstance(info, dict) and f"_{_STATISTICS}" in info]
     for info in told:
         info[f"_{_STATISTICS}"] = np.array(info[f"_{_STATISTICS}"])  # which RecordEpisodeStatistics goes on to read
     shown = [info[_STATISTICS] for info in told if info[f"_{_STATISTICS}"][index]]
@@ -45,7 +44,7 @@ def correct_statistics(infos: Info, index: int, episode: RewardedEpisode, *, tol
         for key, value in _statistics(episode).items():
             if key in statistics:
                 statistics[key][index] = value
-    return with_statistics({}, episode, told_of_ends=told_of_ends and not shown)
+    return with_statistics({}, episode, has_statistics=has_statistics and not shown)
 
 
 def _statistics(episode: RewardedEpisode) -> dict[str, float]:
