@@ -75,9 +75,7 @@ BAD_OPTIONS = {
     "--allow-folder nowhere": "No such file or directory",
     "--api-key-file nowhere": "'--api-key-file': expected a text file, got",
     f"--api-key-file {os.devnull}": NO_KEY,
-    "--port 0": "'--port': expected at least 1, got 0",
     "--host 192.0.2.1": "Cannot assign requested address; --host names another",
-    "--timeout inf": "'--timeout': expected a finite number, got inf",
 }
 
 
@@ -141,50 +139,29 @@ def test_a_fault_of_triton_tells_a_caller_who_can_mend_it_and_no_option_of_the_c
     assert error.remedy not in detail
 
 
-def test_every_line_about_a_failed_request_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_line_about_a_failed_request_names_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     async def broken(_: TritonState) -> None:
         raise RuntimeError("made up")
 
-    class Log(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            lines.extend(LogLines("rfm-gateway").format(record).splitlines())
-
-    lines: list[str] = []
+    caplog.handler.setFormatter(LogLines("rfm-gateway"))
     monkeypatch.setattr(TritonState, "model_info", broken)
-    log, handler = logging.getLogger("rfm_gateway"), Log()
-    log.addHandler(handler)
-    try:
-        with inside() as client:
-            assert client.get("/model_info", headers={"X-Request-ID": "a/caller-s"}).status_code == 500
-    finally:
-        log.removeHandler(handler)
+    with inside() as client:
+        assert client.get("/model_info", headers={"X-Request-ID": "a/caller-s"}).status_code == 500
+    lines = [line for line in caplog.text.splitlines() if line and " INFO " not in line]
+    assert len(lines) > 3
     assert lines[-1].endswith(": RuntimeError: made up")
-    assert all(re.search(r" ERROR rfm-gateway\[\d+\] request=a/caller-s: ", line) for line in lines)
+    assert all(re.search(r" ERROR rfm-gateway\[\d+\] request=a/caller-s: ", line) for line in lines), lines
 
 
 GATEWAY, INSTALL = ("gateway", "--triton", NO_TRITON), "pip install ./client ./apps/gateway ./apps/page"
 
 
-@pytest.fixture
-def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No page is installed beside the gateway."""
-    monkeypatch.setattr(mounting, "entry_points", lambda group: ())
-
-
-@pytest.mark.usefixtures("no_page")
-def test_without_a_page_the_gateway_serves_its_endpoints_alone() -> None:
-    with inside() as gateway:
-        assert gateway.post("/evaluate_batch", json=[]).status_code == 422
-        for path in ("/metrics", "/docs", "/openapi.json"):
-            assert gateway.get(path).status_code == 200
-        for path in ("/", "/viewer/main.js", "/viewer/served", "/viewer/datasets"):
-            assert gateway.get(path).status_code == 404
-
-
-@pytest.mark.usefixtures("no_page")
 def test_the_log_says_that_there_is_no_page_if_one_is_wanted(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    monkeypatch.setattr(mounting, "entry_points", lambda group: ())
     monkeypatch.setattr(uvicorn, "run", lambda *_arguments, **_options: None)
     message = f"no page in the browser, since the package rfm-page is not installed: {INSTALL}"
     with caplog.at_level(logging.INFO, "rfm_gateway"):

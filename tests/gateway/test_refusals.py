@@ -56,11 +56,9 @@ BODIES: dict[str, tuple[bytes, list[Any], str]] = {
     "ten thousand brackets": (b"[" * 10_000, [], "expected JSON, got: recursion limit .*"),
     "an empty list": (b"[]", ["samples"], NO_SAMPLE),
     "an empty object": (b"{}", ["samples"], NO_SAMPLE),
-    "a number": (b"5", [], "expected a list of samples, got int"),
     "samples as an object": (b'{"samples": {}}', ["samples"], "expected a list of samples, got dict"),
     "too many": (b"[%b5]" % (b"5," * 10_000), ["samples"], "expected at most 10000 samples, got 10001"),
     "very many errors": (b"[%b5]" % (b"5," * 2000), [], "expected no faulty fields, got 2001"),
-    "a list of numbers": (b"[5]", [0], "expected an object, got 5"),
     "a sample without a type": (b'{"sample_type": null}', ["sample_type"], "expected progress, .*, got None"),
     "a list by another name": (b'{"batch": [5]}', ["batch", 0], "expected an object, got 5"),
     "an object of samples": (b'{"a": %b, "b": 6}' % SAMPLE.encode(), ["b"], "expected an object, got 6"),
@@ -76,7 +74,6 @@ FILES = {
     "a shape of petabytes": (npy_of(HUGE), NO_NPY),
     "pickled": (npy(np.array([[1, {}]], object), pickled=True), NO_NPY),
     "text": (npy(np.array([["a", "b"]])), r"expected a \.npy file of numbers, got <U1"),
-    "complex": (npy(np.ones((3, 2), complex)), r"expected a \.npy file of numbers, got complex128"),
     "no .npy file": (b"hello world", NO_NPY),
     "an unbalanced header": (npy_of("{'descr': '<f4', ("), NO_NPY),
     "a type of nothing": (npy_of(HUGE.replace("'<f4'", "()")), NO_NPY),
@@ -131,11 +128,10 @@ UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
             f"{MULTIPART}; charset={name}",
             WHOLE + b"--b--\r\n",
         )
-        for name in ("undefined", "unicode_escape", "idna", "rot13", "latin-1")
+        for name in ("undefined", "latin-1")
     },
     "nothing": (400, NO_END, MULTIPART, b""),
     "cut off": (400, NO_END, MULTIPART, WHOLE + NAMED + b"{"),
-    "cut off in a boundary": (400, NO_END, MULTIPART, WHOLE + b"--"),
 }
 
 
@@ -193,12 +189,9 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
     "video_embeddings": {
         "another width": (np.ones((3, 7)), r"expected \[T, 48\], got \[3, 7\]"),
         "ragged": ([ROW, [1.0]], EQUAL_ROWS),
-        "a number and a row": ([ROW, 1.0], EQUAL_ROWS),
         "NaN": ([ROW, [np.nan] * 48], r"expected finite values, got nan at \[1, 0\]"),
         "more than float32 holds": ([[1e39] * 48], r"expected finite values, got inf at \[0, 0\]"),
-        "huge numbers": ([[10**30] * 48], NUMBERS),
         "words for numbers": ([["1.0"] * 48], NUMBERS),
-        "nulls": ([[None] * 48], NUMBERS),
         "a word": ("1.0", "expected an array, got str"),
         "truths": ([[True] * 48], r"expected float32 \[T, D\], got bool \[1, 48\]"),
         "five axes": ([[[[ROW]]]], "expected at most 4 axes, got more"),
@@ -214,7 +207,6 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
     "frames": {
         "floats in 0..1": (BLACK + 0.5, r"expected values in 0\.\.255, got values up to 0\.5: multiply by 255 first"),
         "values beyond 255": (BLACK.astype(int) + 256, r"expected values in 0\.\.255, got 256\.\.256"),
-        "values below 0": (BLACK.astype(int) - 1, r"expected values in 0\.\.255, got -1\.\.-1"),
         "NaN": (BLACK + np.nan, r"expected finite values in 0\.\.255, got NaN, Inf or nothing"),
         "channels first": (
             np.ones((2, 3, 8, 8), np.uint8),
@@ -225,16 +217,12 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
             np.ones((3, 8, 8), np.uint8),
             r".*, got .*; .* transpose the axes to \(1, 2, 0\)",
         ),
-        "two channels": (np.ones((2, 8, 8, 2), int), r"expected uint8 \[T, H, W, 3\], got .* \[2, 8, 8, 2\]"),
-        "grey levels": (np.ones((8, 8), int), r"expected uint8 \[T, H, W, 3\], got .* \[8, 8\]"),
         "no pixels": (BLACK[:, :0], "expected .*, got .*"),
         "truths": (BLACK > 0, r"expected uint8 \[T, H, W, 3\], got bool \[2, 8, 8, 3\]"),
-        "words and numbers": (["0.png", 1], NUMBERS),
         "null": (None, "expected frames, got neither frames nor video_embeddings"),
     },
 }
 TWO_WIDE = preference(embedded(1, 2, ENCODER_DIMS), embedded(1, 2, (7, 32)))
-SLIVER, TOO_LONG = np.ones((1, 2, 200, 3), int), "expected frames at most 50 times as long .*"
 BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
     f"{field}, {name}": (
         of_frames(value) if field == "frames" else but(**{field: value}),

@@ -7,9 +7,9 @@ import json
 import signal
 import socket
 import subprocess
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,18 +23,15 @@ from gateway_requests import (
     FRAME_STEPS,
     SECOND,
     SEED_PAYLOAD,
-    SIDES,
     TINY,
     Array,
     Ask,
     Json,
     Triton,
     answered,
-    as_parts,
     ask_json,
     ask_npy,
     begun,
-    check_refused,
     dumped,
     embedded,
     expected,
@@ -49,7 +46,8 @@ from gateway_requests import (
     similarity,
 )
 from gateways import WITHIN_S, Gateway, poll, running
-from rfm_client import Trajectory
+from rfm_client import InvalidSampleError, ModelNotFoundError, Trajectory
+from tolerances import TOLERANCE
 
 pytestmark = pytest.mark.triton
 
@@ -117,6 +115,10 @@ ONE = [progress(FIRST)]
 ALIASES = {"reference_trajectory": FIRST, "traj_sim_trajectory": SECOND, "traj_diff_trajectory": embedded(3, 4)}
 THIRD = {**similarity(FIRST, SECOND), "diff_trajectory": embedded(3, 4)}
 UNKNOWN = {**progress({**FIRST, "quality": {"a": [None]}}), "resample": 3}
+NULLS = {**progress({**FIRST, "frames": None, "embeddings_path": None, "metadata": None}), "data_gen_strategy": None}
+BESIDE = progress({**FIRST, "frames": ["0.png"], "embeddings_path": "episode_7.pt"})
+TOLD = {"data_source": "bridge", "metadata": {"fps": 3, "camera": {"name": "wrist"}}}
+PAIRED = {**similarity({**FIRST, **TOLD}, SECOND), "data_gen_strategy": "paired"}
 FORMS: dict[str, tuple[Any, int, list[Json]]] = {
     "a bare list": (ONE, 0, ONE),
     "a sample alone": (progress(FIRST), 0, ONE),
@@ -126,6 +128,9 @@ FORMS: dict[str, tuple[Any, int, list[Json]]] = {
     "an object with one list": ({"use_frame_steps": False, "anything": ONE}, 0, ONE),
     "an object of samples": ({"first": progress(FIRST), "use_frame_steps": "false"}, 0, ONE),
     "unknown fields": ({"samples": [UNKNOWN], "x": 1}, 0, ONE),
+    "null for what is not there": ([NULLS], 0, ONE),
+    "embeddings win over frames and files": ([BESIDE], 0, ONE),
+    "fields that the answer repeats": ([PAIRED], 0, [PAIRED]),
     "other names": ([{"sample_type": "similarity", **ALIASES}, THIRD], 0, [similarity(FIRST, SECOND)] * 2),
 }
 
@@ -133,53 +138,6 @@ FORMS: dict[str, tuple[Any, int, list[Json]]] = {
 @pytest.mark.parametrize(("document", "frame_steps", "samples"), FORMS.values(), ids=FORMS)
 def test_every_form_of_a_request_is_read(tiny: Gateway, document: Any, frame_steps: int, samples: list[Json]) -> None:
     assert answered(post_json(tiny, document)) == expected(tiny, samples, frame_steps=frame_steps)
-
-
-UPSTREAM_FIELDS: Json = {  # further fields of the FastAPI server's clients
-    "id": "episode_7",
-    "lang_vector": np.zeros(384, np.float32),
-    "frames_shape": [3, 32, 32, 3],
-    "data_source": "bridge",
-    "data_gen_strategy": None,
-    "quality_label": "successful",
-    "is_robot": True,
-    "target_progress": [0.1, 0.5, 1.0],
-    "partial_success": None,
-    "metadata": {"fps": 3, "camera": {"name": "wrist"}},
-}
-UPSTREAM_KINDS: dict[str, Callable[[int, int], Json]] = {
-    "frames": lambda seed, t: filmed(
-        seed,
-        t,
-        **UPSTREAM_FIELDS,
-        video_embeddings=None,
-        text_embedding=None,
-        embeddings_path="episode_7/embeddings.pt",
-    ),
-    "embeddings": lambda seed, t: embedded(seed, t, ENCODER_DIMS, **UPSTREAM_FIELDS, frames=None, embeddings_path=None),
-    "both": lambda seed, t: embedded(seed, t, ENCODER_DIMS, **UPSTREAM_FIELDS, frames=filmed(seed, t)["frames"]),
-    "paths and embeddings": lambda seed, t: embedded(seed, t, ENCODER_DIMS, **UPSTREAM_FIELDS, frames=["0.png"] * t),
-}
-
-
-@pytest.mark.parametrize("make", UPSTREAM_KINDS.values(), ids=UPSTREAM_KINDS)
-def test_a_client_of_the_fastapi_server_changes_nothing_but_the_url(
-    encoders: Gateway, ask: Ask, make: Callable[[int, int], Json]
-) -> None:
-    samples = [
-        {**progress(make(1, 3)), "data_gen_strategy": "rewound", "resample_attempts": 1},
-        preference(make(2, 2), make(3, 4)),
-        {**similarity(make(4, 3), make(5, 1)), "data_gen_strategy": "paired", "diff_trajectory": None},
-    ]
-    plain = [dict(sample) for sample in samples]
-    for sample in plain:  # embeddings win, as there
-        for side in SIDES[sample["sample_type"]]:
-            has_embeddings = sample[side].get("video_embeddings") is not None
-            sample[side] = {**sample[side], "frames": None if has_embeddings else sample[side]["frames"]}
-    answer = answered(ask(encoders, samples))
-    assert answer == numbers(expected(encoders, plain))
-    assert answer["outputs_similarity"]["metadata"] == [UPSTREAM_FIELDS["metadata"]]
-    assert answer["outputs_similarity"]["data_gen_strategy"] == ["paired"]
 
 
 FLOATS = np.random.default_rng(0).uniform(-20, 280, (3, 32, 32, 3)).astype(np.float32)
@@ -214,10 +172,18 @@ def test_any_npy_file_of_numbers_is_read(tiny: Gateway, written: Callable[[Array
     assert answered(response) == expected(tiny, [progress({**FIRST, "video_embeddings": video})])
 
 
-def test_a_task_without_embedding_is_encoded(encoders: Gateway) -> None:
+def test_a_task_without_embedding_is_encoded(encoders: Gateway, tiny: Gateway) -> None:
     given = embedded(1, 3, ENCODER_DIMS, task="open the drawer")
+    frames = Trajectory(frames=filmed(1, 2)["frames"], task="open the drawer")
     with encoders.client() as client:
-        encoded = client.encode(Trajectory(frames=filmed(1, 2)["frames"], task="open the drawer"))
+        encoded = client.encode(frames)
+        np.testing.assert_allclose(client.progress(encoded).progress, client.progress(frames).progress, atol=TOLERANCE)
+        with pytest.raises(InvalidSampleError, match="trajectory: expected frames, got video_embeddings"):
+            client.encode(encoded)
+        with pytest.raises(InvalidSampleError, match=r"expected a model .*, got .*; leave out"):
+            client.encode(replace(frames, goal=frames.positions[0]))
+    with tiny.client() as client, pytest.raises(ModelNotFoundError, match="rfm_encoder"):
+        client.encode(frames)
     samples = [progress({**given, "text_embedding": None}), preference({**given, "text_embedding": None}, given)]
     with_text = {**given, "text_embedding": encoded.text_embedding}
     answer = answered(ask_json(encoders, samples))
@@ -240,23 +206,10 @@ def test_a_model_that_sees_a_video_gives_a_value_for_two_frames(video: Gateway) 
 @pytest.mark.slow
 def test_concurrent_callers_each_get_their_own_answer(encoders: Gateway) -> None:
     asked = [[mixed(embedded, ENCODER_DIMS)[k % 6], progress(embedded(k, 1 + k % 9, ENCODER_DIMS))] for k in range(32)]
-    alone = [expected(encoders, samples) for samples in asked]
-    for index in range(0, len(asked), 8):  # bad samples do not affect the others
-        asked[index][1] = progress(embedded(index, 17, ENCODER_DIMS))
-    start = threading.Barrier(len(asked))
-
-    def call(index: int) -> requests.Response:
-        start.wait()
-        return (ask_json if index % 2 else ask_npy)(encoders, asked[index])
-
     with ThreadPoolExecutor(len(asked)) as pool:
-        for index, response in enumerate(pool.map(call, range(len(asked)))):
-            if index % 8:
-                assert answered(response) == numbers(alone[index])
-            else:
-                at = ["samples", 1, "trajectory", "video_embeddings"]
-                at = at if index % 2 else as_parts(at)
-                check_refused(response, (at, "expected at most 16 .*, got 17; send fewer frames.*"))
+        answers = list(pool.map(lambda samples: answered(ask_json(encoders, samples)), asked))
+    for samples, answer in zip(asked, answers, strict=True):
+        assert answer == numbers(expected(encoders, samples))
 
 
 def listens(gateway: Gateway) -> bool:

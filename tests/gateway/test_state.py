@@ -6,23 +6,18 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import psutil
 import pytest
 import requests
 import torch
 
 import goldens
-from commands import own_regions
 from engines import training_run
 from gateway_requests import (
-    ENCODER_DIMS,
     ENCODERS,
     FIRST,
     SECOND,
@@ -39,12 +34,11 @@ from gateway_requests import (
     progress,
 )
 from gateways import WITHIN_S, Gateway, StandIn, answers, free_port, inside, poll
-from rfm_client import AsyncRewardClient, InvalidSampleError, ModelNotFoundError, ServerUnavailableError, Trajectory
+from rfm_client import AsyncRewardClient, ServerUnavailableError
 from rfm_client.serving import ServerStatus
 from rfm_gateway import GatewayConfig
 from rfm_gateway.state import STALL_S, ServedParts, TritonState
-from servers import Endpoints
-from tolerances import TOLERANCE
+from servers import Serving, serving
 
 pytestmark = pytest.mark.triton
 
@@ -123,7 +117,6 @@ def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: torch.nn.M
     assert sum(part["parameters"] for part in parts) == total
     tops = dict((*tiny_network.named_parameters(recurse=False), *tiny_network.named_children()))
     assert {part["name"]: part["type"] for part in parts} == {name: type(top).__name__ for name, top in tops.items()}
-    assert {part["name"] for part in parts} == {name.partition(".")[0] for name in tiny_network.state_dict()}
     assert architecture == {
         "model_class": "RewindTransformer",
         "model_module": "rfm.families.rewind.network",
@@ -163,69 +156,43 @@ def test_metrics_count_what_was_asked(tiny: Gateway) -> None:
     assert tiny.metric("requests_in_flight") == 0
 
 
+def own_gateway(served: Serving) -> psutil.Process:
+    children = psutil.Process(served.process.pid).children(recursive=True)
+    (found,) = (child for child in children if "rfm_gateway" in child.cmdline())
+    return found
+
+
 @pytest.mark.slow
 def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_silent(
     triton: Triton, tmp_path: Path
 ) -> None:
-    repository, endpoints, port = tmp_path / "model_repository", Endpoints.free(), free_port()
+    repository, port = tmp_path / "model_repository", free_port()
     shutil.copytree(triton.repository / TINY, repository / TINY)
-    ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
-    options = [word for name, number in (ports | {"gateway": port}).items() for word in (f"--{name}-port", str(number))]
-    options += ["--gateway-timeout", "90", "--gateway-max-waiting", "7", "--triton-silent-s", "4"]
-    rfm = [str(Path(sys.executable).parent / "rfm"), "serve", "--repository", str(repository), *options]
-    log_file = tmp_path / "rfm.log"
-    with log_file.open("wb") as log:
-        process = subprocess.Popen(rfm, stdout=log, stderr=log)
-    try:
-        url = f"http://127.0.0.1:{port}"
-        poll(lambda: process.poll() is not None or answers(url))
-        assert process.poll() is None, log_file.read_text()
-        gateway = Gateway(url, TINY, endpoints.grpc_url, process, log_file)
-        answer = expected(gateway, [progress(FIRST)])
-        assert answered(ask_json(gateway, [progress(FIRST)])) == answer
-        assert requests.get(f"{url}/health").json()["status"] == "healthy"
-        started = psutil.Process(process.pid).children(recursive=True)
-        (own,) = (child for child in started if "rfm_gateway" in child.cmdline())
-        assert "--timeout 90.0 --max-body-mib 512" in " ".join(own.cmdline())
-        assert "--max-waiting 7" in " ".join(own.cmdline())
-        own.kill()
+    url, options = (
+        f"http://127.0.0.1:{port}",
+        ["--gateway-timeout=90", "--gateway-max-waiting=7", "--triton-silent-s=4"],
+    )
+    with serving(repository, f"--gateway-port={port}", *options) as served:
+        poll(lambda: served.process.poll() is not None or answers(url))
+        gateway = Gateway(url, TINY, served.endpoints.grpc_url, served.process, served.log)
+
+        def scores() -> None:
+            poll(lambda: answers(url))
+            assert answered(ask_json(gateway, [progress(FIRST)])) == expected(gateway, [progress(FIRST)])
+
+        scores()
+        first = own_gateway(served)
+        assert "--timeout 90.0 --max-body-mib 512" in " ".join(first.cmdline())
+        assert "--max-waiting 7" in " ".join(first.cmdline())
+        first.kill()
         poll(lambda: not answers(url))
-        poll(lambda: answers(url))
-        assert answered(ask_json(gateway, [progress(FIRST)])) == answer
-        running = psutil.Process(process.pid).children(recursive=True)
-        started += running
-        (stopped,) = (child for child in running if "rfm_gateway" in child.cmdline())
-        stopped.suspend()
-        poll(lambda: not stopped.is_running())
-        poll(lambda: answers(url))
-        assert answered(ask_json(gateway, [progress(FIRST)])) == answer
-        started += psutil.Process(process.pid).children(recursive=True)
-        process.terminate()
-        assert process.wait(WITHIN_S) == 0
-    finally:
-        process.terminate()
-        process.wait(WITHIN_S)
+        scores()
+        second = own_gateway(served)
+        second.suspend()
+        poll(lambda: not second.is_running())
+        scores()
+        started = [first, second, *psutil.Process(served.process.pid).children(recursive=True)]
+    assert served.process.returncode == 0
     for why in ("killed by SIGKILL", "no answer for 4 s"):
         assert f"]: gateway is started again: {why}\n" in gateway.log
-    assert len(set(started)) >= 5  # Triton, a model process, and three gateways
     assert not [child for child in started if child.is_running()]
-    assert not own_regions(process.pid)
-
-
-def test_the_client_encodes_a_trajectory_once_for_many_questions(encoders: Gateway, tiny: Gateway) -> None:
-    given = filmed(1, 4)
-    frames = Trajectory(frames=given["frames"], task=given["task"])
-    with encoders.client() as client:
-        encoded = client.encode(frames)
-        assert (encoded.positions.shape, encoded.frames, encoded.task) == ((4, ENCODER_DIMS[0]), None, given["task"])
-        assert encoded.text_embedding is not None
-        assert encoded.text_embedding.shape == (ENCODER_DIMS[1],)
-        first, second = client.progress(frames), client.progress(encoded)
-        np.testing.assert_allclose(first.progress, second.progress, rtol=0, atol=TOLERANCE)
-        np.testing.assert_allclose(first.success, second.success, rtol=0, atol=TOLERANCE)
-        with pytest.raises(InvalidSampleError, match="trajectory: expected frames, got video_embeddings"):
-            client.encode(encoded)
-        with pytest.raises(InvalidSampleError, match=r"expected a model .*, got .*; leave out"):
-            client.encode(replace(frames, goal=frames.positions[0]))
-    with tiny.client() as client, pytest.raises(ModelNotFoundError, match="rfm_encoder"):
-        client.encode(frames)

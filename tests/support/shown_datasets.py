@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import h5py
 import numpy as np
 import pyarrow as pa
 from pyarrow import parquet
@@ -66,3 +67,17 @@ def large(root: Path, num_episodes: int, seed: int = 0) -> Path:
     scores = {name: np.float32(random.random(2 * num_episodes)) for name in ("progress_sparse", "success")}
     parquet.write_table(pa.table({**identity, **scores}), root / "rfm_progress.parquet")
     return root
+
+
+def hdf5(folder: Path) -> Path:
+    """Write two demonstrations with smooth pictures of odd size, and depth maps."""
+    file = folder / "demos.hdf5"
+    rows, columns = np.mgrid[:63, :81]
+    with h5py.File(file, "w") as opened:
+        for number in (3, 7):
+            pictures = [np.stack([rows * 3, columns * 3, rows * 0 + 10 * t + number], -1) for t in range(12)]
+            opened[f"data/demo_{number}/obs/front"] = np.array(pictures, np.uint8)
+            opened[f"data/demo_{number}/obs/range"] = np.ones((12, 63, 81), np.uint16)
+        about = {"env_name": "Lift", "lang": "open the drawer", "env_kwargs": {"control_freq": 10}}
+        opened["data"].attrs["env_args"] = json.dumps(about)
+    return file
