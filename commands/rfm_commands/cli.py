@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from rfm.config import ExportConfig, ServeConfig
-from rfm.launch.admin_key import take_key
+from rfm.launch.admin_key import new_key, take_key
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.triton_server import TritonServer, short_spin
@@ -193,7 +193,7 @@ def serve(
             find_installation(tritonserver),
             http_threads=config.serve.http_threads,
             log=lines,
-            admin_key=take_key(admin_key_file, os.environ),
+            admin_key=take_key(admin_key_file, os.environ) or new_key(),
             accepts_known_vulnerabilities=accept_known_vulnerabilities,
             more_arguments=more_arguments,
             hang_s=config.serve.hang_s,

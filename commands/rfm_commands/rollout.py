@@ -8,7 +8,8 @@ models: encoder and scorer (the parts), and an ensemble, whose configuration nam
    version gets no request.
 2. The new version of each part answers a probe that names it.
 3. The ensemble changes to the new version. Triton finishes the requests of the old version.
-4. Each part serves the new version alone. Triton again finishes the requests of the old version.
+4. Each part serves the new version alone. Triton again finishes the requests of the old version. Every model then
+   answers a last probe.
 
 If a step fails, the server loads the old versions with their own configurations again. Their files are
 put back even if the server is gone, so that a restart serves the old versions. A server that comes back within RETURN_S
@@ -129,8 +130,7 @@ class Rollout:
         for model in (*(model for model in new if model not in parts), *parts):
             self._serve(new[model], [version])
             self.server.wait_gone(model, kept=[version])
-            if model not in parts:
-                probe(self.server, new[model], version)
+            probe(self.server, new[model], version)
 
     def _go_back(self, old: Configs, served: Mapping[str, Sequence[int]]) -> str:
         """Serve the old versions again. Return the outcome in words."""

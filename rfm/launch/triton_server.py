@@ -10,6 +10,7 @@ import signal
 import time
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import KW_ONLY, dataclass, field
 from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
@@ -65,6 +66,7 @@ class SpoiltStartError(ServerStartError):
     """
 
 
+@dataclass(eq=False)
 class TritonServer:
     """A tritonserver with all models of ``repository``. The context manager starts and stops it.
 
@@ -73,34 +75,24 @@ class TritonServer:
     http_threads: threads that read HTTP requests; None: Triton's choice
     hang_s: seconds without progress of a batch after which a model process ends itself
     log: file for Triton's log; None: warnings and errors go to this process's standard error
-    admin_key: key of the restricted APIs; None: a new random key
+    admin_key: key of the restricted APIs; default: a new random key
     accepts_known_vulnerabilities: True: listen on any address, even with a vulnerable Triton
     more_arguments: further arguments of tritonserver, such as ``--trace-config=...``
     """
 
-    def __init__(
-        self,
-        repository: Path,
-        endpoints: Endpoints,
-        installation: Installation,
-        *,
-        http_threads: int | None = None,
-        hang_s: int = DEFAULT_HANG_S,
-        log: IO[bytes] | None = None,
-        admin_key: str | None = None,
-        accepts_known_vulnerabilities: bool = False,
-        more_arguments: Sequence[str] = (),
-    ) -> None:
-        self.endpoints = endpoints
-        self.repository = repository
-        self.admin_key = admin_key or new_key()
-        self._installation = installation
-        self._http_threads = http_threads
-        self._hang_s = hang_s
-        self._log = log
-        self._accepts_known_vulnerabilities = accepts_known_vulnerabilities
-        self._more_arguments = tuple(more_arguments)
-        self._http = Http(endpoints.http_host, endpoints.http_port, http_headers(self.admin_key))
+    repository: Path
+    endpoints: Endpoints
+    installation: Installation
+    _: KW_ONLY
+    http_threads: int | None = None
+    hang_s: int = DEFAULT_HANG_S
+    log: IO[bytes] | None = None
+    admin_key: str = field(default_factory=new_key, repr=False)
+    accepts_known_vulnerabilities: bool = False
+    more_arguments: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        self._http = Http(self.endpoints.http_host, self.endpoints.http_port, http_headers(self.admin_key))
         self._claim: Claim | None = None
         self._signal: int | None = None  # the last signal that was sent
         self._group: ProcessGroup | None = None  # the newest
@@ -201,24 +193,24 @@ class TritonServer:
     def _start(self, models: Sequence[str]) -> None:
         """Start the process with ``models``. Raises ServerStartError for wrong arguments, addresses or files."""
         own = self._arguments(models)
-        check_arguments(self._more_arguments, [*own, _REGIONS])
-        if self._installation.wheel is not None:
-            check_version(self.endpoints.host, WHEEL_VERSION, accepted=self._accepts_known_vulnerabilities)
+        check_arguments(self.more_arguments, [*own, _REGIONS])
+        if self.installation.wheel is not None:
+            check_version(self.endpoints.host, WHEEL_VERSION, accepted=self.accepts_known_vulnerabilities)
         self.endpoints.check()
         self._claim = Claim()
         arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
-        arguments += self._installation.lay_out_backends(self._claim.backends)
+        arguments += self.installation.lay_out_backends(self._claim.backends)
         arguments += self.endpoints.grpc_tls.arguments() if self.endpoints.grpc_tls else []
-        if self._log is None and not any(each.startswith("--log-") for each in self._more_arguments):
+        if self.log is None and not any(each.startswith("--log-") for each in self.more_arguments):
             arguments += ["--log-info=false"]
-        arguments += [*size_limits(self._installation, self._more_arguments), *self._more_arguments]
-        program = self._installation.executable
+        arguments += [*size_limits(self.installation, self.more_arguments), *self.more_arguments]
+        program = self.installation.executable
         try:
             self._group = ProcessGroup(
                 [program, *arguments],
                 env=self._environment(),
-                stdout=self._log,
-                stderr=self._log,
+                stdout=self.log,
+                stderr=self.log,
                 pass_fds=[self._claim.lock_file],
             )
         except OSError as error:
@@ -242,7 +234,7 @@ class TritonServer:
             if failed:
                 reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
                 raise _failed(f"expected all to be ready, got {reasons}{_remedy(reasons)}", failed[0].name)
-            check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
+            check_version(self.endpoints.host, version, accepted=self.accepts_known_vulnerabilities)
             return
         kind = SpoiltStartError if status == -signal.SIGABRT else ServerStartError
         raise kind(f"tritonserver: expected to run, got {how_it_ended(status)}")
@@ -284,14 +276,14 @@ class TritonServer:
             "--exit-on-error=false",  # keeps the reason of each failed model readable
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
             *self.endpoints.arguments(),
-            *([f"--http-thread-count={self._http_threads}"] if self._http_threads else []),
+            *([f"--http-thread-count={self.http_threads}"] if self.http_threads else []),
             *restrictions(self.admin_key),
         ]
 
     def _environment(self) -> dict[str, str]:
         own = {name: value for name, value in os.environ.items() if not SECRET.fullmatch(name)}
-        of_models = {HANG_VARIABLE: str(self._hang_s)}
-        return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE, **of_models}
+        of_models = {HANG_VARIABLE: str(self.hang_s)}
+        return {**short_spin(own), **own, **self.installation.environment, **NO_BYTECODE, **of_models}
 
 
 def _failed(problem: str, model: str) -> ServerStartError:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
-from functools import partial
+from dataclasses import KW_ONLY, dataclass
 from types import FrameType
 
 from rfm.launch import cleanup
@@ -36,10 +36,7 @@ class CrashLoopError(ServerStartError):
 
 
 class BackOff:
-    """Growing pauses between the restarts of Triton; none before the first.
-
-    row: what had each of the faults in a row
-    """
+    """Growing pauses between the restarts of Triton; none before the first."""
 
     def __init__(self, steady_s: float = STEADY_S) -> None:
         self._steady_s = steady_s
@@ -50,15 +47,12 @@ class BackOff:
         """Record a successful start."""
         self._running_since_s = time.monotonic()
 
-    def failed(self) -> None:
-        """Record a fault or a failed start."""
+    def failed(self, reason: str) -> float:
+        """Record a fault or a failed start. Return the seconds to wait before the next. Raises CrashLoopError."""
         if self._running_since_s is not None and time.monotonic() - self._running_since_s >= self._steady_s:
             self._num_faults = 0
         self._running_since_s = None  # a failed start does not count as running
         self._num_faults += 1
-
-    def pause_s(self, reason: str) -> float:
-        """Return the seconds to wait before the next start. Raises CrashLoopError. reason: that of the last fault"""
         if self._num_faults > MOST:
             got = f"{self._num_faults} faults in a row; the last: {reason}"
             raise CrashLoopError(f"{TRITON}: expected to run, got {got}")
@@ -126,6 +120,7 @@ class GatewayProcess:
             self._group.end()
 
 
+@dataclass(eq=False)
 class Supervisor:
     """Serves until a stop signal. For the main thread.
 
@@ -135,27 +130,19 @@ class Supervisor:
     tell_ready: tells the user that all models are ready for the first time; None: a line in the log
     """
 
-    def __init__(
-        self,
-        server: TritonServer,
-        *,
-        gateway: GatewayProcess | None = None,
-        status_port: int | None = None,
-        probe_s: float,
-        hang_s: float,
-        triton_silent_s: float,
-        tell_ready: Callable[[], None] | None = None,
-    ) -> None:
-        self._server = server
-        self._gateway = gateway
-        self._tell_ready = tell_ready or self._log_ready
-        self._status_port = status_port
+    server: TritonServer
+    _: KW_ONLY
+    probe_s: float
+    hang_s: float
+    triton_silent_s: float
+    gateway: GatewayProcess | None = None
+    status_port: int | None = None
+    tell_ready: Callable[[], None] | None = None
+
+    def __post_init__(self) -> None:
         self._status = Status()
-        self._new_watch = partial(
-            TritonWatch, server, self._status, probe_s=probe_s, hang_s=hang_s, silent_s=triton_silent_s
-        )
         self._is_to_stop = threading.Event()
-        self._back_off = BackOff(STEADY_S + hang_s)
+        self._back_off = BackOff(STEADY_S + self.hang_s)
         self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
 
@@ -163,10 +150,10 @@ class Supervisor:
         """Serve until a stop signal. Raises ServerStartError for a failed start or a crash loop."""
         for path in cleanup.clear():
             logger.info("removed %s, left by a killed server", path)
-        self._status.record(dict.fromkeys(self._server.models, "it is loading"))
-        for what in (TRITON, *self._server.models, *(() if self._gateway is None else (GATEWAY,))):
+        self._status.record(dict.fromkeys(self.server.models, "it is loading"))
+        for what in (TRITON, *self.server.models, *(() if self.gateway is None else (GATEWAY,))):
             self._status.restarts.labels(what)  # begins at 0, so that the first restart is an increase
-        port, host = self._status_port, self._server.endpoints.host
+        port, host = self.status_port, self.server.endpoints.host
         with (
             stop_signals_to(self._stop),
             nullcontext() if port is None else closing(StatusServer(host, port, self._status)),
@@ -176,13 +163,13 @@ class Supervisor:
     def _stop(self, number: int, _frame: FrameType | None) -> None:
         self._is_to_stop.set()
         if self._watch is None:  # Triton is loading
-            self._server.signal(signal.SIGTERM if number == signal.SIGHUP else number)
+            self.server.signal(signal.SIGTERM if number == signal.SIGHUP else number)
 
     def _serve(self) -> None:
         try:
             self._start()
-            if self._gateway is not None and self._watch is not None:
-                self._gateway.start()
+            if self.gateway is not None and self._watch is not None:
+                self.gateway.start()
             while not self._is_to_stop.wait(POLL_S):
                 self._look()
         except ServerStartError:
@@ -190,35 +177,42 @@ class Supervisor:
                 raise
         finally:
             self._status.record_down("it is stopping")
-            if self._gateway is not None:  # before the server, so that requests in flight get answers
-                self._gateway.stop()
+            if self.gateway is not None:  # before the server, so that requests in flight get answers
+                self.gateway.stop()
             self._close_watch()
-            self._server.stop()
+            self.server.stop()
 
     def _start(self) -> None:
         """Start Triton with the versions served before (at first, the repository's). Raises ServerStartError."""
-        self._server.start_ready(self._served)
+        self.server.start_ready(self._served)
         if self._is_to_stop.is_set():
             return
         if self._served is None:
-            self._tell_ready()
+            (self.tell_ready or self._log_ready)()
         self._back_off.started()
-        self._watch = self._new_watch(served=self._served or {})
+        self._watch = TritonWatch(
+            self.server,
+            self._status,
+            probe_s=self.probe_s,
+            hang_s=self.hang_s,
+            silent_s=self.triton_silent_s,
+            served=self._served or {},
+        )
 
     def _log_ready(self) -> None:
-        ends = self._server.endpoints
+        ends = self.server.endpoints
         urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
-        logger.info("ready: %s at %s", ", ".join(self._server.models), urls)
+        logger.info("ready: %s at %s", ", ".join(self.server.models), urls)
 
     def _look(self) -> None:
         """Restart Triton or the gateway if it ended or has a fault. Raises CrashLoopError."""
         if self._watch is None:
             return
-        if self._server.exit_status is not None:
-            self._start_again(TRITON, how_it_ended(self._server.exit_status))
+        if self.server.exit_status is not None:
+            self._start_again(TRITON, how_it_ended(self.server.exit_status))
         elif self._watch.fault is not None:
             self._start_again(*self._watch.fault, counts=not self._watch.is_of_load)
-        if self._gateway is not None and (why := self._gateway.look()):
+        if self.gateway is not None and (why := self.gateway.look()):
             self._count(GATEWAY, why)
         if self._watch is not None and self._watch.reasons:
             self._status.record(self._watch.reasons)
@@ -234,12 +228,10 @@ class Supervisor:
             self._close_watch()
             reason = why if what == TRITON else f"{what}: {why}"
             self._status.record_down(f"{TRITON} is started again: {reason}")
-            self._server.kill()
-            self._server.stop()
-            if counts:
-                self._back_off.failed()
-                if self._is_to_stop.wait(self._back_off.pause_s(reason)):
-                    return
+            self.server.kill()
+            self.server.stop()
+            if counts and self._is_to_stop.wait(self._back_off.failed(reason)):
+                return
             counts = True
             self._count(what, why)
             try:
@@ -249,7 +241,7 @@ class Supervisor:
                 return
             except ServerStartError as error:
                 # A crash of Triton itself is the fault of the model before; a kill from outside is not.
-                was_killed = self._server.exit_status == -signal.SIGKILL and not isinstance(error, SpoiltStartError)
+                was_killed = self.server.exit_status == -signal.SIGKILL and not isinstance(error, SpoiltStartError)
                 what, why = error.model or (TRITON if was_killed else what), str(error)
 
     def _count(self, what: str, why: str) -> None:

@@ -24,7 +24,7 @@ from urllib.parse import quote
 from rfm.launch.admin_key import http_headers
 from rfm.launch.http import NO_ANSWER, Http
 from rfm.launch.model_processes import ModelProcesses
-from rfm.launch.repository_api import INDEX_PATH, LOADING, READY, UNLOADING, ModelVersion, versions_of
+from rfm.launch.repository_api import INDEX_PATH, LOADING, UNLOADING, ModelVersion, versions_of
 from rfm.launch.triton_server import Config, TritonServer
 from rfm.supervise.probe import Probe, can_be_probed
 from rfm.supervise.status import NO_REASON, Status
@@ -139,15 +139,27 @@ class TritonWatch:
         """Read Triton's index. Raises NO_ANSWER."""
         timeout_s = min(_INDEX_TIMEOUT_S, self._silent_s / LOOKS)  # a silent Triton is no hung model
         versions = versions_of(self._http.json(INDEX_PATH, timeout_s, "POST"))
-        for model in {entry.name for entry in versions}:
-            self._keep_up_with(model, [entry for entry in versions if entry.name == model])
+        ready = {entry.name: list[int]() for entry in versions}
+        for entry in versions:
+            if entry.is_ready:
+                ready[entry.name].append(entry.version or 1)
+        loading = {entry.name for entry in versions if entry.state == LOADING}
+        self._going = loading | {entry.name for entry in versions if entry.state == UNLOADING}
+        for model in ready:
+            self._keep_up_with(model, ready[model])
+        unloaded = ready.keys() - {entry.name for entry in versions if not entry.is_unloaded}
+        for model in unloaded & self._leaving:
+            self.served.pop(model, None)
+        self._leaving = unloaded
+        known = [model for model in ready.keys() - loading if model in self.served or not ready[model]]
+        self._wanted = {model: len(ready[model]) * num_instances(self.served.get(model, {})) for model in known}
         self.reasons = {name: self._reason(name, versions) for name in self.served}
 
-    def _keep_up_with(self, model: str, versions: Sequence[ModelVersion]) -> None:
-        ready = [entry.version or 1 for entry in versions if entry.state == READY]
-        is_going = any(entry.state in (LOADING, UNLOADING) for entry in versions)
-        is_settled = len(ready) > 0 and not is_going
-        if is_settled and ready != self._ready.get(model):
+    def _keep_up_with(self, model: str, ready: list[int]) -> None:
+        """Note the configuration and probe a model whose ready versions are others than before."""
+        if not ready:
+            self._forget(model)
+        elif model not in self._going and ready != self._ready.get(model):
             path = f"/v2/models/{quote(model, safe='')}/versions/{max(ready)}/config"
             self.served[model] = serving_just(self._http.json(path), ready)
             self._status.restarts.labels(model)  # begins at 0, so that the first restart is an increase
@@ -158,18 +170,7 @@ class TritonWatch:
                 self._probes[model] = self._new_probe(model, observe=observe)
                 known = before is not None and before.has_answered
                 self._probes[model].has_answered = known  # a reloaded model stays ready
-        (self._going.add if is_going else self._going.discard)(model)
-        self._wanted.pop(model, None)
-        if not any(entry.state == LOADING for entry in versions) and (model in self.served or not ready):
-            self._wanted[model] = len(ready) * num_instances(self.served.get(model, {}))
-        if is_settled:
             self._ready[model] = ready
-        elif not ready:
-            self._forget(model)
-        is_unloaded = all(entry.is_unloaded for entry in versions)
-        if is_unloaded and model in self._leaving:
-            self.served.pop(model, None)
-        self._leaving = self._leaving | {model} if is_unloaded else self._leaving - {model}
 
     def _forget(self, model: str) -> None:
         """Stop probing a model that was reloaded or unloaded."""

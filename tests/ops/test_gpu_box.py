@@ -12,6 +12,7 @@ import ssl
 import subprocess
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ import clip
 from in_process import rfm_parsed
 from paths import ROOT
 from rfm_client import AccessDeniedError, RewardClient, ServerUnavailableError, Trajectory
-from servers import Endpoints, serving, wait_for
+from servers import Endpoints, serving, wait_for, web_server
 from tolerances import TOLERANCE
 
 GUIDE = (ROOT / "docs" / "guides" / "deploy.md").read_text()
@@ -147,6 +148,28 @@ def test_nginx_passes_on_what_scoring_needs_with_a_key_and_nothing_else(nginx: s
     log = (papers / "access.log").read_text()
     assert '"alice" "POST /inference.GRPCInferenceService/ModelInfer' in log
     assert not {key for key in (alice, bob) if key in log}
+
+
+def test_nginx_tells_triton_that_no_body_is_a_form(nginx: str, papers: Path) -> None:
+    """With a stand-in for Triton."""
+
+    class Told(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(200)
+            self.send_header("X-Type", self.headers["Content-Type"])
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    key, port = (papers / "keys" / "alice.key").read_text().strip(), Endpoints.free().http_port
+    context = ssl.create_default_context(cafile=papers / "keys" / "ca.pem")
+    form = {"Content-Type": "application/x-www-form-urlencoded", "Authorization": f"Bearer {key}"}
+    with web_server(Told) as url, proxy(nginx, papers, {"http": httpx.URL(url).port or 0, "proxy": port}):
+        infer = f"https://{IP}:{port}/v2/models/rfm/infer"
+        answer = httpx.post(infer, content=b"{}", headers=form, verify=context)
+    assert (answer.status_code, answer.headers["X-Type"]) == (200, "application/octet-stream")
 
 
 def test_nginx_does_not_start_with_an_empty_key(nginx: str, papers: Path) -> None:

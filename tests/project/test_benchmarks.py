@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,15 +9,10 @@ from pathlib import Path
 import pytest
 
 from paths import ROOT
-from rfm import published
-from rfm.engine import Engine
-from rfm_client import ProgressResult
 
 sys.path.append(str(ROOT / "benchmarks"))
 
-import contestants
 import gpu
-import random_checkpoints
 from load import NUM_FILMED, Calls, Load, Measured, samples
 from real_size import FULL
 
@@ -32,35 +26,9 @@ def test_no_frame_comes_twice_but_in_a_load_that_repeats_few_videos() -> None:
         assert len({frame.tobytes() for frames in made for frame in frames}) == expected  # type: ignore[union-attr]
 
 
-def test_processes_share_the_callers_of_a_load() -> None:
-    parts = contestants.shares(replace(FILMED, callers=10), 4)
-    assert [part.callers for part in parts] == [3, 3, 2, 2]
-    assert [part.rate_per_s for part in contestants.shares(Load(0, 1, (1, 1), rate_per_s=8.0), 2)] == [4.0, 4.0]
-
-
 def test_percentiles_are_those_of_all_processes() -> None:
     measured = Measured.of([Calls([0.1] * 3, 0, 1.0), Calls([0.5], 2, 2.0)], together=2)
     assert measured == Measured(samples_per_s=7.0, failed=2, p50_ms=100.0, p99_ms=pytest.approx(488.0), took_s=2.0)
-
-
-def test_a_server_of_another_commit_is_started_with_a_relative_python(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    program = tmp_path / "bin" / "python"
-    program.parent.mkdir()
-    program.write_text('#!/bin/sh\necho \'{"grpc": "grpc://here:1"}\'\nread line\n')
-    program.chmod(0o755)
-    monkeypatch.chdir(tmp_path)
-    with contestants.serving(tmp_path, tmp_path, {}, os.path.join("bin", "python")) as addresses:  # noqa: PTH118
-        assert addresses == {"grpc": "grpc://here:1"}
-
-
-def test_a_random_checkpoint_writes_the_answer_of_a_trained_one(tmp_path: Path) -> None:
-    folder = random_checkpoints.write(tmp_path, random_checkpoints.QWEN, random_checkpoints.TINY)
-    engine = Engine.of(published.load(folder, reward_model="roboreward"))
-    (result,) = engine.evaluate([samples(replace(FILMED, frame_px=(64, 64)), 0, 0)(0)])
-    assert isinstance(result, ProgressResult), result
-    assert result.last_progress == 0.75
 
 
 def test_results_of_parts_and_of_another_checkout_stay_and_are_judged(tmp_path: Path) -> None:

@@ -82,18 +82,3 @@ def test_every_default_is_shown(name: str, told: list[str]) -> None:
     shown = " ".join(CliRunner().invoke(COMMANDS[program], [*words, "--help"], env=COMMON).output.split())
     for text in told:
         assert text in shown, text
-
-
-ALTERNATIVES = {
-    "rfm label": "rfm-client label",
-    "rfm-client label": "rfm label",
-    "rfm gateway": "rfm serve --gateway-port",
-    "rfm-client gateway": "rfm serve --gateway-port",
-    "rfm serve": "--gateway-port",
-}
-
-
-@pytest.mark.parametrize(("name", "other"), ALTERNATIVES.items(), ids=ALTERNATIVES)
-def test_help_says_which_other_command_does_the_same_job(name: str, other: str) -> None:
-    shown = " ".join(str(COMMANDS[name].help).split())
-    assert other in shown

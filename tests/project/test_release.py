@@ -61,7 +61,7 @@ def packages_in(environment: Path) -> Path:
     return environment / "lib" / f"python{sysconfig.get_python_version()}" / "site-packages"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # half a minute for the wheels
 def test_wheels_have_their_packages_programs_and_the_files_of_the_page(environment: Path, tmp_path: Path) -> None:
     packages = packages_in(environment)
     where = "import rfm, rfm_gateway as g; print(rfm.__file__, g.__file__)"
@@ -79,7 +79,7 @@ def test_wheels_have_their_packages_programs_and_the_files_of_the_page(environme
         assert shown == f"{program} {version()}\n"
 
 
-@pytest.mark.nightly  # half a minute; the image of docker/ serves then, too
+@pytest.mark.nightly  # the image of docker/ serves then, too
 def test_wheels_serve_and_score_without_the_source_tree(environment: Path, tmp_path: Path) -> None:
     ports = Endpoints.free()
     serve = [environment / "bin" / "rfm", "serve", ROOT / "model_repository", "--grpc-port", str(ports.grpc_port)]

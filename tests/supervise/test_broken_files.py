@@ -27,31 +27,20 @@ def write_config(text: str) -> Callable[[Path], object]:
     return lambda model: (model / "config.pbtxt").write_text(text)
 
 
-def change_stamp(version: str) -> Callable[[Path], None]:
+def parameter(name: str, value: str | None) -> Callable[[Path], None]:
+    """Give a parameter another value; None: remove it."""
+
     def change(model: Path) -> None:
         with changing(model) as config:
-            config.parameters[EXPORT_PARAMETER].string_value = version
-
-    return change
-
-
-def forget(parameter: str) -> Callable[[Path], None]:
-    def change(model: Path) -> None:
-        with changing(model) as config:
-            del config.parameters[parameter]
-
-    return change
-
-
-def describe(text: str) -> Callable[[Path], None]:
-    def change(model: Path) -> None:
-        with changing(model) as config:
-            config.parameters[DESCRIPTION_PARAMETER].string_value = text
+            del config.parameters[name]
+            if value is not None:
+                config.parameters[name].string_value = value
 
     return change
 
 
 DESCRIBED = "/rfm/config.pbtxt: parameter description: "
+AGAIN = "/config.pbtxt: .* got one of an older version; "
 DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "garbage": (
         "rfm",
@@ -59,30 +48,23 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
         "/rfm/config.pbtxt: expected a model's configuration, got 1:1 : ",
     ),
     "empty": ("rfm", write_config(""), "/rfm/config.pbtxt: expected a model's configuration, got an empty file; "),
-    "of no version": ("rfm", forget(EXPORT_PARAMETER), "/rfm/config.pbtxt: .* got one of an older version; "),
-    "of an older version": ("rfm_frames", change_stamp("0"), "/rfm_frames/config.pbtxt: .* of an older version; "),
-    "of a newer version": ("rfm_encoder", change_stamp("999"), "/rfm_encoder/config.pbtxt: .* of a newer version; "),
+    "of no version": ("rfm", parameter(EXPORT_PARAMETER, None), f"/rfm{AGAIN}"),
+    "of an older version": ("rfm_frames", parameter(EXPORT_PARAMETER, "0"), f"/rfm_frames{AGAIN}"),
+    "of a newer version": ("rfm_encoder", parameter(EXPORT_PARAMETER, "999"), "/rfm_encoder/.* of a newer version; "),
     "no program": ("rfm", lambda model: (model / "1/model.py").unlink(), "/rfm/1/model.py: expected the model's pro"),
     "no version": ("rfm", lambda model: shutil.rmtree(model / "1"), "/rfm/1: expected the folder of a version, got no"),
     "no version of an ensemble": ("rfm_frames", lambda model: shutil.rmtree(model / "1"), "/rfm_frames/1: expected "),
-    "no description": (
-        "rfm",
-        forget(DESCRIPTION_PARAMETER),
-        f"{DESCRIBED}expected the JSON object of an export, got none; ",
-    ),
-    "a broken description": ("rfm", describe('{"kind"'), f"{DESCRIBED}expected .* got '{{\"kind\"': Expecting ':'"),
-    "a wrong description": (
-        "rfm",
-        describe('{"text_dim": "32"}'),
-        f"{DESCRIBED}text_dim: expected int or null, got '32'; ",
-    ),
-    "no description of an ensemble": (
-        "rfm_frames",
-        forget(DESCRIPTION_PARAMETER),
-        "/rfm_frames/config.pbtxt: parameter descr",
-    ),
     **{
-        name: ("rfm", forget(name), f"/rfm/config.pbtxt: .* parameter {name}, got none; ") for name in PYTHON_PARAMETERS
+        f"{told} in the description": ("rfm", parameter(DESCRIPTION_PARAMETER, value), f"{DESCRIBED}{message}")
+        for told, value, message in (
+            ("nothing", None, "expected the JSON object of an export, got none; "),
+            ("half", '{"kind"', "expected .* got '{\"kind\"': Expecting ':'"),
+            ("another type", '{"text_dim": "32"}', "text_dim: expected int or null, got '32'; "),
+        )
+    },
+    **{
+        name: ("rfm", parameter(name, None), f"/rfm/config.pbtxt: .* parameter {name}, got none; ")
+        for name in PYTHON_PARAMETERS
     },
 }
 
@@ -112,8 +94,7 @@ def test_the_faults_of_several_models_are_told_together(tmp_path: Path) -> None:
 def test_a_model_with_broken_files_is_refused_before_a_running_server_loads_it(tmp_path: Path) -> None:
     repository = shutil.copytree(REPOSITORY, tmp_path / "models")
     (repository / "rfm" / "1" / "model.py").unlink()
-    words = ["models", "load", "rfm", f"--repository={repository}", "--url=grpc://127.0.0.1:1"]
-    done = rfm(*words)
+    done = rfm("models", "load", "rfm", f"--repository={repository}", "--url=grpc://127.0.0.1:1")
     assert done.exit_code == 1
     assert done.stderr.startswith(f"rfm: {repository}/rfm/1/model.py: expected the model's program, got none; ")
 

@@ -47,8 +47,8 @@ def test_what_dies_or_hangs_is_healed_and_no_call_is_lost(
 ) -> None:
     """tests/supervise/test_supervisor.py has the other faults."""
     trigger = tmp_path / "trigger"
-    once = f"os.path.exists({str(trigger)!r}) and os.unlink({str(trigger)!r}) is None"  # in a single process
-    repository = make_repository(tmp_path, more_code=answering(f"if {once}: time.sleep(3600)"), instances=2)
+    once = f"os.path.exists({str(trigger)!r}) and os.unlink({str(trigger)!r}) is None"
+    repository = make_repository(tmp_path, more_code=answering(f"if {once}: time.sleep(3600)"))
     with (
         administered(repository, hang_s=HANG_S) as served,
         served.client() as client,

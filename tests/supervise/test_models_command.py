@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,21 +26,13 @@ from rfm_commands import rollout as rfm_rollout
 from rfm_commands.rollout import Rollout, RolloutError
 from rfm_export.publish import read_config
 from rollout import NAME, WITH_ENCODERS, callers
-from servers import Serving, administered, wait_for
+from servers import Serving, administered
 from trajectories import random_trajectory
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 PLAIN = goldens.config("c1_t1_disc10")  # embeddings alone
 PARTS = ("rfm_encoder", "rfm", "rfm_frames")
-CONNECTIONS = 24  # of each protocol; Triton has 8 threads for HTTP
-DEADLINE_S = 20.0
-WAITS_AT_IMPORT = """
-import time, pathlib
-pathlib.Path({begun!r}).touch()
-while not pathlib.Path({may_end!r}).exists():
-    time.sleep(0.02)
-"""
 
 
 def models(command: str, *words: str) -> Result:
@@ -96,19 +87,20 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         yield Running(served, repository)
 
 
-def test_a_name_is_loaded_listed_and_unloaded_beside_the_others(running: Running) -> None:
+def test_a_name_is_loaded_rolled_out_and_unloaded_beside_the_others(running: Running) -> None:
     running.export_plain("listed")
     assert running.models("load", "listed") == "listed: 1 ready\n"
     assert ["listed", "1", "READY"] in running.listed()
+    running.export_plain("listed")
+    assert running.models("rollout", "listed", "2").endswith("listed: version 2 is served\n")
+    assert (running.served_by_restart("listed"), running.ready("listed")) == ([2], ["2"])
     assert ["rfm_frames", "1", "READY"] in running.listed()
-    assert running.models("unload", "listed") == "listed: unloaded\n"
-    assert ["listed", "1", "UNAVAILABLE", "unloaded"] in running.listed()
-    with running.client("listed") as client, pytest.raises((ModelNotFoundError, ServerError)):
-        client.progress(random_trajectory(0, 3))
-    running.models("load", "listed")
     with running.client("listed") as client:
         assert np.isfinite(client.progress(random_trajectory(0, 3)).progress).all()
-    running.models("unload", "listed")
+        assert running.models("unload", "listed") == "listed: unloaded\n"
+        with pytest.raises((ModelNotFoundError, ServerError)):
+            client.progress(random_trajectory(0, 3))
+    assert ["listed", "2", "UNAVAILABLE", "unloaded"] in running.listed()
 
 
 @pytest.mark.nightly
@@ -124,45 +116,6 @@ def test_a_model_whose_progress_may_be_missing_is_rolled_out(running: Running, f
             running.models("load", family)
     assert running.models("rollout", family, "2").endswith(f"{family}: version 2 is served\n")
     running.models("unload", family)
-
-
-@contextmanager
-def loading(running: Running, name: str, folder: Path) -> Iterator[None]:
-    """Keep Triton loading a model, whose process waits for a file that comes at the end."""
-    running.export_plain(name)
-    begun, may_end = folder / "begun", folder / "may_end"
-    model_file = running.repository / name / "1" / "model.py"
-    first = "from __future__ import annotations\n"
-    wait = WAITS_AT_IMPORT.format(begun=str(begun), may_end=str(may_end))
-    model_file.write_text(model_file.read_text().replace(first, first + wait))
-    with ThreadPoolExecutor(1) as thread, running.served.api() as api:
-        load = thread.submit(api.load, name)
-        try:
-            wait_for(lambda: begun.exists() or load.done())
-            yield
-        finally:
-            may_end.touch()
-        load.result()
-        assert api.ready_versions(name) == [1]
-
-
-def test_callers_are_answered_while_another_model_loads(running: Running, tmp_path: Path) -> None:
-    """Use several connections per HTTP thread of Triton. The load ends after the answers."""
-    trajectory = random_trajectory(1, 5, *rollout.WIDTHS)
-    endpoints = running.served.endpoints
-    urls = (endpoints.http_url, endpoints.grpc_url) * CONNECTIONS
-    with ExitStack() as stack, ThreadPoolExecutor(len(urls)) as threads:
-        clients = [stack.enter_context(RewardClient(url, model=NAME, retry=False)) for url in urls]
-
-        def ask(client: RewardClient) -> bool:
-            return bool(np.isfinite(client.progress(trajectory, timeout_s=DEADLINE_S).progress).all())
-
-        assert all(threads.map(ask, clients))  # they are connected: new connections would keep away from a busy thread
-        with loading(running, "held", tmp_path):
-            assert all(threads.map(ask, clients))
-            # Requests over gRPC do not wait either.
-            assert ["held", "1", "LOADING"] in running.listed()
-    running.models("unload", "held")
 
 
 @pytest.mark.parametrize(
@@ -252,6 +205,20 @@ def three_models(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rollout.export(WITH_ENCODERS.checkpoint, repository)
     rollout.export(WITH_ENCODERS.checkpoint, repository)
     return repository
+
+
+def test_each_model_is_probed_once_more_when_its_old_version_is_gone(
+    three_models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Unloading(GoingAway):
+        def wait_gone(self, model: str, kept: list[int]) -> None:
+            self.loaded.append("the old version is gone")
+
+    server = Unloading({part: [1] for part in PARTS}, 10**9, 0)
+    monkeypatch.setattr(rfm_rollout, "probe", lambda *_: server.loaded.append("probe"))
+    Rollout(shutil.copytree(three_models, tmp_path / "copy"), NAME, server, lambda line: None).to(2)  # type: ignore[arg-type]
+    asked = zip(server.loaded, [*server.loaded[1:], ""], strict=True)
+    assert [after for before, after in asked if before == "the old version is gone"] == ["probe"] * 3
 
 
 @pytest.mark.parametrize("loads", [0, 2, 4])

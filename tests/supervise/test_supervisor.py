@@ -219,7 +219,7 @@ def test_what_was_served_is_served_again_and_not_what_was_exported_since(tmp_pat
         httpx.post(f"{stage.serving.endpoints.http_url}/v2/repository/models/b/unload")
         wait_for(lambda: stage.serving.reasons() == {"a": NO_REASON, "c": NO_REASON})
         config = stage.repository / "a" / "config.pbtxt"
-        config.write_text(config.read_text() + "version_policy { specific { versions: 2 } }\n")
+        config.write_text(config.read_text().replace("versions: 1", "versions: 2"))
         stage.signal(signal.SIGKILL)
         wait_for(lambda: stage.serving.restarts("triton") == 1)
         stage.serving.wait_ready()
@@ -256,8 +256,7 @@ def test_a_crash_loop_is_many_faults_each_soon_after_a_start(monkeypatch: pytest
         if starts:
             ends.started()
         now_s += duration_s
-        ends.failed()
-        return ends.pause_s("why")
+        return ends.failed("why")
 
     ends = BackOff()
     assert [run_for(1.0) for _ in range(MOST)] == [0, 0.5, 1, 2, 4]

@@ -28,11 +28,12 @@ from tritonclient.utils import deserialize_bytes_tensor, np_to_triton_dtype, tri
 import goldens
 from engines import serve_config
 from paths import ROOT
+from rfm.config import ExportConfig
 from rfm.engine import Execution
 from rfm.engine.threads import use_threads
 from rfm_client import InvalidSampleError, RewardClient, RewardError
 from rfm_client.contract.wire import Tensors
-from rfm_export.layout import CONFIG_FILE, Version, generated_models
+from rfm_export.layout import CONFIG_FILE, Version, generated_files, generated_models
 from rfm_export.pbtxt import parse
 from rfm_export.source import read_for_export
 
@@ -120,15 +121,19 @@ class EngineServer(service_pb2_grpc.GRPCInferenceServiceServicer):
             self._models |= {each.name: Model(each, DEMO / each.name / "1") for each in configs}
         elif name in {config.name for config in (*goldens.SERVED, *goldens.ON_DEMAND)}:
             config = goldens.config(name)
-            source = read_for_export(
-                config.checkpoint, serve_config(config, name), None, None, lambda _: None, other_machine=True
-            )
-            version = Version(1, source.settings, source.num_gpus, source.family.name)
-            source.checkpoint.save(version.checkpoint_folder(source.description, self._folder))
-            if source.encoders is not None:
-                source.encoders.save(version.encoders_folder(self._folder))
-            for each in generated_models(source.description, source.of_encoders, version):
-                self._models[each.name] = Model(each.config, self._folder / each.name / "1")
+            self.add(config.checkpoint, serve_config(config, name))
+
+    def add(self, checkpoint: Path, settings: ExportConfig) -> None:
+        """Serve the export of a checkpoint, too."""
+        source = read_for_export(checkpoint, settings, None, None, lambda _: None, other_machine=True)
+        version = Version(1, source.settings, source.num_gpus, source.family.name)
+        source.checkpoint.save(version.checkpoint_folder(source.description, self._folder))
+        if source.encoders is not None:
+            source.encoders.save(version.encoders_folder(self._folder))
+        models = generated_models(source.description, source.of_encoders, version)
+        generated_files(models, self._folder)  # notes the digests of weights
+        for each in models:
+            self._models[each.name] = Model(each.config, self._folder / each.name / "1")
 
     def _find(self, name: str, context: grpc.ServicerContext) -> Model:
         with self._working:
@@ -162,6 +167,9 @@ class EngineServer(service_pb2_grpc.GRPCInferenceServiceServicer):
 
     def ModelInfer(self, request: Any, context: Any) -> Any:  # noqa: N802
         model, outputs = self._find(request.model_name, context), [each.name for each in request.outputs]
+        for name in {each.name for each in request.inputs} - {spec.name for spec in model.config.input}:
+            told = f"unexpected inference input '{name}' for model '{request.model_name}'"  # in Triton's words
+            context.abort(grpc.StatusCode.INVALID_ARGUMENT, told)
         tensors = {
             spec.name: _read(spec, content)
             for spec, content in zip(request.inputs, request.raw_input_contents, strict=True)

@@ -15,16 +15,16 @@ from paths import ROOT
 from repositories import configure
 from rfm import published
 from rfm.engine import Engine
-from rfm_client import ProgressSample, RewardClient, Trajectory
+from rfm_client import ProgressSample, RewardClient
 from servers import MODEL
+from trajectories import random_trajectory
 
 CALLERS = 16
 PAUSE_S = 0.05  # without it they would take the processors from a server that starts
-MARK = 7.0  # in the text embedding of a deadly sample
 
 
 def answering(body: str) -> str:
-    """Return code for a model.py that runs ``body`` before it answers. ``marks``: by question"""
+    """Return code for a model.py that runs ``body`` before it answers."""
     return f"""
 
 _plain_answer = TritonPythonModel.answer
@@ -33,16 +33,12 @@ _plain_answer = TritonPythonModel.answer
 def answer(self, questions, execution):
     import os, pathlib, time
 
-    marks = [q.sample.trajectories[0].text_embedding[0] for q in questions]
     {body}
     return _plain_answer(self, questions, execution)
 
 
 TritonPythonModel.answer = answer
 """
-
-
-DEADLY = answering(f"if {MARK} in marks: os._exit(1)")
 
 
 def answering_after(seconds: float, began: Path | None = None) -> str:
@@ -63,21 +59,16 @@ def make_repository(
     return repository
 
 
-def trajectory(seed: int, num_frames: int = 8, mark: float = 0.0) -> Trajectory:
-    random = np.random.default_rng(seed)
-    text = random.standard_normal(32, np.float32)
-    text[0] = mark
-    return Trajectory(video_embeddings=random.standard_normal((num_frames, 64), np.float32), text_embedding=text)
+SAMPLES = [ProgressSample(random_trajectory(number, 8, 64, 32)) for number in range(CALLERS)]
 
 
 @pytest.fixture(scope="module")
 def references() -> list[np.ndarray[Any, Any]]:
     """The engine's answers, without Triton."""
     engine = Engine.of(published.load(ROOT / "model_repository" / MODEL / "1" / "checkpoint"))
-    return [result.progress for result in engine.evaluate([ProgressSample(trajectory(n)) for n in range(CALLERS)])]  # type: ignore[union-attr]
+    return [result.progress for result in engine.evaluate(SAMPLES)]  # type: ignore[union-attr]
 
 
 def calling(client: RewardClient, references: list[np.ndarray[Any, Any]]) -> Callers:
     """Return 16 threads that ask again and again and compare each answer with the engine's."""
-    exam = Exam([ProgressSample(trajectory(n)) for n in range(CALLERS)], references)
-    return Callers(progress_of(client), exam, CALLERS, PAUSE_S)
+    return Callers(progress_of(client), Exam(SAMPLES, references), CALLERS, PAUSE_S)

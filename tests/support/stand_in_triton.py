@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,9 @@ CONFIG = {
 }
 
 
+CONFIG_FILE = 'name: "%s"\nbackend: "python"\nversion_policy { specific { versions: 1 } }\n'
+
+
 class Answer(BaseHTTPRequestHandler):
     repository = Path()
     processes: dict[str, subprocess.Popen[bytes]] = {}  # noqa: RUF012  of all connections
@@ -34,6 +38,8 @@ class Answer(BaseHTTPRequestHandler):
     def load(cls, model: str) -> None:
         words = ["triton_python_backend_stub", str(cls.repository / model / "1" / "model.py")]
         cls.processes[model] = subprocess.Popen(words, executable=sys.executable)
+        with suppress(OSError):  # the log has no room
+            print("a stand-in has loaded", model, flush=True)
 
     def do_GET(self) -> None:
         if self.path == "/metrics":
@@ -88,7 +94,7 @@ def repository(folder: Path, *models: str) -> Path:
     for model in models:
         version = folder / "models" / model / "1"
         version.mkdir(parents=True)
-        (version.parent / "config.pbtxt").write_text(f'name: "{model}"\nbackend: "python"\n')
+        (version.parent / "config.pbtxt").write_text(CONFIG_FILE % model)
         deadly = f"pathlib.Path({str(folder / f'deadly-{model}')!r})"
         (version / "model.py").write_text(f"import pathlib, time\nwhile not {deadly}.exists():\n    time.sleep(0.02)\n")
     return folder / "models"

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Vision-language reward models behind Triton: protocols, the gateway, the page, the command line, steps and labels.
+"""Vision-language reward models behind a server: the gateway, the page, the command line, steps and labels.
 
-tests/families compares each model with the original code in more settings.
+A server in this process stands in for Triton, which is compared with it at night. tests/families compares each model
+with the original code in more settings.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ import robodopamine
 import rynnvalue
 from browsers import Browser
 from encoding import encode_here
+from engine_server import EngineServer
 from environments import cart_pole, play
-from faulty_servers import url_of
 from gateways import TestClient, inside, running
 from in_process import rfm_client
 from paths import VIDEOS
@@ -45,6 +46,7 @@ from rfm_client import (
     RewardClient,
     Trajectory,
 )
+from rfm_client.contract import FRAME_SCORES
 from rfm_rl import RewardModelWrapper, RewardOptions
 from robodopamine import case_named
 from servers import Endpoints, start_triton
@@ -54,7 +56,7 @@ fake_lerobot.provide()
 
 from lerobot_reward_rfm import RfmRewardConfig, RfmRewardModel  # noqa: E402
 
-pytestmark = pytest.mark.triton
+pytestmark = pytest.mark.slow
 
 TOP, ROBO = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied", ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint"
 RYNN = ROOT / "rynnvalue" / "bro_symlog_bf16_tied" / "checkpoint"
@@ -71,29 +73,54 @@ VIDEO = VIDEOS / "jaco_play_pick_up_green_cup.mp4"
 
 @dataclass(frozen=True)
 class Served:
-    endpoints: Endpoints
+    url: str
 
-    def client(self, model: str, protocol: str = "grpc") -> RewardClient:
-        return RewardClient(url_of(self.endpoints, protocol), model=model)
+    def client(self, model: str) -> RewardClient:
+        return RewardClient(self.url, model=model)
 
     def gateway(self, model: str) -> Any:
         """A gateway for the model, inside this process."""
-        return inside(triton=self.endpoints.grpc_url, metrics_url=self.endpoints.metrics_url, model=model)
+        return inside(triton=self.url, model=model)
 
     def command(self, *words: object, model: str, fails: bool = False) -> str:
         """Run a command of ``rfm-client``. Return what it printed, in one line."""
-        done = rfm_client(*words, "--url", self.endpoints.grpc_url, "--model", model)
+        done = rfm_client(*words, "--url", self.url, "--model", model)
         assert (done.exit_code != 0) is fails, done.output + done.stderr
-        return " ".join((done.output + done.stderr).replace("│", "").split())
+        return " ".join((done.stdout + done.stderr).replace("│", "").split())
 
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    repository = tmp_path_factory.mktemp("language_models") / "model_repository"
+    with EngineServer(tmp_path_factory.mktemp("language_models")) as server:
+        for name, (checkpoint, settings) in MODELS.items():
+            server.add(checkpoint, ExportConfig(name=name, num_gpus=0, **settings))
+        yield Served(server.url)
+
+
+@pytest.mark.nightly
+@pytest.mark.triton
+def test_triton_answers_the_same(asked: Served, tmp_path: Path) -> None:
+    repository = tmp_path / "model_repository"
     for name, (checkpoint, settings) in MODELS.items():
         rfm_export.export(checkpoint, repository, ExportConfig(name=name, num_gpus=0, **settings))
+    samples = {
+        "top": case("topreward", "B2_T4").samples(),
+        "robo": case("roboreward", "batch_B3").samples(),
+        "rynn": [each.sample for each in rynnvalue_case("B3_ragged").asked()],
+        "forward": [case_named("forward_T5").sample],
+    }
     with start_triton(repository) as server:
-        yield Served(server.endpoints)
+        for url in (server.endpoints.grpc_url, server.endpoints.http_url):
+            for name in MODELS:
+                with asked.client(name) as here, RewardClient(url, model=name) as client:
+                    expected, results = (each.evaluate(samples[name], all_scores=True) for each in (here, client))
+                    assert client.model_info(frames=True) == here.model_info(frames=True)
+                for left, right in zip(expected, results, strict=True):
+                    for score in FRAME_SCORES:
+                        values = (getattr(left, score), getattr(right, score))
+                        assert (values[0] is None) == (values[1] is None), score
+                        if values[0] is not None:
+                            np.testing.assert_allclose(*values, rtol=1e-4, atol=1e-4, err_msg=score)
 
 
 def case(section: str, name: str) -> Reference:
@@ -110,10 +137,10 @@ def body(samples: list[ProgressSample], **more: bool) -> dict[str, Any]:
     return {"samples": [{"sample_type": "progress", "trajectory": each} for each in told], **more}
 
 
-def test_topreward_is_answered_as_by_the_engine(asked: Served, protocol: str) -> None:
+def test_topreward_is_answered_as_by_the_engine(asked: Served) -> None:
     samples = [sample for name in ("T8_48x80", "B2_T4") for sample in case("topreward", name).samples()]
     engine = Engine.of(published.load(str(TOP), reward_model="topreward"))
-    with asked.client("top", protocol) as client:
+    with asked.client("top") as client:
         results = client.evaluate(samples, log_prob=True)
         plain, full = client.evaluate(samples), client.evaluate(samples, all_scores=True)
     for result, without, every, expected in zip(results, plain, full, engine.evaluate(samples), strict=True):
@@ -154,10 +181,10 @@ def test_remaining_seconds_are_those_of_the_original(asked: Served) -> None:
     assert len(dense.remaining_s) == 3
 
 
-def test_samples_with_and_without_views_are_answered_as_by_the_engine(asked: Served, protocol: str) -> None:
+def test_samples_with_and_without_views_are_answered_as_by_the_engine(asked: Served) -> None:
     names = ("forward_T5", "forward_T4_odd_size", "baseline_T3_forward")
     samples = [case_named(name).sample for name in names]
-    with asked.client("forward", protocol) as client:
+    with asked.client("forward") as client:
         together, alone = client.evaluate(samples), [client.progress(each.trajectory) for each in samples]
     for expected, *results in zip(case_named(names[0]).engine().evaluate(samples), together, alone, strict=True):
         assert isinstance(expected, ProgressResult), expected
@@ -348,7 +375,8 @@ def test_remaining_seconds_are_shown_in_tables_pictures_and_on_the_page(
     seconds, page = told["remaining_s"], quiet_browser
     assert f"{seconds[-1]:.2f} s" in output
     assert "In s, in place of progress: seconds that remain until the task is done." in output
-    with running(asked.endpoints, tmp_path, "rynn") as gateway:
+    endpoints = Endpoints(grpc_port=int(asked.url.rpartition(":")[2]))
+    with running(endpoints, tmp_path, "rynn") as gateway:
         page.open(gateway.url)
         page.run("document.getElementById('advanced').open = true")
         Select(page["rule"]).select_by_visible_text("rint_pad")
@@ -444,7 +472,7 @@ def test_labels_of_seconds_name_the_rule_that_makes_progress(asked: Served, tmp_
     frames = np.random.default_rng(1).integers(0, 256, (5, 48, 80, 3), np.uint8)
     trajectory = Trajectory(frames=frames, task=TASK)
     np.save(tmp_path / "a.npy", frames)
-    told = asked.command("label", tmp_path / "a.npy", "--task", TASK, model="rynn", fails=True)
+    told = asked.command("label", tmp_path, "--task", TASK, model="rynn", fails=True)
     assert "predicts remaining seconds and no progress, got none; give --progress-rule remaining_over_first" in told
     rule = ("--progress-rule", "remaining_over_first")
     signals = labelled(asked, tmp_path / "data", ProgressSample(trajectory), "rynn", *rule)

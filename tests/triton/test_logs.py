@@ -11,7 +11,6 @@ from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from http.server import BaseHTTPRequestHandler
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -33,7 +32,7 @@ from rfm_client import (
     RewardError,
     ServerUnavailableError,
 )
-from servers import Endpoints, Serving, children, serving, wait_for, web_server
+from servers import Endpoints, Serving, serving, wait_for, web_server
 from tensors import encode_samples
 from trajectories import random_trajectory
 
@@ -41,7 +40,6 @@ CONFIG = goldens.config("c1_t1_disc10")
 NOBODY = "grpc://127.0.0.1:9"
 PATIENCE_S = 30.0
 RANDOM_ID = re.compile(r"[0-9a-f]{16}")
-KEY = "an-admin-key-that-nothing-logs"
 FAILING_STEPS = 7
 
 # A model with a fault.
@@ -107,7 +105,7 @@ def documented_options(traces_url: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """An ``rfm serve`` with an admin key from the environment, and a gateway beside."""
+    """An ``rfm serve`` and a gateway beside."""
     folder = tmp_path_factory.mktemp("logs")
     repository = folder / "repository"
     rfm_export.export(CONFIG.checkpoint, repository, serve_config(CONFIG))
@@ -115,7 +113,6 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     model.write_text(model.read_text() + FAULTY)
     traces: list[bytes] = []
     with web_server(partial(Collector, traces)) as collector, pytest.MonkeyPatch.context() as environment:
-        environment.setitem(os.environ, "RFM_ADMIN_KEY", KEY)
         environment.setitem(os.environ, "RFM_LOG_LEVEL", "debug")
         options = documented_options(f"{collector}/v1/traces")
         port = Endpoints.free().http_port
@@ -204,16 +201,6 @@ def test_traces_name_the_request_and_continue_a_caller_s(running: Running) -> No
         client.infer("rfm", inputs, headers=headers, request_id="traced")
     for told in (b'"triton.request_id","value":{"stringValue":"traced"}', trace_id.encode()):
         wait_for(lambda told=told: any(told in trace for trace in running.traces), PATIENCE_S)
-
-
-@pytest.mark.triton
-def test_the_admin_key_is_among_triton_s_arguments_alone(running: Running) -> None:
-    for program in ("tritonserver", "triton_python"):
-        parent = running.served.process.pid if program == "tritonserver" else running.served.triton
-        for child in children(parent, program):
-            assert KEY not in Path(f"/proc/{child}/environ").read_text()
-    assert f"={KEY}" in Path(f"/proc/{running.served.triton}/cmdline").read_text()
-    assert KEY not in running.served.log.read_text()
 
 
 def asked(running: Running, request_id: str, **content: Any) -> requests.Response:
