@@ -9,7 +9,8 @@ set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
-"$folder/venv/bin/pip" install --quiet --disable-pip-version-check "minari[create,hdf5]==0.5.4" gymnasium==1.4.0
+"$folder/venv/bin/pip" install --quiet --disable-pip-version-check "minari[create,hdf5]==0.5.4" gymnasium==1.4.0 \
+  pillow==12.3.0
 cd "$folder"
 cat > collect.py <<'PYTHON'
 import gymnasium

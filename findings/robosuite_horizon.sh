@@ -3,14 +3,14 @@
 # reached a final state. Who learns from it takes the value after a time limit for 0, and potential-based shaping pays
 # back the progress. A success does not end the episode at all.
 #
-# Seen with robosuite 1.5.2, mujoco 3.3.0, gymnasium 1.4.0 and numpy 2.2.6, Python 3.11, Lift with a Panda, no rendering.
+# Seen with robosuite 1.5.2, mujoco 3.3.7, gymnasium 1.4.0 and numpy 1.26.4, Python 3.11, Lift with a Panda, no rendering.
 # Needs Python 3.10 or 3.11 and the package index. Ends with status 1 if the behaviour changes.
 set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
-"$folder/venv/bin/pip" install --quiet --disable-pip-version-check robosuite==1.5.2 mujoco==3.3.0 gymnasium==1.4.0 \
-  numpy==2.2.6
+"$folder/venv/bin/pip" install --quiet --disable-pip-version-check robosuite==1.5.2 mujoco==3.3.7 gymnasium==1.4.0 \
+  numpy==1.26.4
 cd "$folder"
 cat > horizon.py <<'PYTHON'
 import numpy as np
