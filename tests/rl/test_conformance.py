@@ -6,23 +6,21 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from functools import partial
 from itertools import cycle, islice, pairwise
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 
-from coded_env import Code, CodedEnv, CodeReader, Recorder, frame_of
+from coded_env import Code, CodedEnv, CodeReader, Recorder, ReturningEnv, frame_of
+from environments import MAX_FRAMES, assert_close, progress
 from reward_doors import (
-    BY_CALLER,
     DOORS,
     ENDED_BY_SUCCESS,
-    SAME_STEP,
     TASKS,
     VECTORS,
-    AutoresetAbove,
     Door,
     InProcesses,
     Sb3InProcesses,
@@ -31,8 +29,8 @@ from reward_doors import (
     makers_of,
     played,
 )
-from rfm_client import InvalidSampleError, ServerUnavailableError
-from rfm_rl import RewardOptions, SuccessRule
+from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError
+from rfm_rl import CopiedObservation, RewardOptions, SuccessRule
 
 PROGRESS = (0.1, 0.4, 0.3, 0.3, 0.8)  # of an episode's frames
 SUCCESS = (0.9, 0.2, 0.6, 0.1, 0.7)
@@ -40,7 +38,6 @@ LAST = len(PROGRESS) - 1
 GAMMA = 0.9
 LENGTHS = (3, 1), (4, 1, 2)  # steps of the episodes by environment, in turn
 CALLS = 10
-RESETS = (4, 6)  # calls that reset a single environment of these lengths
 TERMINATES, TRUNCATES = 0, 1  # numbers of environments
 
 at_each_door = pytest.mark.parametrize("kind", DOORS.values(), ids=DOORS)
@@ -72,7 +69,7 @@ def options(**more: Any) -> RewardOptions:
     return RewardOptions(**{"sampling": "all", "frames_from": "pixels", **more})
 
 
-def opened(kind: type[Door], client: Recorder, envs: Sequence[CodedEnv], asked: RewardOptions) -> Door:
+def opened(kind: type[Door], client: RewardClient, envs: Sequence[gym.Env[Any, Any]], asked: RewardOptions) -> Door:
     return kind(makers_of(envs), client, asked)
 
 
@@ -115,6 +112,10 @@ PAID: dict[str, tuple[dict[str, Any], list[float]]] = {
         {"mode": "delta", "success_bonus": 10.0, "success": SuccessRule(0.65)},
         [0.3, -0.1, 0, 10.5],
     ),
+    "a bonus that most of the last frames would have to earn": (
+        {"mode": "delta", "success_bonus": 10.0, "success": SuccessRule(0.65, last=3)},
+        [0.3, -0.1, 0, 0.5],
+    ),
     "a bonus at the end alone": (
         {"mode": "final", "success_bonus": 2.0, "success": SuccessRule(0.65)},
         [0, 0, 0, 2.8],
@@ -138,7 +139,11 @@ PAID_AT = [
 
 @pytest.mark.parametrize(("kind", "asked", "expected"), PAID_AT)
 def test_an_episode_is_paid_by_its_mode(
-    judge: Recorder, kind: type[Door], asked: dict[str, Any], expected: list[float]
+    judge: Recorder,
+    warnings: Callable[[], list[str]],
+    kind: type[Door],
+    asked: dict[str, Any],
+    expected: list[float],
 ) -> None:
     envs = [CodedEnv(TERMINATES, (LAST,)), CodedEnv(TERMINATES, (2,))]
     with opened(kind, judge, envs, options(**asked)) as door:
@@ -146,6 +151,21 @@ def test_an_episode_is_paid_by_its_mode(
     assert len(episodes) >= 2
     for episode in episodes:
         np.testing.assert_allclose(episode.rewards, expected, atol=1e-6)
+    assert warnings() == []
+
+
+@pytest.mark.triton
+@pytest.mark.parametrize("max_frames", [None, 3])
+@at_each_door
+def test_the_scores_of_a_server_are_paid(client: RewardClient, kind: type[Door], max_frames: int | None) -> None:
+    envs = [CodedEnv(number, (length,)) for number, length in enumerate((5, 4))]
+    asked = RewardOptions(mode="delta", frames_from="pixels", max_frames=max_frames)
+    with opened(kind, client, envs, asked) as door:
+        firsts = [episodes[0] for episodes in played(door, 5)]
+    for number, episode in enumerate(firsts):
+        video = [frame_of(number, 0, step) for step in range(len(episode.rewards) + 1)]
+        scores = progress(client, video, range(len(video)), max_frames or MAX_FRAMES, TASKS[number])
+        assert_close(episode.rewards, np.diff(scores))
 
 
 @at_each_door
@@ -252,13 +272,12 @@ SENT = [
     for door, kind in DOORS.items()
     for name, source in SOURCES.items()
     for reuse in (False, True)
-    if kind.resets != SAME_STEP or (not (reuse and source) and (door == "VecEnv" or source))  # refused, see below
+    if kind is not VECTORS["SAME_STEP"] or source  # which renders no frames
 ]
 SENT += [
-    pytest.param(kind, "pixels", kind.resets != SAME_STEP, call, id=f"{door}-fails at {call}")
+    pytest.param(kind, "pixels", True, call, id=f"{door}-fails at {call}")
     for door, kind in DOORS.items()
     for call in range(CALLS - 1)
-    if not (kind is AutoresetAbove and call in RESETS)  # Gymnasium's wrapper then resets once more
 ]
 
 
@@ -291,13 +310,8 @@ def test_each_question_has_the_frames_of_its_own_episode(
     envs = envs if kind.asks_once else envs[:1]
     with Recorder(failing) as client, opened(kind, client, envs, options(frames_from=source)) as door:
         for call in range(CALLS):
-            act: Any = partial(go_on, door, envs) if call else door.reset
-            if kind is AutoresetAbove and envs[0].has_ended and call - 1 == failing:  # which was not told of the end
-                with pytest.raises(ResetNeeded):
-                    door.step()
-                act = door.reset
             with pytest.raises(ServerUnavailableError) if call == failing else nullcontext():
-                act()
+                go_on(door, envs) if call else door.reset()
     assert len(client.calls) == CALLS
     check_asked(client, len(envs), CALLS - 3)
 
@@ -305,8 +319,8 @@ def test_each_question_has_the_frames_of_its_own_episode(
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "source"), [(InProcesses, "pixels"), (Sb3InProcesses, None)])
 def test_environments_in_processes_send_their_own_frames(recorder: Recorder, kind: type[Door], source: Any) -> None:
-    makers = [partial(CodedEnv, number, lengths, reuse=source is None) for number, lengths in enumerate(LENGTHS)]
-    with kind(makers, recorder, options(frames_from=source)) as door:
+    envs = [CopiedObservation(CodedEnv(number, lengths, reuse=True)) for number, lengths in enumerate(LENGTHS)]
+    with opened(kind, recorder, envs, options(frames_from=source)) as door:
         door.reset()
         for _ in range(CALLS):
             door.step()
@@ -354,16 +368,23 @@ def test_a_vector_goes_on_after_a_reset_of_the_environment_that_lost_a_frame(rec
     assert recorder.calls[-1] == [up_to((0, 0, 2), TASKS[0]), up_to((1, 1, 1), TASKS[1])]
 
 
-@pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if kind.resets == SAME_STEP])
-def test_a_reset_that_draws_over_the_last_frame_is_refused(recorder: Recorder, kind: type[Door]) -> None:
-    expected = r"^(final_obs\[0\]|infos\[0\]\['terminal_observation'\]): expected the last frame .* a copy .*"
-    with opened(kind, recorder, [CodedEnv(reuse=True)], options()) as door:
-        door.reset()
-        for _ in range(2):
-            door.step()
-        with pytest.raises(InvalidSampleError, match=rf"{expected}(NEXT_STEP|RenderedFrame)$"):
-            door.step()
-    assert all(codes == up_to(codes[-1], "")[0] for call in recorder.calls for codes, _ in call)
+@at_each_door
+def test_an_episode_that_ends_where_the_next_begins_is_paid(judge: Recorder, kind: type[Door]) -> None:
+    with opened(kind, judge, [ReturningEnv()], options()) as door:
+        ended = [episode for episode in played(door, 8)[0] if episode.terminated]
+    assert len(ended) >= 2
+    for episode in ended:
+        assert episode.rewards == pytest.approx([PROGRESS[1], PROGRESS[0]])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("since", [0, 1])
+def test_a_process_that_may_have_drawn_over_a_last_frame_is_refused(judge: Recorder, since: int) -> None:
+    """Until an episode's last frame differs from the next one's first."""
+    expected = r"^final_obs\[0\]: expected the last frame .*, got the first frame .*rfm_rl\.CopiedObservation"
+    refused = pytest.raises(InvalidSampleError, match=expected) if since == 0 else nullcontext()
+    with opened(InProcesses, judge, [ReturningEnv(since)], options()) as door, refused:
+        assert len(played(door, 4)[0]) == 3
 
 
 @pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if kind is not VECTORS["SAME_STEP"]])
@@ -402,12 +423,17 @@ def test_an_observation_without_the_frame_is_refused(
 
 
 class ResettingEnv(CodedEnv):
-    """Resets in the step that ends an episode, and returns the observation from before, as LeRobot's environments do."""
+    """Resets in the step that ends an episode, and returns the observation from before, as LeRobot's environments do.
+
+    tells: a key in the info of this step; None, as in LeRobot's VLABench: none
+    """
+
+    tells: str | None = "final_info"
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = super().step(action)
         if terminated:
-            info = {"final_info": {"is_success": True}}
+            info = {self.tells: {"is_success": True}} if self.tells else {}
             self.reset()
         return observation, reward, terminated, truncated, info
 
@@ -423,10 +449,15 @@ def test_an_environment_that_resets_in_its_last_step_is_paid_by_its_observation(
         assert episode.rewards == pytest.approx(PROGRESS[1:3])
 
 
+@pytest.mark.parametrize("tells", ["final_info", None])
 @pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if kind is not VECTORS["SAME_STEP"]])
-def test_an_environment_that_resets_in_its_last_step_is_not_rendered(recorder: Recorder, kind: type[Door]) -> None:
-    expected = r"^(info|infos\[0\]): expected no final_info with frames from render\(\), .*frames_from='pixels'$"
-    with opened(kind, recorder, [ResettingEnv(TERMINATES, (2,))], options(frames_from=None)) as door:
+def test_an_environment_that_resets_in_its_last_step_is_not_rendered(
+    recorder: Recorder, kind: type[Door], tells: str | None
+) -> None:
+    expected = r"^(info|infos\[0\]): expected no reset in the last step .* frames_from='pixels'$"
+    env = ResettingEnv(TERMINATES, (2,))
+    env.tells = tells
+    with opened(kind, recorder, [env], options(frames_from=None)) as door:
         door.reset()
         door.step()
         with pytest.raises(InvalidSampleError, match=expected):
@@ -434,20 +465,15 @@ def test_an_environment_that_resets_in_its_last_step_is_not_rendered(recorder: R
     assert [codes[-1] for call in recorder.calls for codes, _ in call] == [(0, 0, 0), (0, 0, 1)]
 
 
-class ReturningEnv(CodedEnv):
-    """Every episode begins in one pose; from the second on, it also ends there."""
-
-    @property
-    def code(self) -> Code:
-        return self.number, 0, 0 if self.episode and self.has_ended else self.t
-
-
-@at_each_door
-def test_an_episode_that_ends_where_the_next_begins_is_paid(judge: Recorder, kind: type[Door]) -> None:
-    with opened(kind, judge, [ReturningEnv(TERMINATES, (2,))], options()) as door:
-        first, second, *_ = (episode for episode in played(door, 8)[0] if episode.terminated)
-    assert first.rewards == pytest.approx(PROGRESS[1:3])
-    assert second.rewards == pytest.approx([PROGRESS[1], PROGRESS[0]])
+def test_an_environment_that_returns_the_next_observation_in_its_last_step_is_refused(recorder: Recorder) -> None:
+    env = ResettingEnv(TERMINATES, (1,))
+    env.tells = "final_observation"
+    with opened(DOORS["single"], recorder, [env], options()) as door:
+        door.reset()
+        with pytest.raises(InvalidSampleError, match=r"^info: expected none of .*, got final_observation; .*Autoreset"):
+            door.step()
+        with pytest.raises(ResetNeeded):
+            door.step()
 
 
 @pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if issubclass(kind, Vector)])
@@ -551,16 +577,6 @@ def test_resets_after_an_error_are_silent(
                 door.step()
 
 
-@at_each_door
-def test_ends_are_no_early_resets(recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]) -> None:
-    with opened(kind, recorder, [CodedEnv(0, (2,))], options(**FINAL)) as door:
-        episodes = played(door, 12)[0]
-    ended = [episode for episode in episodes if episode.terminated]
-    assert len(ended) >= 4
-    assert all(episode.rewards[-1] > 0 for episode in ended)
-    assert warnings() == []
-
-
 REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "mode": ({"mode": "relative"}, "^mode: expected one of absolute, delta, shaping, final, got 'relative'$"),
     "no gamma": ({"mode": "shaping"}, "^gamma: expected the policy's discount, .* with mode 'shaping', got None$"),
@@ -655,9 +671,7 @@ def test_a_door_refuses_what_it_cannot_pay(
         opened(kind, recorder, [CodedEnv()], options(**asked))
 
 
-@pytest.mark.parametrize(
-    "kind", [each for each in DOORS.values() if each.resets == BY_CALLER or each is AutoresetAbove]
-)
+@pytest.mark.parametrize("kind", ENDED_BY_SUCCESS.values())
 def test_a_success_ends_an_episode_and_a_step_after_it_is_refused(judge: Recorder, kind: type[Door]) -> None:
     envs = [CodedEnv(TERMINATES, (LAST,)) for _ in range(2)]
     with opened(kind, judge, envs, options(terminate_on_success=ENDS)) as door:
@@ -666,14 +680,11 @@ def test_a_success_ends_an_episode_and_a_step_after_it_is_refused(judge: Recorde
         assert [said.ends for said in (first, second)] == [False, True]
         assert (second.terminated, second.truncated) == (True, False)
         assert [said.info["reward_model"]["succeeded"] for said in (first, second)] == [False, True]
-        if door.resets == BY_CALLER:
-            with pytest.raises(ResetNeeded, match=r"^step: expected a reset.*(has|have) ended, got another step; call"):
-                door.step()
-            assert envs[0].code == (TERMINATES, 0, 2)  # it was not stepped
-            assert list(door.reset([True, False])) == [0]
-            with pytest.raises(ResetNeeded, match=r"^step: expected a reset(,| of the environments \[1\],) since"):
-                door.step()
-            door.reset([False, True])
-        else:
-            assert door.step()[0].reward == 0
+        with pytest.raises(ResetNeeded, match=r"^step: expected a reset.*(has|have) ended, got another step; call"):
+            door.step()
+        assert envs[0].code == (TERMINATES, 0, 2)  # it was not stepped
+        assert list(door.reset([True, False])) == [0]
+        with pytest.raises(ResetNeeded, match=r"^step: expected a reset(,| of the environments \[1\],) since"):
+            door.step()
+        door.reset([False, True])
         assert judge.calls[-1][0][0] == [(TERMINATES, 1, 0)]

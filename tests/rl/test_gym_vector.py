@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from typing import Any
@@ -17,11 +16,10 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
 from coded_env import SIZE_PX, CodedEnv, Recorder
-from environments import MODEL, TASK, LateClient, assert_close, cart_pole, cart_pole_with_pixels, progress, two_cameras
+from environments import MODEL, TASK, LateClient, assert_close, cart_pole, progress
 from rfm_client import InvalidSampleError, RewardClient
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 from servers import Served
-from tolerances import TOLERANCE
 
 NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 TASKS = ["task 0", "task 1"]
@@ -33,52 +31,9 @@ def options(**more: Any) -> RewardOptions:
     return RewardOptions(sampling="all", **{"frames_from": "pixels", **more})
 
 
-def vector_env(env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], mode: AutoresetMode) -> SyncVectorEnv:
-    return SyncVectorEnv(env_fns, autoreset_mode=mode)
-
-
-def roll(env: Any, mode: AutoresetMode, steps: int = 24) -> list[tuple[Any, ...]]:
-    """Yield the results of each step and reset. Both poles fall twice, at different times."""
-    told: list[tuple[Any, ...]] = [env.reset(seed=[0, 1])]
-    num_ended = 0
-    for _ in range(steps):
-        told.append(env.step(np.array([0, 1])))
-        ended = told[-1][2] | told[-1][3]
-        if ended.any() and (mode is DISABLED or not num_ended):
-            told.append(env.reset(seed=[3, 4], options={"reset_mask": ended}))
-        num_ended += ended.sum()
-    assert num_ended >= 4
-    return told
-
-
-def arrays(told: Any, where: str = "") -> dict[str, np.ndarray]:
-    """Return all arrays of step results by path: observations, rewards, infos with masks."""
-    if told is None:
-        return {}
-    if isinstance(told, dict):
-        parts = list(told.items())
-    elif isinstance(told, tuple | list) or (isinstance(told, np.ndarray) and told.dtype == object):
-        parts = list(enumerate(told))
-    else:
-        return {where: np.asarray(told)}
-    return {place: array for key, part in parts for place, array in arrays(part, f"{where}.{key}").items()}
-
-
-@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
-def test_a_vector_is_paid_as_its_environments_would_be(client: RewardClient, mode: AutoresetMode) -> None:
-    options = RewardOptions(mode="delta", every=2, frames_from=two_cameras, cameras=("front", "wrist"), fuse="min")
-    tasks = [TASK, "let the pole fall"]
-    singles = [
-        partial(lambda task: RewardModelWrapper(cart_pole_with_pixels(), client, task, options), task) for task in tasks
-    ]
-    vector = RewardModelVectorWrapper(vector_env([cart_pole_with_pixels] * 2, mode), client, tasks, options)
-    left, right = arrays(roll(vector, mode)), arrays(roll(vector_env(singles, mode), mode))
-    torch.testing.assert_close(left, right, rtol=0, atol=TOLERANCE, equal_nan=True)
-
-
 def test_a_reset_of_a_vector_takes_back_what_is_open_about_what_it_resets(late: LateClient) -> None:
     tasks, options = [TASK, "let the pole fall"], RewardOptions(sampling="all", blocking=False)
-    env = RewardModelVectorWrapper(vector_env([cart_pole] * 2, DISABLED), late, tasks, options)
+    env = RewardModelVectorWrapper(SyncVectorEnv([cart_pole] * 2, autoreset_mode=DISABLED), late, tasks, options)
     env.reset(seed=0)
     late.hold(1)
     env.step(np.array([0, 1]))
@@ -86,17 +41,6 @@ def test_a_reset_of_a_vector_takes_back_what_is_open_about_what_it_resets(late: 
     assert [answer.cancelled() for answer in late.submitted] == [False, True]
     env.close()
     assert [answer.cancelled() for answer in late.submitted] == [True, True]
-
-
-def test_a_mask_of_a_reset_may_be_a_list(recorder: Recorder) -> None:
-    env = RewardModelVectorWrapper(vector_env([CodedEnv] * 2, DISABLED), recorder, TASK, options())
-    env.reset(seed=0)
-    given = {"reset_mask": [True, False]}
-    infos = env.reset(options=given)[1]
-    assert infos["reward_model"]["_progress"].tolist() == [True, False]
-    assert given == {"reset_mask": [True, False]}
-    with pytest.raises(ValueError, match=r"^reset_mask: expected bool \[2\], got int64 \[1\]$"):
-        env.reset(options={"reset_mask": [0]})
 
 
 @pytest.mark.slow
@@ -137,6 +81,18 @@ def test_a_vector_that_does_not_tell_the_last_frame_is_refused(recorder: Recorde
         ResetNeeded, match=r"^step: expected a reset of the environments \[0, 1\], since an earlier call failed"
     ):
         env.step(ACTIONS)
+
+
+@pytest.mark.slow
+def test_rendered_frames_of_lerobot_s_environments_in_processes_are_refused(recorder: Recorder) -> None:
+    """Its VLABench resets in the successful step without a sign, which no other process sees."""
+    env = CodedEnv()
+    env.__module__ = "lerobot.envs.vlabench"
+    with (
+        closing(AsyncVectorEnv([lambda: env], autoreset_mode=NEXT_STEP)) as workers,
+        pytest.raises(ValueError, match=r"^frames_from: expected a source .* 'pixels', for LeRobot's .*, got render"),
+    ):
+        RewardModelVectorWrapper(workers, recorder, TASK, options(frames_from=None))
 
 
 @pytest.mark.slow
@@ -249,6 +205,8 @@ def test_a_partial_reset_that_a_vector_does_not_read_is_refused(recorder: Record
     with pytest.raises(ValueError, match=r"^options: expected a reset of all environments, got env_idx; ManiSkill"):
         env.reset(options={"env_idx": torch.tensor([0])})
     env.step(on_device([0, 0]))
+    with pytest.raises(ValueError, match=r"^reset_mask: expected bool \[2\], got int64 \[1\]$"):
+        env.reset(options={"reset_mask": [0]})
     with pytest.raises(ValueError, match=r"^reset_mask: expected a vector that takes it .*; reset all environments$"):
         env.reset(options={"reset_mask": [True, False]})
     with pytest.raises(ResetNeeded):

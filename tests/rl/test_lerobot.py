@@ -51,12 +51,6 @@ def model(client: RewardClient) -> RfmRewardModel:
     return RfmRewardModel(RfmRewardConfig(sampling="linspace_round", frames=3), client=client)
 
 
-@pytest.fixture
-def recorder() -> Any:
-    with Recorder() as client:
-        yield client
-
-
 def stepped(client: RewardClient, images: torch.Tensor, task: str) -> list[float]:
     """The progress of an episode, step by step."""
     with client.episode(task, sampling="linspace_round", frames=3) as episode:
@@ -74,20 +68,18 @@ def test_a_reward_is_the_score_of_the_episode_at_the_newest_frame(
     assert wanted[0] != wanted[1]
 
 
-def test_the_scores_of_all_frames_are_those_of_a_running_episode(model: RfmRewardModel, client: RewardClient) -> None:
-    batch = {KEY: PIXELS, "task": TASK}
-    prediction = model.predict_progress(batch)
-    wanted = torch.tensor([stepped(client, images, TASK) for images in PIXELS])
+@pytest.mark.parametrize("repeats", [1, 8], ids=["one call", "more frames than are sent at a time"])
+def test_the_scores_of_all_frames_are_those_of_a_running_episode(
+    model: RfmRewardModel, client: RewardClient, repeats: int
+) -> None:
+    images = PIXELS[:, [0, 1, 2, 3, 4] * repeats]
+    prediction = model.predict_progress({KEY: images, "task": TASK})
+    wanted = torch.tensor([stepped(client, video, TASK) for video in images])
     torch.testing.assert_close(prediction.progress, wanted, **CLOSE)
-    torch.testing.assert_close(prediction.progress[:, -1], model.compute_reward(batch), **CLOSE)
     assert prediction.success_probability is not None
-    assert prediction.success_probability.shape == (2, 5)
-
-
-def test_images_without_time_are_one_frame_each(model: RfmRewardModel, client: RewardClient) -> None:
-    reward = model.compute_reward({KEY: PIXELS[0], "task": TASK})  # [5, 3, H, W]
-    wanted = [stepped(client, image[None], TASK)[0] for image in PIXELS[0]]
-    torch.testing.assert_close(reward, torch.tensor(wanted), **CLOSE)
+    assert prediction.success_probability.shape == images.shape[:2]
+    singles = model.compute_reward({KEY: images[:, 0], "task": TASK})  # [B, 3, H, W]: one frame each
+    torch.testing.assert_close(singles, wanted[:, 0], **CLOSE)
 
 
 def test_padding_is_not_shown_and_gets_the_score_of_the_frame_that_it_repeats(
@@ -148,18 +140,14 @@ def test_a_batch_that_cannot_be_scored_is_refused(recorder: Recorder, case: str)
     assert not recorder.calls
 
 
-def test_a_batch_without_a_task_gets_the_default_task(recorder: Recorder) -> None:
-    model = RfmRewardModel(RfmRewardConfig(sampling="all", default_task=TASK), client=recorder)
-    model.compute_reward({KEY: PIXELS, "task": ["open the drawer", ""]})
-    assert sorted(task for call in recorder.calls for _, task in call) == ["open the drawer", TASK]
-
-
-def test_a_failed_request_is_an_error_and_no_reward() -> None:
-    with Recorder(failing=0) as failing:
-        model = RfmRewardModel(RfmRewardConfig(sampling="all"), client=failing)
+def test_a_batch_without_a_task_gets_the_default_task_and_a_failed_request_is_no_reward() -> None:
+    with Recorder(failing=0) as client:
+        model = RfmRewardModel(RfmRewardConfig(sampling="all", default_task=TASK), client=client)
+        batch = {KEY: PIXELS, "task": ["open the drawer", ""]}
         with pytest.raises(ServerError, match="the server is restarting"):
-            model.compute_reward({KEY: PIXELS, "task": TASK})
-        assert model.compute_reward({KEY: PIXELS, "task": TASK}).shape == (2,)
+            model.compute_reward(batch)
+        assert model.compute_reward(batch).shape == (2,)
+    assert [sorted(task for _, task in call) for call in client.calls] == [["open the drawer", TASK]] * 2
 
 
 class SuccessAlone(CodeReader):
@@ -171,27 +159,20 @@ class SuccessAlone(CodeReader):
         return {"success": [self.success] * len(codes)}
 
 
-@pytest.mark.parametrize(("success", "reward"), [(0.9, 1.0), (0.8, 1.0), (0.7, 0.0)])
-def test_the_reward_of_success_is_one_or_zero(success: float, reward: float) -> None:
+@pytest.mark.parametrize(("success", "reward"), [(0.9, 1.0), (0.8, 1.0), (0.7, 0.0), (float("nan"), None)])
+def test_the_reward_of_success_is_one_or_zero(success: float, reward: float | None) -> None:
     server = SuccessAlone()
     server.success = success
     config = RfmRewardConfig(sampling="all", reward_output="success", success_threshold=0.8 - 1e-6)
     with Recorder(server=server) as client:
-        got = RfmRewardModel(config, client=client).compute_reward({KEY: PIXELS, "task": TASK})
-    assert got.tolist() == [reward, reward]
-
-
-def test_a_checkpoint_that_does_not_predict_success_gives_none() -> None:
-    server = SuccessAlone()
-    server.success = float("nan")
-    config = RfmRewardConfig(sampling="all", reward_output="success")
-    with Recorder(server=server) as client:
-        model = RfmRewardModel(config, client=client)
-        with pytest.raises(
-            ValueError, match=r"^reward_output: expected progress, got success, which the checkpoint does"
-        ):
-            model.compute_reward({KEY: PIXELS, "task": TASK})
-        assert model.predict_progress({KEY: PIXELS, "task": TASK}).success_probability is None
+        model, batch = RfmRewardModel(config, client=client), {KEY: PIXELS, "task": TASK}
+        if reward is not None:
+            assert model.compute_reward(batch).tolist() == [reward, reward]
+        else:
+            expected = r"^reward_output: expected progress, got success, which the checkpoint does"
+            with pytest.raises(ValueError, match=expected):
+                model.compute_reward(batch)
+            assert model.predict_progress(batch).success_probability is None
 
 
 def test_an_answer_without_a_clear_score_is_an_error() -> None:
@@ -224,12 +205,6 @@ def test_a_model_with_a_client_of_yours_has_no_copies(recorder: Recorder) -> Non
     for copied in (copy.deepcopy, pickle.dumps):
         with pytest.raises(TypeError, match=r"expected no client of yours .* name its server in the configuration"):
             copied(model)
-
-
-def test_more_frames_than_are_sent_at_a_time_are_all_scored(model: RfmRewardModel, client: RewardClient) -> None:
-    images = PIXELS[:1, [0, 1, 2, 3, 4] * 8]
-    progress = model.predict_progress({KEY: images, "task": TASK}).progress
-    torch.testing.assert_close(progress, torch.tensor([stepped(client, images[0], TASK)]), **CLOSE)
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The plug-in in a LeRobot of its own: parser, factories, saved folders, a dataset, and the guide's example."""
+"""The plug-in in a LeRobot of its own: parser, factories, saved folders, a dataset, the guide's example, and an environment."""
 
 from __future__ import annotations
 
@@ -31,9 +31,8 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     environment = folder / "environment"
     ours = [shutil.copytree(place, folder / name) for name, place in OURS.items()]  # pip builds in the folder
     subprocess.run([PYTHON, "-m", "venv", environment], check=True)
-    subprocess.run(
-        [environment / "bin" / "pip", "install", "--quiet", "lerobot[dataset]>=0.6", *ours], check=True, timeout=1800
-    )
+    packages = "lerobot[dataset,metaworld]>=0.6", "mujoco<3.4", "stable-baselines3"  # for Meta-World 3.0
+    subprocess.run([environment / "bin" / "pip", "install", "--quiet", *packages, *ours], check=True, timeout=1800)
     return environment / "bin" / "python"
 
 
@@ -46,7 +45,10 @@ def folder(tmp_path: Path) -> Path:
 
 def run(python: Path, arguments: list[str], folder: Path) -> str:
     """Return what a program prints."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"HF_HUB_OFFLINE": "1"}
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {
+        "HF_HUB_OFFLINE": "1",
+        "MUJOCO_GL": "egl",
+    }
     done = subprocess.run(
         [python, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False
     )
@@ -70,3 +72,12 @@ def test_lerobot_loads_saves_and_calls_the_model(demo_server: Endpoints, python:
     assert options
     arguments = options[1].replace("grpc://gpu:8001", demo_server.grpc_url).split()
     assert run(python, [str(program), *arguments], folder).splitlines()[-1] == "all is well"
+
+
+@pytest.mark.timeout(2400)
+def test_a_success_in_lerobot_s_meta_world_is_paid_by_its_last_frame(
+    demo_server: Endpoints, python: Path, folder: Path
+) -> None:
+    """Its environment resets in the successful step: rendered frames are refused."""
+    program = ROOT / "tests" / "support" / "lerobot_metaworld.py"
+    assert run(python, [str(program), demo_server.grpc_url], folder).splitlines()[-1].startswith("all is well")

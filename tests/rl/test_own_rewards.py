@@ -3,22 +3,23 @@
 
 from __future__ import annotations
 
+import json
 import pickle
+import re
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
-from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
+from gymnasium.wrappers import RecordEpisodeStatistics
 from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
 
 from coded_env import Code, CodedEnv, CodeReader, Recorder
 from environments import TASK
-from goal_env import LENGTH, Reach
+from paths import ROOT
 from rfm_client import RewardClient
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 from rfm_rl.own_rewards import WritingMonitor
@@ -29,12 +30,36 @@ from stable_baselines3 import PPO, SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 from rfm_rl.sb3 import RenderedFrame, RewardModelVecEnv
 
 ALL = RewardOptions(sampling="all")
+LENGTH = 5  # steps of an episode
+
+
+class Reach(CodedEnv):
+    """An environment with goals, whose rewards no reward model would give."""
+
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self) -> None:
+        super().__init__(1, (LENGTH,))
+        point = gym.spaces.Box(-1, 1, (2,), np.float32)
+        self.observation_space = gym.spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), point))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        _, _, *told = super().step(action)
+        return self.observation_space.sample(), -100.0, *told
+
+    def compute_reward(self, achieved: Any, desired: Any, infos: Any) -> Any:
+        return np.full(np.shape(achieved)[:-1], -100.0)
 
 
 def vector(client: RewardClient, venv: Any) -> Any:
@@ -145,21 +170,29 @@ class Pleased(CodeReader):
         return {"progress": 1.0, "success": 1.0}
 
 
-def test_a_monitor_outside_counts_episodes_that_end_by_success() -> None:
+def test_the_callback_of_the_guide_logs_rewards_progress_and_success(tmp_path: Path) -> None:
+    guide = (ROOT / "docs" / "guides" / "reward_an_rl_loop.md").read_text()
+    (code,) = (each for each in re.findall(r"^```python\n(.*?)^```", guide, re.M | re.S) if "class LogRewards" in each)
+    shown: dict[str, Any] = {}
+    exec(code, shown)
     with Recorder(server=Pleased()) as client:
-        env = single(client, Reach(), terminate_on_success=SuccessRule())
+        model = PPO("MultiInputPolicy", single(client, Reach()), n_steps=4, batch_size=4, device="cpu")
+        model.set_logger(configure(str(tmp_path), ["json"]))
+        model.learn(4, shown["LogRewards"]()).logger.close()
+    logged = json.loads((tmp_path / "progress.json").read_text())
+    assert [logged[f"reward_model/{key}"] for key in ("reward", "progress", "success")] == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    "inside", [lambda env: env, Monitor, RecordEpisodeStatistics], ids=["none", "Monitor", "Record"]
+)
+def test_an_end_by_success_is_an_episode_for_statistics(inside: Any) -> None:
+    """Those inside do not see it: without it, ``evaluate_policy`` would wait for ever for an episode's end."""
+    with Recorder(server=Pleased()) as client:
+        env = single(client, inside(Reach()), terminate_on_success=SuccessRule())
         model = PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, device="cpu").learn(4)
         assert [(episode["r"], episode["l"]) for episode in model.ep_info_buffer] == [(1, 1)] * 4
         assert evaluate_policy(model, model.env, 2) == (1, 0)
-
-
-@pytest.mark.parametrize("inside", [Monitor, RecordEpisodeStatistics])
-def test_statistics_that_would_miss_an_end_by_success_are_refused(recorder: Recorder, inside: Any) -> None:
-    """With them, ``evaluate_policy`` would wait for ever for an episode's end."""
-    remedy = r"; wrap in the other order: Monitor\(.*RewardModelWrapper\(TimeLimit\(env.unwrapped, steps\), ...\)$"
-    with pytest.raises(ValueError, match=rf"^terminate_on_success: expected None with a Monitor .*{remedy}"):
-        single(recorder, inside(Reach()), terminate_on_success=SuccessRule())
-    single(recorder, TimeLimit(inside(Reach()).unwrapped, 5), terminate_on_success=SuccessRule())
 
 
 @pytest.mark.parametrize(
@@ -210,26 +243,39 @@ def test_statistics_inside_a_vector_show_the_reward_model_s_rewards(
     assert num_ended >= 5
 
 
-SILENT: dict[str, Callable[[], Any]] = {
-    "the vector": lambda: VectorWrapper(INSIDE["the vector"](AutoresetMode.DISABLED)),
-    "each environment": lambda: INSIDE["each environment"](AutoresetMode.DISABLED),
-    "each environment, in a process": lambda: AsyncVectorEnv(
-        [lambda: RecordEpisodeStatistics(CodedEnv())], autoreset_mode=AutoresetMode.DISABLED
+@pytest.mark.parametrize("inside", INSIDE.values(), ids=INSIDE)
+def test_statistics_inside_a_vector_tell_of_ends_by_success(inside: Callable[[AutoresetMode], Any]) -> None:
+    rewarded = RewardOptions(sampling="all", frames_from="pixels", terminate_on_success=SuccessRule())
+    with Recorder(server=Pleased()) as client:
+        env = RewardModelVectorWrapper(VectorWrapper(inside(AutoresetMode.DISABLED)), client, TASK, rewarded)
+        env.reset()
+        infos = env.step(np.zeros(2, int))[4]
+    assert infos["_episode"].tolist() == [True, True]
+    assert [infos["episode"][key].tolist() for key in "rl"] == [[1, 1], [1, 1]]
+
+
+REFUSED: dict[str, tuple[Any, type[Exception], str]] = {
+    "no VecEnv": (Reach, TypeError, "^venv: expected a VecEnv of stable_baselines3, got .*Reach"),
+    "no pictures": (
+        lambda: DummyVecEnv([Reach]),
+        ValueError,
+        r"^venv: expected each environment in RenderedFrame, .*: make_vec_env\(..., wrapper_class=RenderedFrame\)$",
+    ),
+    "a normalization": (
+        lambda: VecMonitor(VecNormalize(DummyVecEnv([lambda: RenderedFrame(Reach())]), norm_obs=False)),
+        ValueError,
+        r"^venv: expected no VecNormalize inside.*; wrap in the other order: VecNormalize\(RewardModelVecEnv",
     ),
 }
 
 
-@pytest.mark.parametrize("inside", SILENT.values(), ids=SILENT)
-def test_statistics_inside_a_vector_that_would_miss_an_end_by_success_are_refused(
-    recorder: Recorder, inside: Callable[[], Any]
+@pytest.mark.parametrize(("make", "error", "message"), REFUSED.values(), ids=REFUSED)
+def test_a_vector_that_cannot_be_paid_is_refused(
+    recorder: Recorder, make: Any, error: type[Exception], message: str
 ) -> None:
-    options = RewardOptions(frames_from="pixels", terminate_on_success=SuccessRule())
-    remedy = r"wrap in the other order: RecordEpisodeStatistics\(RewardModelVectorWrapper\(...\)\)$"
-    with (
-        closing(inside()) as env,
-        pytest.raises(ValueError, match=rf"^terminate_on_success: expected None .*; {remedy}"),
-    ):
-        RewardModelVectorWrapper(env, recorder, TASK, options)
+    """Off-policy algorithms look for a ``VecNormalize`` and store the rewards that it got."""
+    with pytest.raises(error, match=message):
+        vector(recorder, make())
 
 
 def test_a_subprocess_gets_the_class_of_a_monitor_that_writes() -> None:

@@ -88,34 +88,24 @@ def scored(client: RewardClient, env: int, count: int, task: str | None = None) 
     return score
 
 
-def test_each_environment_is_paid_the_progress_of_its_pictures_for_its_task(made: Any, client: RewardClient) -> None:
-    rewards = made().compute_reward(history([5, 3, 1]))
-    assert (rewards.dtype, rewards.shape) == (torch.float32, (3,))
-    assert_close(rewards, [scored(client, env, count).progress for env, count in enumerate([5, 3, 1])])
-
-
-def test_all_environments_are_scored_in_one_call(made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, calls = made(reward="delta"), []
+@pytest.mark.parametrize("reward", ["progress", "delta", "success"])
+def test_each_environment_is_paid_for_its_pictures_in_one_call(
+    made: Any, client: RewardClient, monkeypatch: pytest.MonkeyPatch, reward: str
+) -> None:
+    """``delta`` pays the change since the picture before, 0 for the first."""
+    counts = [5, 3, 1]
+    expected = [getattr(scored(client, env, n), reward.replace("delta", "progress")) for env, n in enumerate(counts)]
+    if reward == "delta":
+        expected = [now - scored(client, env, counts[env] - 1).progress for env, now in enumerate(expected[:2])] + [0.0]
+    calls: list[int] = []
     score = RewardClient.score_episodes
     monkeypatch.setattr(
         RewardClient, "score_episodes", lambda self, episodes: calls.append(len(episodes)) or score(self, episodes)
     )
-    model.compute_reward(history([5, 3, 1]))
-    assert calls == [5]  # three newest pictures, and the two before them
-
-
-def test_delta_is_the_change_since_the_picture_before(made: Any, client: RewardClient) -> None:
-    rewards = made(reward="delta").compute_reward(history([5, 3, 1]))
-    changes = [
-        scored(client, env, count).progress - scored(client, env, count - 1).progress for env, count in ((0, 5), (1, 3))
-    ]
-    assert_close(rewards, [*changes, 0.0])
-
-
-def test_success_is_a_probability_of_the_checkpoint(made: Any, client: RewardClient) -> None:
-    rewards = made(reward="success", task="open the drawer").compute_reward(history([5, 3, 1]))
-    counts = enumerate([5, 3, 1])
-    assert_close(rewards, [scored(client, env, count, "open the drawer").success for env, count in counts])
+    rewards = made(reward=reward).compute_reward(history(counts))
+    assert (rewards.dtype, rewards.shape) == (torch.float32, (3,))
+    assert_close(rewards, expected)
+    assert calls == [5 if reward == "delta" else 3]
 
 
 def test_two_cameras_are_fused(made: Any, client: RewardClient) -> None:

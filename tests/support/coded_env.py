@@ -34,7 +34,7 @@ class CodedEnv(gym.Env[Any, Any]):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
-    action_space = gym.spaces.Discrete(2)
+    action_space: gym.spaces.Space[Any] = gym.spaces.Discrete(2)
 
     def __init__(self, number: int = 0, lengths: Sequence[int] = (3,), *, reuse: bool = False, bad: Code | None = None):
         self.render_mode = "rgb_array"
@@ -72,6 +72,18 @@ class CodedEnv(gym.Env[Any, Any]):
             return frame_of(*self.code)
         self.canvas[:] = frame_of(*self.code)
         return self.canvas
+
+
+class ReturningEnv(CodedEnv):
+    """Every episode begins and ends in one pose. since: the first episode that ends there"""
+
+    def __init__(self, since: int = 0) -> None:
+        super().__init__(lengths=(2,))
+        self.since = since
+
+    @property
+    def code(self) -> Code:
+        return self.number, 0, 0 if self.episode >= self.since and self.has_ended else self.t
 
 
 class CodeReader(Shelf):

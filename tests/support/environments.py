@@ -11,7 +11,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import AddRenderObservation
 
 from rfm_client import ProgressResult, RewardClient, Trajectory, UInt8Array
 from rfm_client.episodes import Episode, StepScore
@@ -27,41 +26,15 @@ SIZE = 240, 160  # pixels; fewer would not show the cart
 Video = list[UInt8Array]
 
 
-class Camera(gym.Wrapper[Any, Any, Any, Any]):
-    """Records each episode: ``videos[-1][t]`` is the frame after step t."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.videos: list[Video] = []
-
-    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        answer = self.env.reset(**options)
-        self.videos.append([np.array(self.env.render())])
-        return answer
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        answer = self.env.step(action)
-        self.videos[-1].append(np.array(self.env.render()))
-        return answer
-
-
 def cart_pole(**options: Any) -> gym.Env[Any, Any]:
     env = gym.make("CartPole-v1", render_mode="rgb_array", **options)
     env.unwrapped.screen_width, env.unwrapped.screen_height = SIZE  # type: ignore[attr-defined]
     return env
 
 
-def cart_pole_with_pixels() -> gym.Env[Any, Any]:
-    return AddRenderObservation(cart_pole(), render_only=False, render_key="pixels", obs_key="state")
-
-
-def two_cameras(observation: dict[str, Any]) -> dict[str, UInt8Array]:
-    """Return frames of two cameras with different sizes, and an entry without a frame."""
-    front = np.asarray(observation["pixels"], np.uint8)
-    return {"front": front, "wrist": 255 - front[::2, ::2], "state": np.zeros(1, np.uint8)}
-
-
-def scores(client: RewardClient, video: Video, step: int, max_frames: int | None = MAX_FRAMES) -> ProgressResult:
+def scores(
+    client: RewardClient, video: Video, step: int, max_frames: int | None = MAX_FRAMES, task: str = TASK
+) -> ProgressResult:
     """Score the frames up to a step as upstream's RL loop does, cut or padded to ``max_frames``; None: all frames.
 
     Without the padded slots but the last, which is the newest frame's.
@@ -70,15 +43,15 @@ def scores(client: RewardClient, video: Video, step: int, max_frames: int | None
     count = min(step + 1, slots)
     picked = np.rint(np.linspace(0, step, count)).astype(int)
     padded = [*picked, *[step] * (slots - count)]
-    result = client.progress(Trajectory(frames=np.stack([video[index] for index in padded]), task=TASK))
+    result = client.progress(Trajectory(frames=np.stack([video[index] for index in padded]), task=task))
     shown = [*range(count - 1), slots - 1]
     return replace(result, progress=result.progress[shown], success=result.success[shown])
 
 
 def progress(
-    client: RewardClient, video: Video, steps: Sequence[int], max_frames: int | None = MAX_FRAMES
+    client: RewardClient, video: Video, steps: Sequence[int], max_frames: int | None = MAX_FRAMES, task: str = TASK
 ) -> list[float]:
-    return [float(scores(client, video, step, max_frames).progress[-1]) for step in steps]
+    return [float(scores(client, video, step, max_frames, task).progress[-1]) for step in steps]
 
 
 def play(env: gym.Env[Any, Any], seed: int = 0) -> tuple[list[float], list[dict[str, Any]]]:

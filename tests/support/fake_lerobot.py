@@ -10,7 +10,7 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import torch
@@ -32,20 +32,6 @@ class PreTrainedRewardModel(torch.nn.Module):
     def __init__(self, config: RewardModelConfig) -> None:
         super().__init__()
         self.config = config
-
-
-@dataclass(frozen=True)
-class SignalDescriptor:
-    description: str
-    direction: str
-    bounds: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
-class FrameSignals:
-    frame_indices: Any
-    signals: Mapping[str, Any]
-    descriptors: Mapping[str, SignalDescriptor]
 
 
 MODULES: dict[str, dict[str, Any]] = {
@@ -82,4 +68,4 @@ def module(name: str, names: Mapping[str, Any]) -> ModuleType:
 
 def scoring() -> ModuleType:
     """Return a fake of LeRobot's offline scoring, which no release has yet."""
-    return module("lerobot.rewards.scoring", {"FrameSignals": FrameSignals, "SignalDescriptor": SignalDescriptor})
+    return module("lerobot.rewards.scoring", {"FrameSignals": SimpleNamespace, "SignalDescriptor": SimpleNamespace})

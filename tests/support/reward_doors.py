@@ -86,13 +86,10 @@ class Single(Door):
 
     resets, asks_once = BY_CALLER, False
     inside: Callable[[Any], Any] = staticmethod(lambda env: env)
-    outside: Callable[[Any], Any] = staticmethod(lambda env: env)
 
     def wrap(self, makers: Sequence[Maker], client: RewardClient, tasks: list[str], options: RewardOptions) -> None:
         pairs = zip(makers, tasks, strict=True)
-        self.envs = [
-            self.outside(RewardModelWrapper(self.inside(make()), client, task, options)) for make, task in pairs
-        ]
+        self.envs = [RewardModelWrapper(self.inside(make()), client, task, options) for make, task in pairs]
 
     def reset(self, mask: Sequence[bool] | None = None) -> dict[int, Info]:
         return {index: env.reset()[1] for index, env in enumerate(self.envs) if mask is None or mask[index]}
@@ -109,10 +106,6 @@ class AutoresetBelow(Single):
     resets, inside = NEXT_STEP, Autoreset
 
 
-class AutoresetAbove(Single):
-    resets, outside = NEXT_STEP, Autoreset
-
-
 class Vector(Door):
     """A vector of Gymnasium. mode: its autoreset mode"""
 
@@ -123,7 +116,7 @@ class Vector(Door):
         self.env = RewardModelVectorWrapper(self.kind(makers, autoreset_mode=self.mode), client, tasks, options)
 
     def reset(self, mask: Sequence[bool] | None = None) -> dict[int, Info]:
-        infos = self.env.reset(options=None if mask is None else {"reset_mask": np.array(mask)})[1]
+        infos = self.env.reset(options=None if mask is None else {"reset_mask": list(mask)})[1]
         return {index: info_of(infos, index) for index in range(self.num_envs) if mask is None or mask[index]}
 
     def step(self) -> list[Said]:
@@ -173,12 +166,14 @@ class Sb3(Door):
 
     def reset(self, mask: Sequence[bool] | None = None) -> dict[int, Info]:
         self.env.reset()
+        assert not [key for info in self.env.reset_infos for key in info if "frame" in key]  # those of RenderedFrame
         return dict(enumerate(self.env.reset_infos))
 
     def step(self) -> list[Said]:
         _, rewards, dones, infos = self.env.step(np.zeros(self.num_envs, int))
         assert (rewards.dtype, rewards.shape) == (np.float32, (self.num_envs,))
         said = []
+        assert not [key for info in (*infos, *self.env.reset_infos) for key in info if "frame" in key]
         for index, (done, info) in enumerate(zip(dones.tolist(), infos, strict=True)):
             truncated = done and info["TimeLimit.truncated"]
             begun = self.env.reset_infos[index] if done else None
@@ -207,9 +202,8 @@ def info_of(infos: Mapping[str, Any], index: int) -> Info:
 
 
 VECTORS: dict[str, type[Door]] = {"NEXT_STEP": NextStep, "SAME_STEP": SameStep, "DISABLED": Disabled, "VecEnv": Sb3}
-DOORS: dict[str, type[Door]] = {"single": Single, "Autoreset below": AutoresetBelow, "Autoreset above": AutoresetAbove}
-DOORS |= VECTORS
-ENDED_BY_SUCCESS = {"single": Single, "Autoreset above": AutoresetAbove, "DISABLED": Disabled}
+DOORS: dict[str, type[Door]] = {"single": Single, "Autoreset below": AutoresetBelow, **VECTORS}
+ENDED_BY_SUCCESS = {"single": Single, "DISABLED": Disabled}
 
 
 def makers_of(envs: Sequence[gym.Env[Any, Any]]) -> list[Maker]:

@@ -4,6 +4,7 @@
 from rfm_client.episodes import SuccessRule
 from rfm_rl.gym import RewardModelWrapper
 from rfm_rl.gym_vector import RewardModelVectorWrapper
+from rfm_rl.own_resets import CopiedObservation
 from rfm_rl.rewards import RewardOptions
 
-__all__ = ["RewardModelVectorWrapper", "RewardModelWrapper", "RewardOptions", "SuccessRule"]
+__all__ = ["CopiedObservation", "RewardModelVectorWrapper", "RewardModelWrapper", "RewardOptions", "SuccessRule"]

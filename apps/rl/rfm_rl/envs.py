@@ -38,7 +38,7 @@ class RewardedEnvs:
     tasks: the task sentence of each environment's next episode
     final: name in errors of the last frame of an episode whose environment has reset in the same step
     remedy: of a step that needs a reset
-    instead: what shows the last frame of an episode if the environment draws over it
+    returns_copies: True: no environment draws over a frame that it has returned
     is_only: True: errors do not name the environment
     """
 
@@ -50,7 +50,7 @@ class RewardedEnvs:
         *,
         remedy: str,
         final: str = "",
-        instead: str = "",
+        returns_copies: bool = False,
         is_only: bool = False,
     ) -> None:
         if not (isinstance(client, RewardClient) or callable(client)):
@@ -63,8 +63,8 @@ class RewardedEnvs:
         self._kept: Mask = self._whole  # those that stay whole in the reset that runs
         self._resetting: Mask = self.ended  # in the reset or step that runs
         self._source, self._options = client, options
-        self._remedy, self._final, self._instead, self._is_only = remedy, final, instead, is_only
-        self._returns_copies: set[int] = set()  # environments whose episodes have ended with a frame of their own
+        self._remedy, self._final, self._is_only = remedy, final, is_only
+        self._returning_copies = set(range(len(tasks))) if returns_copies else set()  # of environments
         self._made: RewardClient | None = None
         self._has_dropped = False  # the last reset has, and no episode has ended since
         self._has_warned = False
@@ -175,23 +175,22 @@ class RewardedEnvs:
             self.episodes[index] = RewardedEpisode(self._options, steps, number)
             self._whole[index] = True
             fresh.append(self.episodes[index])
-            if index in last and not self._options.renders:  # a rendered frame is a copy
+            if index in last and index not in self._returning_copies:
                 self._check_differ(index, last[index], _copied(frame))
         return fresh
 
     def _check_differ(self, index: int, last: Any, first: Any) -> None:
         """Raise InvalidSampleError if a reset may have drawn over the last frame of the episode before.
 
-        An environment that draws into one array shows equal frames at every end; others may at one.
+        An environment that draws into one array shows equal frames at every end.
         """
         pairs = [(last[camera], first[camera]) for camera in last] if isinstance(last, Mapping) else [(last, first)]
-        if not any(np.array_equal(*pair) for pair in pairs):
-            self._returns_copies.add(index)
-        elif index not in self._returns_copies:
-            got = "the first frame of the next one: the environment seems to draw into the array that it has returned"
-            remedy = f"let it return a copy of its observation, or {self._instead}"
+        if any(np.array_equal(*pair) for pair in pairs):
+            got = "the first frame of the next one: the environment ended where it begins, or drew over its last frame"
+            remedy = "wrap each environment in rfm_rl.CopiedObservation, which pays both"
             where = self._final.format(index)
             raise InvalidSampleError.at(where, "the last frame of the ended episode", f"{got}; {remedy}")
+        self._returning_copies.add(index)
 
     def _score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
         """Collect known scores, and request those of newest frames that are due. Raises RewardError.

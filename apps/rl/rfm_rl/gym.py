@@ -22,8 +22,8 @@ frame, and in delta mode the next reward includes its change. If the frame was l
 ResetNeeded. A step after an episode's end does, too, unless the environment resets in that step.
 
 ``compute_reward`` of RewardModelWrapper raises NotImplementedError: hindsight relabelling would mix the environment's
-rewards with the model's. If a Monitor or RecordEpisodeStatistics inside the wrapper reports an episode, the wrapper
-puts the sum of the model's rewards into ``info["episode"]``.
+rewards with the model's. With a Monitor or RecordEpisodeStatistics inside the wrapper, ``info["episode"]`` has the sum
+of the model's rewards, also at an end by ``terminate_on_success``, which they do not see.
 
 A time limit belongs inside the wrapper, as ``gymnasium.make`` puts it. A reset of an unended episode that drops a
 reward logs a warning, once. In mode ``final``, a second such reset in a row, with no end of an episode and no error in
@@ -38,22 +38,19 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from rfm_client import InvalidSampleError
 from rfm_client.options import InvalidValueError, require
 from rfm_rl.envs import INFO, ClientSource, RewardedEnvs
+from rfm_rl.own_resets import HAS_RESET, check_observes_its_end, check_renders_its_end, watched_resets
 from rfm_rl.own_rewards import (
     RETURNS,
     WritingMonitor,
     refuse_relabelling,
-    refuse_statistics,
     warn_of_file,
     with_statistics,
 )
 from rfm_rl.rewards import Info, RewardOptions
 
 DEFAULTS = RewardOptions()
-_ENDS = "final_obs", "final_observation", "terminal_observation"  # in info, if the last step also reset
-_RESETS = "final_info"  # in info, if the last step of LeRobot's environments reset; the observation is from before
 _ALL = np.ones(1, np.bool_)
 _REMEDY = "call reset, or wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
 _UNBATCH = (
@@ -71,11 +68,10 @@ class RewardModelWrapper(gymnasium.Wrapper):
 
     A step after an episode's end raises ResetNeeded. With ``Autoreset(RewardModelWrapper(env, ...))`` of
     ``gymnasium.wrappers``, this step begins a new episode instead, with reward 0. An ``Autoreset`` among the wrappers
-    of ``env`` does the same, but does not see an end by ``terminate_on_success``. ``env`` itself must not reset in the
-    step that ends an episode.
+    of ``env`` does the same, but does not see an end by ``terminate_on_success``. If ``env`` itself resets in the step
+    that ends an episode, that step raises InvalidSampleError, unless frames come from an observation before the reset.
 
-    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, and for ``terminate_on_success`` with
-    a Monitor or RecordEpisodeStatistics inside, which would miss that end; TypeError if ``env`` is no
+    Raises ValueError if ``options`` names a source of frames that ``env`` lacks; TypeError if ``env`` is no
     ``gymnasium.Env``.
     """
 
@@ -88,11 +84,13 @@ class RewardModelWrapper(gymnasium.Wrapper):
     ) -> None:
         check_kind(env, gymnasium.Env)
         check_frame_source(options, env.render_mode, env.observation_space)
-        _check_statistics(env, options)
+        if any(isinstance(layer, WritingMonitor) for layer in _layers(env)):
+            warn_of_file("env", "Monitor(RewardModelWrapper(...), filename)")
         super().__init__(env)
         self._envs = RewardedEnvs(client, options, [""], remedy=_REMEDY, is_only=True)
         self._options = options
         self._task = task
+        self._has_statistics = env.has_wrapper_attr(RETURNS)
         self._autoresets = [layer for layer in _layers(env) if isinstance(layer, gymnasium.wrappers.Autoreset)]
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
@@ -107,16 +105,17 @@ class RewardModelWrapper(gymnasium.Wrapper):
         """Step the environment; return the reward model's reward. Raises RewardError, ResetNeeded."""
         resets = any(wrapper.autoreset for wrapper in self._autoresets)
         self._envs.check_step(_ALL & resets)
-        observation, env_reward, terminated, truncated, info = self.env.step(action)
+        with watched_resets(self.env) as own_resets:
+            observation, env_reward, terminated, truncated, info = self.env.step(action)
         if resets:
             self._set_task(info)
         elif terminated or truncated:
-            _check_shows_its_end(info)
-            check_renders_its_end(self._options, info)
+            check_observes_its_end(info)
+            check_renders_its_end(self._options, "info", bool(own_resets) or HAS_RESET in info)
         said = [float(env_reward)], [bool(terminated)], [bool(truncated)]
         (reward,), _ = self._envs.keep(lambda _: self._frame(observation), *said)
         episode = self._envs.episodes[0]
-        info = {**with_statistics(info, episode), INFO: episode.info()}
+        info = {**with_statistics(info, episode, has_statistics=self._has_statistics), INFO: episode.info()}
         return observation, float(reward), bool(terminated or episode.succeeded), truncated, info
 
     compute_reward = refuse_relabelling
@@ -157,32 +156,6 @@ def _is_batch(env: gymnasium.Env[Any, Any]) -> bool:
     """True for an environment of ManiSkill or Isaac Lab, unless a wrapper picks the only environment of its batch."""
     single = getattr(env.unwrapped, "single_observation_space", None)
     return single is not None and all(layer.observation_space != single for layer in _layers(env))
-
-
-def _check_shows_its_end(info: Info) -> None:
-    found = [key for key in _ENDS if key in info]
-    if found:
-        expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"
-        remedy = "turn off its own reset, and wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
-        raise InvalidSampleError.at("info", expected, f"{', '.join(found)}; {remedy}")
-
-
-def check_renders_its_end(options: RewardOptions, info: Info, where: str = "info") -> None:
-    """Raise InvalidSampleError if ``render()`` already shows the next episode. info: of an episode's last step."""
-    if options.renders and _RESETS in info:
-        expected = f"no {_RESETS} with frames from render(), which must show the last frame of the episode"
-        remedy = "it has reset in this step: take frames from the observation, frames_from='pixels'"
-        raise InvalidSampleError.at(where, expected, f"{_RESETS}; {remedy}")
-
-
-def _check_statistics(env: gymnasium.Env[Any, Any], options: RewardOptions) -> None:
-    """Raise ValueError for statistics that would miss episodes; warn of a file with the environment's rewards."""
-    if options.terminate_on_success is not None and env.has_wrapper_attr(RETURNS):
-        make = "call make_vec_env with a function that makes RewardModelWrapper(...)"
-        inside = "if gymnasium.make puts them inside, RewardModelWrapper(TimeLimit(env.unwrapped, steps), ...)"
-        refuse_statistics(options.terminate_on_success, f"Monitor(RewardModelWrapper(...)); {make}; {inside}")
-    if any(isinstance(layer, WritingMonitor) for layer in _layers(env)):
-        warn_of_file("env", "Monitor(RewardModelWrapper(...), filename)")
 
 
 def tasks_of(task: str | Sequence[str], num_envs: int) -> list[str]:

@@ -7,6 +7,7 @@ A vector may return torch tensors on a GPU, as ManiSkillVectorEnv does. Nothing 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -18,8 +19,9 @@ from gymnasium.vector.utils import iterate
 from rfm_client import InvalidSampleError, as_array
 from rfm_client.options import InvalidValueError, require
 from rfm_rl.envs import INFO, ClientSource, Mask, RewardedEnvs
-from rfm_rl.gym import DEFAULTS, check_frame_source, check_kind, check_renders_its_end, tasks_of
-from rfm_rl.own_rewards import RETURNS, correct_statistics, refuse_statistics
+from rfm_rl.gym import DEFAULTS, check_frame_source, check_kind, tasks_of
+from rfm_rl.own_resets import HAS_RESET, check_renders_its_end, copied_steps, watched_resets
+from rfm_rl.own_rewards import RETURNS, correct_statistics
 from rfm_rl.rewards import Info, RewardOptions
 
 _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
@@ -48,8 +50,7 @@ class RewardModelVectorWrapper(VectorWrapper):
     Raises ValueError if ``options`` names a source of frames that ``env`` lacks; for SAME_STEP with frames from
     ``render()``, which never shows an episode's last frame; and for ``terminate_on_success`` unless DISABLED, because
     an environment that resets by itself does not know of the success. In these two cases, wrap each sub-environment in
-    RewardModelWrapper instead. Raises ValueError, too, for ``terminate_on_success`` with a RecordEpisodeStatistics
-    inside, which would miss that end; TypeError if ``env`` is no ``gymnasium.vector.VectorEnv``.
+    RewardModelWrapper instead. Raises TypeError if ``env`` is no ``gymnasium.vector.VectorEnv``.
     """
 
     def __init__(
@@ -61,16 +62,21 @@ class RewardModelVectorWrapper(VectorWrapper):
     ) -> None:
         check_kind(env, VectorEnv)
         check_frame_source(options, env.render_mode, env.single_observation_space)
+        _check_tells_resets(env, options)
         autoreset_mode = _checked_autoreset_mode(env, options)
-        if options.terminate_on_success is not None and _has_statistics(env):
-            refuse_statistics(options.terminate_on_success, "RecordEpisodeStatistics(RewardModelVectorWrapper(...))")
         tasks = tasks_of(task, env.num_envs)
         super().__init__(env)  # after the checks: a refused wrapper must not close the environments when collected
+        here = list(env.unwrapped.envs) if isinstance(env.unwrapped, SyncVectorEnv) else []
+        is_mani_skill = type(env).__module__.startswith("mani_skill.")  # which keeps copies of last frames
+        in_processes = _of_each(env, "has_wrapper_attr", "copies_observations")
+        has_copies = bool(here) or is_mani_skill or (bool(in_processes) and all(in_processes))
         self._envs = RewardedEnvs(
-            client, options, tasks, remedy=_REMEDY, final="final_obs[{}]", instead=_INSTEAD_OF_SAME_STEP
+            client, options, tasks, remedy=_REMEDY, final="final_obs[{}]", returns_copies=has_copies
         )
         self._options = options
         self._autoreset_mode = autoreset_mode
+        self._has_statistics = _has_statistics(env)
+        self._here = here if options.renders or autoreset_mode is AutoresetMode.SAME_STEP else []  # in this process
 
     @property
     def autoreset_mode(self) -> AutoresetMode:
@@ -96,17 +102,21 @@ class RewardModelVectorWrapper(VectorWrapper):
         """Step the environments; return the model's rewards, [num_envs]. Raises RewardError, ResetNeeded."""
         resetting = self._resetting
         self._envs.check_step(resetting)
-        observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
+        with ExitStack() as stack:
+            watch = watched_resets if self._options.renders else copied_steps
+            watched = [stack.enter_context(watch(env)) for env in self._here]
+            observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
         terminated, truncated = (as_array(each).astype(np.bool_) for each in (terminations, truncations))
         ended, resets_at_once = terminated | truncated, self._autoreset_mode is AutoresetMode.SAME_STEP
-        for index in np.flatnonzero(ended & as_array(infos.get("_final_info", False))).tolist():
-            check_renders_its_end(self._options, infos, f"infos[{index}]")
+        have_reset = as_array(infos.get(f"_{HAS_RESET}", False)) | ([bool(resets) for resets in watched] or False)
+        for index in np.flatnonzero(ended & have_reset).tolist():
+            check_renders_its_end(self._options, f"infos[{index}]", True)
         final = partial(self._frame, self._final_observations(infos, ended)) if resets_at_once else None
         shown = partial(self._frame, self._shown(observations))
         rewards, stepped = self._envs.keep(shown, as_array(env_rewards), terminated, truncated, final=final)
         for index, episode in stepped.items():
-            correct_statistics(infos, index, episode)
-            scores: Info = {INFO: episode.info()}
+            missed = correct_statistics(infos, index, episode, has_statistics=self._has_statistics)
+            scores: Info = {INFO: episode.info(), **missed}
             has_reset = resets_at_once and ended[index]
             infos = self._add_info(infos, {"final_info": scores} if has_reset else scores, index)
         infos = self._with_scores(infos, resetting | (ended & resets_at_once))
@@ -195,7 +205,21 @@ def _has_statistics(env: VectorEnv) -> bool:
     """True with a RecordEpisodeStatistics around the vector or around environments in it."""
     if isinstance(env, VectorWrapper):
         return hasattr(env, RETURNS) or _has_statistics(env.env)
-    return isinstance(env, (AsyncVectorEnv, SyncVectorEnv)) and any(env.call("has_wrapper_attr", RETURNS))
+    return any(_of_each(env, "has_wrapper_attr", RETURNS))
+
+
+def _of_each(env: VectorEnv, name: str, *args: str) -> Sequence[Any]:
+    """An attribute of each environment, or what a method returns; empty if the vector cannot tell."""
+    vector = env.unwrapped
+    return vector.call(name, *args) if isinstance(vector, (AsyncVectorEnv, SyncVectorEnv)) else ()
+
+
+def _check_tells_resets(env: VectorEnv, options: RewardOptions) -> None:
+    """Raise ValueError for rendered frames of LeRobot's environments in processes: some reset there unseen."""
+    modules = _of_each(env, "__module__") if options.renders and isinstance(env.unwrapped, AsyncVectorEnv) else ()
+    is_lerobot = any(str(module).startswith("lerobot.envs") for module in modules)
+    expected = "a source of frames in the observation, such as 'pixels', for LeRobot's environments in processes"
+    require("frames_from", not is_lerobot, expected, "render(), which may show the next episode's first frame")
 
 
 def _checked_autoreset_mode(env: VectorEnv, options: RewardOptions) -> AutoresetMode:

@@ -7,8 +7,8 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
-from rfm_client.episodes import SuccessRule
-from rfm_client.options import InvalidValueError
+import numpy as np
+
 from rfm_rl.rewards import Info, RewardedEpisode
 
 RELABELS = "compute_reward"  # method of an environment that rewards a step for another goal
@@ -23,30 +23,29 @@ def refuse_relabelling(*_args: object, **_kwargs: object) -> NoReturn:
     raise NotImplementedError(f"{RELABELS}: expected {expected}, got a call; {remedy}")
 
 
-def refuse_statistics(rule: SuccessRule, instead: str) -> NoReturn:
-    """Raise ValueError for statistics inside, which would miss the ends by ``terminate_on_success``.
+def with_statistics(info: Info, episode: RewardedEpisode, *, has_statistics: bool = False) -> Info:
+    """Return the info of a step. Statistics from a Monitor inside the wrapper show the model's rewards.
 
-    instead: what to make instead
+    has_statistics: True: a Monitor inside tells of ends, but does not see one by ``terminate_on_success``
     """
-    expected = "None with a Monitor or RecordEpisodeStatistics inside, which does not see this end"
-    raise InvalidValueError.at("terminate_on_success", expected, rule, f"wrap in the other order: {instead}")
-
-
-def with_statistics(info: Info, episode: RewardedEpisode) -> Info:
-    """Return the info of a step. Statistics from a Monitor inside the wrapper show the model's rewards."""
     told = info.get(_STATISTICS)
-    if not isinstance(told, dict) or "r" not in told:
-        return info
-    return {**info, _STATISTICS: {**told, **_statistics(episode)}}
+    if isinstance(told, dict) and "r" in told:
+        return {**info, _STATISTICS: {**told, **_statistics(episode)}}
+    return {**info, _STATISTICS: _statistics(episode)} if has_statistics and episode.succeeded else info
 
 
-def correct_statistics(infos: Info, index: int, episode: RewardedEpisode) -> None:
-    """Let statistics in the infos of a Gymnasium vector show the model's rewards of one environment."""
-    for info in (infos, infos.get("final_info")):
-        if isinstance(info, Mapping) and f"_{_STATISTICS}" in info and info[f"_{_STATISTICS}"][index]:
-            for key, value in _statistics(episode).items():
-                if key in info[_STATISTICS]:
-                    info[_STATISTICS][key][index] = value
+def correct_statistics(infos: Info, index: int, episode: RewardedEpisode, *, has_statistics: bool) -> Info:
+    """Return what to add to the infos of a Gymnasium vector, whose statistics now show the model's rewards."""
+    told = [infos, infos.get("final_info")]
+    told = [info for info in told if isinstance(info, Mapping) and f"_{_STATISTICS}" in info]
+    for info in told:
+        info[f"_{_STATISTICS}"] = np.array(info[f"_{_STATISTICS}"])  # which RecordEpisodeStatistics goes on to read
+    shown = [info[_STATISTICS] for info in told if info[f"_{_STATISTICS}"][index]]
+    for statistics in shown:
+        for key, value in _statistics(episode).items():
+            if key in statistics:
+                statistics[key][index] = value
+    return with_statistics({}, episode, has_statistics=has_statistics and not shown)
 
 
 def _statistics(episode: RewardedEpisode) -> dict[str, float]:

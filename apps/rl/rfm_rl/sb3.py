@@ -11,6 +11,7 @@ of that episode is then in the info: ``terminal_observation``, or the frame of R
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import gymnasium
@@ -19,7 +20,8 @@ import numpy as np
 from rfm_client import InvalidSampleError
 from rfm_client.options import require
 from rfm_rl.envs import INFO, ClientSource, RewardedEnvs
-from rfm_rl.gym import DEFAULTS, check_frame_source, check_renders_its_end, tasks_of
+from rfm_rl.gym import DEFAULTS, check_frame_source, tasks_of
+from rfm_rl.own_resets import HAS_RESET, CopiedObservation, check_renders_its_end, copied_steps, watched_resets
 from rfm_rl.own_rewards import (
     RELABELS,
     WritingMonitor,
@@ -58,9 +60,12 @@ class RenderedFrame(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, {**info, _FRAME: np.array(self.env.render())}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, Info]:
-        """Step the environment, and add a picture to the info."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, {**info, _FRAME: np.array(self.env.render())}
+        """Step the environment, and add a picture to the info, unless the environment has reset after its last."""
+        with watched_resets(self.env) as own_resets:
+            observation, reward, terminated, truncated, info = self.env.step(action)
+        if not (own_resets and (terminated or truncated)):
+            info = {**info, _FRAME: np.array(self.env.render())}
+        return observation, reward, terminated, truncated, info
 
 
 class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is optional, and so untyped here
@@ -98,8 +103,12 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         require("terminate_on_success", options.terminate_on_success is None, "None, since a VecEnv resets", instead)
         _check_own_rewards(venv)
         tasks = tasks_of(task, venv.num_envs)
-        final, instead = "infos[{}]['terminal_observation']", "use RenderedFrame"
-        self._envs = RewardedEnvs(client, options, tasks, remedy="call reset", final=final, instead=instead)
+        final = "infos[{}]['terminal_observation']"
+        is_here = isinstance(venv.unwrapped, DummyVecEnv) and not options.renders
+        self._here = list(venv.unwrapped.envs) if is_here else []  # environments in this process
+        in_processes = _has_own_envs(venv) and all(venv.env_is_wrapped(CopiedObservation))
+        copies = options.renders or is_here or in_processes
+        self._envs = RewardedEnvs(client, options, tasks, remedy="call reset", final=final, returns_copies=copies)
         self._reward_options = options
         super().__init__(venv)  # which reads attributes
 
@@ -119,11 +128,15 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
 
     def step_wait(self) -> tuple[Any, Any, Any, list[Info]]:
         """End the step; return the model's rewards, float32 [num_envs]. Raises RewardError."""
-        observations, env_rewards, dones, told = self.venv.step_wait()
+        with ExitStack() as stack:
+            for env in self._here:
+                stack.enter_context(copied_steps(env))
+            observations, env_rewards, dones, told = self.venv.step_wait()
         infos = [dict(info) for info in told]  # a list in one ``VecEnv``, a tuple in another
         ended = np.flatnonzero(dones).tolist()
         for index in ended:
-            check_renders_its_end(self._reward_options, infos[index], f"infos[{index}]")
+            has_reset = _FRAME not in infos[index] or HAS_RESET in infos[index]
+            check_renders_its_end(self._reward_options, f"infos[{index}]", has_reset)
         self._take_reset_infos(ended)
         rendered = [info.pop(_FRAME, None) for info in infos]
         truncated = dones & np.array([info.get("TimeLimit.truncated", False) for info in infos], np.bool_)
@@ -189,9 +202,12 @@ def _check_own_rewards(venv: Any) -> None:
     expected = "no VecNormalize inside, whose rewards SAC and other off-policy algorithms would learn from"
     instead = "one; wrap in the other order: VecNormalize(RewardModelVecEnv(...))"
     require("venv", unwrap_vec_normalize(venv) is None, expected, instead)
-    has_envs = isinstance(venv.unwrapped, (DummyVecEnv, SubprocVecEnv))  # other kinds may not be able to look
-    if isinstance(venv, WritingMonitor) or (has_envs and any(venv.env_is_wrapped(WritingMonitor))):
+    if isinstance(venv, WritingMonitor) or (_has_own_envs(venv) and any(venv.env_is_wrapped(WritingMonitor))):
         warn_of_file("venv", "VecMonitor(RewardModelVecEnv(...), filename)")
+
+
+def _has_own_envs(venv: Any) -> bool:
+    return isinstance(venv.unwrapped, (DummyVecEnv, SubprocVecEnv))  # other kinds may not be able to look
 
 
 def _of_env(observations: Any, index: int) -> Any:
