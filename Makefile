@@ -5,6 +5,9 @@ UV := 0.13.9
 # Stamp files: what make demo runs is installed; everything is installed, which tests and tools need.
 RUNS := $(VENV)/runs
 INSTALLED := $(VENV)/installed
+LEROBOT := $(VENV)/lerobot/installed
+# What make test-newest prints, as the table of versions in docs/reference/configuration.md has it.
+NEWEST := av|grpcio|gymnasium|h5py|huggingface-hub|lerobot|numpy|peft|pyarrow|stable-baselines3|tokenizers|torch|torchrl|transformers|tritonclient
 WORKERS := --dist loadgroup --no-loadscope-reorder
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
@@ -48,13 +51,19 @@ nightly: check ops-tools
 	$(if $(RFM_GOLDENS),$(BIN)/pytest -m reference)
 	$(TOOL) tools/chaos.py
 
-# Test scoring with the newest transformers. Needs the network.
-# The other tests use the pinned one.
-test-newest: $(INSTALLED)
-	$(BIN)/pip install --quiet --disable-pip-version-check --upgrade --target $(VENV)/newest --no-deps \
-	  "transformers<6" "huggingface_hub<2" tokenizers
-	PYTHONPATH=$(CURDIR)/$(VENV)/newest $(BIN)/python -m pytest --numprocesses 3 $(WORKERS) -m "not gpu and not slow and not triton" \
-	  tests/families
+# Test with the newest packages that the index has, pinned or not, and beside LeRobot's own classes. Half an hour.
+# Needs the network, Python 3.12 (uv gets it) and 12 GB. Triton's own Python keeps numpy 1. Prints the versions.
+test-newest: $(INSTALLED) $(LEROBOT)
+	$(BIN)/uv venv --quiet --clear --python 3.12 $(VENV)/newest
+	$(UV_SETTINGS) $(BIN)/uv pip install --quiet --python $(VENV)/newest --editable "client[cli,rerun]" --editable apps/gateway \
+	  --editable "apps/labels[hdf5,ray,rerun,rlds]" --editable apps/page --editable "apps/rl[sb3]" \
+	  --editable ".[encoders,vlm,quantized,demo,dev]" peft torchrl
+	$(BIN)/python tools/tritonserver.py $(VENV)/newest/server
+	for environment in newest lerobot; do $(BIN)/uv pip list --python $(VENV)/$$environment | grep -E "^($(NEWEST)) "; done
+	PATH=$(CURDIR)/$(VENV)/newest/server:$$PATH $(VENV)/newest/bin/pytest --numprocesses 2 $(WORKERS) \
+	  -m "not gpu and not alone and not slow and not debian and not nightly" \
+	  tests/client tests/contract tests/families tests/labels tests/rl
+	$(BIN)/pytest -m nightly tests/families/test_lerobot_scores.py tests/rl/test_lerobot_itself.py
 
 # Lint, format, generated files.
 lint: $(INSTALLED)
@@ -195,8 +204,8 @@ CHECK_PYTHON = 'import sys; own = sys.version_info[:2]; sys.exit("make: expected
 PINS := pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.toml) constraints.txt
 # uv reads no settings of pip: a package index and folders of wheels are handed on.
 PIP_SETTING = $(shell $(BIN)/pip config list | sed -n "s/^[^=]*[.]$(1)='\(.*\)'$$/$(2)=\1/p" | head -n 1)
-INSTALL = $(call PIP_SETTING,index-url,UV_DEFAULT_INDEX) $(call PIP_SETTING,find-links,UV_FIND_LINKS) \
-  $(BIN)/uv pip install --quiet --python $(BIN)/python --constraint constraints.txt
+UV_SETTINGS = $(call PIP_SETTING,index-url,UV_DEFAULT_INDEX) $(call PIP_SETTING,find-links,UV_FIND_LINKS)
+INSTALL = $(UV_SETTINGS) $(BIN)/uv pip install --quiet --python $(BIN)/python --constraint constraints.txt
 
 $(BIN)/uv:
 	@$(PYTHON) -c $(CHECK_PYTHON)
@@ -211,6 +220,13 @@ $(INSTALLED): $(PINS) | $(BIN)/uv
 	$(INSTALL) --editable "client[cli,rerun]" --editable apps/gateway --editable "apps/labels[hdf5,ray,rerun,rlds]" \
 	  --editable apps/page --editable "apps/rl[sb3]" --editable ".[encoders,vlm,quantized,triton,demo,dev]"
 	touch $(RUNS) $@
+
+# LeRobot, which needs Python 3.12, with the plug-in. mujoco: for its Meta-World 3.0
+$(LEROBOT): client/pyproject.toml apps/rl/pyproject.toml | $(BIN)/uv
+	$(BIN)/uv venv --quiet --clear --python 3.12 $(VENV)/lerobot
+	$(UV_SETTINGS) $(BIN)/uv pip install --quiet --python $(VENV)/lerobot "lerobot[dataset,metaworld,robometer,topreward]" \
+	  "mujoco<3.4" --editable client --editable "apps/rl[sb3]"
+	touch $@
 
 # Remove what make has made.
 clean:

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""LeRobot's own Robometer and TOPReward, as its newest release has them, beside ours."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from paths import ROOT
+from reward_models import BASE
+from rfm import published
+from rfm.engine import Engine
+from rfm_client import ProgressResult, ProgressSample, Trajectory
+
+pytestmark = pytest.mark.nightly
+
+PYTHON = ROOT / ".venv" / "lerobot" / "bin" / "python"
+PROGRAM = ROOT / "tests" / "support" / "lerobot_scores.py"
+TASK = "put the red block in the bowl"
+IMAGES = {"use_per_frame_progress_token": False}
+VIDEO = IMAGES | {"use_multi_image": False}
+ROBOMETER: dict[str, dict[str, Any]] = {
+    "tokens": {},
+    "tokens_7_bins": {"progress_discrete_bins": 7},
+    "images_mean": IMAGES,
+    "images_boundary": IMAGES | {"frame_pooling": "boundary"},
+    "images_attention": IMAGES | {"frame_pooling": "attention", "frame_pooling_attn_temperature": 0.7},
+    "images_l2": IMAGES | {"progress_loss_type": "l2"},
+    "video_mean": VIDEO,
+    "video_last": VIDEO | {"average_temporal_patches": False},
+}
+TOPREWARD: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "chat": {"add_chat_template": True},
+    "fps_4": {"fps": 4.0},
+}
+FLOAT32, BFLOAT16 = "float32", "bfloat16"
+SETTINGS = {
+    f"{model}_{name}_{dtype}": {"model": model, "torch_dtype": dtype} | settings
+    for model, by_name in {"robometer": ROBOMETER, "topreward": TOPREWARD}.items()
+    for name, settings in by_name.items()
+    for dtype in (FLOAT32, BFLOAT16)
+}
+TOLERANCES = {  # seen in float32: 1.2e-7 and 1.9e-6, in bfloat16: 2.2e-3 and 0.022
+    "robometer": {FLOAT32: 2e-6, BFLOAT16: 5e-3},
+    "topreward": {FLOAT32: 2e-5, BFLOAT16: 0.05},
+}
+
+
+@pytest.fixture(scope="module")
+def frames() -> Any:
+    noise = np.random.default_rng(0).integers(0, 256, (5, 64, 96, 3), np.uint8)
+    return noise // np.arange(1, 6, dtype=np.uint8)[:, None, None, None]  # darker and darker
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, frames: Any) -> Path:
+    """A folder with LeRobot's checkpoints and their scores."""
+    if not PYTHON.exists():
+        pytest.skip("make test-newest installs LeRobot")
+    made = tmp_path_factory.mktemp("lerobot")
+    (made / "settings.json").write_text(json.dumps(SETTINGS))
+    np.save(made / "frames.npy", frames)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [PYTHON, PROGRAM, made, BASE], env=environment, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return made
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_scores_are_those_of_lerobot_s_newest_release(folder: Path, frames: Any, name: str) -> None:
+    settings, expected = SETTINGS[name], json.loads((folder / "scores.json").read_text())[name]
+    dtype = settings["torch_dtype"]
+    tolerance = TOLERANCES[settings["model"]][dtype]
+    words = {"reward_model": asked(settings)} if settings["model"] == "topreward" else {"base_model": str(BASE)}
+    engine = Engine.of(published.load(folder / name, **words), dtype=getattr(torch, dtype))
+    (result,) = engine.evaluate([ProgressSample(Trajectory(frames=frames, task=TASK))])
+    assert isinstance(result, ProgressResult), result
+    for kind, values in expected.items():
+        got = getattr(result, kind)
+        got = got if len(values) == len(got) else got[::2]  # one value for each pair of a video
+        np.testing.assert_allclose(got, values, rtol=0, atol=tolerance)
+        assert np.ptp(values) > 2 * tolerance
+
+
+def asked(settings: dict[str, Any]) -> str:
+    """Return the words of ``--as``."""
+    words = [f"fps={settings['fps']}"] if "fps" in settings else []
+    words += [f"chat_template={str(settings['add_chat_template']).lower()}"] if "add_chat_template" in settings else []
+    return ",".join(["topreward", *words])
