@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import pytest
 import safetensors.torch
 from typer.testing import Result
@@ -26,7 +25,7 @@ from rfm_commands import rollout as rfm_rollout
 from rfm_commands.rollout import Rollout, RolloutError
 from rfm_export.publish import read_config
 from rollout import NAME, WITH_ENCODERS, callers
-from servers import Serving, administered
+from servers import Serving, administered, wait_for
 from trajectories import random_trajectory
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -87,22 +86,6 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         yield Running(served, repository)
 
 
-def test_a_name_is_loaded_rolled_out_and_unloaded_beside_the_others(running: Running) -> None:
-    running.export_plain("listed")
-    assert running.models("load", "listed") == "listed: 1 ready\n"
-    assert ["listed", "1", "READY"] in running.listed()
-    running.export_plain("listed")
-    assert running.models("rollout", "listed", "2").endswith("listed: version 2 is served\n")
-    assert (running.served_by_restart("listed"), running.ready("listed")) == ([2], ["2"])
-    assert ["rfm_frames", "1", "READY"] in running.listed()
-    with running.client("listed") as client:
-        assert np.isfinite(client.progress(random_trajectory(0, 3)).progress).all()
-        assert running.models("unload", "listed") == "listed: unloaded\n"
-        with pytest.raises((ModelNotFoundError, ServerError)):
-            client.progress(random_trajectory(0, 3))
-    assert ["listed", "2", "UNAVAILABLE", "unloaded"] in running.listed()
-
-
 @pytest.mark.nightly
 @pytest.mark.parametrize("family", ["rynnvalue", "robodopamine"])
 def test_a_model_whose_progress_may_be_missing_is_rolled_out(running: Running, family: str) -> None:
@@ -148,29 +131,38 @@ def test_another_url_than_a_server_s_for_grpc_is_refused(url: str, message: str)
         assert message in done.stderr.splitlines()[-1]
 
 
-def test_a_broken_version_is_never_asked_and_the_old_one_stays(running: Running, tmp_path: Path) -> None:
+def test_a_broken_version_is_never_asked_and_a_good_one_is_rolled_out(running: Running, tmp_path: Path) -> None:
+    """No call is lost, and the other models stay."""
     name, sample = "fragile", ProgressSample(random_trajectory(1, 5))
     running.export_plain(name)
-    running.models("load", name)
+    assert running.models("load", name) == f"{name}: 1 ready\n"
     running.export_plain(name, rollout.other_checkpoint(tmp_path / "other", PLAIN.checkpoint))
     expected = load_engine(PLAIN.name).evaluate([sample])
     weights = running.repository / name / "2" / "checkpoint" / "model.safetensors"
     changed = safetensors.torch.load_file(weights)
     changed["progress_head.4.weight"] *= 1.5  # numbers all the same
     safetensors.torch.save_file(changed, weights, {"format": "pt"})
-    with callers(running.served.endpoints.grpc_url, [sample], {"1": expected}, model=name) as tally:
+    with callers(running.served.endpoints.grpc_url, [sample], {"1": expected, "3": expected}, model=name) as tally:
         line = running.refused("rollout", name, "2")
         assert line.startswith(f"rfm: {name} version 2: ")
         assert "/2: expected the weights that were exported (" in line
         assert line.endswith(f"(served as before: {name}: version 1)")
-        assert (running.served_by_restart(name), running.ready(name)) == ([1], ["1"])
         (running.repository / name / "2" / "model.py").unlink()  # as in a folder that was copied in part
         assert f"/{name}/2/model.py: expected the model's program, got none" in running.refused("rollout", name, "2")
         assert (running.served_by_restart(name), running.ready(name)) == ([1], ["1"])
-    assert (tally.failed, tally.unlike, set(tally.by_version)) == ([], [], {"1"})
+        running.export_plain(name)
+        assert running.models("rollout", name, "3").endswith(f"{name}: version 3 is served\n")
+        assert (running.served_by_restart(name), running.ready(name)) == ([3], ["3"])
+        wait_for(lambda: tally.by_version["3"])
+    assert (tally.failed, tally.unlike, set(tally.by_version)) == ([], [], {"1", "3"})
     with running.client(NAME) as client:
         assert client.is_ready()  # a failed call is no reason to stop
-    running.models("unload", name)
+    assert running.models("unload", name) == f"{name}: unloaded\n"
+    listed = running.listed()
+    assert [name, "3", "UNAVAILABLE", "unloaded"] in listed
+    assert ["rfm_frames", "1", "READY"] in listed
+    with running.client(name) as client, pytest.raises((ModelNotFoundError, ServerError)):
+        client.progress(random_trajectory(0, 3))
 
 
 @dataclass

@@ -24,10 +24,8 @@ from rfm.triton_model.batch_model import ASKING_S
 from rfm.triton_model.placement import Placement
 from rfm.triton_model.watchdog import FAILED_BATCHES, Watchdog
 from rfm_client import (
-    FrameScores,
     InferenceFailedError,
     InvalidSampleError,
-    PreferenceSample,
     ProgressResult,
     Result,
     RewardError,
@@ -37,7 +35,6 @@ from rfm_client.contract import wire
 from rfm_client.contract.description import Description
 from rfm_client.contract.names import PROBE_PREFIX
 from servers import PATIENCE_S
-from trajectories import random_trajectory
 
 REASON = "scoring failed; the server's log has the reason"
 
@@ -196,18 +193,6 @@ def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:
     assert model.samples == {("progress", "scored"): 1}
     model.respond(request(1), request(1, id="caller"))
     assert model.samples == {("progress", "scored"): 3}
-
-
-def test_pairs_are_counted_with_all_their_frames(tmp_path: Path) -> None:
-    class Pairs(Model):
-        def encode(self, answers: Sequence[Result], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
-            return {"progress": FrameScores(progress=np.ones(1, np.float32), success=np.ones(1, np.float32)).progress}
-
-    model = Pairs(tmp_path)
-    pair = PreferenceSample(random_trajectory(0, 5, *WIDTHS), random_trajectory(1, 7, *WIDTHS))
-    model.respond(Request(wire.encode_samples([pair])))
-    assert model.samples == {("preference", "scored"): 1}
-    assert model.told("frames_total") == {(): 12}
 
 
 def test_what_an_execution_took_is_told(tmp_path: Path) -> None:

@@ -101,26 +101,16 @@ def test_what_is_not_prepared_waits_for_another_batch(tmp_path: Path) -> None:
     model.open(*late)
 
 
-def test_execute_returns_when_less_than_a_batch_waits(tmp_path: Path) -> None:
-    model = Ahead(tmp_path)
-    first = model.begin()
-    full = [request(5) for _ in range(MAX_BATCH)]
-    with ThreadPoolExecutor(1) as pool:
-        taken = pool.submit(model.take, *full)
-        wait_for(lambda: len(model.prepared) >= MAX_BATCH)
-        assert not taken.done()  # the rest waits in Triton, where another instance can take it
-        model.open(*first, *full)
-        taken.result(PATIENCE_S)
-
-
-def test_a_batch_has_no_more_samples_than_triton_s_largest_batch(tmp_path: Path) -> None:
+def test_execute_returns_when_less_than_a_batch_waits_and_no_batch_is_larger_than_triton_s(tmp_path: Path) -> None:
     model = Ahead(tmp_path)
     first = model.begin()
     many = [request(5) for _ in range(MAX_BATCH + 1)]
-    with ThreadPoolExecutor(1) as pool:  # the call waits until less than a batch waits
-        pool.submit(model.take, *many)
+    with ThreadPoolExecutor(1) as pool:
+        taken = pool.submit(model.take, *many)
         wait_for(lambda: len(model.prepared) == len(first) + len(many))
+        assert not taken.done()  # the rest waits in Triton, where another instance can take it
         model.open(*first, *many)
+        taken.result(PATIENCE_S)
     assert max(model.batches) <= MAX_BATCH
     assert sum(model.batches) == len(first) + len(many)
 
