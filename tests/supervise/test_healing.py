@@ -88,7 +88,6 @@ def test_a_start_is_repeated_when_a_model_process_is_killed(tmp_path: Path) -> N
             assert killed.result().isdisjoint(model_processes(server.pid))
 
 
-@pytest.mark.alone
 def test_a_killed_server_without_a_log_leaves_nothing_running_and_the_next_removes_the_rest(tmp_path: Path) -> None:
     """With a stand-in for Triton, in a container whose process ids mean nothing here, if this user may make one."""
     apart = ["unshare", "--map-root-user", "--pid", "--fork", "--kill-child", "--mount-proc"]
