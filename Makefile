@@ -33,12 +33,13 @@ test: $(INSTALLED)
 
 # The tests of make test, without lint.
 fast: $(INSTALLED)
-	$(BIN)/pytest --numprocesses 2 $(WORKERS) --durations 10 --durations-min 1 -m "not gpu and not slow and not debian and not nightly"
+	$(BIN)/pytest --numprocesses 2 $(WORKERS) --durations 10 --durations-min 1 -m "not gpu and not alone and not slow and not debian and not nightly"
 
 # The rest of CI: types, the documents, and the tests that are slow or need programs of Debian.
 test-more: $(INSTALLED)
 	+$(MAKE) --jobs 3 check docs ops-tools
-	$(BIN)/pytest --numprocesses 3 $(WORKERS) --durations 10 -m "(slow or debian) and not gpu and not nightly"
+	$(BIN)/pytest --numprocesses 3 $(WORKERS) --durations 10 -m "(slow or debian) and not gpu and not alone and not nightly"
+	$(BIN)/pytest -m "alone and not nightly" $$(grep --recursive --files-with-matches mark.alone tests)
 
 # All tests of CI.
 test-all: test test-more
@@ -60,7 +61,7 @@ test-newest: $(INSTALLED) $(LEROBOT)
 	$(BIN)/python tools/tritonserver.py $(VENV)/newest/server
 	for environment in newest lerobot; do $(BIN)/uv pip list --python $(VENV)/$$environment | grep -E "^($(NEWEST)) "; done
 	PATH=$(CURDIR)/$(VENV)/newest/server:$$PATH $(VENV)/newest/bin/pytest --numprocesses 2 $(WORKERS) \
-	  -m "not gpu and not slow and not debian and not nightly" \
+	  -m "not gpu and not alone and not slow and not debian and not nightly" \
 	  tests/client tests/contract tests/families tests/labels tests/rl
 	$(BIN)/pytest -m nightly tests/families/test_lerobot_scores.py tests/rl/test_lerobot_itself.py
 

@@ -35,8 +35,7 @@ from contestants import (
 from load import SHARED_MEMORY, Load
 from report import Row
 
-from rfm.launch.temporary import temporary_server
-from rfm.launch.triton_server import Endpoints
+from rfm.serve.triton_server import Endpoints, temporary_server
 from rfm_gateway.command import gateway_command
 from rfm_gateway.config import GatewayConfig
 

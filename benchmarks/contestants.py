@@ -26,7 +26,7 @@ from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.families.rewind.checkpoint import RewindCheckpoint
 from rfm.families.rewind.network import RewindConfig, RewindTransformer
-from rfm.launch.triton_server import Endpoints
+from rfm.serve.triton_server import Endpoints
 from rfm_commands.config import Config
 
 HERE = Path(__file__).parent

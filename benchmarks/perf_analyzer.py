@@ -25,8 +25,8 @@ import report
 from contestants import BareEngine, Contestant, checkpoint
 from load import Load, samples
 
-from rfm.launch.installation import find_installation
-from rfm.launch.temporary import temporary_server
+from rfm.serve.installation import find_installation
+from rfm.serve.triton_server import temporary_server
 from rfm_client.cli.synthetic import write_perf_analyzer_input
 
 WHEEL = "tritonclient==2.51.0"

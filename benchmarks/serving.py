@@ -15,7 +15,7 @@ from pathlib import Path
 
 import rfm_export
 from rfm.config import ExportConfig
-from rfm.launch.temporary import temporary_server
+from rfm.serve.triton_server import temporary_server
 
 
 def main(checkpoint: str, folder: Path, settings: str) -> None:

@@ -14,7 +14,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 
-from rfm.launch.temporary import stopped_by_signals, temporary_server
+from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
 from rfm_client.cli.next_steps import next_steps, steps_with_server
 from rfm_client.cli.pictures import Panel, plot

@@ -19,7 +19,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from rfm.launch.temporary import stopped_by_signals, temporary_server
+from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import RewardClient
 from toy_world import Task, forward, pick_and_place, random_scene, render, resting
 

@@ -18,7 +18,7 @@ from environments import MODEL, LateClient
 from paths import ROOT
 from patients import references  # noqa: F401  a fixture
 from rfm.engine import Engine
-from rfm.launch import endpoints
+from rfm.serve import access
 from rfm_client import RewardClient
 from servers import CRASHES, Endpoints, Served, start_triton
 
@@ -31,7 +31,7 @@ os.environ["OMP_NUM_THREADS"] = "1"  # of processes that tests start, since othe
 os.environ[RUN] = uuid.uuid4().hex  # marks the processes of this run
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test asks the network
 worker, workers = os.getenv("PYTEST_XDIST_WORKER", "gw0"), os.getenv("PYTEST_XDIST_WORKER_COUNT", "1")
-endpoints.PORTS = endpoints.PORTS[int(worker.removeprefix("gw")) :: int(workers)]  # no two workers choose the same port
+access.PORTS = access.PORTS[int(worker.removeprefix("gw")) :: int(workers)]  # no two workers choose the same port
 os.environ["ONEDNN_MAX_CPU_ISA"] = "AVX512_CORE"  # as the references were computed: AMX rounds bfloat16 elsewhere
 
 

@@ -20,9 +20,9 @@ import rfm_export
 from callers import Callers, Exam, direct, through_gateway
 from paths import ROOT
 from rfm.config import ExportConfig
-from rfm.launch.model_processes import has_ended
-from rfm.launch.repository_folder import MODEL_FILE
-from rfm.supervise.supervisor import GATEWAY
+from rfm.serve.processes import has_ended
+from rfm.serve.repository import MODEL_FILE
+from rfm.serve.supervisor import GATEWAY
 from rfm_client import RewardClient
 from rfm_client.contract import descriptors
 from servers import MODEL, RFM, START_S, Endpoints, Serving, children, serving, wait_for

@@ -13,8 +13,8 @@ from rich.table import Table
 import goldens
 import rfm_export
 from engines import serve_config
-from rfm.launch.installation import find_installation
-from rfm.launch.triton_server import Endpoints, TritonServer
+from rfm.serve.installation import find_installation
+from rfm.serve.triton_server import Endpoints, TritonServer
 from rfm_client import RewardClient
 
 

@@ -10,7 +10,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from rfm.launch.installation import find_installation
+from rfm.serve.installation import find_installation
 
 folder = Path(sys.argv[1]).resolve()
 folder.mkdir()

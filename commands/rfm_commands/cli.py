@@ -16,11 +16,10 @@ from typing import Annotated, Any
 import typer
 
 from rfm.config import ExportConfig, ServeConfig
-from rfm.launch.admin_key import new_key, take_key
-from rfm.launch.endpoints import Endpoints
-from rfm.launch.installation import ServerStartError, find_installation
-from rfm.launch.triton_server import TritonServer, short_spin
-from rfm.supervise.supervisor import CrashLoopError, GatewayProcess, Supervisor
+from rfm.serve.access import Endpoints, new_key, take_key
+from rfm.serve.installation import ServerStartError, find_installation
+from rfm.serve.supervisor import CrashLoopError, GatewayProcess, Supervisor
+from rfm.serve.triton_server import TritonServer, short_spin
 from rfm_client.cli.command import Given, add_missing, with_options
 from rfm_client.cli.messages import MOST_COLUMNS
 from rfm_client.contract.descriptors import raise_limit

@@ -16,8 +16,8 @@ from typing import Annotated, ClassVar
 
 import typer
 
-from rfm.launch.admin_key import take_key
-from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
+from rfm.serve.access import take_key
+from rfm.serve.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
 from rfm_client.cli.command import CommandGroup, Given, usage_errors, with_options
 from rfm_client.cli.options import CredentialFiles
 from rfm_client.contract.errors import InvalidValueError

@@ -32,9 +32,8 @@ import numpy as np
 from google.protobuf.text_format import ParseError
 from tritonclient.grpc import model_config_pb2 as pb
 
-from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
-from rfm.launch.repository_check import fault_in
-from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
+from rfm.serve.repository import CONFIG_FILE, fault_in, models_in, no_models
+from rfm.serve.repository_api import RepositoryApi, RepositoryApiError
 from rfm_client import PreferenceSample, ProgressSample, RewardError, Sample
 from rfm_client.contract import wire
 from rfm_client.contract.errors import LocatedError

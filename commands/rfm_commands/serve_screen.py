@@ -17,8 +17,8 @@ from typing import IO
 
 from google.protobuf.text_format import ParseError
 
-from rfm.launch.endpoints import Endpoints
-from rfm.launch.repository_folder import models_in
+from rfm.serve.access import Endpoints
+from rfm.serve.repository import models_in
 from rfm_client.cli.next_steps import PAGE_PORT, PAGE_URL, command, next_steps, score_step
 from rfm_client.contract.listening import from_here
 from rfm_client.contract.names import frames_name

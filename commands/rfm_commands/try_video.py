@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from rfm.config import CheckpointConfig, ExportConfig
-from rfm.launch.endpoints import Endpoints
-from rfm.launch.temporary import stopped_by_signals, temporary_server
+from rfm.serve.access import Endpoints
+from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.command import Given, with_options
 from rfm_client.cli.next_steps import PAGE_PORT, PAGE_URL, command, next_steps

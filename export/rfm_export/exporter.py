@@ -14,9 +14,9 @@ from safetensors import SafetensorError
 
 from rfm import families, published
 from rfm.config import ExportConfig
-from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import CHECKPOINT_FOLDER, FAMILY_PARAMETER
 from rfm.published.provenance import write
+from rfm.serve.repository import CONFIG_FILE
 from rfm_client.contract import FRAME_SCORES, wire
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.errors import ExportError

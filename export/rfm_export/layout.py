@@ -17,7 +17,6 @@ from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.config import ExportConfig
 from rfm.files import settings_digest, weights_digest
-from rfm.launch.repository_folder import CONFIG_FILE, MODEL_FILE
 from rfm.parameters import (
     CHECKPOINT_FOLDER,
     DTYPE_PARAMETER,
@@ -25,6 +24,7 @@ from rfm.parameters import (
     FEATURE_CACHE_PARAMETER,
     GRAPHS_PARAMETER,
 )
+from rfm.serve.repository import CONFIG_FILE, MODEL_FILE
 from rfm_client.contract import PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 from rfm_client.contract.names import encoder_name, frames_name

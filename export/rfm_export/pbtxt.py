@@ -13,7 +13,6 @@ from google.protobuf import text_format
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.config import ExportConfig
-from rfm.launch.repository_folder import EXPORT_HEADER
 from rfm.parameters import (
     BUDGET_PARAMETER,
     DTYPE_PARAMETER,
@@ -22,6 +21,7 @@ from rfm.parameters import (
     SAMPLE_TOKENS_PARAMETER,
     THREADS_PARAMETER,
 )
+from rfm.serve.repository import EXPORT_HEADER
 from rfm_client.contract import wire
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 from rfm_client.contract.wire import TensorSpec

@@ -27,7 +27,7 @@ from pathlib import Path
 
 from tritonclient.grpc import model_config_pb2 as pb
 
-from rfm.launch.repository_folder import CONFIG_FILE
+from rfm.serve.repository import CONFIG_FILE
 from rfm_export.errors import ExportError
 from rfm_export.layout import WARMUP_FOLDER, GeneratedModel, generated_files
 from rfm_export.pbtxt import parse, render, serving_versions

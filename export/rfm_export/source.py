@@ -27,12 +27,12 @@ from rfm.config import ExportConfig
 from rfm.engine.computation import computation
 from rfm.engine.family import NETWORK, Checkpoint, Family, FrameEncoders, config_fields
 from rfm.files import read_run_config
-from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import CHECKPOINT_FOLDER
 from rfm.published.hub import check_links, commit_of
 from rfm.published.provenance import Assumption, is_folder, license_of, source_name
 from rfm.published.reader import Options
 from rfm.published.run_config import find_run_config
+from rfm.serve.repository import CONFIG_FILE
 from rfm.weights import num_values
 from rfm_client.contract import ProgressSample
 from rfm_client.contract.description import Description, Origin

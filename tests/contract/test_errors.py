@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rfm.files import CheckpointError
-from rfm.launch.installation import ServerStartError
+from rfm.serve.installation import ServerStartError
 from rfm_client import InvalidSampleError
 from rfm_client.contract import triton
 from rfm_client.contract.errors import LocatedError

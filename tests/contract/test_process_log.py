@@ -20,7 +20,7 @@ PROGRAM = """
 import logging, os, sys
 from rfm_client.contract.process_log import about, write_log
 write_log("rfm-serve", os.environ)
-log = logging.getLogger("rfm.supervise")
+log = logging.getLogger("rfm.serve")
 """
 
 

@@ -15,8 +15,8 @@ from typer.testing import CliRunner, Result
 from labelling import LEROBOT
 from paths import ROOT
 from rfm.config import ExportConfig, ServeConfig
-from rfm.launch.endpoints import PORT_STEP, free_ports
-from rfm.supervise.supervisor import GatewayProcess, Supervisor
+from rfm.serve.access import PORT_STEP, free_ports
+from rfm.serve.supervisor import GatewayProcess, Supervisor
 from rfm_client.options import ConfigError
 from rfm_commands import cli
 from rfm_commands.config import SECTIONS, Config

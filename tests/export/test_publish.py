@@ -23,7 +23,7 @@ from engines import serve_config
 from in_process import rfm
 from rfm import published
 from rfm.files import CheckpointError
-from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
+from rfm.serve.repository_api import RepositoryApi, RepositoryApiError
 from rfm_export import ExportError
 from rfm_export.publish import alone, read_config, staging
 from servers import Served

@@ -25,7 +25,7 @@ from rfm import families, published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.files import CheckpointError
-from rfm.launch.installation import Installation
+from rfm.serve.installation import Installation
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,

@@ -24,7 +24,7 @@ import yaml
 from gateways import inside
 from paths import ROOT
 from repositories import kill_model
-from rfm.supervise.status import Status
+from rfm.serve.status import Status
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
 from servers import MODEL, Endpoints, Served, serving, wait_for
 from trajectories import random_trajectory

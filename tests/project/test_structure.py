@@ -76,8 +76,7 @@ MAY_IMPORT = {
     **{f"rfm.families.{family}": {*SHARED, "rfm.qwen"} for family in FAMILIES},  # no other family
     "rfm.published": {*SHARED, "rfm.families", "rfm.qwen"},
     "rfm.triton_model": {"rfm.engine", "rfm.files", "rfm.parameters", "rfm.probe_request", "rfm_client.contract"},
-    "rfm.launch": {"rfm.config", "rfm.parameters", "rfm_client.contract"},
-    "rfm.supervise": {"rfm.launch", "rfm.probe_request", "rfm_client.contract"},
+    "rfm.serve": {"rfm.config", "rfm.parameters", "rfm.probe_request", "rfm_client.contract"},
     "rfm.engine": {"rfm.config", "rfm.files", "rfm_client.contract"},
     "rfm": {"rfm_client.contract"},
     "rfm_export": {"rfm", "rfm_client.contract"},
@@ -217,7 +216,7 @@ LOADS = {  # modules: packages that must not be loaded with them
     "rfm.engine": {"transformers", "PIL", "av", "matplotlib"},
     ", ".join(f"rfm.families.{family}" for family in FAMILIES): {"rfm.published", "transformers", "huggingface_hub"},
     "rfm_labels": {*EXTRAS, "h5py", "pyarrow", "fsspec", "ray", "scipy", "sklearn", "torch"} - {"async_timeout"},
-    "rfm_commands.cli, rfm_commands.rollout, rfm.supervise.supervisor": {"torch"},  # two seconds and 200 MB
+    "rfm_commands.cli, rfm_commands.rollout, rfm.serve.supervisor": {"torch"},  # two seconds and 200 MB
 }
 
 
@@ -230,7 +229,7 @@ def test_a_module_starts_without_what_it_may_not_need(modules: str) -> None:
 
 def test_the_domain_knows_nothing_of_triton() -> None:
     for file in (ROOT / "rfm").rglob("*.py"):
-        if not {"launch", "supervise", "triton_model"} & set(file.parts):
+        if not {"serve", "triton_model"} & set(file.parts):
             assert not [name for name in imports(file) if "triton" in name.replace("rfm_triton", "")], file
 
 

@@ -15,10 +15,9 @@ from tritonclient.utils import InferenceServerException
 
 from commands import REPOSITORY
 from in_process import rfm
-from rfm.launch.admin_key import VARIABLE, take_key
-from rfm.launch.installation import Installation, ServerStartError, find_installation
-from rfm.launch.triton_options import MAX_HTTP_BYTES, size_limits
-from rfm.launch.triton_server import TritonServer
+from rfm.serve.access import VARIABLE, take_key
+from rfm.serve.installation import Installation, ServerStartError, find_installation
+from rfm.serve.triton_server import MAX_HTTP_BYTES, TritonServer, size_limits
 from rfm_client.options import InvalidValueError
 from servers import KEY, Endpoints, Served
 

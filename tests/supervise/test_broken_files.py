@@ -13,10 +13,10 @@ import pytest
 from commands import REPOSITORY, nothing_left_behind
 from in_process import rfm
 from repositories import changing
-from rfm.launch.installation import ServerStartError
-from rfm.launch.repository_check import fault_in
-from rfm.launch.triton_server import TritonServer
 from rfm.parameters import EXPORT_PARAMETER, PYTHON_PARAMETERS
+from rfm.serve.installation import ServerStartError
+from rfm.serve.repository import fault_in
+from rfm.serve.triton_server import TritonServer
 from rfm_client.contract.description import DESCRIPTION_PARAMETER
 from servers import Endpoints, find_installation
 

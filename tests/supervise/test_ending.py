@@ -12,13 +12,13 @@ import psutil
 import pytest
 
 from commands import is_alive
-from rfm.launch.ending import ProcessGroup, how_it_ended
+from rfm.serve.processes import ProcessGroup, how_it_ended
 from servers import PATIENCE_S, children, wait_for
 
 AT_ONCE_S = 10.0  # a model process used to stay for two minutes
 GROUP = """
 import ctypes, os, sys, time
-from rfm.launch.ending import ProcessGroup
+from rfm.serve.processes import ProcessGroup
 ctypes.CDLL(None).prctl(36, 1)  # PR_SET_CHILD_SUBREAPER: as the first process of a container
 group = ProcessGroup(["/bin/sh", "-c", "trap '' HUP; sleep 600 & sleep 601 & wait"])
 """
@@ -46,7 +46,7 @@ def test_a_process_that_is_killed_takes_its_groups_along() -> None:
 
 def test_an_ended_group_leaves_no_orphan_and_no_zombie() -> None:
     code = """
-from rfm.launch.model_processes import children_of
+from rfm.serve.processes import children_of
 while len(list(children_of(group.process.pid))) < 2:
     time.sleep(0.01)
 os.kill(group.process.pid, 9)  # so that its children are orphans

@@ -15,11 +15,11 @@ import stand_in_triton
 from commands import REPOSITORY, nothing_left_behind
 from in_process import rfm
 from rfm.config import ServeConfig
-from rfm.launch import endpoints
-from rfm.launch.endpoints import PORTS, Endpoints, GrpcTls, check_version, free_ports
-from rfm.launch.installation import ServerStartError
-from rfm.launch.model_processes import children_of, has_ended
-from rfm.launch.triton_server import TritonServer
+from rfm.serve import access
+from rfm.serve.access import PORTS, Endpoints, GrpcTls, check_version, free_ports
+from rfm.serve.installation import ServerStartError
+from rfm.serve.processes import children_of, has_ended
+from rfm.serve.triton_server import TritonServer
 from rfm_client.options import ConfigError
 from secured import Papers
 from servers import wait_for
@@ -37,7 +37,7 @@ def test_rfm_serve_says_what_others_may_not_reach(caplog: pytest.LogCaptureFixtu
 
 def test_an_older_triton_that_listens_elsewhere_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stand-in, which tells the version only when it runs, unlike the wheel's. No address counts as loopback."""
-    monkeypatch.setattr(endpoints, "is_loopback", lambda _: False)
+    monkeypatch.setattr(access, "is_loopback", lambda _: False)
     repository, program = stand_in_triton.repository(tmp_path, "a"), stand_in_triton.installation(tmp_path)
     with (
         nothing_left_behind(),
@@ -96,7 +96,7 @@ def test_ports_are_free_and_given_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(given) <= set(PORTS)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        monkeypatch.setattr(endpoints, "PORTS", range(port, port + 1))
+        monkeypatch.setattr(access, "PORTS", range(port, port + 1))
         with pytest.raises(OSError, match="ports: expected 1 free ones in"):
             free_ports(1)
 

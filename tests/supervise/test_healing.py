@@ -18,9 +18,8 @@ import pytest
 import stand_in_triton
 from commands import is_alive, running
 from patients import answering, calling, make_repository
-from rfm.launch import cleanup
-from rfm.launch.cleanup import SHARED_MEMORY
-from rfm.supervise.status import NO_REASON
+from rfm.serve.processes import SHARED_MEMORY, clear_shared_memory
+from rfm.serve.status import NO_REASON
 from servers import (
     MODEL,
     PATIENCE_S,
@@ -88,6 +87,7 @@ def test_a_start_is_repeated_when_a_model_process_is_killed(tmp_path: Path) -> N
             assert killed.result().isdisjoint(model_processes(server.pid))
 
 
+@pytest.mark.alone
 def test_a_killed_server_without_a_log_leaves_nothing_running_and_the_next_removes_the_rest(tmp_path: Path) -> None:
     """With a stand-in for Triton, in a container whose process ids mean nothing here, if this user may make one."""
     apart = ["unshare", "--map-root-user", "--pid", "--fork", "--kill-child", "--mount-proc"]
@@ -124,7 +124,7 @@ def test_a_killed_server_without_a_log_leaves_nothing_running_and_the_next_remov
         assert len(started) >= 4
         own = {*SHARED_MEMORY.glob(f"{prefix}*")}
         assert own
-        assert not own & set(cleanup.clear())  # it lives
+        assert not own & set(clear_shared_memory())  # it lives
         assert own == {*SHARED_MEMORY.glob(f"{prefix}*")}
     finally:
         killed.kill()

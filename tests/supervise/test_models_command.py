@@ -19,7 +19,7 @@ from engines import load_engine, serve_config
 from in_process import rfm
 from reward_models import ROOT
 from rfm.config import ExportConfig
-from rfm.launch.repository_api import RepositoryApiError
+from rfm.serve.repository_api import RepositoryApiError
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_commands import rollout as rfm_rollout
 from rfm_commands.rollout import Rollout, RolloutError

@@ -26,10 +26,10 @@ from commands import EXIT_S, REPOSITORY, RFM, command, is_alive, nothing_left_be
 from in_process import rfm
 from paths import ROOT
 from rfm.config import ExportConfig
-from rfm.launch import installation
-from rfm.launch.endpoints import free_ports
-from rfm.launch.installation import ServerStartError, find_installation
-from rfm.launch.triton_server import Endpoints, TritonServer, short_spin
+from rfm.serve import installation
+from rfm.serve.access import free_ports
+from rfm.serve.installation import ServerStartError, find_installation
+from rfm.serve.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.contract.descriptors import MOST
 from servers import children, model_processes, wait_for

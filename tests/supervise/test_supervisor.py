@@ -22,12 +22,11 @@ import pytest
 
 import stand_in_triton
 from commands import running
-from rfm.launch import model_processes, triton_server
-from rfm.launch.model_processes import LOADING_DEAD_S, UNKNOWN, ModelProcesses
-from rfm.launch.triton_server import TritonServer
-from rfm.supervise import probe, status, supervisor, watch
-from rfm.supervise.status import NO_REASON, Status, StatusServer
-from rfm.supervise.supervisor import MOST, STEADY_S, BackOff, CrashLoopError, GatewayProcess, Supervisor
+from rfm.serve import probe, processes, status, supervisor, triton_server, watch
+from rfm.serve.processes import LOADING_DEAD_S, UNKNOWN, ModelProcesses
+from rfm.serve.status import NO_REASON, Status, StatusServer
+from rfm.serve.supervisor import MOST, STEADY_S, BackOff, CrashLoopError, GatewayProcess, Supervisor
+from rfm.serve.triton_server import TritonServer
 from servers import Endpoints, Serving, wait_for
 
 SILENT_S, HANG_S = 1.5, 1.5
@@ -183,7 +182,7 @@ PROCESSES: dict[str, tuple[list[tuple[str, str]], dict[str, int] | None, bool, f
 def test_a_dead_process_counts_unless_it_was_replaced(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     processes, wanted, is_settled, counts_s = PROCESSES[name]
     now_s = 0.0
-    monkeypatch.setattr(model_processes, "time", SimpleNamespace(monotonic=lambda: now_s))
+    monkeypatch.setattr(processes, "time", SimpleNamespace(monotonic=lambda: now_s))
     stubs = Stubs()
     stubs.states = dict(enumerate(processes))
     for now_s in (0.0, 0.1, LOADING_DEAD_S - 0.1, LOADING_DEAD_S, 100.0):
@@ -198,7 +197,7 @@ def test_a_fault_of_a_load_counts_for_the_model_that_loads_and_is_part_of_no_cra
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor, "MOST", 1)
-    monkeypatch.setattr(model_processes, "LOADING_DEAD_S", 0.2)
+    monkeypatch.setattr(processes, "LOADING_DEAD_S", 0.2)
     with supervised(tmp_path, "a", "b") as stage:
         for number in (1, 2):
             stage.file("loading-b").touch()

@@ -16,9 +16,8 @@ from typing import Any
 import psutil
 
 from paths import ROOT
-from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
-from rfm.launch.endpoints import Endpoints
-from rfm.launch.model_processes import has_ended
+from rfm.serve.access import Endpoints
+from rfm.serve.processes import REGION_PREFIX, SHARED_MEMORY, has_ended
 from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"

@@ -23,7 +23,7 @@ import uvicorn
 from fastapi import FastAPI
 from prometheus_client.parser import text_string_to_metric_families
 
-from rfm.launch.endpoints import free_ports
+from rfm.serve.access import free_ports
 from rfm_client import AsyncRewardClient, DeadlineExceededError, ModelInfo, ModelNotFoundError, RewardClient
 from rfm_gateway import GatewayConfig
 from rfm_gateway.app import create_app

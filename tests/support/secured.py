@@ -8,7 +8,7 @@ from pathlib import Path
 
 import trustme
 
-from rfm.launch.installation import Installation, find_installation
+from rfm.serve.installation import Installation, find_installation
 
 PUBLIC_HOST = "127.0.0.2"  # stands for an address that others reach
 

@@ -28,12 +28,12 @@ import goldens
 import rfm_export
 from commands import RFM, own_regions, running
 from engines import serve_config
-from rfm.launch.endpoints import Endpoints
-from rfm.launch.endpoints import GrpcTls as GrpcTls
-from rfm.launch.installation import Installation, find_installation
-from rfm.launch.model_processes import children_of
-from rfm.launch.repository_api import RepositoryApi
-from rfm.launch.triton_server import TritonServer
+from rfm.serve.access import Endpoints
+from rfm.serve.access import GrpcTls as GrpcTls
+from rfm.serve.installation import Installation, find_installation
+from rfm.serve.processes import children_of
+from rfm.serve.repository_api import RepositoryApi
+from rfm.serve.triton_server import TritonServer
 from rfm_client import RewardClient
 
 CRASHES: list[Path] = []  # repositories whose Triton aborted, or started twice

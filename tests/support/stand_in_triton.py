@@ -102,7 +102,7 @@ def repository(folder: Path, *models: str) -> Path:
 
 def installation(folder: Path) -> Any:
     """The program that stands in for Triton."""
-    from rfm.launch.installation import Installation
+    from rfm.serve.installation import Installation
 
     program = folder / "tritonserver"
     program.write_text(f"#!{sys.executable}\n{Path(__file__).read_text()}")

@@ -20,7 +20,7 @@ import rfm_export
 from engines import serve_config
 from mixtures import TOLD_S, mixed_samples
 from patients import make_repository
-from rfm.launch.installation import Installation, find_installation
+from rfm.serve.installation import Installation, find_installation
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
 from rfm_client import (

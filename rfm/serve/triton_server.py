@@ -4,34 +4,90 @@
 from __future__ import annotations
 
 import json
+import mmap
 import os
 import re
 import signal
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from http import HTTPStatus
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any
+from types import FrameType, TracebackType
+from typing import IO, Any, NoReturn
 from urllib.parse import quote
 
 from google.protobuf import text_format
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
-from rfm.launch.admin_key import http_headers, new_key, restrictions
-from rfm.launch.cleanup import NEEDS_ROOM, Claim
-from rfm.launch.ending import EXIT_TIMEOUT_S, ProcessGroup, how_it_ended
-from rfm.launch.endpoints import Endpoints, check_version
-from rfm.launch.http import NO_ANSWER, Http
-from rfm.launch.installation import WHEEL_VERSION, Installation, ServerStartError
-from rfm.launch.model_processes import UNKNOWN, ModelProcesses
-from rfm.launch.repository_api import INDEX_PATH, versions_of
-from rfm.launch.repository_check import check_models
-from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
-from rfm.launch.triton_options import check_arguments, size_limits
 from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE
+from rfm.serve.access import Endpoints, check_version, http_headers, new_key, restrictions
+from rfm.serve.installation import WHEEL_VERSION, Installation, ServerStartError, find_installation
+from rfm.serve.probe import NO_ANSWER, Http
+from rfm.serve.processes import (
+    EXIT_TIMEOUT_S,
+    NEEDS_ROOM,
+    UNKNOWN,
+    Claim,
+    ModelProcesses,
+    ProcessGroup,
+    how_it_ended,
+    stop_signals_to,
+)
+from rfm.serve.repository import CONFIG_FILE, check_models, models_in, no_models
+from rfm.serve.repository_api import INDEX_PATH, versions_of
+
+MAX_HTTP_BYTES = 256 * 2**20  # of a request's body; gRPC takes 2 GiB
+# Also refused, besides the options that rfm serve sets: their aliases, and options that break a start.
+_KEPT = {
+    "--model-store",
+    "--backend-directory",
+    "--http-thread-count",
+    "--allow-http",
+    "--allow-grpc",
+    "--allow-metrics",
+    "--reuse-http-port",
+    "--reuse-grpc-port",
+    "--grpc-use-ssl",
+    "--grpc-use-ssl-mutual",
+    "--grpc-server-cert",
+    "--grpc-server-key",
+    "--grpc-root-cert",
+}
+# Users may repeat these for other APIs. Triton refuses to start with two keys for the same API.
+_REPEATED = {"--http-restricted-api", "--grpc-restricted-protocol"}
+_SIZE_OPTION = "http-max-input-size"
+_ARGUMENT = re.compile(r"(--[a-z][a-z0-9-]+)=.*")
+
+
+def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
+    """Raise ServerStartError for an option of ``own``, also abbreviated, and for anything but ``--option=value``."""
+    kept = {argument.partition("=")[0] for argument in own} - _REPEATED | _KEPT
+    for argument in more:
+        match = _ARGUMENT.fullmatch(argument)
+        if match is None:
+            raise ServerStartError.at("tritonserver", "--option=value", argument.partition("=")[0])
+        if match[1] not in _REPEATED and any(option.startswith(match[1]) for option in kept):
+            raise ServerStartError.at("tritonserver", "an option that rfm serve leaves open", match[1])
+
+
+def size_limits(installation: Installation, given: Sequence[str]) -> list[str]:
+    """Return the option that limits a request's size; empty if ``given`` has it, or tritonserver (2.51) lacks it."""
+    if any(argument.startswith(f"--{_SIZE_OPTION}=") for argument in given):
+        return []
+    return [f"--{_SIZE_OPTION}={MAX_HTTP_BYTES}"] if _knows(installation.executable, _SIZE_OPTION) else []
+
+
+def _knows(program: Path, option: str) -> bool:
+    """True if the program file contains the option's name. ``--help`` would start Triton."""
+    try:
+        with program.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            return content.find(option.encode()) >= 0
+    except (OSError, ValueError):  # unreadable or empty: the start gives the reason
+        return False
+
 
 POLL_S = 0.1
 LOAD_S = 1800.0
@@ -46,7 +102,6 @@ _REMEDIES = {  # by a pattern of the reason why a model is not loaded
 }
 _DIED = "Stub process .* is not healthy"  # Triton's words for a process that died during a load
 _REGIONS = "--backend-config=python,shm-region-prefix-name="
-
 Config = Mapping[str, Any]  # a model's configuration in Triton's JSON
 
 
@@ -303,3 +358,26 @@ def _names_the_same_versions(repository: Path, model: str, config: Config) -> bo
     if not file.version_policy.HasField("specific"):  # a model of another program
         return True
     return bool(list(file.version_policy.specific.versions) == config["version_policy"]["specific"]["versions"])
+
+
+@contextmanager
+def stopped_by_signals() -> Iterator[None]:
+    """Context manager in which a stop signal raises SystemExit, so that inner contexts clean up."""
+
+    def leave(number: int, _frame: FrameType | None) -> NoReturn:
+        raise SystemExit(128 + number)
+
+    with stop_signals_to(leave):
+        yield
+
+
+@contextmanager
+def temporary_server(repository: Path, log: Path, tritonserver: Path | None = None) -> Iterator[Endpoints]:
+    """Context manager with a server on free ports and its log in a file. Raises ServerStartError."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    installation = find_installation(tritonserver)
+    with (
+        log.open("wb") as lines,
+        TritonServer(repository, Endpoints.free(), installation, log=lines) as server,
+    ):
+        yield server.endpoints

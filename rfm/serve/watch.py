@@ -21,26 +21,22 @@ from contextlib import suppress
 from functools import partial
 from urllib.parse import quote
 
-from rfm.launch.admin_key import http_headers
-from rfm.launch.http import NO_ANSWER, Http
-from rfm.launch.model_processes import ModelProcesses
-from rfm.launch.repository_api import INDEX_PATH, LOADING, UNLOADING, ModelVersion, versions_of
-from rfm.launch.triton_server import Config, TritonServer
-from rfm.supervise.probe import Probe, can_be_probed
-from rfm.supervise.status import NO_REASON, Status
+from rfm.serve.access import http_headers
+from rfm.serve.probe import NO_ANSWER, Http, Probe, can_be_probed
+from rfm.serve.processes import ModelProcesses
+from rfm.serve.repository_api import INDEX_PATH, LOADING, UNLOADING, ModelVersion, versions_of
+from rfm.serve.status import NO_REASON, Status
+from rfm.serve.triton_server import Config, TritonServer
 
 LOOK_S = 0.5
 LOOKS = 3  # a restart needs at least so many looks without an answer
-
 _TIMEOUT_S = 1.5
 _INDEX_TIMEOUT_S = 5.0
 _PROGRESS = re.compile(  # counts that grow with a model's progress
     r'^(?:nv_inference_request_success|rfm_forward_passes_total)\{[^}]*\bmodel="(?P<model>[^"]+)".*\} (?P<count>\S+)$',
     re.MULTILINE,
 )
-
 TRITON = "triton"
-
 logger = logging.getLogger(__name__)
 
 

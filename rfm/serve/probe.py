@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Probes: a synthetic request to a model every few seconds."""
+"""Ask a running Triton: HTTP requests that bound their time, and a probe of each model."""
 
 from __future__ import annotations
 
+import http.client
 import json
 import threading
 import time
@@ -12,14 +13,52 @@ from typing import Any
 
 from tritonclient.utils import np_to_triton_dtype
 
-from rfm.launch.http import NO_ANSWER, Http
 from rfm.probe_request import probe_request
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
 
+PROBE_TIMEOUT_S = 1.0  # for answers without a model
+
+
+class UnreadableAnswerError(Exception):
+    """An answer with a status other than 200, or without JSON."""
+
+
+NO_ANSWER = (OSError, http.client.HTTPException, UnreadableAnswerError)
+
+
+class Http:
+    """The server at ``host:port``. Its methods raise NO_ANSWER.
+
+    headers: sent with each request
+    """
+
+    def __init__(self, host: str, port: int, headers: Mapping[str, str] | None = None) -> None:
+        self._address, self._headers = (host, port), headers or {}
+
+    def request(self, method: str, path: str, timeout_s: float, body: bytes | None = None) -> tuple[int, str]:
+        """Send a request. Return status and content of the answer."""
+        connection = http.client.HTTPConnection(*self._address, timeout=timeout_s)
+        try:
+            connection.request(method, path, body, self._headers)
+            answer = connection.getresponse()
+            return answer.status, answer.read().decode(errors="replace")
+        finally:
+            connection.close()
+
+    def json(self, path: str, timeout_s: float = PROBE_TIMEOUT_S, method: str = "GET") -> Any:
+        """Send a request. Return the JSON of the answer."""
+        status, text = self.request(method, path, timeout_s)
+        if status != http.client.OK:
+            raise UnreadableAnswerError(f"{path}: {status} {text}")
+        try:
+            return json.loads(text)
+        except ValueError as error:
+            raise UnreadableAnswerError(f"{path}: {error}") from error
+
+
 BROKEN_COUNT, BROKEN_S = 3, 30.0  # a model is broken after so many failed probes in a row, over so long
 SHARE = 0.1  # largest share of a model's time
-
 _OUTPUTS = (wire.PROGRESS, wire.VIDEO_EMBEDDINGS)
 
 

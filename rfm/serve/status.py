@@ -19,7 +19,6 @@ from rfm_client.contract.listening import ListenAddress
 
 NO_REASON = ""  # of a ready model
 REQUEST_S = 5.0  # longest silence of a connection
-
 _BUCKETS_S = tuple(digit * 10.0**power for power in range(-3, 2) for digit in (1, 2, 5))
 
 

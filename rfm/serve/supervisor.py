@@ -13,12 +13,11 @@ from contextlib import closing, nullcontext
 from dataclasses import KW_ONLY, dataclass
 from types import FrameType
 
-from rfm.launch import cleanup
-from rfm.launch.ending import ProcessGroup, how_it_ended, stop_signals_to
-from rfm.launch.installation import ServerStartError
-from rfm.launch.triton_server import POLL_S, Config, SpoiltStartError, TritonServer
-from rfm.supervise.status import Status, StatusServer
-from rfm.supervise.watch import TRITON, TritonWatch
+from rfm.serve.installation import ServerStartError
+from rfm.serve.processes import ProcessGroup, clear_shared_memory, how_it_ended, stop_signals_to
+from rfm.serve.status import Status, StatusServer
+from rfm.serve.triton_server import POLL_S, Config, SpoiltStartError, TritonServer
+from rfm.serve.watch import TRITON, TritonWatch
 
 GATEWAY = "gateway"
 STEADY_S = 60.0  # after a longer run, a process is not in a crash loop
@@ -27,7 +26,6 @@ ASK_S = 1.0  # between the requests to the gateway
 TRIES = 2  # requests in a row without an answer; one alone may be due to a machine that stood still
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 GATEWAY_PAUSE_S = 5.0  # between its starts
-
 logger = logging.getLogger(__name__)
 
 
@@ -148,7 +146,7 @@ class Supervisor:
 
     def run(self) -> None:
         """Serve until a stop signal. Raises ServerStartError for a failed start or a crash loop."""
-        for path in cleanup.clear():
+        for path in clear_shared_memory():
             logger.info("removed %s, left by a killed server", path)
         self._status.record(dict.fromkeys(self.server.models, "it is loading"))
         for what in (TRITON, *self.server.models, *(() if self.gateway is None else (GATEWAY,))):

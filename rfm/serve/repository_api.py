@@ -16,7 +16,7 @@ import tritonclient.grpc
 from google.protobuf.json_format import MessageToDict
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
-from rfm.launch.admin_key import VARIABLE, grpc_metadata
+from rfm.serve.access import VARIABLE, grpc_metadata
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.checks import require
@@ -29,7 +29,6 @@ READY, LOADING, UNLOADING = "READY", "LOADING", "UNLOADING"
 POLL_S = 0.1
 ANSWER_S = 1800.0  # for a request; a load answers after the warm-up
 FINISH_S = 600.0  # for requests in flight on an old version
-
 _CHANNEL = [
     ("grpc.min_reconnect_backoff_ms", 10_000),  # also bounds the time to connect
     ("grpc.enable_http_proxy", 0),
