@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -37,11 +35,11 @@ def labelled(file: Path) -> UInt8Array:
     return np.stack(list(dataset.frames(episode, "video")))
 
 
-def assert_both_refuse(file: Path, reason: str) -> None:
-    """Both readers give the reason, a pattern."""
+def assert_both_refuse(file: Path, reason: str, of_label: str = "") -> None:
+    """Both readers give a reason, a pattern; ``label`` perhaps another."""
     with pytest.raises(InvalidSampleError, match=rf"^video: {reason}.* \({file}\)$"):
         read_video(file)
-    with pytest.raises(DatasetError, match=rf"{file}: {reason}"):
+    with pytest.raises(DatasetError, match=rf"{file}: {of_label or reason}"):
         labelled(file)
 
 
@@ -78,60 +76,6 @@ def test_packets_that_are_not_shown_are_no_frames(tmp_path: Path) -> None:
     assert numbers(read_video(file, 5), 10) == [4, 6, 9]
 
 
-# Pixel format, matrix and range (1: limited, 2: full) of a video, as ITU-T H.273 numbers them; 2: no matrix is named.
-COLOURS = {
-    "BT.709": ("yuv420p", 1, 1),
-    "BT.709, 10 bits": ("yuv420p10le", 1, 1),
-    "BT.601": ("yuv420p", 6, 1),
-    "no matrix": ("yuv420p", 2, 1),
-    "SMPTE 240M": ("yuv444p", 7, 1),
-    "BT.2020": ("yuv420p", 9, 1),
-}
-WEIGHTS = {1: (0.2126, 0.0722), 7: (0.212, 0.087), 9: (0.2627, 0.0593)}  # Kr and Kb; BT.601's where there are none
-BLOCK_PX = 16
-
-
-def rgb(levels: np.ndarray[Any, Any], matrix: int, is_full: bool) -> np.ndarray[Any, Any]:
-    """Convert 8-bit Y, Cb, Cr to float64 [..., 3] in 0..255 (ITU-T H.273, matrix coefficients)."""
-    kr, kb = WEIGHTS.get(matrix, (0.299, 0.114))
-    low, scale, chroma = (0, 255, 255) if is_full else (16, 219, 224)
-    y, pb, pr = (levels[..., 0] - low) / scale, (levels[..., 1] - 128) / chroma, (levels[..., 2] - 128) / chroma
-    red, blue = y + 2 * (1 - kr) * pr, y + 2 * (1 - kb) * pb
-    return np.clip(np.stack([red, (y - kr * red - kb * blue) / (1 - kr - kb), blue], -1) * 255, 0, 255)
-
-
-def write_levels(file: Path, levels: UInt8Array, pixels: str, matrix: int, full: int) -> None:
-    """Write a lossless video of coloured blocks. levels: uint8 [rows, columns, 3]"""
-    with av.open(str(file), "w") as container:
-        stream: Any = container.add_stream("libx264", rate=10, options={"qp": "0"})
-        stream.height, stream.width, stream.pix_fmt = *(BLOCK_PX * n for n in levels.shape[:2]), pixels
-        stream.codec_context.colorspace, stream.codec_context.color_range = matrix, full
-        frame = av.VideoFrame(stream.width, stream.height, pixels)
-        frame.colorspace, frame.color_range = matrix, full
-        for plane, channel in zip(frame.planes, np.moveaxis(levels, -1, 0), strict=True):
-            size = (plane.height // levels.shape[0], plane.width // levels.shape[1])
-            is_deep = pixels.endswith("10le")
-            values = np.kron(channel, np.ones(size, np.uint8)).astype("<u2" if is_deep else np.uint8) << 2 * is_deep
-            padded = np.zeros((plane.height, plane.line_size // values.itemsize), values.dtype)
-            padded[:, : plane.width] = values
-            plane.update(padded.tobytes())
-        for _ in range(2):
-            container.mux(stream.encode(frame))
-            frame.pts = None
-        container.mux(stream.encode())
-
-
-@pytest.mark.parametrize(("pixels", "matrix", "full"), COLOURS.values(), ids=COLOURS)
-def test_colours_are_those_of_the_video_s_matrix_and_range(tmp_path: Path, pixels: str, matrix: int, full: int) -> None:
-    """With any PyAV: some versions decode every video as BT.601, 6 to 29 levels off."""
-    levels = np.random.default_rng(0).integers(60, 190, (6, 8, 3), np.uint8)
-    write_levels(tmp_path / "video.mp4", levels, pixels, matrix, full)
-    read = read_video(tmp_path / "video.mp4")[0]
-    centres = read[BLOCK_PX // 2 :: BLOCK_PX, BLOCK_PX // 2 :: BLOCK_PX]
-    assert np.abs(centres - rgb(levels.astype(float), matrix, full == 2)).max() < 3.5  # libswscale rounds
-    np.testing.assert_array_equal(labelled(tmp_path / "video.mp4")[0], read)
-
-
 GREY = {"gray": False, "gray10le": True, "gray16le": True, "yuv420p10le": False, "bgr0": False}
 
 
@@ -162,7 +106,7 @@ def write_streams(file: Path, *videos: tuple[UInt8Array, bool]) -> None:
                 container.mux(stream.encode(frame))
 
 
-def test_cover_art_is_no_video(tmp_path: Path) -> None:
+def test_cover_art_is_no_video_and_a_file_of_several_videos_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "video.mp4"
     write_streams(file, (numbered(1)[:, :16], True), (numbered(5), False))
     with av.open(str(file)) as container:
@@ -171,10 +115,6 @@ def test_cover_art_is_no_video(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame_times_s(file, 5), np.arange(5) / 10)
     write_streams(file, (numbered(1), True))
     assert_both_refuse(file, "expected a file with a video stream, got none")
-
-
-def test_a_file_of_several_videos_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "video.mp4"
     write_streams(file, (numbered(1)[:, :16], False), (numbered(1), True), (numbered(5), False))
     refused = (
         r"expected one video stream \(take one: ffmpeg -i IN -map 0:v:N -c copy OUT\), "
@@ -185,38 +125,21 @@ def test_a_file_of_several_videos_is_refused(tmp_path: Path) -> None:
         frame_times_s(file, 5)
 
 
-def at_irregular_times(file: Path, frames: UInt8Array) -> None:
-    write_video(file, frames, times=[2 * t + 30 * (t > 10) + 90 * (t == len(frames) - 1) for t in range(len(frames))])
-
-
 def coded(codec: str = "libx264", **more: Any) -> Write:
     """Writes a video with this codec. more: as in ``encode_here``"""
     return lambda file, frames: encode_here(file, frames, codec, **more)
 
 
-def recorded_live(file: Path, frames: UInt8Array) -> None:
-    """A file that cannot seek, like a pipe."""
-    codec, format = ("mpeg4", "avi") if file.suffix == ".avi" else ("libx264", "matroska")
-    with file.open("wb") as opened:
-        encode_here(SimpleNamespace(write=opened.write), frames, codec, format=format)
-
-
 CONTAINERS: dict[str, tuple[str, Write]] = {
     "Matroska": ("video.mkv", write_video),
-    "Matroska of a variable rate": ("video.mkv", at_irregular_times),
-    "WebM": ("video.webm", coded("libvpx", options={"deadline": "realtime"})),
     "MP4": ("video.mp4", write_video),
     "MP4 with its index in front": ("video.mp4", coded(of_container={"movflags": "+faststart"})),
     "MP4 in fragments": ("video.mp4", coded(of_container={"movflags": "+frag_keyframe+empty_moov"})),
     "AVI": ("video.avi", coded("mpeg4")),
     "GIF": ("video.gif", coded("gif", pixels="rgb8")),
     "Ogg": ("video.ogv", coded("libvpx", options={"deadline": "realtime"})),
-    "Matroska recorded live": ("video.mkv", recorded_live),
-    "AVI recorded live": ("video.avi", recorded_live),
     "MPEG-TS": ("video.ts", coded()),
-    "MPEG-PS": ("video.mpg", coded("mpeg2video", rate=Fraction(25))),
     "FLV": ("video.flv", coded("flv")),
-    "ASF": ("video.wmv", coded("wmv2")),
 }
 
 
@@ -277,13 +200,6 @@ def remux(source: Path, target: Path, change: Callable[[list[Any]], list[Any]], 
             part.mux(packet)
 
 
-def assert_label_refuses(file: Path) -> None:
-    (file.parent / "tasks.csv").write_text(f"video,task\n{file.name},stack the cups\n")
-    with pytest.raises(DatasetError, match=file.name):
-        dataset = open_dataset(file.parent)
-        list(dataset.frames(dataset.episodes[0], "video"))
-
-
 OPEN = "open-gop=1:keyint=10:min-keyint=10:scenecut=0:bframes=3"
 STREAMS: dict[str, tuple[str, dict[str, str]]] = {
     "x264": ("libx264", {"g": "10", "bf": "0", "sc_threshold": "0"}),
@@ -306,7 +222,8 @@ def test_a_video_without_its_first_key_frame_is_refused_but_a_part_that_needs_no
     remux(tmp_path / "all.mp4", file, lambda packets: packets[13:])
     with pytest.raises(InvalidSampleError, match=rf"^video: expected 27 frames, one for each packet, got \d+ {LOST}"):
         load_trajectory(file, fps=3)
-    assert_label_refuses(file)
+    with pytest.raises(DatasetError, match=file.name):
+        labelled(file)
     with av.open(str(file)) as container:
         first_s = min(float(packet.pts * packet.time_base) for packet in container.demux(video=0) if packet.size)
     with av.open(str(file)) as container:
@@ -328,11 +245,7 @@ def test_an_hevc_video_without_its_first_key_frame_is_refused_whatever_the_decod
     file = tmp_path / f"video.{suffix}"
     encode_here(tmp_path / "all.mp4", moving(), *X265)
     remux(tmp_path / "all.mp4", file, lambda packets: packets[13:])
-    with pytest.raises(
-        InvalidSampleError, match=r"^video: expected an HEVC video that begins with a key frame \(cut it"
-    ):
-        read_video(file)
-    assert_label_refuses(file)
+    assert_both_refuse(file, r"expected an HEVC video that begins with a key frame \(cut it", "expected ")
 
 
 DROPPED = {  # overwrites the type of a coded picture; unknown to every decoder
@@ -355,9 +268,7 @@ def test_frames_that_the_decoder_drops_amid_a_video_are_missed(
     for begin in begins[-3:]:
         content[begin + 4] = kind
     file.write_bytes(content)
-    with pytest.raises(InvalidSampleError, match=f"^video: {refused}"):
-        read_video(file, 3)
-    assert_label_refuses(file)
+    assert_both_refuse(file, refused, "expected frame 3[57] ")
 
 
 def test_frames_that_a_remuxed_stream_hides_are_missed(tmp_path: Path) -> None:
@@ -378,15 +289,15 @@ def test_frames_that_a_remuxed_stream_hides_are_missed(tmp_path: Path) -> None:
         read_video(file)
     with pytest.raises(InvalidSampleError, match=r"^video: expected frames in the order of their time stamps"):
         read_video(file, start_s=1.0)
-    assert_label_refuses(file)
+    with pytest.raises(DatasetError, match=file.name):
+        labelled(file)
 
 
 def test_a_bare_stream_is_scored_but_not_labelled(tmp_path: Path) -> None:
     encode_here(tmp_path / "video.h264", moving(), format="h264")
     assert len(read_video(tmp_path / "video.h264")) == NUM_FRAMES
-    (tmp_path / "tasks.csv").write_text("video,task\nvideo.h264,stack the cups\n")
     with pytest.raises(DatasetError, match="expected 40 frames with time stamps, got 0"):
-        open_dataset(tmp_path).episodes  # noqa: B018
+        labelled(tmp_path / "video.h264")
 
 
 def test_a_transport_stream_that_ends_inside_a_packet_is_refused(tmp_path: Path) -> None:
@@ -395,8 +306,4 @@ def test_a_transport_stream_that_ends_inside_a_packet_is_refused(tmp_path: Path)
     encode_here(file, moving()[:1].repeat(NUM_FRAMES, axis=0))
     assert len(read_video(file)) == NUM_FRAMES
     file.write_bytes(file.read_bytes()[: 188 * 30 + 90])
-    with pytest.raises(
-        InvalidSampleError, match=r"^video: expected a whole video file, got one that ends inside a picture, after"
-    ):
-        read_video(file)
-    assert_label_refuses(file)
+    assert_both_refuse(file, "expected a whole video file, got one that ends inside a picture, after")
