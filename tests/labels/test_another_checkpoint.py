@@ -11,8 +11,7 @@ import pytest
 from pyarrow import parquet
 
 from labelling import FEW, LEROBOT
-from rfm_client import InferenceFailedError, InvalidSampleError, ProgressResult, RewardClient
-from rfm_client.frames import Sampling
+from rfm_client import InvalidSampleError, RewardClient
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset
 from shelves import V1, V2, Kept, Shelf
 
@@ -72,10 +71,3 @@ def test_servers_of_different_checkpoints_are_refused_at_once(output: Path) -> N
     ):
         labelled(output, *shelves)
     assert (shelves[0].count, shelves[1].count) == (0, 0)
-
-
-def test_a_curve_of_several_versions_is_none() -> None:
-    score = np.ones(1, np.float32)
-    results = [ProgressResult(progress=score, success=score, model_version=version) for version in ("1", "2")]
-    with pytest.raises(InferenceFailedError, match="model_version: expected one for all frames, got 1, 2"):
-        Sampling("all", None).joined(results)

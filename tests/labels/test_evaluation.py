@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -17,10 +16,11 @@ from pyarrow import parquet
 
 from in_process import rfm_client
 from labelling import FEW, LEROBOT, WRIST, BrightnessScorer
-from rfm_labels import DatasetError, LabelOptions, evaluate_labels, label, open_dataset, read_outcomes
-from rfm_labels.evaluation import kendall, spearman
+from rfm_client import FrameScores
+from rfm_labels import DatasetError, LabelOptions, evaluate_labels, label, open_dataset, read_outcomes, summarise
 from rfm_labels.label_files import read_cost
 from rfm_labels.metadata import Cost
+from rfm_labels.summary import voted_success
 from shown_datasets import copied
 
 Curves = Mapping[int, Sequence[float]]
@@ -38,22 +38,6 @@ def labels(file: Path, progress: Curves, success: Curves | None = None) -> Path:
     return file
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_rank_correlations_are_those_of_slow_formulas(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    values = random.integers(0, 6, random.integers(2, 30)).astype(np.float32)  # with ties
-    time = np.arange(len(values))
-    pairs = list(itertools.combinations(range(len(values)), 2))
-    signs = [int(np.sign(values[later] - values[earlier])) for earlier, later in pairs]
-    untied = sum(sign != 0 for sign in signs)
-    if not untied:
-        assert kendall(values) is spearman(values, time) is None
-        return
-    assert kendall(values) == pytest.approx(sum(signs) / np.sqrt(len(pairs) * untied))
-    ranks = [np.mean(np.flatnonzero(np.sort(values) == value)) for value in values]
-    assert spearman(values, time) == pytest.approx(float(np.corrcoef(ranks, time)[0, 1]))
-
-
 def test_successes_are_told_from_failures(tmp_path: Path) -> None:
     final = {0: 0.9, 1: 0.8, 2: 0.8, 3: 0.1}  # the last of each episode; a success ties with a failure
     success = {0: [0.9, 0.0, 0.7, 0.7], 1: [0.4, 0.4], 2: [0.9, 0.9, 0.3, 0.3, 0.9], 3: [0.1] * 4}  # the last 3 vote
@@ -68,6 +52,30 @@ def test_successes_are_told_from_failures(tmp_path: Path) -> None:
     assert (found.by_success.auroc, found.by_success.balanced_accuracy) == (1.0, 1.0)
     assert found.by_success.threshold == pytest.approx(0.4)
     assert (found.final_of_successes, found.final_of_failures) == (pytest.approx(0.85), pytest.approx(0.45))
+
+
+def test_the_last_three_frames_decide_who_succeeds_and_an_undone_success_is_a_class_of_its_own(tmp_path: Path) -> None:
+    success = {
+        0: [0, 0, 0.9, 0.9],
+        1: [0.9, 0.9, 0.1, 0.2],
+        2: [0.1] * 4,
+        3: [0, 0, 0, 0.9],
+        4: [0.9, 0, 0.9],
+        5: [0.8, 0],
+    }
+    file = labels(tmp_path / "rfm_progress.parquet", success, success)
+    rows = dict(summarise(file).rows())
+    assert {name: row for name, row in rows.items() if name.startswith("episodes that")} == {
+        "episodes that succeed": "2: 0, 4",
+        "episodes that succeed, then undo it": "3: 1, 3, 5",
+        "episodes that never succeed": "1: 2",
+    }
+    for values in success.values():
+        scores = FrameScores(progress=np.float32(values), success=np.float32(values))
+        assert scores.succeeded(last=3) == (voted_success(scores.success) >= 0.5)
+    done = rfm_client("label", file, "--report")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "rfm_summary.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_of_two_thresholds_that_are_equally_good_the_lower_counts(tmp_path: Path) -> None:
@@ -138,15 +146,19 @@ def written(file: Path, text: str) -> str:
 
 
 def test_outcomes_are_read_from_a_table_the_frames_or_the_episodes(tmp_path: Path) -> None:
-    assert read_outcomes(written(tmp_path / "a.csv", "\ufeffepisode,success\n0,1\n1,FALSE\n")) == {0: True, 1: False}
+    outcomes = read_outcomes(written(tmp_path / "a.csv", "\ufeffepisode,success\n0,1\n1,FALSE\n2,\n"))
+    assert outcomes == {0: True, 1: False, 2: None}
     v30, v21 = copied("toy_v30_many", tmp_path), copied("toy_v21", tmp_path)
     for file in sorted(v30.rglob("data/**/*.parquet")):
         table = parquet.read_table(file)
         done = np.append(np.diff(table["episode_index"].to_numpy()) != 0, True)
         done &= table["episode_index"].to_numpy() % 2 == 0
-        parquet.write_table(table.append_column("next.success", pa.array(done)), file)
+        gaps = table["episode_index"].to_numpy() == 3
+        parquet.write_table(table.append_column("next.success", pa.array(done, mask=gaps)), file)
     outcomes = read_outcomes("next.success", v30)
-    assert outcomes == {episode.index: episode.index % 2 == 0 for episode in open_dataset(v30).episodes}
+    assert outcomes == {
+        each.index: each.index % 2 == 0 if each.index != 3 else None for each in open_dataset(v30).episodes
+    }
     lines = v21 / "meta" / "episodes.jsonl"
     rows = [json.loads(line) | {"success": index % 3 == 0} for index, line in enumerate(lines.read_text().splitlines())]
     lines.write_text("\n".join(map(json.dumps, rows)))
@@ -174,6 +186,10 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda folder: read_outcomes(written(folder / "a.csv", "episode,success\n0,1\n0,0\n")),
         r"a\.csv: line 3: expected each episode once, got 0 again",
     ),
+    "no outcome at all": (
+        lambda folder: evaluate_labels([labels(folder / "a.parquet", {0: RISING})], {0: None}),
+        "outcome: expected one that is known, got none for 1 episodes",
+    ),
     "another word": (
         lambda folder: read_outcomes(written(folder / "a.csv", "episode,success\n0,maybe\n")),
         r"line 2: success: expected true, false, 1 or 0, got 'maybe'",
@@ -197,6 +213,28 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
 def test_what_cannot_be_compared_is_refused(tmp_path: Path, ask: Callable[[Path], Any], message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         ask(tmp_path)
+
+
+def test_no_number_is_cut_on_a_terminal_and_episodes_without_an_outcome_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    curves = {0: RISING, 1: FALLING, 2: RISING, 3: FLAT, 4: RISING}
+    files = [labels(tmp_path / f"{name}_progress.parquet", curves, curves) for name in ("a_long_name_of_a_model", "b")]
+    outcomes = written(tmp_path / "a.csv", "episode,success\n0,1\n1,0\n2,\n3,0\n4,1\n")
+    for name, value in {"COLUMNS": "80", "FORCE_COLOR": "1"}.items():  # as on a terminal
+        monkeypatch.setenv(name, value)
+    done = rfm_client("evaluate", tmp_path, "--outcome", outcomes, "--json", tmp_path / "out.json")
+    assert done.exit_code == 0, done.output
+    shown = re.sub(r"\x1b\[\d*m", "", done.stdout)
+    assert "4 episodes: 2 successes, 2 failures; 1 left out, whose outcome is empty " in shown
+    document = json.loads((tmp_path / "out.json").read_text())
+    assert (document["episodes"], document["num_without_outcome"]) == ([0, 1, 3, 4], 1)
+    assert max(map(len, shown.partition("VOC: ")[0].splitlines())) <= 80
+    for name, found in zip(("a_", "b "), evaluate_labels(files, read_outcomes(outcomes)).evaluations, strict=True):
+        told = " ".join(line for line in shown.splitlines() if line.lstrip().startswith(name)).split()
+        assert found.final_of_successes is not None and found.by_success is not None
+        numbers = [found.final, found.final_of_successes, found.by_success.threshold]
+        assert {*(f"{number:.3f}" for number in numbers), f"{found.backwards:.1%}"} <= {*told}
 
 
 @pytest.mark.slow

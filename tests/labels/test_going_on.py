@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import signal
 import subprocess
@@ -101,9 +102,7 @@ def test_an_episode_that_fails_is_told_and_the_others_go_on(output: Path, undist
     assert goes_on(output, undisturbed) == sum(episode.num_frames for episode in failing)
 
 
-def test_a_server_that_is_gone_stops_the_run_and_not_one_episode_after_the_other(
-    output: Path, undisturbed: list[bytes]
-) -> None:
+def test_a_server_that_is_gone_stops_the_run(output: Path, undisturbed: list[bytes]) -> None:
     class Gone(BrightnessScorer):
         def evaluate(self, samples: Any) -> list[ProgressResult]:
             if self.num_samples >= 150:
@@ -116,24 +115,27 @@ def test_a_server_that_is_gone_stops_the_run_and_not_one_episode_after_the_other
     goes_on(output, undisturbed)
 
 
-def test_a_full_disk_stops_the_run_and_leaves_no_half_of_a_part(
-    output: Path, undisturbed: list[bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    synced = os.fsync
-    count = 0
+def full_disk(monkeypatch: pytest.MonkeyPatch, after: int) -> None:
+    """Files reach the disk ``after`` times."""
+    synced, counts = os.fsync, itertools.count(1)
 
-    def full(file: int) -> None:
-        nonlocal count
-        count += 1
-        if count == 4:
+    def sync(file: int) -> None:
+        if next(counts) > after:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         synced(file)
 
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", sync)
+
+
+def test_a_full_disk_stops_the_run_and_leaves_no_half_of_a_part(
+    output: Path, undisturbed: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full_disk(monkeypatch, after=3)
     advice = "make room or name another place with --parts, and run the same command"
     with pytest.raises(OSError, match=rf"\.rfm_parts: expected .* got No space left on device: {advice}$"):
         label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, workers=1, **FEW))
     assert len(parts_of(output)) == len(list((output / ".rfm_parts").iterdir())) == 3
+    monkeypatch.undo()
     goes_on(output, undisturbed)
 
 
@@ -170,24 +172,26 @@ SPOILT: dict[str, Callable[[Any], Any]] = {
 }
 
 
-@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
-def test_label_files_that_read_back_otherwise_are_not_put_in_place(
-    output: Path, monkeypatch: pytest.MonkeyPatch, spoil: Callable[[Any], Any]
+@pytest.mark.parametrize("spoil", [*SPOILT.values(), None], ids=[*SPOILT, "the second of both is not written"])
+def test_label_files_that_are_not_written_or_read_back_otherwise_change_no_file(
+    output: Path, monkeypatch: pytest.MonkeyPatch, spoil: Callable[[Any], Any] | None
 ) -> None:
-    def run() -> None:
-        label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, limit=1, **FEW))
-
-    run()
-    before = [(output / name).read_bytes() for name in FILES]
+    options = LabelOptions(output=output, limit=1, **FEW)
+    label(open_dataset(ROOT), BrightnessScorer(), options)
+    before = [(output / name).stat().st_ino for name in FILES]
     write = parquet.write_table
 
-    def spoilt(table: Any, file: Any, **options: Any) -> None:
-        write(spoil(table) if "reward" not in str(table.column_names) else table, file, **options)
+    def spoilt(table: Any, file: Any, **more: Any) -> None:
+        assert spoil is not None
+        write(spoil(table) if "reward" not in str(table.column_names) else table, file, **more)
 
-    monkeypatch.setattr(parquet, "write_table", spoilt)
-    with pytest.raises(
-        OSError, match=r"rfm_progress\.parquet: expected the labels that were written, read others: make"
-    ):
-        run()
-    assert [(output / name).read_bytes() for name in FILES] == before
+    if spoil is None:
+        full_disk(monkeypatch, after=1)
+        message = "No space left on device: make"
+    else:
+        monkeypatch.setattr(parquet, "write_table", spoilt)
+        message = r"rfm_progress\.parquet: expected the labels that were written, read others: make"
+    with pytest.raises(OSError, match=message):
+        label(open_dataset(ROOT), BrightnessScorer(), options)
+    assert [(output / name).stat().st_ino for name in FILES] == before
     assert sorted(file.name for file in output.iterdir()) == [".rfm_parts", "reward_signals", "rfm_progress.parquet"]

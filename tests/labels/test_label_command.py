@@ -7,9 +7,7 @@ import re
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 import rerun
@@ -23,7 +21,6 @@ from labelling import FRONT, LEROBOT
 from paths import ROOT
 from rfm_client.command_line import ExitCode
 from servers import Endpoints
-from toy_world import Task, make_clip
 
 DATASET = LEROBOT / "toy_v30_many"
 MODELS = ROOT / "model_repository"
@@ -51,14 +48,13 @@ def cells(output: str) -> dict[str, str]:
 def test_both_commands_write_the_same_labels_and_tell_what_they_did(demo_server: Endpoints, output: Path) -> None:
     words = ("--episodes", "2,3,9", "--frames", 8, "--cameras", "front", "--alias", "sarm_progress")
     served = invoke("label", DATASET, *words, "--output", output, "--url", demo_server.http_url)
-    assert (served.exit_code, served.stderr.splitlines()) == (
+    assert (served.exit_code, [line.removeprefix("rfm-client: note: ") for line in served.stderr.splitlines()]) == (
         0,
         [
-            f"rfm-client: note: cameras: {FRONT} (asked for)",
-            "rfm-client: note: sampling: rint (the checkpoint's training did not pad)",
-            "rfm-client: note: frames: 8 (asked for)",
-            "rfm-client: note: 3 of the dataset's 10 episodes have labels; "
-            "LeRobot's reader gives frames of the others the weight 1.0",
+            f"cameras: {FRONT} (asked for)",
+            "sampling: rint (the checkpoint's training did not pad)",
+            "frames: 8 (asked for)",
+            "3 of the dataset's 10 episodes have labels; LeRobot's reader gives frames of the others the weight 1.0",
         ],
     )
     assert {"episodes": "3", "frames": "121"}.items() <= cells(served.stdout).items()
@@ -120,10 +116,6 @@ def test_labelled_episodes_are_recorded_with_the_frames_and_scores_of_each_camer
         assert result.exit_code == 0, result.stderr
         files = [folder / f"episode_{index:06d}.rrd" for index in (2, 3)]
         assert [line for line in result.stdout.splitlines() if line.endswith(".rrd")] == list(map(str, files))
-    chosen = (*words[:2], "--episodes", 3, *words[4:6], "--rrd", output / "look", "--output", output / "one")
-    chosen = (*chosen, "--parts", output / ".rfm_parts")
-    assert invoke(*chosen, "--url", demo_server.grpc_url).exit_code == 0
-    assert [file.name for file in (output / "look").iterdir()] == ["episode_000003.rrd"]
     labels = parquet.read_table(output / FILES[0])
     assert labels["episode_index"].unique().to_pylist() == [2, 3]
     cameras = [name.removeprefix("progress.") for name in labels.column_names if name.startswith("progress.")]
@@ -154,26 +146,6 @@ def test_no_frame_is_scored_where_the_package_for_recordings_is_missing(
     assert list(output.iterdir()) == []
 
 
-@pytest.mark.slow
-def test_pictures_that_are_stored_as_bgr_get_the_labels_of_rgb(output: Path) -> None:
-    task = Task("red", "bowl")
-    frames = make_clip("success", task, 2_000_000).frames
-
-    def last_success(name: str, stored: Any, *words: str) -> float:
-        with h5py.File(output / f"{name}.hdf5", "w") as opened:
-            opened["data/demo_0/obs/front"] = stored
-        asked = ("--task", task.sentence(), "--no-picture", *words)
-        result = own(output / f"{name}.hdf5", *ENGINE, *asked)
-        assert result.exit_code == 0, result.stderr
-        assert ("rfm: note: channels: front bgr (asked for)" in result.stderr) == bool(words)
-        return float(parquet.read_table(output / f"{name}.rfm_progress.parquet")["success"][-1].as_py())
-
-    expected = last_success("rgb", frames)
-    assert expected == pytest.approx(0.999, abs=5e-4)  # as the guide says
-    assert last_success("bgr", frames[..., ::-1]) == pytest.approx(0.001, abs=5e-4)
-    assert last_success("told", frames[..., ::-1], "--channels", "bgr") == expected
-
-
 def test_what_the_run_did_not_train_is_told(output: Path) -> None:
     """Only of labelled outputs, not of preference or similarity."""
     checkpoint = shutil.copytree(MODELS / "rfm" / "1" / "checkpoint", output / "checkpoint")
@@ -191,13 +163,7 @@ def test_what_the_run_did_not_train_is_told(output: Path) -> None:
 
 WRONG = {
     "a format": (["--format", "csv"], "'--format': expected some of progress, signals, got csv"),
-    "a rule": (["--sampling", "first"], "Invalid value for '--sampling': 'first' is not one of 'linspace_trunc', "),
-    "an option that contradicts": (["--shard", "3/3"], "'--shard': expected i/n with i from 0 to n - 1, got 3/3"),
-    "an orientation": (["--orient", "up"], "Invalid value for '--orient': expected one of none, rotate180, "),
-    "an order of colours": (
-        ["--channels", "a=gbr"],
-        "Invalid value for '--channels': expected one of rgb, bgr, got 'gbr'",
-    ),
+    "an order of colours": (["--channels", "a=gbr"], "'--channels': expected one of rgb, bgr, got 'gbr'"),
     "a camera twice": (["--orient", "a=none", "--orient", "a=rotate90"], "expected each camera once, got 'a=rotate90'"),
 }
 

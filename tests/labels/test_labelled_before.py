@@ -77,7 +77,6 @@ OTHERS: dict[str, tuple[BrightnessScorer, dict[str, Any], str]] = {
         {},
         "checkpoint.computation: float32, torch 2.13.0, sdpa there, float32, torch 2.14.0, sdpa now",
     ),
-    "settings": (BrightnessScorer(settings="new"), {}, "checkpoint.settings_digest: settings there, new now"),
 }
 
 

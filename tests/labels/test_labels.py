@@ -14,7 +14,6 @@ import pytest
 from pyarrow import parquet
 
 import engines
-import goldens
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
 from rfm_client import ProgressSample, RewardClient, Trajectory
@@ -33,18 +32,6 @@ from rfm_labels import (
 from tolerances import TOLERANCE
 
 MODELS = ROOT / "model_repository"
-ELSEWHERE = goldens.ROOT.parent / "lerobot"
-DATASETS = [
-    *(pytest.param(LEROBOT / name, id=name) for name in ("toy_v30_many",)),
-    pytest.param(
-        ELSEWHERE / "toy_v30",
-        id="elsewhere toy_v30",
-        marks=[
-            pytest.mark.reference,
-            pytest.mark.skipif(not (ELSEWHERE / "toy_v30").exists(), reason="RFM_GOLDENS names none"),
-        ],
-    ),
-]
 
 
 def engine_scorer(checkpoint: Path, encoders: Path) -> Scorer:
@@ -69,24 +56,19 @@ def progress_of(report: Report) -> dict[str, np.ndarray[Any, Any]]:
     return {name: column.to_numpy() for name, column in zip(table.column_names, table.columns, strict=True)}
 
 
-def area_under_curve(scores: Any, is_success: Any) -> float:
-    good, bad = np.asarray(scores)[is_success], np.asarray(scores)[~np.asarray(is_success)]
-    return float(np.mean((good[:, None] > bad) + 0.5 * (good[:, None] == bad)))
-
-
 @pytest.mark.slow
 @pytest.mark.triton
-@pytest.mark.parametrize("root", DATASETS)
 def test_triton_and_the_engine_score_each_frame_on_its_prefix_and_tell_successes_from_failures(
-    client: RewardClient, root: Path, output: Path
+    client: RewardClient, output: Path
 ) -> None:
-    dataset = open_dataset(root)
+    dataset = open_dataset(LEROBOT / "toy_v30_many")
     (output / "engine").mkdir()
     report = label(dataset, ClientScorer(client), LabelOptions(output=output))
-    kinds = json.loads((root.parent / "kinds.json").read_text())[root.name]
+    kinds = json.loads((LEROBOT / "kinds.json").read_text())["toy_v30_many"]
     assert report.summary is not None
     is_success = np.array(kinds) == "success"
-    assert area_under_curve(report.summary.final_progress, is_success) >= 0.95
+    final = report.summary.final_progress
+    assert np.mean(final[is_success][:, None] > final[~is_success]) >= 0.95  # the area under the ROC curve
     assert not report.summary.outcomes["never succeed"][is_success].any()
 
     served = progress_of(report)
@@ -99,20 +81,15 @@ def test_triton_and_the_engine_score_each_frame_on_its_prefix_and_tell_successes
 
     sampling = Sampling("rint", client.model_info(frames=True).max_frames)
     episode, trajectories = next(iter_episodes(dataset))
-    by_hand = {}
     for camera, video in trajectories.items():
         assert video.frames is not None
         shown = [sampling.prefix(t) for t in range(episode.num_frames)]
         samples = [ProgressSample(Trajectory(frames=video.frames[p.indices], task=episode.task)) for p in shown]
         results = client.evaluate(samples)
-        by_hand[camera] = [(r.progress[p.read], r.success[p.read]) for r, p in zip(results, shown, strict=True)]
-        for name, number in (("progress", 0), ("success", 1)):
-            expected = [scores[number] for scores in by_hand[camera]]
-            np.testing.assert_allclose(
-                served[f"{name}.{camera}"][: episode.num_frames], expected, rtol=0, atol=TOLERANCE
-            )
-    fused = np.mean([[scores[0] for scores in by_hand[camera]] for camera in by_hand], axis=0)
-    np.testing.assert_allclose(served["progress_sparse"][: episode.num_frames], fused, rtol=0, atol=TOLERANCE)
+        by_hand = [(r.progress[p.read], r.success[p.read]) for r, p in zip(results, shown, strict=True)]
+        for name, expected in zip(("progress", "success"), zip(*by_hand, strict=True), strict=True):
+            got = served[f"{name}.{camera}"][: episode.num_frames]
+            np.testing.assert_allclose(got, expected, rtol=0, atol=TOLERANCE)
 
 
 @pytest.mark.slow
@@ -195,10 +172,9 @@ def test_the_files_have_the_documented_form(output: Path) -> None:
     own_names = ["descriptors", "episode_indices", "format", "provenance", "rfm.cost", "rfm.episodes", "schema_version"]
     assert sorted(own) == own_names
     assert sorted(json.loads(own["rfm.episodes"])) == ["1", "2"]
-    assert json.loads(own["rfm.cost"]).keys() == {"frames", "seconds"}
     assert json.loads(own["rfm.cost"])["frames"] == len(signals)
-    assert progress.schema.metadata[b"rfm.cost"] == signals.schema.metadata[b"rfm.cost"]
-    assert progress.schema.metadata[b"rfm.episodes"] == signals.schema.metadata[b"rfm.episodes"]
+    for key in (b"rfm.cost", b"rfm.episodes"):
+        assert progress.schema.metadata[key] == signals.schema.metadata[key]
     assert (own["format"], own["schema_version"], own["episode_indices"]) == ("lerobot.frame_signals", "1", "[1,2]")
     descriptors = json.loads(own["descriptors"])
     assert sorted(descriptors) == signal_names
@@ -222,7 +198,6 @@ def test_the_files_have_the_documented_form(output: Path) -> None:
     assert provenance["cameras"] == [FRONT, WRIST]
     assert set(provenance["decoders"]) == {FRONT, WRIST}
     assert provenance["decoders"][FRONT].startswith(f"PyAV {av.__version__}")
-    assert provenance["orientations"] == {}
     assert (provenance["dataset"]["kind"], provenance["dataset"]["source"]) == ("LeRobot v3.0", "toy_v30_many")
     assert progress.schema.metadata[b"reward_model_path"] == b"toy/brightness"
     assert json.loads(progress.schema.metadata[b"rfm.provenance"]) == provenance
@@ -238,11 +213,6 @@ def test_the_run_tells_what_was_decided_and_by_whom(output: Path) -> None:
         "fuse: mean of 2 cameras",
         "1 of the dataset's 8 episodes have labels; LeRobot's reader gives frames of the others the weight 1.0",
     ]
-    notes = Notes()
-    options = LabelOptions(output=output, name="b", limit=1, sampling="linspace_round", frames=4, cameras=(WRIST,))
-    label(open_dataset(LEROBOT / "toy_v21"), BrightnessScorer(), options, notes)
-    asked = (f"cameras: {WRIST}", "sampling: linspace_round", "frames: 4")
-    assert notes.lines[:-1] == [f"{setting} (asked for)" for setting in asked]
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {

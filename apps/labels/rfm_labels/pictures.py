@@ -117,7 +117,7 @@ def _draw_ends(
     if not outcomes:
         ax.hist(final, bins=BINS, range=(0, 1))
     else:
-        names = [*reversed(outcomes)]
+        names = [*outcomes][::-1]
         shares, shown = [final[outcomes[name]] for name in names], [colours[name] for name in names]
         ax.hist(shares, bins=BINS, range=(0, 1), color=shown, label=names, stacked=True)
     ax.set(ylabel="episodes", xlim=(0, 1))

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 LEGEND = (
     "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, by the vote of the last three "
-    "frames, and of progress at the last frame; 0.5 is chance. Threshold: of the vote, with the best balanced accuracy. Falls: "
-    "steps on which progress falls by more than 0.01. Frames/s: of the run that labelled, with decoding."
+    "frames, and of progress at the last frame; 0.5 is chance. Threshold: of the vote, with the best balanced accuracy."
+    " Falls: steps on which progress falls by more than 0.01. Frames/s: of the run that labelled, with decoding."
 )
 
 
