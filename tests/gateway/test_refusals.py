@@ -189,6 +189,8 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
     "video_embeddings": {
         "another width": (np.ones((3, 7)), r"expected \[T, 48\], got \[3, 7\]"),
         "ragged": ([ROW, [1.0]], EQUAL_ROWS),
+        "a number and a row": ([ROW, 1.0], EQUAL_ROWS),
+        "huge numbers": ([[10**30] * 48], NUMBERS),
         "NaN": ([ROW, [np.nan] * 48], r"expected finite values, got nan at \[1, 0\]"),
         "more than float32 holds": ([[1e39] * 48], r"expected finite values, got inf at \[0, 0\]"),
         "words for numbers": ([["1.0"] * 48], NUMBERS),
@@ -207,6 +209,7 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
     "frames": {
         "floats in 0..1": (BLACK + 0.5, r"expected values in 0\.\.255, got values up to 0\.5: multiply by 255 first"),
         "values beyond 255": (BLACK.astype(int) + 256, r"expected values in 0\.\.255, got 256\.\.256"),
+        "values below 0": (BLACK.astype(int) - 1, r"expected values in 0\.\.255, got -1\.\.-1"),
         "NaN": (BLACK + np.nan, r"expected finite values in 0\.\.255, got NaN, Inf or nothing"),
         "channels first": (
             np.ones((2, 3, 8, 8), np.uint8),
@@ -219,6 +222,7 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
         ),
         "no pixels": (BLACK[:, :0], "expected .*, got .*"),
         "truths": (BLACK > 0, r"expected uint8 \[T, H, W, 3\], got bool \[2, 8, 8, 3\]"),
+        "words and numbers": (["0.png", 1], NUMBERS),
         "null": (None, "expected frames, got neither frames nor video_embeddings"),
     },
 }

@@ -109,7 +109,9 @@ def test_a_model_that_works_is_healthy_until_it_finishes_nothing_for_long(triton
     asyncio.run(ask())
 
 
-def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: torch.nn.Module) -> None:
+def test_model_info_tells_the_checkpoint_and_its_training_run(
+    tiny: Gateway, encoders: Gateway, tiny_network: torch.nn.Module
+) -> None:
     info = requests.get(f"{tiny.url}/model_info").json()
     total = sum(parameter.numel() for parameter in tiny_network.parameters())
     architecture = info.pop("model_architecture")
@@ -129,9 +131,6 @@ def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: torch.nn.M
     assert config.items() >= {"video_feature_dim": 2, "hidden_dim": 8, "causal_mask": True, "progress_bins": 10}.items()
     assert info.pop("model_path").endswith("two_wide")
     assert info == {"model_version": "1", "num_gpus": 1}
-
-
-def test_model_info_has_the_whole_configuration_of_the_training_run(encoders: Gateway) -> None:
     run = training_run(goldens.config("enc_c1_t1_disc10").checkpoint / "config.yaml")
     assert requests.get(f"{encoders.url}/model_info").json()["experiment_config"] == json.loads(json.dumps(run))
 

@@ -15,14 +15,12 @@ from labelling import BrightnessScorer
 from paths import ROOT
 from rfm_labels import LabelOptions, label, open_dataset
 from servers import Endpoints, OneModelServer
-from shown_datasets import copied, large
+from shown_datasets import copied, hdf5, large
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 NOWHERE = Endpoints(http_port=1, grpc_port=1, metrics_port=1)
-BLOCKED = """
-Object.defineProperty(window, "localStorage", { get() { throw new DOMException("denied", "SecurityError"); } });
-"""  # what Chromium does with cookies blocked
+KEY = "open sesame"
 THEMES = ("light", "dark")
 
 
@@ -37,26 +35,12 @@ def without_violations(browser: Browser) -> None:
             assert browser.violations() == []
 
 
-def test_the_page_works_where_the_browser_blocks_cookies(
-    demo_server: Endpoints, quiet_browser: Browser, tmp_path: Path
-) -> None:
-    blocking = quiet_browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": BLOCKED})
-    try:
-        with running(demo_server, tmp_path) as gateway:
-            quiet_browser.open(gateway.url)
-            quiet_browser["fold"].click()
-            assert not quiet_browser["question"].is_displayed()
-            quiet_browser.all("#examples [data-example=success]")[0].click()
-            quiet_browser.until_text("scored", "1 of 1 scored")
-            quiet_browser.driver.get("about:blank")  # before the gateway ends
-    finally:
-        quiet_browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", blocking)
-
-
-def test_a_page_opened_before_triton_goes_on_when_triton_is_there(
+def test_a_page_goes_on_without_a_reload_when_triton_a_key_and_a_broken_dataset_are_there(
     demo_server: Endpoints, browser: Browser, tmp_path: Path
 ) -> None:
-    port = free_port()
+    root, port = copied("toy_v21", tmp_path), free_port()
+    label(open_dataset(root), BrightnessScorer(), LabelOptions())
+    next(root.rglob("*front/episode_000002.mp4")).write_text("no video")
     with running(NOWHERE, tmp_path, port=port) as gateway:
         browser.driver.get(gateway.url)
         told = wait_for_state(browser, "served-state")
@@ -69,22 +53,6 @@ def test_a_page_opened_before_triton_goes_on_when_triton_is_there(
         without_violations(browser)
         browser.run("window.isFirst = true")
 
-        browser["dataset-tab"].click()  # the page asks on, and finds that the server is away
-    assert wait_for_state(browser, "away").startswith("The server does not answer")
-    assert "connection refused" not in browser["away"].text.lower()
-    without_violations(browser)
-    with running(demo_server, tmp_path, port=port):
-        browser["score-tab"].click()
-        browser.until("document.getElementById('model').value")
-        browser.until("!document.querySelector('#away .state, #served-state .state')")
-    assert browser.run("return window.isFirst")  # without a reload
-
-
-def test_a_dataset_added_by_a_restart_is_shown_without_a_reload(browser: Browser, tmp_path: Path) -> None:
-    root, port = copied("toy_v21", tmp_path), free_port()
-    label(open_dataset(root), BrightnessScorer(), LabelOptions())
-    with running(NOWHERE, tmp_path, port=port) as gateway:
-        browser.driver.get(gateway.url)
         browser["dataset-tab"].click()
         told = wait_for_state(browser, "no-datasets")
         assert told.startswith("No dataset yet")
@@ -95,9 +63,29 @@ def test_a_dataset_added_by_a_restart_is_shown_without_a_reload(browser: Browser
         )
         assert middle == pytest.approx(0.5, abs=0.02)  # not in the column of the settings
         without_violations(browser)
-    with running(NOWHERE, tmp_path, "rfm", "--dataset", str(root), port=port):
+    assert wait_for_state(browser, "away").startswith("The server does not answer")  # the page asks on
+    assert "connection refused" not in browser["away"].text.lower()
+    without_violations(browser)
+    with running(demo_server, tmp_path, "rfm", "--dataset", str(root), port=port, RFM_GATEWAY_API_KEY=KEY):
+        browser.until("!document.getElementById('key-form').hidden")
+        assert browser.all("#episodes tr") == []
+        for key, told in (("sesame", ""), (KEY, "This is not the key. Type it again.")):
+            browser.until_text("key-wrong", told)
+            browser.write("key", key)
+            browser.all("#key-form button")[0].click()
         browser.until("document.querySelectorAll('#episodes tr').length === 8")
         assert not browser.all("#no-datasets .state")
+        browser.until("document.getElementById('model').value")
+        browser.until("!document.querySelector('#away .state, #served-state .state')")
+        assert browser.run("return window.isFirst")
+        broken = "document.querySelector('#episodes tr[data-episode=\"2\"]')"
+        message = "episode_000002.mp4: expected a whole video file, got "
+        assert message in browser.until(f"{broken}.querySelector('.failed')?.textContent")
+        assert len(browser.all("#episodes .failed")) == 1
+        browser.run(f"{broken}.querySelector('button').click()")
+        told = browser.until("document.getElementById('episode-errors').textContent")
+        assert message in told
+        assert str(tmp_path) not in told
         browser.write("task-part", "no task has this")
         assert wait_for_state(browser, "no-hits").startswith("No episode matches\nThe filters hide all 8 episodes.")
         without_violations(browser)
@@ -117,11 +105,11 @@ def test_a_dataset_added_by_a_restart_is_shown_without_a_reload(browser: Browser
 
 
 def test_nothing_to_show_says_what_to_do(browser: Browser, tmp_path: Path) -> None:
-    """Of the demo's models ``rfm`` alone scores no frames; one dataset has no episodes, and the other no cameras."""
+    """Of the demo's models ``rfm`` alone scores no frames; one dataset has no episodes, one no cameras, one a depth map."""
     shutil.copytree(ROOT / "model_repository" / "rfm", tmp_path / "models" / "rfm")
     empty, bare = large(tmp_path / "empty", 0), large(tmp_path / "bare", 3)
     (empty / "rfm_progress.parquet").unlink()
-    options = ("--dataset", str(empty), "--dataset", str(bare))
+    options = ("--dataset", str(empty), "--dataset", str(bare), "--dataset", str(hdf5(tmp_path)))
 
     def check(place: str, title: str, command: str) -> None:
         told, sentence, line, *_ = wait_for_state(browser, place).split("\n")
@@ -144,3 +132,6 @@ def test_nothing_to_show_says_what_to_do(browser: Browser, tmp_path: Path) -> No
         browser.all("#episodes button")[0].click()
         check("episode-errors", "No videos", "-dataset my_dataset")
         without_violations(browser)
+        Select(browser["dataset"]).select_by_value("2")
+        browser.until("!document.getElementById('left-out').hidden")
+        assert browser["left-out"].text.startswith("range is left out: uint16 [12, 63, 81], a depth map, a mask")

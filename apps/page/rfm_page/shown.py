@@ -107,6 +107,7 @@ class ShownDataset(ABC):
         """Return a row for each episode, with a summary of its labels.
 
         ``unused`` has what each camera shows instead of colours (``Dataset.unused_cameras``); null: colours.
+        ``left_out`` has the reason for each further camera.
         """
         file = self._labels(labels)
         status = None if file is None else file.stat()
@@ -118,6 +119,7 @@ class ShownDataset(ABC):
             "cameras": list(self.cameras),
             "has_stored_pixels": self.has_stored_pixels,
             "unused": [unused.get(camera) for camera in self.cameras],
+            "left_out": dict(self.dataset.left_out),
             "corrections": [asdict(self._correction(file, camera)) for camera in self.cameras],
             "fps": self.fps,
             "threshold": SuccessRule.threshold,

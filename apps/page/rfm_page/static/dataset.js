@@ -19,7 +19,7 @@ const CAMERA_PREFIX = "observation.images.";
 const MOST_LETTERS = 400; // that are shown of words for LeRobot: thousands of numbers slow the page down
 const NARROW = "(max-width: 719px)";
 const NOTHING = {
-  episodes: [], cameras: [], unused: [], corrections: [], threshold: 0.5, provenance: null, written_s: null,
+  episodes: [], cameras: [], unused: [], corrections: [], left_out: {}, threshold: 0.5, provenance: null, written_s: null,
   has_stored_pixels: true,
 };
 
@@ -279,6 +279,9 @@ export class DatasetTab {
     if (!other) page["only-differ"].checked = false;
     page["episode-list"].classList.toggle("beside", Boolean(other));
     page.ends.hidden = !isLabelled;
+    const leftOut = Object.entries(this.#told.left_out).map(([camera, reason]) => `${short(camera)} is left out: ${reason}`);
+    page["left-out"].textContent = leftOut.join("; ");
+    page["left-out"].hidden = !leftOut.length;
     this.#showMade();
     this.#cutAt(this.#told.threshold);
     this.#check();

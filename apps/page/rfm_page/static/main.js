@@ -279,13 +279,21 @@ async function ask(curve, signal) {
     await score(form(fields, { video: video.file }), signal, (name, document) => {
       curve.take(name, document);
       update();
+      if (name === "done") showEnds();
     }, (share) => curve.takeSent(share) && update());
   } catch (error) {
     curve.state = "failed";
     curve.error = signal.aborted ? "stopped" : error.message;
+    showEnds();
     if (!signal.aborted) failed(error, `${video.name} could not be scored`, error instanceof ServerError ? scoreAll : null);
   }
   setTimeout(update); // when the queue knows, too
+}
+
+/** Moves to the end of the curves once all are there: the numbers beside the chart are then those of the ends. */
+function showEnds() {
+  const isOver = curves.every(({ state }) => ["done", "failed"].includes(state));
+  if (isOver && !videos.isPlaying) timeline.moveTo(Infinity);
 }
 
 async function comparePair() {
@@ -372,6 +380,7 @@ function restore({ entries, curves: old, verdicts: oldVerdicts }) {
   page.undo.hidden = true;
   page.status.textContent = "";
   showNames();
+  showEnds();
 }
 
 function removeVideo(video) {

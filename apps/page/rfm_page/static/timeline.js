@@ -75,8 +75,12 @@ export class Timeline {
   }
 
   #play() {
-    if (this.videos.isPlaying) this.videos.pause();
-    else this.videos.play();
+    if (this.videos.isPlaying) {
+      this.videos.pause();
+    } else {
+      if (this.time >= Number(this.#slider.max)) this.moveTo(0);
+      this.videos.play();
+    }
     setTimeout(() => this.#showTime());
   }
 
