@@ -15,7 +15,7 @@ from gymnasium.wrappers import Autoreset, RecordEpisodeStatistics, TimeLimit
 from coded_env import CodedEnv, Recorder, frame_of
 from environments import MAX_FRAMES, MODEL, TASK, LateClient, assert_close, cart_pole, play, play_on, progress, scores
 from rfm_client import InvalidSampleError, RewardClient
-from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
+from rfm_rl import RewardModelWrapper, RewardOptions, SuccessRule
 from servers import Served
 
 TASKS = ["task 0", "task 1"]
@@ -198,11 +198,3 @@ def test_a_step_after_an_end_that_an_autoreset_below_does_not_learn_of_is_refuse
     assert any(outside.step(0)[2:4])
     assert outside.step(0)[1] == 0
     assert recorder.calls[-1] == [([(0, 2, 0)], TASKS[0])]
-
-
-@pytest.mark.parametrize("wrapper", [RewardModelWrapper, RewardModelVectorWrapper])
-def test_another_kind_of_vector_is_refused(recorder: Recorder, wrapper: Any) -> None:
-    with pytest.raises(
-        TypeError, match=r"^env: expected a gymnasium \w+, got .*object; .*wrap each environment in Rew"
-    ):
-        wrapper(object(), recorder, TASKS[0])

@@ -234,16 +234,23 @@ class Unbatched(gym.Wrapper[Any, Any, Any, Any]):
         self.observation_space = env.single_observation_space
 
 
+OTHERS = {
+    "a batch of one": (
+        lambda: gym.wrappers.TimeLimit(Batch(1), 5),
+        r"an Env that is a batch .*\.Batch; ManiSkill: .*Isaac",
+    ),
+    "a batch": (lambda: Batch(4), r"an Env that is a batch .*\.Batch; ManiSkill: .*Isaac Lab .*episodes\("),
+    "no environment": (object, r".*object; .*wrap each environment in Rew"),
+}
+
+
 @pytest.mark.parametrize("wrapper", [RewardModelWrapper, RewardModelVectorWrapper])
-@pytest.mark.parametrize("num_envs", [1, 4])
-def test_a_batch_of_environments_in_one_is_refused_with_the_remedy(
-    recorder: Recorder, wrapper: Any, num_envs: int
+@pytest.mark.parametrize(("make", "message"), OTHERS.values(), ids=OTHERS)
+def test_another_kind_of_environment_is_refused_with_the_remedy(
+    recorder: Recorder, wrapper: Any, make: Any, message: str
 ) -> None:
-    message = (
-        r"^env: expected a gymnasium \w+, got an Env that is a batch .*\.Batch; ManiSkill: .*Isaac Lab .*episodes\("
-    )
-    with pytest.raises(TypeError, match=message):
-        wrapper(gym.wrappers.TimeLimit(Batch(num_envs), 5), recorder, TASKS[0])
+    with pytest.raises(TypeError, match=rf"^env: expected a gymnasium \w+, got {message}"):
+        wrapper(make(), recorder, TASKS[0])
 
 
 def test_the_only_environment_of_a_batch_is_taken(recorder: Recorder) -> None:

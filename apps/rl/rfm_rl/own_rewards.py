@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import numpy as np
@@ -36,8 +35,8 @@ def with_statistics(info: Info, episode: RewardedEpisode, *, has_statistics: boo
 
 def correct_statistics(infos: Info, index: int, episode: RewardedEpisode, *, has_statistics: bool) -> Info:
     """Return what to add to the infos of a Gymnasium vector, whose statistics now show the model's rewards."""
-    told = [infos, infos.get("final_info")]
-    told = [info for info in told if isinstance(info, Mapping) and f"_{_STATISTICS}" in info]
+    places: list[Any] = [infos, infos.get("final_info")]
+    told = [info for info in places if isinstance(info, dict) and f"_{_STATISTICS}" in info]
     for info in told:
         info[f"_{_STATISTICS}"] = np.array(info[f"_{_STATISTICS}"])  # which RecordEpisodeStatistics goes on to read
     shown = [info[_STATISTICS] for info in told if info[f"_{_STATISTICS}"][index]]
