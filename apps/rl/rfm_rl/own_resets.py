@@ -26,7 +26,7 @@ class CopiedObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
     copies_observations = True
 
     def observation(self, observation: Any) -> Any:
-        """Return a copy."""
+        """Return a copy of the observation."""
         return deepcopy(observation)
 
 
