@@ -10,7 +10,7 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
 "$folder/venv/bin/pip" install --quiet --disable-pip-version-check robosuite==1.5.2 mujoco==3.3.7 gymnasium==1.4.0 \
-  numpy==1.26.4
+  numpy==1.26.4 h5py==3.16.0
 cd "$folder"
 cat > horizon.py <<'PYTHON'
 import numpy as np

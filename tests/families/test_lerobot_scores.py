@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +11,15 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_environment import IS_THERE, run
 from paths import ROOT
 from reward_models import BASE
 from rfm import published
 from rfm.engine import Engine
 from rfm_client import ProgressResult, ProgressSample, Trajectory
 
-pytestmark = pytest.mark.nightly
+pytestmark = [pytest.mark.nightly, IS_THERE]
 
-PYTHON = ROOT / ".venv" / "lerobot" / "bin" / "python"
 PROGRAM = ROOT / "tests" / "support" / "lerobot_scores.py"
 TASK = "put the red block in the bowl"
 IMAGES = {"use_per_frame_progress_token": False}
@@ -63,16 +61,10 @@ def frames() -> Any:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, frames: Any) -> Path:
     """A folder with LeRobot's checkpoints and their scores."""
-    if not PYTHON.exists():
-        pytest.skip("make test-newest installs LeRobot")
     made = tmp_path_factory.mktemp("lerobot")
     (made / "settings.json").write_text(json.dumps(SETTINGS))
     np.save(made / "frames.npy", frames)
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(
-        [PYTHON, PROGRAM, made, BASE], env=environment, capture_output=True, text=True, timeout=600, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    run([PROGRAM, made, BASE], made)
     return made
 
 

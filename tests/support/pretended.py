@@ -228,6 +228,13 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
         made = on_host(data, **more)
         return made if device is None else made.to(device)
 
+    class Stream(_Stream):
+        """A new stream. A class, since transformers has the name in annotations."""
+
+        def __init__(self, *device: Any) -> None:
+            seen.calls.append("Stream")
+            super().__init__(seen, *device)
+
     class Threads(ThreadPoolExecutor):
         """Threads in which PyTorch also has the GPU, since dispatch keys are per thread."""
 
@@ -239,7 +246,7 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
             return super().submit(pretending)
 
     monkeypatch.setattr(torch.cuda, "_lazy_init", lambda: None)
-    monkeypatch.setattr(torch.cuda, "Stream", recorded("Stream", lambda *device: _Stream(seen, *device)))
+    monkeypatch.setattr(torch.cuda, "Stream", Stream)
     monkeypatch.setattr(torch.cuda, "stream", recorded("stream", lambda stream: within(stream.device)))
     monkeypatch.setattr(torch.cuda, "current_stream", lambda *device: _Stream(seen, *device))
     monkeypatch.setattr(torch.cuda, "current_device", lambda: seen.current.index)
