@@ -35,13 +35,16 @@ from rfm.checkpoint.hub import local_copy
 from rfm.checkpoint.weights import read_weights, refuse_pickles
 from rfm.vlm.backbone import (
     ADAPTER_NAMES,
-    DEQUANTIZED,
+    NF4,
     QWEN_NAMES,
+    UNQUANTIZED,
     backbone_config,
     check_not_quantized,
+    quantization,
     renamed,
 )
 from rfm.vlm.lora_targets import TEXT, WHOLE, check_factors, check_none_lost, check_replaced
+from rfm.vlm.nf4 import dequantize
 from rfm.vlm.rounded import is_rounded, shape_of
 
 LORA_NAME = re.compile(r"(?P<module>.+)\.lora_(?P<side>[AB])(\.default)?\.weight")
@@ -247,7 +250,10 @@ def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Te
 
 
 def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return a base model's backbone: its configuration, and its weights under VlmRewardModel's names."""
+    """Return a base model's backbone: its configuration, and its weights under VlmRewardModel's names.
+
+    Weights in NF4 are decoded, as in training.
+    """
     where = f"base model {base_model}"
     try:
         folder = local_copy(base_model, with_weights=True)
@@ -257,8 +263,11 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
         ) from error
     content = read_json(folder / NETWORK_CONFIG)
     config = backbone_config(content, f"{where}: {NETWORK_CONFIG}")
-    check_not_quantized(config, f"{where}: {NETWORK_CONFIG}", DEQUANTIZED.format(base=base_model))
+    if quantization(config) == NF4:
+        del config["quantization_config"]
+    check_not_quantized(config, f"{where}: {NETWORK_CONFIG}", UNQUANTIZED)
     config.pop("transformers_version", None)  # of whoever saved the base model, not that of training
     weights = renamed(read_weights(folder), _BASE_NAMES)
+    dequantize(weights)
     dtype = getattr(torch, str(content.get("dtype") or content.get("torch_dtype")), None)  # in which transformers loads
     return config, {n: w.to(dtype) if dtype and w.is_floating_point() else w for n, w in weights.items()}

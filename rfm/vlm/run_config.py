@@ -23,7 +23,7 @@ from rfm.checkpoint.content import (
 )
 from rfm.checkpoint.provenance import OF_UPSTREAM, Assumption, file_name, source_name
 from rfm.checkpoint.run_config import find_run_config, frame_count
-from rfm.vlm.backbone import DEQUANTIZED, QWEN_2_5
+from rfm.vlm.backbone import QWEN_2_5
 from rfm.vlm.lora import MERGE
 from rfm.vlm.network import Dtype, VlmConfig
 from rfm_client.contract.checks import require
@@ -44,8 +44,8 @@ SETTINGS = {
     "size_px": ("data.resized_height", "data.resized_width"),
     "trained_frames": ("data.max_frames",),
 }
-_VARIANT = re.compile(r"-unsloth$")  # Unsloth's name for its copy of a base model
-_FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # Unsloth's names of base models rounded to fewer bits, for training
+_FEW_BITS = re.compile(r"-bnb-4bit/?$")  # Unsloth's names of base models in NF4, on which it trains
+_VARIANT = re.compile(r"(-unsloth)?(-bnb-4bit)?$")  # Unsloth's names for its copies of a base model
 _DROPPED = ("pairwise_progress", "use_progress_token")  # settings of prompts that upstream has dropped
 
 Value = TypeVar("Value", bool, str, float)
@@ -180,7 +180,7 @@ class RunConfig:
 
 
 def base_of_adapter(folder: Path, run: RunConfig) -> str:
-    """Return the base model that the run names.
+    """Return the base model that the run names, or the form of it in NF4 that the adapter names.
 
     Raises CheckpointError if the adapter names another, or if the run began with a checkpoint, whose weights the
     adapter may change.
@@ -190,9 +190,6 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
         raise CheckpointError.at(run.file, "model.base_model_id (or --base-model)", "none")
     named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
     where = f"{folder / ADAPTER_CONFIG}: base_model_name_or_path"
-    if isinstance(named, str) and _FEW_BITS.search(named):
-        remedy = DEQUANTIZED.format(base=named)
-        raise CheckpointError.at(where, "weights in full precision", shown(named), remedy)
     if named and _model_name(str(named)) != _model_name(base):
         remedy = "name the one that the adapter was trained on with --base-model"
         raise CheckpointError.at(where, f"{cut(base)}, the model.base_model_id of {run.file}", shown(named), remedy)
@@ -201,7 +198,7 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
         got = f"{shown(began_with)}: the adapter may change its weights in place of those of {cut(base)}"
         remedy = f"{MERGE}; if it does change those of {cut(base)}, name them with --base-model"
         raise CheckpointError.at(f"{run.file}: training.load_from_checkpoint", "none beside an adapter", got, remedy)
-    return base
+    return named if isinstance(named, str) and _FEW_BITS.search(named) else base
 
 
 def assumptions_of(

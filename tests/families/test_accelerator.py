@@ -17,7 +17,7 @@ from reward_models import ROOT, references
 from rfm import families
 from rfm.engine import Engine, Execution
 from rfm.triton_model.placement import Placement
-from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Sample
+from rfm_client import PreferenceSample, ProgressSample, Sample
 from vlm import PLAIN, assert_close, video
 
 
@@ -71,19 +71,6 @@ def test_a_device_gives_the_reference_answers_and_waits_no_more_often_than_it_mu
         assert seen.awaited - awaited <= WAITS[config.name][1]
 
 
-def test_a_device_writes_the_answers_of_the_original(seen: Seen) -> None:
-    names = ["T1_single", "fallback_digits_T2", "lower_T2"]  # 'ANSWER: 2', 'Score 2 of 5', 'answer: 3'
-    cases = [next(case for case in references("roboreward") if case.file.stem == name) for name in names]
-    checkpoint = families.load(cases[0].config / "checkpoint", reward_model="roboreward")
-    with torch.inference_mode():
-        engine = Engine.of(checkpoint, device=CUDA, dtype=torch.float32)
-    results = engine.evaluate([case.samples()[0] for case in cases])
-    assert seen.num_operators > 100
-    for result, case in zip(results, cases, strict=True):
-        assert isinstance(result, ProgressResult), result
-        assert result.last_progress == case.content["generations"][0]["parsed_score"] / 4 - 0.25
-
-
 @pytest.mark.parametrize("name", ["topreward", "topreward-robometer", "roboreward", "roboreward-expected"])
 def test_reward_models_that_are_asked_in_words_stay_on_their_device(seen: Seen, name: str) -> None:
     of_topreward = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
@@ -97,33 +84,6 @@ def test_reward_models_that_are_asked_in_words_stay_on_their_device(seen: Seen, 
         (expected,) = Engine.of(checkpoint).evaluate([sample])
         assert type(result) is type(expected)
     assert {*seen.made_on} == {SECOND}
-
-
-def test_tensors_of_two_places_do_not_meet(seen: Seen) -> None:
-    first, second = (torch.ones(2, device=device) for device in (CUDA, SECOND))
-    index = torch.tensor([1], device=SECOND)
-    for mix in (
-        lambda: first + second,
-        lambda: torch.cat([first, second]),
-        lambda: first[index],
-        lambda: first + second.sum(),  # not even a single number
-        lambda: torch.ones(2) + second,
-    ):
-        with pytest.raises(RuntimeError, match="expected all tensors to be on the same device"):
-            mix()
-    with pytest.raises(RuntimeError, match="invalid device ordinal 2"):
-        torch.ones(2, device="cuda:2")
-    assert (second + torch.ones(2, device=SECOND)).device == SECOND
-    assert (first + second.to(CUDA)).device == CUDA
-
-
-def test_a_device_without_an_index_is_the_thread_s_current_one(seen: Seen) -> None:
-    assert torch.ones(1, device="cuda").device == CUDA
-    Placement(SECOND, torch.get_num_threads()).apply()
-    assert torch.ones(1, device="cuda").device == SECOND
-    with torch.cuda.stream(torch.cuda.Stream(CUDA)):
-        assert torch.ones(1, device="cuda").device == CUDA
-    assert torch.cuda.current_device() == SECOND.index
 
 
 MIXED: list[Sample] = [

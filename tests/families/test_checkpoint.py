@@ -183,18 +183,6 @@ def test_the_conversion_of_a_pickled_adapter_works(tmp_path: Path) -> None:
     assert_same(load(folder), load(golden.checkpoint))
 
 
-def test_the_command_that_strips_a_prefix_works(folder: Path) -> None:
-    before = families.load(folder)
-    renamed(lambda name: name if name.startswith("video") else f"student.{name}")(folder)
-    expected = (
-        r"got 'student\.progress_head\.4\.weight', with the prefix student\. that 'video_proj\.bias' lacks; strip"
-    )
-    with pytest.raises(CheckpointError, match=expected):
-        families.load(folder)
-    convert(families.load, folder)
-    assert_same(families.load(folder), before)
-
-
 ZEROED = {
     "the whole head": (["success_head"], ["success"]),
     "its last weights": (["progress_head.4.weight"], ["progress"]),

@@ -48,17 +48,6 @@ def scores(folder: Path, name: str, **sources: str) -> Result:
     return result
 
 
-def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
-    original = load(LORA_INSIDE)
-    original.save(tmp_path / "saved")
-    copy = families.load(tmp_path / "saved")
-    assert copy.config == original.config
-    assert original.factors
-    for got, wanted in ((copy.weights, original.weights), (copy.factors, original.factors)):
-        assert got.keys() == wanted.keys()
-        assert all(torch.equal(got[name], wanted[name]) for name in wanted)
-
-
 def as_transformers_5_writes(backbone: dict[str, Any]) -> None:
     text = backbone["text_config"]
     text["rope_parameters"] = {"rope_type": "default"} | (text.pop("rope_scaling") or {})
