@@ -108,7 +108,7 @@ def check_one_form(folder: Path) -> None:
     shards = [path.name for path in (folder / WEIGHTS_INDEX, *sorted(folder.glob(_SHARDS))) if is_there(path)]
     if shards and is_there(folder / WEIGHTS):
         expected = f"{WEIGHTS} or shards"
-        remedy = "move away what is not meant: transformers, which reads the former, leaves it when it writes shards"
+        remedy = "name a copy without what is not meant: transformers, which reads the former, leaves it beside shards"
         raise CheckpointError.at(folder, expected, f"{WEIGHTS} and {listed(shards)}, of which one is older", remedy)
 
 
@@ -133,7 +133,7 @@ def _read_shards(index: Path) -> dict[str, Tensor]:
         unknown = set(tensor_names(file)) - shard_of.keys()
         if unknown:
             got = f"{file.name}, which it does not name, with {listed(sorted(unknown))}"
-            raise CheckpointError.at(index, "the names of all shards", got, "move that file away")
+            raise CheckpointError.at(index, "the names of all shards", got, "name a copy of the folder without it")
     return weights
 
 
@@ -245,7 +245,7 @@ def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
         return
     if len(names) > 1 and f"{stem}.bin" in names:
         both = f"{stem}.bin and {names[0]}"
-        raise CheckpointError.at(folder, "one form of the weights", both, "move away what is not meant")
+        raise CheckpointError.at(folder, "one form of the weights", both, "name a copy without what is not meant")
     files = names if names[0].endswith(".bin") and "-of-" in names[0] else names[:1]  # all shards, or the first other
     arguments = shlex.join(map(str, [folder / wanted, *(folder / name for name in files)]))
     command = f'python -c "{_CONVERT}" {arguments}'

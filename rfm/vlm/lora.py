@@ -212,7 +212,7 @@ def has_adapter(folder: Path) -> bool:
     if adapter and whole:
         if is_there(folder / ADAPTER_TARGET):
             return False
-        remedy = "move away the one that is not meant"
+        remedy = "name a copy of the folder without the one that is not meant"
         raise CheckpointError.at(folder, f"an adapter ({adapter[0]}) or whole weights ({whole[0]})", "both", remedy)
     return bool(adapter)
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -126,23 +125,3 @@ def test_a_thread_that_computes_is_told_its_device(seen: Seen) -> None:
     Placement(CUDA, 1).apply()
     Placement(torch.device("cpu"), 1).apply()
     assert seen.calls == ["set_device"]
-
-
-def test_encoders_send_uint8_from_pinned_memory_and_read_all_embeddings_at_once(
-    seen: Seen, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    encoders: Any = engine_there("enc_c1_t1_disc10").encoders
-    videos = [video(seed, 40, 20, 30 + seed).positions for seed in range(4)]  # in three passes
-    expected = load_engine("enc_c1_t1_disc10").encoders.encode_frames(videos)  # type: ignore[union-attr]
-    encoders.encode_frames(videos)  # the first time, constants are sent too
-    pin, sent, asked, awaited = torch.Tensor.pin_memory, [], seen.asked.total(), seen.awaited
-
-    def pinned(tensor: torch.Tensor) -> torch.Tensor:
-        sent.append((tensor.dtype, len(tensor)))
-        return pin(tensor)
-
-    monkeypatch.setattr(torch.Tensor, "pin_memory", pinned)
-    for made, wanted in zip(encoders.encode_frames(videos), expected, strict=True):
-        np.testing.assert_allclose(made, wanted, rtol=0, atol=1e-5)
-    assert sent == [(torch.uint8, 64), (torch.uint8, 64), (torch.uint8, 32)]
-    assert (seen.asked.total() - asked, seen.awaited - awaited) == (1, 0)
