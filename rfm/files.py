@@ -179,7 +179,7 @@ def check_one_form(folder: Path) -> None:
     shards = [path.name for path in (folder / WEIGHTS_INDEX, *sorted(folder.glob(SHARDS))) if is_there(path)]
     if shards and is_there(folder / WEIGHTS):
         expected = f"{WEIGHTS} or shards"
-        remedy = "move away what is not meant: transformers, which reads the former, leaves it when it writes shards"
+        remedy = "name a copy without what is not meant: transformers, which reads the former, leaves it beside shards"
         raise CheckpointError.at(folder, expected, f"{WEIGHTS} and {listed(shards)}, of which one is older", remedy)
 
 

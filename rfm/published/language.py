@@ -38,7 +38,7 @@ class LanguageFolder:
     base_model: source of the tokenizer and processor
     video_prompt: form of the prompt
     rounded: form of rounded layers; None: not rounded
-    assumed: dtype and video_prompt, if no file proves them
+    assumed: dtype, video_prompt and language_head, if no file proves them
     """
 
     folder: Path
@@ -68,7 +68,7 @@ class LanguageFolder:
         weights = {name: tensor for name, tensor in renamed(tensors, _NAMES).items() if "inv_freq" not in name}
         if any(name.startswith("progress_head") for name in weights):
             raise CheckpointError.at(folder, "an ordinary Qwen3-VL", "reward heads: leave out --as")
-        _tie(weights, backbone, file)
+        of_head = _tie(weights, backbone, file)
         own = folder / PROCESSOR_FOLDER
         processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
         dtype, of_dtype = dtype_of(backbone, file)
@@ -78,7 +78,8 @@ class LanguageFolder:
             weights, _ = round_layers(weights, {}, options.weights, getattr(torch, dtype))
             rounded = options.weights
         name = source_name(processor)
-        return cls(folder, backbone, weights, processor, dtype, name, form, rounded, (*of_dtype, *of_form))
+        assumed = (*of_dtype, *of_form, *of_head)
+        return cls(folder, backbone, weights, processor, dtype, name, form, rounded, assumed)
 
     @property
     def made_of(self) -> dict[str, Any]:
@@ -106,27 +107,34 @@ def reopened(made: type[Made], folder: Path, options: Options) -> Made:
     return replace(checkpoint, config=config, weights=weights, processor=options.base_model or checkpoint.processor)
 
 
-def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> None:
-    """Drop a head that equals the embedding to which config.json ties it.
+def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> tuple[Assumption, ...]:
+    """Drop a head that equals the embedding to which config.json ties it; return the head if it is assumed.
 
-    Raises CheckpointError for a tied head with other values: transformers 4 reads the embedding in its place,
-    transformers 5 the head.
+    transformers 4 (seen: 4.57.6) obeys text_config, and replaces a stored head; transformers 5 (seen: 5.23.0) obeys the
+    outer setting, and keeps a stored head.
+    Raises CheckpointError for a head that only one of them uses.
     """
-    stated = [part.get(_TIED) for part in (config, config["text_config"])]
+    outer, text = (part.get(_TIED) is True for part in (config, config["text_config"]))
     head, embedding = weights.get(HEAD), weights.get(EMBEDDING)
     if head is None:
-        if not (stated[1] if stated[0] is None else stated[0]):
+        if not (outer or text):
             raise CheckpointError.at(file.parent, f"{HEAD}, since {_TIED} is false", "none")
-    elif embedding is not None and True in stated:
-        if head.shape != embedding.shape or not bool((head == embedding).all()):
-            where = f"{file}: {_TIED}"
-            remedy = (
-                "transformers 4 scores with the embedding, transformers 5 with the head. For the head, set it to false "
-                "here and in text_config. For the embedding, load and save the model with transformers 4, which drops "
-                "the head"
-            )
-            raise CheckpointError.at(where, f"false, since {HEAD} differs from the embedding", "true", remedy)
+        if outer and text:
+            return ()
+        obeyed = "text_config alone, as transformers 4" if text else "the outer setting alone, as transformers 5"
+        return (Assumption("language_head", "the embedding", f"{_TIED} of {obeyed} reads it"),)
+    if embedding is None or not (outer or text):
+        return ()
+    if head.shape == embedding.shape and bool((head == embedding).all()):
         del weights[HEAD]
+    elif text:
+        where = f"{file}: text_config.{_TIED}"
+        remedy = (
+            "transformers 4 scores with the embedding, transformers 5 with the head. For the head, set it to false. "
+            "For the embedding, load and save the model with transformers 4, which drops the head"
+        )
+        raise CheckpointError.at(where, f"false, since {HEAD} differs from the embedding", "true", remedy)
+    return ()
 
 
 def dtype_of(config: Mapping[str, Any], file: Path) -> tuple[Dtype, tuple[Assumption, ...]]:

@@ -30,7 +30,17 @@ from rfm.files import (
     read_tensors,
     shown,
 )
-from rfm.published.qwen import ADAPTER_NAMES, DEQUANTIZED, QWEN_NAMES, backbone_config, check_not_quantized, renamed
+from rfm.published.nf4 import dequantize
+from rfm.published.qwen import (
+    ADAPTER_NAMES,
+    NF4,
+    QWEN_NAMES,
+    UNQUANTIZED,
+    backbone_config,
+    check_not_quantized,
+    quantization,
+    renamed,
+)
 from rfm.published.weights import read_weights, refuse_pickles
 from rfm.qwen.lora import BASE_LAYER, LORA_NAME, MERGE, module_of
 
@@ -135,7 +145,7 @@ def has_adapter(folder: Path) -> bool:
     if adapter and whole:
         if is_there(folder / ADAPTER_TARGET):
             return False
-        remedy = "move away the one that is not meant"
+        remedy = "name a copy of the folder without the one that is not meant"
         raise CheckpointError.at(folder, f"an adapter ({adapter[0]}) or whole weights ({whole[0]})", "both", remedy)
     return bool(adapter)
 
@@ -173,7 +183,10 @@ def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Te
 
 
 def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return a base model's backbone: its configuration, and its weights under VlmRewardModel's names."""
+    """Return a base model's backbone: its configuration, and its weights under VlmRewardModel's names.
+
+    Weights in NF4 are decoded, as in training.
+    """
     where = f"base model {base_model}"
     try:
         folder = local_copy(base_model, with_weights=True)
@@ -183,9 +196,12 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
         ) from error
     content = read_json(folder / NETWORK_CONFIG)
     config = backbone_config(content, f"{where}: {NETWORK_CONFIG}")
-    check_not_quantized(config, f"{where}: {NETWORK_CONFIG}", DEQUANTIZED.format(base=base_model))
+    if quantization(config) == NF4:
+        del config["quantization_config"]
+    check_not_quantized(config, f"{where}: {NETWORK_CONFIG}", UNQUANTIZED)
     config.pop("transformers_version", None)  # of whoever saved the base model, not that of training
     weights = renamed(read_weights(folder), _BASE_NAMES)
+    dequantize(weights)
     dtype = getattr(torch, str(content.get("dtype") or content.get("torch_dtype")), None)  # in which transformers loads
     return config, {n: w.to(dtype) if dtype and w.is_floating_point() else w for n, w in weights.items()}
 

@@ -34,9 +34,10 @@ _NEEDED = {
     ),
     "qwen3_vl": (("num_attention_heads", "rms_norm_eps"), ("num_heads", "patch_size", "deepstack_visual_indexes")),
 }
+_TIED = "tie_word_embeddings"
 # Fields that stay outside text_config, in a Qwen2.5-VL from before text_config.
 _NOT_OF_TEXT = (
-    "architectures", "dtype", "image_token_id", "model_type", "tie_word_embeddings", "torch_dtype",
+    "architectures", "dtype", "image_token_id", "model_type", _TIED, "torch_dtype",
     "transformers_version", "video_token_id", "vision_config", "vision_end_token_id", "vision_start_token_id",
     "vision_token_id",
 )  # fmt: skip
@@ -44,13 +45,7 @@ NF4 = "bitsandbytes nf4"  # a result of ``quantization``
 _ROPE = ("rope_theta", "rope_scaling", "rope_parameters", "partial_rotary_factor")
 UNQUANTIZED = (
     "export the checkpoint that was quantized (its scores differ), or load this one with the code that trained it, "
-    "call dequantize() of its model and save that"
-)
-DEQUANTIZED = (
-    "where bitsandbytes is installed, write its weights in full precision into a new folder: python -c "
-    "\"from transformers import AutoModelForImageTextToText as M; m = M.from_pretrained('{base}', device_map='auto'); "
-    "m.dequantize(); m.save_pretrained('NEW_FOLDER')\"; copy its tokenizer and processor files there, and name it "
-    "with --base-model"
+    "and after model.dequantize() save model.state_dict() with safetensors"
 )
 _COPY = "copy it from config.json of the base model"
 
@@ -94,9 +89,9 @@ def check_not_quantized(config: Mapping[str, Any], where: object, remedy: str) -
 
 
 def _nested(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Move the text model's fields into ``text_config``, as transformers does since 4.52."""
+    """Move the text model's fields into ``text_config``, as transformers does since 4.52, which copies the tie."""
     rest = {name: value for name, value in content.items() if name in _NOT_OF_TEXT}
-    text = {name: value for name, value in content.items() if name not in _NOT_OF_TEXT}
+    text = {name: value for name, value in content.items() if name not in _NOT_OF_TEXT or name == _TIED}
     return rest | {"text_config": text | {"model_type": f"{QWEN_2_5}_text"}}
 
 

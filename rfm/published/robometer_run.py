@@ -27,7 +27,7 @@ from rfm.files import (
     shown,
 )
 from rfm.published.provenance import OF_UPSTREAM, Assumption, file_name, source_name
-from rfm.published.qwen import DEQUANTIZED, Renames, renamed
+from rfm.published.qwen import Renames, renamed
 from rfm.published.run_config import find_run_config, frame_count
 from rfm.qwen.lora import MERGE
 from rfm.qwen.network import QWEN_2_5, Dtype
@@ -49,8 +49,8 @@ SETTINGS = {
     "size_px": ("data.resized_height", "data.resized_width"),
     "trained_frames": ("data.max_frames",),
 }
-_VARIANT = re.compile(r"-unsloth$")  # Unsloth's name for its copy of a base model
-_FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # Unsloth's names of base models rounded to fewer bits, for training
+_FEW_BITS = re.compile(r"-bnb-4bit/?$")  # Unsloth's names of base models in NF4, on which it trains
+_VARIANT = re.compile(r"(-unsloth)?(-bnb-4bit)?$")  # Unsloth's names for its copies of a base model
 _DROPPED = ("pairwise_progress", "use_progress_token")  # settings of prompts that upstream has dropped
 Value = TypeVar("Value", bool, str, float)
 
@@ -184,7 +184,7 @@ class RunConfig:
 
 
 def base_of_adapter(folder: Path, run: RunConfig) -> str:
-    """Return the base model that the run names.
+    """Return the base model that the run names, or the form of it in NF4 that the adapter names.
 
     Raises CheckpointError if the adapter names another, or if the run began with a checkpoint, whose weights the
     adapter may change.
@@ -194,9 +194,6 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
         raise CheckpointError.at(run.file, "model.base_model_id (or --base-model)", "none")
     named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
     where = f"{folder / ADAPTER_CONFIG}: base_model_name_or_path"
-    if isinstance(named, str) and _FEW_BITS.search(named):
-        remedy = DEQUANTIZED.format(base=named)
-        raise CheckpointError.at(where, "weights in full precision", shown(named), remedy)
     if named and _model_name(str(named)) != _model_name(base):
         remedy = "name the one that the adapter was trained on with --base-model"
         raise CheckpointError.at(where, f"{cut(base)}, the model.base_model_id of {run.file}", shown(named), remedy)
@@ -205,7 +202,7 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
         got = f"{shown(began_with)}: the adapter may change its weights in place of those of {cut(base)}"
         remedy = f"{MERGE}; if it does change those of {cut(base)}, name them with --base-model"
         raise CheckpointError.at(f"{run.file}: training.load_from_checkpoint", "none beside an adapter", got, remedy)
-    return base
+    return named if isinstance(named, str) and _FEW_BITS.search(named) else base
 
 
 def assumptions_of(

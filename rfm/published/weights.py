@@ -60,11 +60,7 @@ _NETWORKS = {
     "qwen2_5_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.gate_proj\."),
     "qwen3_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.linear_fc1\."),
 }
-_STRIP = (
-    "import sys, safetensors.torch as s; prefix, target, *files = sys.argv[1:]; "
-    "t = [(name.removeprefix(prefix), v) for file in files for name, v in s.load_file(file).items()]; "
-    "assert len(dict(t)) == len(t), 'two tensors would have one name'; s.save_file(dict(t), target, {'format': 'pt'})"
-)
+_PART = re.compile(r"_(text|vision)$")  # ends the model_type of a part
 
 
 def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tensor]:
@@ -75,15 +71,15 @@ def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tenso
     """
     check_one_form(folder)
     if is_there(folder / WEIGHTS):
-        files, weights = [folder / WEIGHTS], read_tensors(folder / WEIGHTS)
+        weights = read_tensors(folder / WEIGHTS)
     elif is_there(folder / WEIGHTS_INDEX):
-        files, weights = _read_shards(folder / WEIGHTS_INDEX)
+        weights = _read_shards(folder / WEIGHTS_INDEX)
     else:
         refuse_pickles(folder, WEIGHTS, PICKLE_STEM)
         got = cut(", ".join(sorted(path.name for path in folder.iterdir()))) or "nothing"
         raise CheckpointError.at(folder, f"{WEIGHTS} or {WEIGHTS_INDEX}", f"{got}: {_below(folder)}")
     _check_network(folder, weights, model_type)
-    return _unwrapped(weights, files, folder / WEIGHTS)
+    return _unwrapped(weights, folder)
 
 
 def _check_network(folder: Path, names: Iterable[str], model_type: str | None) -> None:
@@ -96,13 +92,16 @@ def _check_network(folder: Path, names: Iterable[str], model_type: str | None) -
     is_expected = stated is not None and stated in (found, model_type)
     if found is None or "type" in content or is_first or is_expected:  # ``type``: of LeRobot
         return
+    if isinstance(stated, str) and _PART.sub("", stated) not in _NETWORKS:  # another network with some of the names
+        got = f"{shown(stated)}, which is not supported"
+        raise CheckpointError.at(f"{file}: model_type", f"one of {', '.join(_NETWORKS)}", got)
     got = "none" if stated is None else shown(stated)
     expected = f"{found}, by the names of the weights"
     remedy = f"copy {NETWORK_CONFIG} of the model that the run started from"
     raise CheckpointError.at(f"{file}: model_type", expected, f"{got}: the file describes another network", remedy)
 
 
-def _read_shards(index: Path) -> tuple[list[Path], dict[str, Tensor]]:
+def _read_shards(index: Path) -> dict[str, Tensor]:
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict):
         raise CheckpointError.at(index, "a weight_map", "none")
@@ -123,31 +122,28 @@ def _read_shards(index: Path) -> tuple[list[Path], dict[str, Tensor]]:
         unknown = set(tensor_names(file)) - shard_of.keys()
         if unknown:
             got = f"{file.name}, which it does not name, with {listed(sorted(unknown))}"
-            raise CheckpointError.at(index, "the names of all shards", got, "move that file away")
-    return [index.parent / shard for shard in dict.fromkeys(shard_of.values())], weights
+            raise CheckpointError.at(index, "the names of all shards", got, "name a copy of the folder without it")
+    return weights
 
 
-def _unwrapped(weights: Mapping[str, Tensor], files: Sequence[Path], target: Path) -> dict[str, Tensor]:
+def _unwrapped(weights: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
     """Remove the prefixes of DataParallel, torch.compile, PEFT and FSDP, and any prefix that all names share.
 
-    files: the files with the weights
-    target: the file for the weights without the prefix, in the error's command
+    folder: of the checkpoint, for messages
     Raises CheckpointError if only some names have the prefix, or two names would be equal.
     """
     bare: dict[str, Tensor] = {}
     for name, tensor in weights.items():
         if (short := _WRAPPERS.sub("", name)) in bare:
-            raise CheckpointError.at(target.parent, "each weight once", f"{shown(short)} and {shown(name)}")
+            raise CheckpointError.at(folder, "each weight once", f"{shown(short)} and {shown(name)}")
         bare[short] = tensor
     head = next((name for name in bare if name == _HEAD or name.endswith(f".{_HEAD}")), _HEAD)
     prefix = head.removesuffix(_HEAD)
     other = next((name for name in bare if not name.startswith(prefix)), None)
     if other is not None:
-        stripped = target.parent / "stripped.safetensors"
-        line = f"{_command(_STRIP, [prefix, stripped, *files])} && mv {shlex.join([str(stripped), str(target)])}"
-        then = "" if list(files) == [target] else ", then move the shards and their index away"
         got = f"{shown(head)}, with the prefix {prefix} that {shown(other)} lacks"
-        raise CheckpointError.at(target.parent, _HEAD, got, f"strip it with: {line}{then}")
+        remedy = "save the weights again where they were trained, with the prefix before all names or none"
+        raise CheckpointError.at(folder, _HEAD, got, remedy)
     return {name.removeprefix(prefix): tensor for name, tensor in bare.items()}
 
 
@@ -196,17 +192,13 @@ def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
         return
     if len(names) > 1 and f"{stem}.bin" in names:
         both = f"{stem}.bin and {names[0]}"
-        raise CheckpointError.at(folder, "one form of the weights", both, "move away what is not meant")
+        raise CheckpointError.at(folder, "one form of the weights", both, "name a copy without what is not meant")
     files = names if names[0].endswith(".bin") and "-of-" in names[0] else names[:1]  # all shards, or the first other
-    command = _command(_CONVERT, [folder / wanted, *(folder / name for name in files)])
+    arguments = shlex.join(map(str, [folder / wanted, *(folder / name for name in files)]))
+    command = f'python -c "{_CONVERT}" {arguments}'
     got = (
         f"{cut(', '.join(names))}: pickles may run code when they are loaded, so they are refused. If you trust who "
         "made it, convert it. weights_only=True lets PyTorch make tensors and little else; do not convert a file that "
         f"needs more: {command}"
     )
     raise CheckpointError.at(folder, wanted, got)
-
-
-def _command(code: str, arguments: Iterable[str | Path]) -> str:
-    """Return a shell command that runs ``code``, which must have no double quotes."""
-    return f'python -c "{code}" {shlex.join(map(str, arguments))}'

@@ -121,6 +121,9 @@ BAD = {  # text, and the message after the file name
     "a host by name": ("serve: {host: gpu.example}", r"serve\.host: expected an IP address .*, got 'gpu\.example'"),
     "half a certificate": ("serve: {grpc_key: a}", r"serve\.grpc_key needs serve\.grpc_certificate$"),
     "a name that is a path": ("export: {name: ../rfm}", r"export\.name: expected letters, digits, _ and -, got '\.\./rfm'"),
+    "an endless name": (f"export: {{name: {'a' * 300}}}", r"export\.name: expected at most 100 characters, got 300"),
+    "a batch beyond int32": ("export: {max_batch_size: 9999999999}", r"export\.max_batch_size: expected at most 2147483647"),
+    "GPUs without end": ("num_gpus: 1000000000", r"num_gpus: expected at most 4096"),
     "a list": ("- 1", "expected keys and values, got list"),
     "no YAML": ("a: [", "expected a YAML file, got"),
     "code": ("model_path: !!python/object/apply:os.getcwd []", "expected a YAML file, got"),
@@ -305,13 +308,6 @@ def test_a_gateway_on_a_port_of_triton_asks_triton_where_it_moved(started: Any, 
     assert result.exit_code == 1
     told = f"(--grpc-port) and gateway.port (--gateway-port): expected different ports, got {grpc_port} for both"
     assert told in result.stderr
-
-
-def test_the_fastapi_servers_file_starts_a_gateway_on_its_port(started: Any, tmp_path: Path, grpc_port: int) -> None:
-    (tmp_path / "server.yaml").write_text(f"server_url: 0.0.0.0\nserver_port: {grpc_port}\n")
-    options = started("--config", str(tmp_path / "server.yaml"))
-    assert (options["--host"], options["--port"]) == (["0.0.0.0"], [str(grpc_port)])
-    assert options["--triton"] == [f"grpc://127.0.0.1:{grpc_port + PORT_STEP}"]
 
 
 WORDS: dict[str, tuple[list[str], str]] = {

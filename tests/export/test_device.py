@@ -18,7 +18,6 @@ import goldens
 import rfm_export
 from captures import CalledAgain
 from in_process import rfm
-from labelling import LEROBOT
 from rfm import published
 from rfm.engine import Engine
 from rfm.engine.family import NETWORK
@@ -150,11 +149,3 @@ def test_seconds_of_graphs_may_differ_as_their_size_lets_them() -> None:
     verify_graphs(lambda: cast(Engine, OfSeconds(5e-6)), description, print)
     with pytest.raises(ExportDiffersError, match="a difference of 2e-05 times the largest"):
         verify_graphs(lambda: cast(Engine, OfSeconds(2e-5)), description, print)
-
-
-def test_label_refuses_a_device_that_is_not_there(free_bytes: list[float]) -> None:
-    assert not free_bytes  # no GPU
-    words = ["label", str(LEROBOT / "toy_v21"), "--checkpoint", str(SMALL.checkpoint), "--device", "0"]
-    done = rfm(*words)
-    assert done.exit_code == 1
-    assert "rfm: device: expected one of cpu, got 0: PyTorch " in done.stderr

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -17,7 +16,7 @@ from reward_models import ROOT, references
 from rfm import published
 from rfm.engine import Engine, Execution
 from rfm.triton_model.placement import Placement
-from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Sample
+from rfm_client import PreferenceSample, ProgressSample, Sample
 from vlm import PLAIN, assert_close, video
 
 
@@ -71,19 +70,6 @@ def test_a_device_gives_the_reference_answers_and_waits_no_more_often_than_it_mu
         assert seen.awaited - awaited <= WAITS[config.name][1]
 
 
-def test_a_device_writes_the_answers_of_the_original(seen: Seen) -> None:
-    names = ["T1_single", "fallback_digits_T2", "lower_T2"]  # 'ANSWER: 2', 'Score 2 of 5', 'answer: 3'
-    cases = [next(case for case in references("roboreward") if case.file.stem == name) for name in names]
-    checkpoint = published.load(cases[0].config / "checkpoint", reward_model="roboreward")
-    with torch.inference_mode():
-        engine = Engine.of(checkpoint, device=CUDA, dtype=torch.float32)
-    results = engine.evaluate([case.samples()[0] for case in cases])
-    assert seen.num_operators > 100
-    for result, case in zip(results, cases, strict=True):
-        assert isinstance(result, ProgressResult), result
-        assert result.last_progress == case.content["generations"][0]["parsed_score"] / 4 - 0.25
-
-
 @pytest.mark.parametrize("name", ["topreward", "topreward-robometer", "roboreward", "roboreward-expected"])
 def test_reward_models_that_are_asked_in_words_stay_on_their_device(seen: Seen, name: str) -> None:
     of_topreward = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
@@ -97,33 +83,6 @@ def test_reward_models_that_are_asked_in_words_stay_on_their_device(seen: Seen, 
         (expected,) = Engine.of(checkpoint).evaluate([sample])
         assert type(result) is type(expected)
     assert {*seen.made_on} == {SECOND}
-
-
-def test_tensors_of_two_places_do_not_meet(seen: Seen) -> None:
-    first, second = (torch.ones(2, device=device) for device in (CUDA, SECOND))
-    index = torch.tensor([1], device=SECOND)
-    for mix in (
-        lambda: first + second,
-        lambda: torch.cat([first, second]),
-        lambda: first[index],
-        lambda: first + second.sum(),  # not even a single number
-        lambda: torch.ones(2) + second,
-    ):
-        with pytest.raises(RuntimeError, match="expected all tensors to be on the same device"):
-            mix()
-    with pytest.raises(RuntimeError, match="invalid device ordinal 2"):
-        torch.ones(2, device="cuda:2")
-    assert (second + torch.ones(2, device=SECOND)).device == SECOND
-    assert (first + second.to(CUDA)).device == CUDA
-
-
-def test_a_device_without_an_index_is_the_thread_s_current_one(seen: Seen) -> None:
-    assert torch.ones(1, device="cuda").device == CUDA
-    Placement(SECOND, torch.get_num_threads()).apply()
-    assert torch.ones(1, device="cuda").device == SECOND
-    with torch.cuda.stream(torch.cuda.Stream(CUDA)):
-        assert torch.ones(1, device="cuda").device == CUDA
-    assert torch.cuda.current_device() == SECOND.index
 
 
 MIXED: list[Sample] = [
@@ -166,23 +125,3 @@ def test_a_thread_that_computes_is_told_its_device(seen: Seen) -> None:
     Placement(CUDA, 1).apply()
     Placement(torch.device("cpu"), 1).apply()
     assert seen.calls == ["set_device"]
-
-
-def test_encoders_send_uint8_from_pinned_memory_and_read_all_embeddings_at_once(
-    seen: Seen, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    encoders: Any = engine_there("enc_c1_t1_disc10").encoders
-    videos = [video(seed, 40, 20, 30 + seed).positions for seed in range(4)]  # in three passes
-    expected = load_engine("enc_c1_t1_disc10").encoders.encode_frames(videos)  # type: ignore[union-attr]
-    encoders.encode_frames(videos)  # the first time, constants are sent too
-    pin, sent, asked, awaited = torch.Tensor.pin_memory, [], seen.asked.total(), seen.awaited
-
-    def pinned(tensor: torch.Tensor) -> torch.Tensor:
-        sent.append((tensor.dtype, len(tensor)))
-        return pin(tensor)
-
-    monkeypatch.setattr(torch.Tensor, "pin_memory", pinned)
-    for made, wanted in zip(encoders.encode_frames(videos), expected, strict=True):
-        np.testing.assert_allclose(made, wanted, rtol=0, atol=1e-5)
-    assert sent == [(torch.uint8, 64), (torch.uint8, 64), (torch.uint8, 32)]
-    assert (seen.asked.total() - asked, seen.awaited - awaited) == (1, 0)

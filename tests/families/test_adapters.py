@@ -14,6 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+import few_bits
 import goldens
 from paths import GOLDEN
 from rfm import published
@@ -123,6 +124,22 @@ def test_lora_in_another_form_gives_the_same_weights(tmp_path: Path, name: str, 
         torch.testing.assert_close(weight, known[key], rtol=0, atol=1e-7)
 
 
+def test_a_base_model_in_nf4_is_decoded(tmp_path: Path) -> None:
+    built = []
+    for form in ("nf4", "decoded"):
+        folder, options = with_sources(ADAPTER, tmp_path / form)
+        base = Path(options["base_model"])
+        tensors = {}
+        for name, tensor in load_file(base / "model.safetensors").items():
+            parts, values = few_bits.rounded(name, tensor) if "_proj.weight" in name else ({name: tensor}, tensor)
+            tensors |= parts if form == "nf4" else {name: values.to(tensor.dtype)}
+        save_file(tensors, base / "model.safetensors", {"format": "pt"})
+        if form == "nf4":
+            few_bits.change_config(base, "nf4")
+        built.append(load(ADAPTER, folder, str(base)).build(torch.float32).state_dict())
+    assert all(torch.equal(weight, built[1][name]) for name, weight in built[0].items())
+
+
 def test_updates_too_small_for_bfloat16_are_not_lost(tmp_path: Path) -> None:
     folder, _ = with_sources(LORA_INSIDE, tmp_path)
     tensors = {}
@@ -222,7 +239,6 @@ Q_PROJ = "model.language_model.layers.{}.self_attn.q_proj"
 MERGE = r".*; merge it where it was trained \(merge_and_unload\(\) of PEFT\)"
 LOST = r"expected LoRA factors of each module that was trained, got none for \[.*"
 LINEAR = rf"{FACTORS}: expected LoRA factors of linear layers of a Qwen backbone, got ".replace(".", r"\.")
-FEW_BITS = r"base_model_name_or_path: expected weights in full precision, got .*m\.dequantize\(\).* with --base-model$"
 QWEN = "Qwen/Qwen2.5-VL-3B-Instruct"
 ANOTHER_BASE = rf"base_model_name_or_path: expected {re.escape(QWEN)}, .*, got 'NAME'; .* --base-model"
 REFUSED: dict[str, tuple[str, Spoil, str]] = {
@@ -290,8 +306,10 @@ def test_an_adapter_that_would_score_otherwise_is_refused(
 BASES = {
     "Qwen/Qwen2.5-VL-7B-Instruct": ANOTHER_BASE.replace("NAME", "Qwen/Qwen2.5-VL-7B-Instruct"),
     "/scratch/snapshots/66285546d2b821cf421d4f5eb2576359d3770cd3": ANOTHER_BASE.replace("NAME", "/scratch/.*"),
-    "unsloth/qwen2.5-vl-3b-instruct-unsloth-bnb-4bit": FEW_BITS,
-    "/models/Qwen2.5-VL-3B-Instruct-bnb-4bit/": FEW_BITS,
+    **{
+        few_bits: rf"^base model {few_bits}: cannot be had"  # the adapter's, on which it was trained
+        for few_bits in ("unsloth/qwen2.5-vl-3b-instruct-unsloth-bnb-4bit", "/models/Qwen2.5-VL-3B-Instruct-bnb-4bit/")
+    },
     **dict.fromkeys(
         ("/scratch/models/Qwen2.5-VL-3B-Instruct/", "unsloth/qwen2.5-vl-3b-instruct-unsloth", None, ""),
         rf"^base model {re.escape(QWEN)}: cannot be had",  # the run's, without the network

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,10 @@ from rfm.files import PREPROCESSOR_CONFIG
 from rfm_client import (
     InferenceFailedError,
     PreferenceSample,
-    ProgressResult,
-    ProgressSample,
     RewardError,
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract import BatchTiming
 from rfm_client.contract.samples import EncoderSample
 from spoilt import in_json
 from vlm import assert_close, video
@@ -152,24 +148,6 @@ def test_a_video_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, mon
     assert isinstance(failed, InferenceFailedError)
     assert str(failed) == "the sample does not fit in the device's memory"
     assert_encoded(first, encoded(last))
-
-
-def test_what_the_encoders_take_is_forward_time(encoders: Encoders, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a clock on which each forward pass takes an hour."""
-    hours, seconds, execution = [0], time.perf_counter, Execution()
-    monkeypatch.setattr(time, "perf_counter", lambda: seconds() + 3600 * hours[0])
-
-    def pass_an_hour(*_: object) -> None:
-        hours[0] += 1
-
-    models = (encoders.image_model, encoders.text_model)
-    with models[0].register_forward_hook(pass_an_hour), models[1].register_forward_hook(pass_an_hour):
-        (result,) = load_engine(NAME).evaluate([ProgressSample(video(0, 3, 40, 40))], execution)
-    assert isinstance(result, ProgressResult)
-    assert hours == [2]
-    assert execution.forward_s == pytest.approx(2 * 3600, abs=60)
-    assert execution.collate_s < 60
-    assert result.timing == BatchTiming(execution.collate_s * 1e3, execution.forward_s * 1e3)
 
 
 def test_special_tokens_in_a_task_are_text(encoders: Encoders) -> None:

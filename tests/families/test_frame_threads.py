@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from engines import load_engine
-from pretended import CUDA, pretended
 from reward_models import ROOT
 from rfm import published
 from rfm.engine import Engine
@@ -25,7 +24,7 @@ from rfm_client import ProgressSample, UInt8Array
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import frame_digest
 from servers import PATIENCE_S
-from vlm import PLAIN, assert_close, load, video
+from vlm import PLAIN, video
 
 THREE = FrameThreads(3)
 ASKED = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
@@ -48,14 +47,6 @@ def test_several_threads_work_at_once_and_give_the_parts_in_order() -> None:
         return part
 
     assert THREE.parts(work, range(7)) == [range(3), range(3, 6), range(6, 7)]
-
-
-def test_an_error_is_raised_where_the_frames_are_asked_for() -> None:
-    def fails(part: Sequence[int]) -> int:
-        return 1 // part[0]
-
-    with pytest.raises(ZeroDivisionError):
-        THREE.parts(fails, [1, 2, 0])
 
 
 def test_a_gpu_gets_all_threads_of_the_instance_and_the_cpu_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,26 +82,6 @@ def test_several_threads_make_the_embeddings_of_one(with_cache: bool, monkeypatc
     assert len(made[0]) == len(samples)
     for one, several in zip(*made, strict=True):
         np.testing.assert_array_equal(several, one)
-
-
-def test_the_frames_of_a_lone_sample_are_divided_among_the_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
-    sample, seen = ProgressSample(video(0, 7, 56, 84)), []
-    (expected,) = load_engine(PLAIN).evaluate([sample])
-    with pretended(monkeypatch):
-        with torch.inference_mode():
-            engine = Engine.of(load(PLAIN), device=CUDA)
-        collator: Any = engine.predictor.collator  # type: ignore[attr-defined]
-        to_size = collator._to_size
-
-        def watched(of: Any, frames: Sequence[int]) -> Any:
-            seen.append((list(frames), threading.current_thread().name.partition("_")[0]))
-            return to_size(of, frames)
-
-        monkeypatch.setattr(collator, "_to_size", watched)
-        (result,) = engine.evaluate([sample])
-    assert sorted(seen) == [([0, 1, 2], "rfm-frames"), ([3, 4, 5], "rfm-frames"), ([6], "rfm-frames")]
-    assert_close(result, expected, 1e-5)
 
 
 def test_only_frames_that_the_model_sees_are_resized() -> None:

@@ -21,7 +21,7 @@ from rfm import published
 from rfm.engine import Engine, Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.graphs import IDLE_CALLS, STEP_TOKENS, Captured, Function, Graphs
-from rfm_client import PreferenceSample, ProgressSample, Sample
+from rfm_client import ProgressSample
 from vlm import PLAIN, assert_close, video
 
 ROBOREWARD = references("roboreward")[0].config / "checkpoint"
@@ -75,25 +75,6 @@ def assert_same(results: Sequence[Any], expected: Sequence[Any]) -> None:
         assert not isinstance(result, Exception), result
         for left, right in zip(goldens.frame_scores(result), goldens.frame_scores(of_plain), strict=True):
             torch.testing.assert_close(left.progress, right.progress, rtol=0, atol=1e-5)
-
-
-def batches() -> list[list[Sample]]:
-    """Batches of several sizes and kinds."""
-    videos = [ProgressSample(video(seed, 2 + seed % 3, 64, 64)) for seed in range(4)]
-    pair = PreferenceSample(video(5, 2, 64, 96), video(6, 3, 64, 64))
-    dense = ProgressSample(video(7, 4, 64, 64), frame_steps=2)
-    return [[videos[0]], [videos[1], pair], [pair], videos[:3], [dense, videos[3]], [videos[3]]]
-
-
-def test_more_shapes_than_graphs_are_not_captured_in_turn() -> None:
-    graphs = Graphs(CalledAgain(), max_graphs=2)
-    engine, plain = engine_with(graphs, goldens.config(PLAIN), 1), load_engine(PLAIN)
-    expected = [plain.evaluate(batch) for batch in batches()]
-    for _ in range(4):
-        for batch, of_batch in zip(batches(), expected, strict=True):
-            for result, of_plain in zip(engine.evaluate(batch), of_batch, strict=True):
-                assert_close(result, of_plain, 1e-5)
-    assert graphs.num_captured == 2
 
 
 def doubled(tensor: Tensor) -> Tensor:
@@ -196,30 +177,6 @@ def test_a_lack_of_memory_drops_the_graphs(monkeypatch: pytest.MonkeyPatch) -> N
     for result, expected in zip(engine.evaluate(samples), load_engine(PLAIN).evaluate(samples), strict=True):
         assert_close(result, expected, 1e-5)
     assert graphs.num_replayed == replayed
-
-
-@pytest.mark.parametrize("name", [PLAIN, "q25_video_last_l2"])
-def test_nothing_waits_inside_a_captured_call(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = goldens.config(name)
-    sample = ProgressSample(video(0, 3, 64, 64))
-    (expected,) = load_engine(name).evaluate([sample])
-    with pretended(monkeypatch) as seen, torch.inference_mode():
-        waits: list[tuple[int, int]] = []
-
-        class Watched(CalledAgain):
-            def __call__(self, function: Function, tensors: Sequence[Tensor], beside: Captured | None) -> Captured:
-                before = seen.asked.total(), seen.awaited
-                captured = super().__call__(function, tensors, beside)
-                waits.append((seen.asked.total() - before[0], seen.awaited - before[1]))
-                return captured
-
-        checkpoint = published.load(config.checkpoint, **config.sources)
-        graphs = Graphs(Watched())
-        engine = Engine(checkpoint.predictor(CUDA, torch.float32), graphs=graphs)
-        for _ in range(4):
-            assert_close(engine.evaluate([sample])[0], expected, 1e-5)
-    assert waits == [(0, 0)] * 2
-    assert graphs.num_replayed == 4
 
 
 def test_an_engine_has_graphs_where_they_can_be_used(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,8 +14,6 @@ import goldens
 import rfm_export
 from engines import serve_config
 from in_process import rfm
-from rfm_client.options import ConfigError
-from rfm_commands.config import Config
 from spoilt import WEIGHTS, Spoil, copied, files_in, text
 
 REWIND = goldens.config("legacy_keys_l2")
@@ -60,18 +58,3 @@ def test_a_refused_export_leaves_the_repository_alone(
     assert re.match(f"rfm: .*{message}", result.stderr), result.stderr
     assert files_in(repository) == before
     assert not list(repository.parent.glob(".*export*"))
-
-
-BAD_SETTINGS = {
-    "a path as name": ("export: {name: ../../etc}", r"serve\.yaml: export\.name: expected letters, digits, _ and -, got"),
-    "an endless name": (f"export: {{name: {'a' * 300}}}", r"export\.name: expected at most 100 characters, got 300"),
-    "a batch beyond int32": ("export: {max_batch_size: 9999999999}", r"max_batch_size: expected at most 2147483647"),
-    "GPUs without end": ("num_gpus: 1000000000", r"serve\.yaml: num_gpus: expected at most 4096"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("content", "message"), BAD_SETTINGS.values(), ids=BAD_SETTINGS)
-def test_hostile_settings_are_refused(tmp_path: Path, content: str, message: str) -> None:
-    (tmp_path / "serve.yaml").write_text(content)
-    with pytest.raises(ConfigError, match=message):
-        Config.from_yaml(tmp_path / "serve.yaml")

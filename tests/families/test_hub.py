@@ -4,9 +4,13 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import shlex
 import shutil
 import socket
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -40,6 +44,15 @@ def outcome(source: str) -> Any:
         return str(error)
 
 
+def fetch(refusal: str, endpoint: str, folder: Path) -> list[str]:
+    """Run the command that a refusal names, and return the files in the folder that it calls the checkpoint."""
+    command, place = re.search(r"hf (download .*) --local-dir FOLDER, then name FOLDER(\S*) as", refusal).groups()  # type: ignore[union-attr]
+    words = [sys.executable, "-m", "huggingface_hub.cli.hf", *shlex.split(command), "--local-dir", str(folder)]
+    env = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HUB_OFFLINE": "0", "HF_HOME": str(folder / "home")}
+    subprocess.run(words, env=env, check=True, capture_output=True)
+    return sorted(file.name for file in Path(f"{folder}{place}").iterdir() if file.is_file())
+
+
 @pytest.fixture(scope="module")
 def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Ask the Hub, then, offline, the cache that this filled.
@@ -69,8 +82,11 @@ def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     repositories["org/late"] = {"main": late_main, "v1": late}
     with local_hub.hub(repositories) as endpoint, local_hub.asked(endpoint, folder / "cache"):
         online = {source: outcome(source) for source in ONLINE}
+        fetched = {
+            f"fetched {name}": fetch(online[name], endpoint, folder / name) for name in (PICKLED, PICKLED_WITHIN)
+        }
     with mock.patch("huggingface_hub.constants.HF_HUB_CACHE", str(folder / "cache")):
-        return online | {f"offline {source}": outcome(source) for source in OFFLINE}
+        return online | fetched | {f"offline {source}": outcome(source) for source in OFFLINE}
 
 
 IN_CACHE = [f"offline {source}" for source in (f"{UNTAGGED}@{TAG}", TAGGED, UNTAGGED, IN_SUBFOLDER, LATE, LATE_ABOVE)]
@@ -97,6 +113,11 @@ REFUSED = {
 @pytest.mark.parametrize(("source", "message"), REFUSED.values(), ids=REFUSED)
 def test_the_refusal_names_what_a_hub_s_repository_lacks(from_hub: dict[str, Any], source: str, message: str) -> None:
     assert re.search(message, from_hub[source]), from_hub[source]
+
+
+@pytest.mark.parametrize("source", [PICKLED, PICKLED_WITHIN])
+def test_the_command_in_the_refusal_fetches_pickles(from_hub: dict[str, Any], source: str) -> None:
+    assert from_hub[f"fetched {source}"] == ["optimizer.pt", "pytorch_model.bin"]
 
 
 CACHED = {

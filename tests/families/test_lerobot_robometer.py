@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,20 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
 from reward_models import BASE, ROOT, Reference, references
 from rfm import published
 from rfm.engine import Engine
 from rfm_client import ProgressResult
+from spoilt import Spoil, in_json, weights, with_sources
 
 CASES = references("lerobot_robometer")
 CHECKPOINT = ROOT / "lerobot_robometer" / "tok_disc10" / "checkpoint"
 TOLERANCES = (1e-4, 2e-5)  # of logits and answers in float32; seen: 2e-6, 3e-7
 ROUNDED = 0.05  # of answers in bfloat16
 TOKENS = "model.lm_head.weight"
-
-Change = Callable[[dict[str, Any], dict[str, torch.Tensor]], Any]
 
 
 def check(results: list[Any], decoded: dict[str, Any], frames_per_value: int, tolerance: float) -> None:
@@ -73,34 +69,20 @@ def test_an_export_scores_the_same_and_assumptions_are_told(tmp_path: Path) -> N
     assert assumed == ["base_model", "progress_in_preference"]
 
 
-def changed(tmp_path: Path, change: Change) -> Path:
-    folder = tmp_path / "checkpoint"
-    shutil.copytree(CHECKPOINT, folder)
-    config, weights = json.loads((folder / "config.json").read_text()), load_file(folder / "model.safetensors")
-    change(config, weights)
-    (folder / "config.json").write_text(json.dumps(config))
-    save_file(weights, folder / "model.safetensors")
-    return folder
-
-
-def text_config(config: dict[str, Any]) -> dict[str, Any]:
-    text: dict[str, Any] = config["vlm_config"]["text_config"]
-    return text
+def of_vlm(change: Callable[[dict[str, Any]], object]) -> Spoil:
+    return in_json("config.json", lambda config: change(config["vlm_config"]))
 
 
 def test_the_theta_of_the_rotation_is_the_file_s(tmp_path: Path) -> None:
-    folder = changed(tmp_path, lambda config, _: text_config(config)["rope_parameters"].update(rope_theta=20_000.0))
-    assert published.load(folder, base_model=str(BASE)).config.backbone["text_config"]["rope_theta"] == 20_000.0
+    folder, options = with_sources("robometer of LeRobot", tmp_path)
+    of_vlm(lambda config: config["text_config"]["rope_parameters"].update(rope_theta=20_000.0))(folder)
+    assert published.load(folder, **options).config.backbone["text_config"]["rope_theta"] == 20_000.0
 
 
 def test_of_untied_weights_the_embedding_is_read(tmp_path: Path) -> None:
-    name = "model.model.language_model.embed_tokens.weight"
-
-    def untie(config: dict[str, Any], weights: dict[str, torch.Tensor]) -> None:
-        weights[name] = weights[TOKENS].clone()
-        weights[TOKENS] = torch.zeros_like(weights[TOKENS])
-        config["vlm_config"]["tie_word_embeddings"] = False
-
+    name, folder = "model.model.language_model.embed_tokens.weight", with_sources("robometer of LeRobot", tmp_path)[0]
+    weights(lambda w: w.update({name: w[TOKENS].clone(), TOKENS: torch.zeros_like(w[TOKENS])}))(folder)
+    of_vlm(lambda config: config.update(tie_word_embeddings=False))(folder)
     case = next(case for case in CASES if case.config == CHECKPOINT.parent)
-    engine = Engine.of(published.load(str(changed(tmp_path, untie)), base_model=str(BASE)))
+    engine = Engine.of(published.load(folder, base_model=str(BASE)))
     check(engine.evaluate(case.samples(case.content.get("cropped_to_last"))), case.content["decoded"], 1, TOLERANCES[1])

@@ -12,7 +12,7 @@ import pytest
 
 import goldens
 from rfm import published
-from spoilt import Spoil, settings, with_sources
+from spoilt import Spoil, nested, settings, with_sources
 from vlm import PLAIN, load
 
 IMAGES, VIDEOS, BOTH = "preprocessor_config.json", "video_preprocessor_config.json", "processor_config.json"
@@ -25,16 +25,6 @@ def loaded(name: str, spoil: Spoil, tmp_path: Path) -> Any:
     base = shutil.copytree(sources["base_model"], tmp_path / "base", copy_function=shutil.copyfile)
     spoil(base)
     return load(name, base=str(base)).collator
-
-
-def nested(**changes: Any) -> Spoil:
-    """Transformers 5's file beside those of transformers 4, with the same content but for ``changes``."""
-
-    def spoil(base: Path) -> None:
-        content = json.loads((base / IMAGES).read_text())
-        (base / BOTH).write_text(json.dumps({"image_processor": content | changes}))
-
-    return spoil
 
 
 SIZES = {"do_resize": False, "size": {"longest_edge": 1, "shortest_edge": 1}, "resample": 0, "max_pixels": 5}

@@ -35,6 +35,8 @@ from spoilt import (
     in_json,
     in_two_shards,
     in_yaml,
+    nested,
+    renamed,
     run_settings,
     settings,
     sharded_pickle,
@@ -145,16 +147,6 @@ def without_encoders(spoil: Spoil) -> Spoil:
     return both(weights(lambda w: [w.pop(key) for key in [*w] if "_encoder." in key]), spoil)
 
 
-def nested(**changes: Any) -> Spoil:
-    """Transformers 5's file beside those of transformers 4, with the same content but for ``changes``."""
-
-    def spoil(base: Path) -> None:
-        content = json.loads((base / IMAGES).read_text())
-        (base / BOTH).write_text(json.dumps({"image_processor": content | changes}))
-
-    return spoil
-
-
 def tied(model: bool | None, text_model: bool | None) -> Spoil:
     """``tie_word_embeddings`` in config.json and in its text_config."""
 
@@ -188,21 +180,22 @@ SAFETENSORS = rf"{WEIGHTS}: expected a safetensors file, got "
 LAUGHS = "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 10)}]\n" for n in range(12))
 MERGES = "a0: &a0 {x: 1}\n" + "".join(f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 10)}]}}\n" for n in range(1, 12))
 ZEROS = r": expected weights, got 0 throughout: the file is incomplete; fetch or copy it again"
-DIFFERENT_HEAD = r"tie_word_embeddings: expected false, since lm_head.weight differs from the embedding, got true.*transformers 4 scores with the embedding, transformers 5 with the head"
+DIFFERENT_HEAD = r"text_config\.tie_word_embeddings: expected false, since lm_head.weight differs from the embedding, got true.*transformers 4 scores with the embedding, transformers 5 with the head"
 
 WEIGHT_FILES: dict[str, tuple[str, Spoil, str]] = {
     "no weights": (REWIND, gone(WEIGHTS), r"expected model.safetensors or .*, got config.*: a checkpoint's folder has it, beside config.json"),
     "missing and unexpected keys": (REWIND, weights(lambda w: w.update(surplus=w.pop("success_head.4.bias"))), r"missing keys: \['success_head.4.bias'\]; unexpected keys: \['surplus'\]"),
-    "whole and in shards": (REWIND, lambda f: [shutil.copy(f / WEIGHTS, f.parent), in_two_shards(f), shutil.copy(f.parent / WEIGHTS, f)], r"expected model\.safetensors or shards, got model\.safetensors and \['model\.safetensors\.index\.json'\], of which one is older; move away what is not meant"),
+    "whole and in shards": (REWIND, lambda f: [shutil.copy(f / WEIGHTS, f.parent), in_two_shards(f), shutil.copy(f.parent / WEIGHTS, f)], r"expected model\.safetensors or shards, got model\.safetensors and \['model\.safetensors\.index\.json'\], of which one is older; name a copy without what is not meant"),
     "whole and in shards without an index": (REWIND, lambda f: shutil.copy(f / WEIGHTS, f / "model-00001-of-00002.safetensors"), r"got model\.safetensors and \['model-00001-of-00002\.safetensors'\]"),
     "an encoder whole and in shards": (ENCODED, without_encoders(beside("image_encoder", text("model.safetensors.index.json", '{"weight_map": {}}'))), r"image_encoder: expected model\.safetensors or shards, got"),
     "a tensor in two shards": (REWIND, both(in_two_shards, shard_twice), r"expected each tensor in one shard, got 'first_embedding_A' in a\.safetensors and in b\.safetensors; save"),
-    "a shard that the index does not name": (REWIND, extra_shard("model-00003-of-00003.safetensors", {"more": torch.ones(1)}), r"expected the names of all shards, got model-00003-of-00003\.safetensors, which it does not name, with \['more'\]; move that file away"),
+    "a shard that the index does not name": (REWIND, extra_shard("model-00003-of-00003.safetensors", {"more": torch.ones(1)}), r"expected the names of all shards, got model-00003-of-00003\.safetensors, which it does not name, with \['more'\]; name a copy of the folder without it"),
     "a lost shard": (REWIND, both(in_two_shards, gone("b.safetensors")), r"names the shard b.safetensors, which is not there"),
     "a shard elsewhere": (REWIND, instead(WEIGHTS, lambda f: Path(f"{f}.index.json").write_text('{"weight_map": {"a": "../secret.safetensors"}}')), r"expected names of files beside it, got '\.\./secret"),
     "a shard with a NUL": (REWIND, instead(WEIGHTS, lambda f: Path(f"{f}.index.json").write_text('{"weight_map": {"a": "a\\u0000.safetensors"}}')), r"expected a file|not there"),
     "a weight with and without a wrapper's prefix": (REWIND, weights(lambda w: w.update({"module.success_head.4.bias": w["success_head.4.bias"] + 1})), r"expected each weight once, got 'success_head\.4\.bias' and"),
-    "pickles whole and in shards": (REWIND, both(lambda f: shutil.copy(f / CONFIG, f / "pytorch_model.bin"), sharded_pickle), r"expected one form of the weights, got pytorch_model\.bin and pytorch_model-00001-of-00002\.bin; move away"),
+    "pickles whole and in shards": (REWIND, both(lambda f: shutil.copy(f / CONFIG, f / "pytorch_model.bin"), sharded_pickle), r"expected one form of the weights, got pytorch_model\.bin and pytorch_model-00001-of-00002\.bin; name a copy without what is not meant"),
+    "a prefix before some names": (REWIND, renamed(r"^(?!video)", "student."), r"got 'student\.progress_head\.4\.weight', with the prefix student\. that 'video_proj\.bias' lacks; save the weights again"),
     "infinity": (REWIND, fill("success_head.4.bias", math.inf), r"success_head\.4\.bias: expected finite weights, got inf at \["),
     "minus infinity": (Q3, fill("progress_head.4.weight", -math.inf), r"progress_head\.4\.weight: expected finite weights, got -inf at \["),
     "NaN in an encoder": (ENCODED, fill("image_encoder.layernorm.bias", math.nan), r"layernorm\.bias: expected finite weights, got nan at \["),
@@ -256,6 +249,10 @@ SETTINGS: dict[str, tuple[str, Spoil, str]] = {
     "Qwen2.5-VL, with Qwen3-VL's": (Q25, config_of(Q3), r"model_type: expected qwen2_5_vl, by the names of the weights, got 'qwen3_vl'"),
     "Qwen3-VL, with ReWiND's": (Q3, config_of(REWIND), r"model_type: expected qwen3_vl, by the names of the weights, got 'rewind_transformer'"),
     "Qwen3-VL, with a part's": (Q3, settings(CONFIG, model_type="qwen3_vl_text"), r"model_type: expected qwen3_vl, by the names of the weights, got 'qwen3_vl_text'"),
+    **{
+        f"a network with names of Qwen3-VL: {kind}": (Q3, settings(CONFIG, model_type=kind), rf"model_type: expected one of rewind_transformer, qwen2_5_vl, qwen3_vl, got '{kind}', which is not supported$")
+        for kind in ("qwen3_5", "qwen3_vl_moe")
+    },
     "Qwen3-VL, without one": (Q3, gone(CONFIG), r"model_type: expected qwen3_vl, by the names of the weights, got none"),
     "a vision-language run above": (REWIND, run_above(Q3), r"/config.yaml: expected the run of .*, whose network is 'rewind_transformer', got model.base_model_id 'Qwen/.*; copy the run's config.yaml into .*, also if it is this one$"),
     "a ReWiND run above": (Q3, run_above(REWIND), r"whose network is 'qwen3_vl', got model.base_model_id 'rewind_transformer'"),
@@ -302,7 +299,7 @@ BACKBONES: dict[str, tuple[str, Spoil, str]] = {
     "layers without end": (Q25, text_settings(num_hidden_layers=10**9), r"num_hidden_layers: expected at most 1024, got 1000000000"),
     "layers of a model with answers without end": (ROBO, text_settings(num_hidden_layers=10**9), r"num_hidden_layers: expected at most 1024, got 1000000000"),
     "a vocabulary that nothing can hold": (Q25, text_settings(vocab_size=10**12), r"embed_tokens\.weight: expected \[1000000000000, \d+\], got"),
-    "code of its own": (Q25, settings(CONFIG, auto_map={"AutoConfig": "evil.Config"}, model_type="evil"), r"model_type: expected qwen2_5_vl, .*, got 'evil'"),
+    "code of its own": (Q25, settings(CONFIG, auto_map={"AutoConfig": "evil.Config"}, model_type="evil"), r"model_type: expected one of .*, got 'evil', which is not supported"),
     "a pipe as adapter": (Q25, lambda f: os.mkfifo(f / "adapter_config.json"), r"adapter_config\.json: expected a file, got a pipe"),
     "a quantization in config.json": (Q3, settings(CONFIG, quantization_config={"quant_method": "gptq"}), r"config\.json: quantization_config: expected none, got 'gptq'; export the checkpoint that was quantized"),
     "bitsandbytes without its kind": (Q3, settings(CONFIG, quantization_config={"quant_method": "bitsandbytes"}), r"quantization_config: expected none, got 'bitsandbytes'; export"),
@@ -354,7 +351,7 @@ PREPROCESSING: dict[str, tuple[str, Spoil, str]] = {
 IN_WORDS: dict[str, tuple[str, Spoil, str]] = {
     **{
         f"tied to an embedding that differs, by {name}": (TOP, tied(*stated), DIFFERENT_HEAD)
-        for name, stated in {"the model": (True, None), "the text model": (False, True), "it alone": (None, True)}.items()
+        for name, stated in {"both": (True, True), "the text model": (False, True), "it alone": (None, True)}.items()
     },
     "no language head": (TOP, weights(lambda w: w.pop(HEAD)), r"expected lm_head.weight, since tie_word_embeddings is false, got none"),
     "a template without the video": (TOP, template_of_text, r"chat template: expected one video in a prompt, got 0"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -279,42 +278,9 @@ def test_only_the_logits_of_an_answer_s_own_tokens_must_be_finite(kind: str, at:
     assert is_lost or answer.tokens == expected.tokens
 
 
-@pytest.mark.parametrize(
-    ("names", "has_mask"),
-    [(["score4_T7"], False), (["lower_T2"], False), (["score1_T4"] * 2, False), (["score1_T4", "score4_T7"], True)],
-    ids=["alone", "alone, with a wrong draft", "equal lengths", "other lengths"],
-)
-def test_only_conversations_of_other_lengths_need_a_mask(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch, names: list[str], has_mask: bool
-) -> None:
-    masks: list[bool] = []
-    attend = torch.nn.functional.scaled_dot_product_attention
-
-    def attending(*arguments: Any, attn_mask: Any = None, **options: Any) -> torch.Tensor:
-        masks.append(attn_mask is not None)
-        return attend(*arguments, attn_mask=attn_mask, **options)
-
-    monkeypatch.setattr(torch.nn.functional, "scaled_dot_product_attention", attending)
-    engine.evaluate([sample for name in names for sample in samples_named(name)])
-    assert any(masks) is has_mask
-
-
 def test_logits_that_are_not_finite_are_a_failure_and_no_answer() -> None:
     checkpoint = published.load(CHECKPOINT, reward_model="roboreward")
     checkpoint.parts["network"]["model.language_model.norm.weight"].fill_(torch.inf)
     engine = Engine.of(checkpoint)
     (outcome,) = engine.evaluate(CASES[0].samples()[:1])
     assert isinstance(outcome, InferenceFailedError)
-
-
-def test_a_folder_of_its_name_needs_no_option(tmp_path: Path) -> None:
-    folder = shutil.copytree(CHECKPOINT, tmp_path / "RoboReward-4B")
-    checkpoint = published.load(folder)
-    assert checkpoint.description.kind == "RoboReward"
-    checkpoint.save(tmp_path / "saved")
-    case = next(case for case in CASES if case.file.stem == "score2_T4")
-    saved, original = (Engine.of(published.load(each)) for each in (tmp_path / "saved", folder))
-    for result, expected in zip(saved.evaluate(case.samples()), original.evaluate(case.samples()), strict=True):
-        assert isinstance(result, ProgressResult)
-        assert isinstance(expected, ProgressResult)
-        np.testing.assert_array_equal(result.progress_logits, expected.progress_logits)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,10 @@ import torch
 from rfm import published
 from rfm.engine import Engine, Execution
 from rfm.families.rynnvalue.network import Bins, entropy
-from rfm.files import CheckpointError
+from rfm.published import CheckpointError
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressResult, ProgressSample, Trajectory, UInt8Array
 from rynnvalue import CASES, FOLDER, ISOLATED, RELATIVE_TOLERANCE, USUAL, Case, engine_of, said
+from spoilt import in_json, settings
 from tolerances import BATCHED_VLM_TOLERANCE
 
 ISOLATED_CONFIG, CAUSAL_CONFIG = "bro_symlog_bf16_tied", "bro_quantile_fp32_tied"
@@ -183,14 +183,6 @@ def test_preferences_and_special_tokens_in_a_task_are_refused() -> None:
     assert "'<value>'" in str(refused[1])
 
 
-def test_features_of_frames_are_computed_once() -> None:
-    cached = Engine.of(published.load(NO_META), feature_cache_mib=16)
-    execution, again = Execution(), Execution()
-    first, second = (scored(cached, progress(noise(3)), execution=each)[0] for each in (execution, again))
-    assert (execution.num_encoded, again.num_encoded, again.num_found) == (3, 0, 3)
-    np.testing.assert_allclose(first.remaining_s, second.remaining_s, rtol=1e-5)
-
-
 def test_an_export_gives_the_same_seconds_and_takes_another_robot(tmp_path: Path) -> None:
     loaded = published.load(CAUSAL, **said(USUAL))
     loaded.save(tmp_path / "export")
@@ -210,12 +202,6 @@ def test_layers_are_rounded_but_not_the_heads() -> None:
     assert rounded.weights["value_heads.0.proj.blocks.0.fc1.weight"].dtype is torch.float32
     (result,) = scored(Engine.of(rounded), progress(noise(2)))
     assert np.isfinite(np.asarray(result.remaining_s)).all()
-
-
-def changed(file: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    content = json.loads(file.read_text())
-    change(content)
-    file.write_text(json.dumps(content))
 
 
 @pytest.fixture
@@ -239,9 +225,9 @@ def test_descriptions_that_do_not_fit_the_prompt_are_refused(
 
 
 def test_missing_settings_are_assumed_and_unexpected_keys_told(copied: Path) -> None:
-    changed(copied / "config.json", lambda config: config.pop("attn_implementation"))
-    changed(copied / "config.json", lambda config: config.update(success_head_config={}))
-    changed(copied / "config.json", lambda config: config["value_head_config"].update(dropout=0.1))
+    in_json("config.json", lambda config: config.pop("attn_implementation"))(copied)
+    settings("config.json", success_head_config={})(copied)
+    in_json("config.json", lambda config: config["value_head_config"].update(dropout=0.1))(copied)
     loaded = published.read(copied)
     assert loaded.checkpoint.config.attention == "isolated"
     assert [(each.name, each.value) for each in loaded.assumptions] == [("attn_implementation", ISOLATED)]
@@ -264,7 +250,7 @@ WRONG = {
 
 @pytest.mark.parametrize(("change", "message"), WRONG.values(), ids=WRONG)
 def test_settings_that_cannot_be_right_are_refused(copied: Path, change: Any, message: str) -> None:
-    changed(copied / "config.json", change)
+    in_json("config.json", change)(copied)
     with pytest.raises(CheckpointError, match=message):
         published.load(copied)
 

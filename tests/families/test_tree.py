@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from pretended import CUDA, Seen, pretended
 from reward_models import ROOT
 from rfm import published
 from rfm.engine import Engine, Execution
@@ -182,31 +180,6 @@ DENSE = ["q3_tok_disc10", "q25_peft_adapter_disc10", "q25_boundary_disc10"]
 def test_dense_mode_in_trees_gives_the_scores_of_separate_prefixes(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     samples = [sample(9, 56, 84, 4), sample(16, 84, 56, 8), sample(3), sample(2, frame_steps=2)]
     assert_as_separate(robometer(name), samples, monkeypatch)
-
-
-def test_dense_mode_has_half_of_the_tokens() -> None:
-    collator: Any = load("q3_tok_disc10").collator
-    for num_steps, times in ((4, 2.7), (8, 2.1)):
-        rows = collator.rows(replace(sample(16, 224, 224), frame_steps=num_steps))
-        assert sum(row.num_tokens for row in rows) >= times * sum(row.cost for row in planned(rows, collator))
-
-
-@pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
-    with pretended(monkeypatch) as seen:
-        yield seen
-
-
-def test_a_device_gives_the_scores_of_a_tree_and_rarely_makes_the_host_wait(seen: Seen) -> None:
-    expected = values(topreward().evaluate(MIXED))
-    with torch.inference_mode():
-        there = topreward(device=CUDA, dtype=torch.float32)
-    for _ in range(2):
-        asked, awaited = seen.asked.total(), seen.awaited
-        found = values(there.evaluate(MIXED))
-    assert (seen.asked.total() - asked, seen.awaited - awaited) == (1, 1)  # the scores are read, the answers sent
-    for each, wanted in zip(found, expected, strict=True):
-        np.testing.assert_allclose(each, wanted, rtol=0, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("engine, frame_steps", [(topreward, 0), (robometer, 4)], ids=["TOPReward", "dense Robometer"])

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import groupby
@@ -22,7 +22,6 @@ from rfm.families.robometer.predictor import VlmPredictor
 from rfm.qwen.backbone import embedded
 from rfm.qwen.network import QWEN_2_5
 from rfm_client import (
-    InferenceFailedError,
     PreferenceResult,
     PreferenceSample,
     ProgressResult,
@@ -152,15 +151,6 @@ def test_a_mixture_equals_its_samples_alone(name: str, token_budget: int, step: 
         assert_close(outcome, engine.evaluate([samples[index]])[0], MIXED_TOLERANCE)
 
 
-def test_an_ordinary_video_over_the_token_budget_is_scored() -> None:
-    """The budget decides how samples share forward passes, not whether they are scored."""
-    samples = [ProgressSample(video(0, 12, 280, 420)), PreferenceSample(video(1, 6, 280, 420), video(2, 7, 280, 420))]
-    samples.append(ProgressSample(video(3, 5, 84, 84), frame_steps=4))
-    engine = Engine(load_engine(PLAIN).predictor, token_budget=100)
-    for outcome, other in zip(engine.evaluate(samples), load_engine(PLAIN).evaluate(samples), strict=True):
-        assert_close(outcome, other, MIXED_TOLERANCE)
-
-
 def changed(name: str, **settings: Any) -> VlmPredictor:
     """A checkpoint as if it had been trained with other settings."""
     checkpoint = load(name)
@@ -268,27 +258,6 @@ def test_a_network_that_reads_images_is_causal_and_one_that_reads_videos_is_not(
     difference = np.abs(whole.progress[:3] - part.progress).max()
     is_causal = load(config.name).description.frames_per_value == 1
     assert (difference <= MIXED_TOLERANCE) == is_causal
-
-
-def test_out_of_memory_halves_the_batch_and_fails_what_never_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A CPU has no device memory to exhaust, so the network itself refuses large batches."""
-    engine, execution = Engine(load_engine(PLAIN).predictor), Execution()
-    samples = [ProgressSample(video(seed, 2, 56, 56)) for seed in range(4)]
-    expected = engine.evaluate(samples)
-    score = engine.predictor.score
-
-    def refusing(rows: Sequence[Any], batch: Any, execution: Execution) -> Any:
-        if len(rows) > 2 or any(len(row.frames[0]) > 2 for row in rows):
-            raise torch.OutOfMemoryError("made up")
-        return score(rows, batch, execution)
-
-    monkeypatch.setattr(engine.predictor, "score", refusing)
-    *results, failed = engine.evaluate([*samples, ProgressSample(video(4, 3, 56, 56))], execution)
-    for result, other in zip(results, expected, strict=True):
-        assert_close(result, other, MIXED_TOLERANCE)
-    assert isinstance(failed, InferenceFailedError)
-    assert str(failed) == "the sample does not fit in the device's memory"
-    assert execution.out_of_memory_count == 4  # 5 rows, then 3, then 2 with the large one, then that alone
 
 
 @pytest.mark.parametrize("name", ["q3_tok_disc10", "q25_video_avg_disc10"])

@@ -102,6 +102,8 @@ def asked(endpoint: str, cache: Path, timeout_s: int = 10) -> Iterator[None]:
     from huggingface_hub.utils import _http
 
     template = endpoint + "/{repo_id}/resolve/{revision}/{filename}"
+    is_copied = hasattr(file_download, "HUGGINGFACE_CO_URL_TEMPLATE")  # until huggingface_hub 1.33
+    reader = file_download if is_copied else constants
     changed = {
         "ENDPOINT": endpoint,
         "HF_HUB_CACHE": str(cache),
@@ -112,7 +114,7 @@ def asked(endpoint: str, cache: Path, timeout_s: int = 10) -> Iterator[None]:
     forget()
     with (
         mock.patch.multiple(constants, **changed),
-        mock.patch.object(file_download, "HUGGINGFACE_CO_URL_TEMPLATE", template),
+        mock.patch.object(reader, "HUGGINGFACE_CO_URL_TEMPLATE", template),
     ):
         yield
     forget()

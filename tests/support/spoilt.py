@@ -150,6 +150,16 @@ def settings(file: str, **changes: Any) -> Spoil:
     return in_json(file, lambda content: content.update(changes))
 
 
+def nested(**changes: Any) -> Spoil:
+    """Transformers 5's file beside those of transformers 4, with the same content but for ``changes``."""
+
+    def spoil(base: Path) -> None:
+        content = json.loads((base / "preprocessor_config.json").read_text())
+        (base / "processor_config.json").write_text(json.dumps({"image_processor": content | changes}))
+
+    return spoil
+
+
 def text(name: str, content: str) -> Spoil:
     return lambda folder: (folder / name).write_text(content)
 
@@ -168,14 +178,10 @@ def conversion(load: Callable[[Path], object], folder: Path) -> str:
 
 
 def convert(load: Callable[[Path], object], folder: Path) -> None:
-    """Run the shell command from the refusal of ``load`` in this process: Python code, and perhaps a ``mv``."""
+    """Run the shell command from the refusal of ``load`` in this process."""
     _, _, code, *arguments = shlex.split(conversion(load, folder))
-    end = arguments.index("&&") if "&&" in arguments else len(arguments)
-    with mock.patch.object(sys, "argv", ["-c", *arguments[:end]]):
+    with mock.patch.object(sys, "argv", ["-c", *arguments]):
         exec(code, {})
-    if arguments[end:]:
-        _, _, source, target = arguments[end:]
-        shutil.move(source, target)
 
 
 def without(name: str, heads: Sequence[str], target: Path) -> Path:
