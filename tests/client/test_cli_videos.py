@@ -259,7 +259,7 @@ def test_a_comparison_names_no_winner_where_the_orders_disagree(
         {order: PreferenceResult(preference=each, first=scores, second=scores) for order, each in preferences.items()},
     )
     assert (comparison.ranks, comparison.ranking) == (ranks, ranking)
-    videos, pairs = ([list(column.cells) for column in shown.wide.columns] for shown in comparison.tables()[:2])
-    assert [str(cell) for cell in videos[1]] == [str(ranks[index] or "?") for index in ranking or range(len(ranks))]
-    assert [str(cell) for cell in pairs[-1]] == answers
+    videos, pairs = ([list(column) for column in zip(*shown.rows, strict=True)] for shown in comparison.tables()[:2])
+    assert videos[1] == [str(ranks[index] or "?") for index in ranking or range(len(ranks))]
+    assert pairs[-1] == answers
     assert comparison.tables()[2:] == [LEGEND] * (ranking is None)

@@ -14,7 +14,7 @@ from click import Command
 from paths import ROOT
 from rfm_commands.cli import app
 
-SERVING = {"launch", "supervise", "triton_model"}  # these name options of tritonserver, too
+SERVING = {"serve", "triton_model"}  # these name options of tritonserver, too
 FILES = [
     file
     for part in ("rfm", "export/rfm_export")

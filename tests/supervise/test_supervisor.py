@@ -180,11 +180,11 @@ PROCESSES: dict[str, tuple[list[tuple[str, str]], dict[str, int] | None, bool, f
 
 @pytest.mark.parametrize("name", PROCESSES)
 def test_a_dead_process_counts_unless_it_was_replaced(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    processes, wanted, is_settled, counts_s = PROCESSES[name]
+    states, wanted, is_settled, counts_s = PROCESSES[name]
     now_s = 0.0
     monkeypatch.setattr(processes, "time", SimpleNamespace(monotonic=lambda: now_s))
     stubs = Stubs()
-    stubs.states = dict(enumerate(processes))
+    stubs.states = dict(enumerate(states))
     for now_s in (0.0, 0.1, LOADING_DEAD_S - 0.1, LOADING_DEAD_S, 100.0):
         found = stubs.fault(wanted, is_settled=is_settled)
         assert (found is not None) == (counts_s is not None and now_s > 0 and now_s >= counts_s)
