@@ -46,7 +46,7 @@ test-all: test test-more
 
 # What takes too long for CI: chaos, a cold install, every snippet of the documents, more reference cases.
 # RFM_GOLDENS names a folder with more reference cases.
-nightly: check ops-tools
+nightly: check ops-tools $(LEROBOT)
 	$(BIN)/pytest --numprocesses 3 $(WORKERS) -m nightly
 	$(if $(RFM_GOLDENS),$(BIN)/pytest -m reference)
 	$(TOOL) tools/chaos.py

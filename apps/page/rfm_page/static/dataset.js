@@ -271,6 +271,7 @@ export class DatasetTab {
       [this.#told, this.#others] = [NOTHING, null];
       this.#failed("errors", "The dataset cannot be shown", error, () => this.#load());
     }
+    this.#previews.begin();
     const isLabelled = this.#told.episodes.some(({ final_progress: final }) => final !== undefined);
     page.cutoff.value = this.#told.threshold;
     page.order.value = this.#usualOrder;

@@ -10,7 +10,7 @@ const [WIDTH, HEIGHT] = [64, 20];
 
 export class Previews {
   #ask;
-  #known = new Map(); // by number of the episode
+  #known = null; // by number of the episode; null: the episodes are about to change
   #waiting = [];
   #numAsked = 0;
   #timer = null;
@@ -20,14 +20,20 @@ export class Previews {
     this.#ask = ask;
   }
 
-  /** Forgets everything: the episodes are others. */
+  /** Forgets everything, and asks nothing until ``begin``: the rows are still those of other episodes. */
   clear() {
-    this.#known = new Map();
+    this.#known = null;
     this.#waiting = [];
+  }
+
+  /** The rows are those of the new episodes. */
+  begin() {
+    this.#known = new Map();
   }
 
   /** Fills a picture and a curve as soon as somebody can see their row. */
   fill(episode, row, picture, curve) {
+    if (!this.#known) return;
     const preview = this.#known.get(episode.episode);
     if (preview) {
       draw(preview, picture, curve);
