@@ -12,7 +12,7 @@ WORKERS := --dist loadgroup --no-loadscope-reorder
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
-.PHONY: help demo install test fast test-more test-all nightly test-newest lint check parity bench gpu gpu-packages perf chaos soak format model_repository \
+.PHONY: help demo install test fast test-more test-all nightly test-newest lint check types parity bench gpu gpu-packages perf chaos soak format model_repository \
   clean ops-check ops-tools audit lock mutate docs reference version
 
 # What can be made: this list.
@@ -37,7 +37,7 @@ fast: $(INSTALLED)
 
 # The rest of CI: types, the documents, and the tests that are slow or need programs of Debian.
 test-more: $(INSTALLED)
-	+$(MAKE) --jobs 3 check docs ops-tools
+	+$(MAKE) --jobs 3 types docs ops-tools
 	$(BIN)/pytest --numprocesses 3 $(WORKERS) --durations 10 -m "(slow or debian) and not gpu and not alone and not nightly"
 	$(BIN)/pytest -m "alone and not nightly" $$(grep --recursive --files-with-matches mark.alone tests)
 
@@ -72,7 +72,10 @@ lint: $(INSTALLED)
 	$(BIN)/rfm export --check --repository model_repository --config model_repository/serve.yaml
 
 # Lint and types; no tests.
-check: lint
+check: lint types
+
+# Types alone.
+types: $(INSTALLED)
 	$(BIN)/mypy
 
 # How far the scores are from the original's: every reference case, through Triton.

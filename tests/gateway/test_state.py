@@ -161,7 +161,7 @@ def own_gateway(served: Serving) -> psutil.Process:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_silent(
     triton: Triton, tmp_path: Path
 ) -> None:

@@ -76,7 +76,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_deselected(items: list[pytest.Item]) -> None:
     for item in items:
-        if packages := _packages(item):
+        if (packages := _packages(item)) and not item.get_closest_marker("nightly"):
             item.config.stash.setdefault(WAITING, Counter())[packages] += 1
 
 
