@@ -109,7 +109,7 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     number = max(versions)
     folder = repository / scorer / str(number) / CHECKPOINT_FOLDER
     family = published.choose(folder, config.parameters[FAMILY_PARAMETER].string_value or None)
-    checkpoint = families.restore(folder, family.name)
+    checkpoint = families.load(folder, family=family.name)
     description = described(checkpoint, origin)
     _check_weights(folder, description.weights, settings)
     settings = with_batch_size(settings, checkpoint, _nobody)

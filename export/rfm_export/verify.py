@@ -75,7 +75,7 @@ def _compare_staged(source: Source, version: Version, staged: Path, say: Say) ->
         say(f"the export's scores are compared with the checkpoint's on {device} (--device names another one)")
 
     def exported(*, cuda_graphs: bool = False) -> Engine:
-        checkpoint = families.restore(version.checkpoint_folder(description, staged), source.family.name)
+        checkpoint = families.load(version.checkpoint_folder(description, staged), family=source.family.name)
         if source.encoders is None:
             return engine(checkpoint, cuda_graphs=cuda_graphs)
         served_by = families.encoders_of(source.family.name)

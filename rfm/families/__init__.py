@@ -48,12 +48,13 @@ def encoders_of(package: str) -> type[FrameEncoders]:
     return encoders
 
 
-def restore(folder: Path, package: str) -> Checkpoint:
+def load(folder: Path, *, family: str) -> Checkpoint:
     """Load what ``Checkpoint.save`` wrote. Raises CheckpointError, also for weights of NaN or zeros.
 
-    package: of the checkpoint's family
+    family: package of the checkpoint's family
+    The model.py of exports since 0.4 calls this.
     """
-    checkpoint = named(package).restore(folder)
+    checkpoint = named(family).restore(folder)
     for weights in checkpoint.parts.values():
         check_values(weights)
     return checkpoint

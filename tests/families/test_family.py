@@ -152,6 +152,13 @@ def test_a_score_that_is_no_number_is_an_error_to_every_client(running: Running)
         client.evaluate([ProgressSample(video([0.5])), bad])
 
 
+@pytest.mark.parametrize(
+    ("name", "now"), [("rfm.vlm", "rfm.families.robometer"), ("rfm.rewind", "rfm.families.rewind")]
+)
+def test_exports_of_0_4_name_packages_of_before(name: str, now: str) -> None:
+    assert families.named(name).name == now
+
+
 NO_FAMILY = {
     "unknown": (None, "model_type: expected rewind_transformer, got redness"),
     "not there": ("no.such.package", "can be imported, got no.such.package: No mod"),

@@ -29,7 +29,7 @@ class TritonPythonModel(BatchModel[Sample, Result]):
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         self.engine = Engine.of(
-            families.restore(version / CHECKPOINT_FOLDER, settings[FAMILY_PARAMETER]),
+            families.load(version / CHECKPOINT_FOLDER, family=settings[FAMILY_PARAMETER]),
             device=device,
             dtype=getattr(torch, settings[DTYPE_PARAMETER]) if settings[DTYPE_PARAMETER] else None,
             token_budget=int(settings[BUDGET_PARAMETER]),
