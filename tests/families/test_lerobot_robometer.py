@@ -86,3 +86,12 @@ def test_of_untied_weights_the_embedding_is_read(tmp_path: Path) -> None:
     case = next(case for case in CASES if case.config == CHECKPOINT.parent)
     engine = Engine.of(published.load(folder, base_model=str(BASE)))
     check(engine.evaluate(case.samples(case.content.get("cropped_to_last"))), case.content["decoded"], 1, TOLERANCES[1])
+
+
+def test_a_head_of_one_output_is_that_of_a_distance_loss(tmp_path: Path) -> None:
+    folder, options = with_sources("robometer of LeRobot", tmp_path)
+    head = "progress_head.4."
+    one = {f"{head}{name}": slice(1) for name in ("weight", "bias")}
+    weights(lambda w: w.update({name: w[name][rows].clone() for name, rows in one.items()}))(folder)
+    in_json("config.json", lambda config: config.update(progress_loss_type="l2"))(folder)
+    assert published.load(folder, **options).config.progress_bins == 1
