@@ -44,6 +44,10 @@ from rfm.published.qwen import (
 from rfm.published.weights import read_weights, refuse_pickles
 from rfm.qwen.lora import BASE_LAYER, LORA_NAME, MERGE, module_of
 
+WHOLE, TEXT = "model.", "model.language_model."  # what PEFT wraps
+_ALL_LINEAR = "all-linear"
+_LAYER = re.compile(r"\.\d+\.")  # the first one in a name
+_PATTERN_S = 5  # for a pattern of an unknown author
 # Initialisations of factors that do not change the base model's weights.
 _PLAIN_INITS = (True, False, "gaussian", "orthogonal")
 # Fields of adapter_config.json that change no score. Any other field, if set, may change the formula above.
@@ -204,12 +208,6 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     dequantize(weights)
     dtype = getattr(torch, str(content.get("dtype") or content.get("torch_dtype")), None)  # in which transformers loads
     return config, {n: w.to(dtype) if dtype and w.is_floating_point() else w for n, w in weights.items()}
-
-
-WHOLE, TEXT = "model.", "model.language_model."  # what PEFT wraps
-_ALL_LINEAR = "all-linear"
-_LAYER = re.compile(r"\.\d+\.")  # the first one in a name
-_PATTERN_S = 5  # for a pattern of an unknown author
 
 
 def check_factors(

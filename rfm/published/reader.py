@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a reader of published checkpoints gets, and what it returns."""
+"""The options that a reader of published checkpoints takes, and the ``Loaded`` that it returns."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from rfm.config import ExportConfig
-from rfm.config import VideoPrompt as VideoPrompt
-from rfm.config import Weights as Weights
+from rfm.config import ExportConfig, VideoPrompt, Weights
 from rfm.engine.family import Checkpoint, FrameEncoders
 from rfm.files import CheckpointError
 from rfm.published.provenance import Assumption
