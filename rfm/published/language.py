@@ -17,7 +17,7 @@ from rfm.published.provenance import HUB_FOLDER, Assumption, source_name
 from rfm.published.qwen import QWEN_NAMES, Renames, backbone_config, decided, renamed
 from rfm.published.reader import Options
 from rfm.published.robometer_run import DTYPES
-from rfm.published.rounding import kind_of, read_published, read_unrounded_config, round_layers
+from rfm.published.rounding import kind_of, read_published, read_unrounded_config, round_layers, rounded_as_asked
 from rfm.qwen.language import EMBEDDING, HEAD, LanguageCheckpoint, LanguageConfig
 from rfm.qwen.network import QWEN3, QWEN_2_5, Dtype
 from rfm.saved import PROCESSOR_FOLDER
@@ -100,10 +100,7 @@ class LanguageFolder:
 def reopened(made: type[Made], folder: Path, options: Options) -> Made:
     """Load an export, with the processor and the form of weights that the user asks for. Raises CheckpointError."""
     checkpoint = made.restore(folder)
-    config, weights = checkpoint.config, checkpoint.weights
-    if options.weights is not None and config.weights is None:
-        weights, _ = round_layers(weights, {}, options.weights, config.torch_dtype)
-        config = replace(config, weights=options.weights)
+    config, weights, _ = rounded_as_asked(checkpoint.config, checkpoint.weights, {}, options.weights)
     return replace(checkpoint, config=config, weights=weights, processor=options.base_model or checkpoint.processor)
 
 

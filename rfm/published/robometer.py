@@ -42,7 +42,7 @@ from rfm.published.robometer_run import (
     lerobot_run,
     lerobot_weights,
 )
-from rfm.published.rounding import kind_of, read_published, read_unrounded_config, round_layers
+from rfm.published.rounding import kind_of, read_published, read_unrounded_config, rounded_as_asked
 from rfm.published.run_config import check_progress
 from rfm.published.weights import has_head, read_weights
 from rfm.qwen.lora import changed_by, split
@@ -103,9 +103,7 @@ def load(folder: Path, options: Options) -> Loaded:
     else:
         parts, assumptions = _published(folder, options)
     config, weights, factors, processor = parts
-    if options.weights is not None and config.weights is None:
-        weights, factors = round_layers(weights, factors, options.weights, config.torch_dtype)
-        config = replace(config, weights=options.weights)
+    config, weights, factors = rounded_as_asked(config, weights, factors, options.weights)
     base = options.base_model
     has_processor = base is None and isinstance(processor, Path)
     checkpoint = PublishedVlm(config, weights, base or processor, factors, base, has_processor)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,3 +75,15 @@ def round_layers(
         own = {factor: rest.pop(factor) for factor in factors if changed_by(factor) == name}
         whole |= rounded(name, merged({name: weight}, own, torch.float32)[name], kind, dtype)
     return whole, rest
+
+
+def rounded_as_asked(
+    config: Any, weights: dict[str, Tensor], factors: dict[str, Tensor], kind: Weights | None
+) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
+    """Return a checkpoint's configuration, weights and LoRA factors, with the layers rounded if the user asks for it.
+
+    kind: the user's option; None, or layers that are rounded already: nothing changes
+    """
+    if kind is None or config.weights is not None:
+        return config, weights, factors
+    return replace(config, weights=kind), *round_layers(weights, factors, kind, config.torch_dtype)

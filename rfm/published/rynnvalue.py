@@ -20,7 +20,7 @@ from rfm.published.language import dtype_of
 from rfm.published.provenance import Assumption, source_name
 from rfm.published.qwen import QWEN_NAMES, UNUSED, backbone_config, renamed
 from rfm.published.reader import Loaded, Options, Reader
-from rfm.published.rounding import read_published, read_unrounded_config, round_layers
+from rfm.published.rounding import read_published, read_unrounded_config, rounded_as_asked
 from rfm.qwen.language import EMBEDDING
 from rfm.qwen.network import QWEN3
 from rfm.qwen.processor import PROCESSOR_CONFIG, pixel_limits, read_processor
@@ -264,13 +264,10 @@ def _exported(folder: Path, options: Options) -> Loaded:
 
 def _rounded(checkpoint: RynnCheckpoint, options: Options) -> RynnCheckpoint:
     """Return the checkpoint, with the backbone's layers rounded if the user asks for it, and checked."""
-    config = checkpoint.config
-    if options.weights is not None and config.weights is None:
-        ours = {name: each for name, each in checkpoint.weights.items() if name.startswith(_OF_BACKBONE)}
-        rounded, _ = round_layers(ours, {}, options.weights, config.torch_dtype)
-        heads = {name: each for name, each in checkpoint.weights.items() if name not in ours}
-        config = replace(config, weights=options.weights)
-        checkpoint = replace(checkpoint, config=config, weights={**rounded, **heads})
+    ours = {name: each for name, each in checkpoint.weights.items() if name.startswith(_OF_BACKBONE)}
+    heads = {name: each for name, each in checkpoint.weights.items() if name not in ours}
+    config, ours, _ = rounded_as_asked(checkpoint.config, ours, {}, options.weights)
+    checkpoint = replace(checkpoint, config=config, weights={**ours, **heads})
     checkpoint.check()
     return checkpoint
 
