@@ -20,7 +20,7 @@ from rfm_client.cli.next_steps import next_steps, steps_with_server
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import checkpoint_of, heading
 from rfm_client.cli.show import print_tables, scores_table
-from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.inputs import load_trajectory
 from rfm_commands.try_video import steps_without_server
 from toy_world import Clip, Task, make_clip

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
 from rfm.parameters import DEFAULT_HANG_S
 from rfm_client.contract.addresses import MAX_PORT, is_loopback
 from rfm_client.contract.checks import require
-from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.settings import ConfigError, Settings, setting
+from rfm_client.contract.wire import DEFAULT_MODEL
 
 if TYPE_CHECKING:
     import torch

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rfm_client.contract import ProgressSample, wire
-from rfm_client.contract.synthetic import blank_trajectory
+from rfm_client.contract.samples import blank_trajectory
 
 
 def probe_request(config: Mapping[str, Any]) -> wire.Tensors:

@@ -24,7 +24,7 @@ from rfm.serve.processes import has_ended
 from rfm.serve.repository import MODEL_FILE
 from rfm.serve.supervisor import GATEWAY
 from rfm_client import RewardClient
-from rfm_client.contract import descriptors
+from rfm_client.contract.process import raise_limit
 from servers import MODEL, RFM, START_S, Endpoints, Serving, children, serving, wait_for
 
 CHECKPOINT = ROOT / "model_repository" / "rfm" / "1" / "checkpoint"
@@ -291,7 +291,7 @@ def dead_load(site: Site) -> list[Row]:
 
 def idle_connections(site: Site) -> list[Row]:
     """Open IDLE connections to the gateway and to each port of Triton, and leave them idle."""
-    descriptors.raise_limit()
+    raise_limit()
     ends, gateway = site.served.endpoints, httpx.URL(site.gateway_url)
     ports = [gateway.port, ends.http_port, ends.grpc_port, ends.metrics_port]
     with ExitStack() as idle, site.callers(CALLERS // 2) as callers, site.gateway_callers() as beside:

@@ -21,10 +21,16 @@ from rfm_client.contract.errors import (
     ModelNotFoundError,
     RewardError,
 )
-from rfm_client.contract.names import PROBE_PREFIX, Part, encoder_name, frames_name
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
-from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
-from rfm_client.contract.synthetic import blank_trajectory
+from rfm_client.contract.samples import (
+    PreferenceSample,
+    ProgressSample,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+    blank_trajectory,
+)
+from rfm_client.contract.wire import PROBE_PREFIX, Part, encoder_name, frames_name
 from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes
 from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
 from rfm_client.episodes.scorer import Asked, StepScorer

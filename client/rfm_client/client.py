@@ -13,9 +13,9 @@ from rfm_client.async_client import AsyncRewardClient
 from rfm_client.client_options import ClientOptions
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import RewardError
-from rfm_client.contract.names import Part
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.contract.wire import Part
 from rfm_client.episodes.episodes import Episode, Episodes
 from rfm_client.episodes.options import StepKeywords, StepScore
 from rfm_client.frames.fit_to_checkpoint import snapshot

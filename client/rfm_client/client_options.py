@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
-from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.transport.calls import Transport
 
 DEFAULT_TIMEOUT_S = 60.0

@@ -22,9 +22,8 @@ from rfm.serve.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm.serve.triton_server import TritonServer, short_spin
 from rfm_client.cli.command import Given, add_missing, with_options
 from rfm_client.cli.messages import MOST_COLUMNS
-from rfm_client.contract.descriptors import raise_limit
-from rfm_client.contract.listening import from_here
-from rfm_client.contract.process_log import write_log
+from rfm_client.contract.addresses import from_here
+from rfm_client.contract.process import raise_limit, write_log
 from rfm_client.contract.settings import ConfigError
 
 try:

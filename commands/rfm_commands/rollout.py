@@ -37,8 +37,8 @@ from rfm.serve.repository_api import RepositoryApi, RepositoryApiError
 from rfm_client import PreferenceSample, ProgressSample, RewardError, Sample
 from rfm_client.contract import wire
 from rfm_client.contract.errors import LocatedError
-from rfm_client.contract.names import encoder_name, frames_name
-from rfm_client.contract.synthetic import random_trajectory
+from rfm_client.contract.samples import random_trajectory
+from rfm_client.contract.wire import encoder_name, frames_name
 from rfm_export.errors import ExportError
 from rfm_export.layout import description_in
 from rfm_export.pbtxt import serving_versions

@@ -18,7 +18,7 @@ from rfm.parameters import CHECKPOINT_FOLDER, FAMILY_PARAMETER
 from rfm.published.provenance import write
 from rfm.serve.repository import CONFIG_FILE
 from rfm_client.contract import FRAME_SCORES, wire
-from rfm_client.contract.names import encoder_name, frames_name
+from rfm_client.contract.wire import encoder_name, frames_name
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, description_in, generated_files, generated_models
 from rfm_export.publish import alone, next_version, publish, read_config, staging

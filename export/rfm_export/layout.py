@@ -27,8 +27,8 @@ from rfm.parameters import (
 from rfm.serve.repository import CONFIG_FILE, MODEL_FILE
 from rfm_client.contract import PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
-from rfm_client.contract.names import encoder_name, frames_name
-from rfm_client.contract.synthetic import blank_trajectory
+from rfm_client.contract.samples import blank_trajectory
+from rfm_client.contract.wire import encoder_name, frames_name
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
 
 WARMUP_FOLDER = "warmup"

@@ -36,7 +36,7 @@ from rfm.serve.repository import CONFIG_FILE
 from rfm.weights import num_values
 from rfm_client.contract import ProgressSample
 from rfm_client.contract.description import Description, Origin
-from rfm_client.contract.synthetic import random_trajectory
+from rfm_client.contract.samples import random_trajectory
 from rfm_export.errors import ExportError
 from rfm_export.layout import description_in
 from rfm_export.pbtxt import parse

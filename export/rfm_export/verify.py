@@ -27,7 +27,7 @@ from rfm_client.contract import (
 )
 from rfm_client.contract.description import Description
 from rfm_client.contract.results import answer, trajectory_scores
-from rfm_client.contract.synthetic import Widths, random_trajectory
+from rfm_client.contract.samples import Widths, random_trajectory
 from rfm_export.errors import ExportDiffersError, ExportError
 from rfm_export.layout import Version
 from rfm_export.source import Say, Source

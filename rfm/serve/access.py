@@ -16,11 +16,10 @@ from pathlib import Path
 
 from rfm.config import DEFAULT_HOST, ServeConfig
 from rfm.serve.installation import ServerStartError
-from rfm_client.contract.addresses import check_authorities, check_certificate, is_loopback
+from rfm_client.contract.addresses import ListenAddress, check_authorities, check_certificate, in_url, is_loopback
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidValueError
-from rfm_client.contract.listening import ListenAddress, in_url
-from rfm_client.contract.names import ADMIN_KEY_VARIABLE
+from rfm_client.contract.wire import ADMIN_KEY_VARIABLE
 
 VARIABLE = ADMIN_KEY_VARIABLE
 HEADER = "rfm-admin-key"

@@ -15,7 +15,7 @@ from tritonclient.utils import np_to_triton_dtype
 
 from rfm.probe_request import probe_request
 from rfm_client.contract import wire
-from rfm_client.contract.names import PROBE_PREFIX
+from rfm_client.contract.wire import PROBE_PREFIX
 
 PROBE_TIMEOUT_S = 1.0  # for answers without a model
 

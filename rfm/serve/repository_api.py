@@ -21,8 +21,7 @@ from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import LocatedError, ServerUnavailableError
-from rfm_client.contract.names import PROBE_PREFIX
-from rfm_client.contract.wire import Tensors
+from rfm_client.contract.wire import PROBE_PREFIX, Tensors
 
 INDEX_PATH = "/v2/repository/index"  # over HTTP
 READY, LOADING, UNLOADING = "READY", "LOADING", "UNLOADING"

@@ -15,7 +15,7 @@ from typing import Any
 
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
-from rfm_client.contract.listening import ListenAddress
+from rfm_client.contract.addresses import ListenAddress
 
 NO_REASON = ""  # of a ready model
 REQUEST_S = 5.0  # longest silence of a connection

@@ -29,7 +29,7 @@ from rfm.triton_model.watchdog import Watchdog
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
-from rfm_client.contract.process_log import write_log
+from rfm_client.contract.process import write_log
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import Tensors
 

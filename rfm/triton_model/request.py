@@ -17,8 +17,8 @@ from rfm_client.contract import (
     SimilaritySample,
     wire,
 )
-from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.samples import EncoderSample
+from rfm_client.contract.wire import PROBE_PREFIX
 
 Question = TypeVar("Question")
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rfm.triton_model.request import FAILED, Request
-from rfm_client.contract.process_log import about
+from rfm_client.contract.process import about
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from client_commands import invoke
 from engine_server import EngineServer
 from proxies import HttpProxy, Proxy
 from rfm_client import DeadlineExceededError, RewardClient
-from rfm_client.contract.proxies import grpc_proxy
+from rfm_client.contract.addresses import grpc_proxy
 from rfm_client.serving import ServerStatus
 from servers import Endpoints
 

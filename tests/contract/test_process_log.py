@@ -18,7 +18,7 @@ from rfm_client.serving import write_log
 HEAD = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z"
 PROGRAM = """
 import logging, os, sys
-from rfm_client.contract.process_log import about, write_log
+from rfm_client.contract.process import about, write_log
 write_log("rfm-serve", os.environ)
 log = logging.getLogger("rfm.serve")
 """

@@ -33,7 +33,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client import SimilaritySample as Similarity
-from rfm_client.contract.synthetic import blank_trajectory, random_trajectory
+from rfm_client.contract.samples import blank_trajectory, random_trajectory
 from rfm_commands.engine_scorer import EngineScorer
 from spoilt import convert, without
 from vlm import assert_close

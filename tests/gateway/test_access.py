@@ -14,7 +14,7 @@ import pytest
 
 from gateway_requests import FIRST, NO_KEY, dumped, failure, of_frames, progress
 from gateways import TestClient, inside
-from rfm_client.contract.process_log import LogLines
+from rfm_client.contract.process import LogLines
 from rfm_client.options import ConfigError
 from rfm_gateway import GatewayConfig
 from rfm_gateway.refusals import PERIOD_S, LimitedLog

@@ -19,8 +19,7 @@ import uvicorn
 from gateways import NO_TRITON, free_port, inside, running
 from in_process import rfm
 from rfm_client import ServerError
-from rfm_client.contract.descriptors import MOST
-from rfm_client.contract.process_log import LogLines
+from rfm_client.contract.process import MOST, LogLines
 from rfm_client.contract.triton import denied, not_served, unreachable
 from rfm_gateway import GatewayConfig, mounting
 from rfm_gateway.command import page_link

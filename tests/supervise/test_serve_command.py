@@ -31,7 +31,7 @@ from rfm.serve.access import free_ports
 from rfm.serve.installation import ServerStartError, find_installation
 from rfm.serve.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
-from rfm_client.contract.descriptors import MOST
+from rfm_client.contract.process import MOST
 from servers import children, model_processes, wait_for
 from terminals import Terminal
 

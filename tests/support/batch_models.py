@@ -30,7 +30,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
-from rfm_client.contract.process_log import LEVEL_VARIABLE, LogLines
+from rfm_client.contract.process import LEVEL_VARIABLE, LogLines
 from servers import wait_for
 from trajectories import random_trajectory
 

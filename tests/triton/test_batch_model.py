@@ -33,7 +33,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.contract.description import Description
-from rfm_client.contract.names import PROBE_PREFIX
+from rfm_client.contract.wire import PROBE_PREFIX
 from servers import PATIENCE_S
 
 REASON = "scoring failed; the server's log has the reason"

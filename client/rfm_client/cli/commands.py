@@ -45,9 +45,9 @@ from rfm_client.cli.show import StreamedTable, in_place_of_progress, print_table
 from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames, write_perf_analyzer_input
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import DeadlineExceededError, RewardError
-from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.settings import ConfigError
+from rfm_client.contract.wire import frames_name
 from rfm_client.plot import save
 
 MIN_COMPARED = 2

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rfm_client.cli.options import DEFAULT_URL
-from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.contract.wire import DEFAULT_MODEL
 
 DEFAULT_URLS = (DEFAULT_URL, DEFAULT_URL.replace("localhost", "127.0.0.1"))
 PAGE_PORT = 8100

@@ -21,9 +21,9 @@ from rfm_client.client_options import DEFAULT_TIMEOUT_S
 from rfm_client.contract import errors
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
-from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
+from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.orientation import ChannelOrder, Orientation
 from rfm_client.frames.sampling import RULES, Rule, Sampling
 from rfm_client.plot import MAX_CURVES

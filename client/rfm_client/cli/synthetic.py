@@ -23,9 +23,8 @@ import numpy.typing as npt
 
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import ModelNotFoundError
-from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample
+from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, random_trajectory
 from rfm_client.contract.settings import Settings, setting
-from rfm_client.contract.synthetic import random_trajectory
 from rfm_client.contract.wire import encode_samples
 
 TASK = "put the block in the bowl"

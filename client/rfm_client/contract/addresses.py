@@ -1,12 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Checks of a server's URL, address and certificate files (PEM)."""
+"""Addresses of servers: URLs, listen addresses, certificate files (PEM), and proxies that the environment names.
+
+Calls to this machine use no proxy. For other hosts gRPC and urllib decide, each by its own variables. This module
+repeats their rules for error messages. The client's HTTP transport uses no proxy.
+"""
 
 from __future__ import annotations
 
+import errno
 import ipaddress
+import os
 import re
+import socket
 import ssl
+import urllib.request
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.settings import ConfigError
@@ -87,3 +98,88 @@ def _reason(error: OSError) -> str:
     if not isinstance(error, ssl.SSLError):
         return error.strerror or str(error)
     return _OPENSSL_REASONS.get(error.reason or "", "a file in another format")
+
+
+def in_url(host: str) -> str:
+    """Return the host as a URL writes it: IPv6 in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+def from_here(host: str) -> str:
+    """Return the address by which this machine reaches a server that listens at ``host``."""
+    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+
+
+@dataclass(frozen=True)
+class ListenAddress:
+    """Host and port that a server listens on."""
+
+    host: str
+    port: int
+
+    @property
+    def is_loopback(self) -> bool:
+        """True if only this machine can reach the server."""
+        return is_loopback(self.host)
+
+    def url(self, scheme: str) -> str:
+        """Return the URL by which this machine reaches the server."""
+        return f"{scheme}://{in_url(from_here(self.host))}:{self.port}"
+
+    def check_free(self, where: str, *, port_option: str, host_option: str = "--host") -> None:
+        """Raise InvalidValueError unless a server can listen here. The message names the option to change."""
+        try:
+            family = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)[0][0]
+            socket.create_server((self.host, self.port), family=family).close()
+        except (OSError, OverflowError) as error:
+            number = getattr(error, "errno", None) or 0
+            reason = os.strerror(number) if number > 0 else str(error)
+            is_of_port = number in (errno.EADDRINUSE, errno.EACCES)
+            remedy = f"{port_option} names another port" if is_of_port else f"{host_option} names another address"
+            expected = f"a free port of this machine at {in_url(self.host)}:{self.port}"
+            raise InvalidValueError.at(where, expected, reason, remedy) from None
+
+
+_OF_GRPC = ("grpc_proxy", "https_proxy", "http_proxy")  # the first that is set counts, even if empty
+_NOT_OF_GRPC = ("no_grpc_proxy", "no_proxy")
+_CREDENTIALS = re.compile(r"[^/@]*@")
+
+
+def grpc_proxy(address: str) -> str | None:
+    """Return ``VARIABLE=VALUE`` of the proxy that gRPC uses for ``host:port``, without a password; None: no proxy."""
+    host = host_of(address)
+    name = next((name for name in _OF_GRPC if name in os.environ), None)
+    if name is None or not os.environ[name] or is_loopback(host):
+        return None
+    excepted = next((os.environ[name] for name in _NOT_OF_GRPC if name in os.environ), "")
+    if any(_matches(host, entry.strip()) for entry in excepted.split(",") if entry.strip()):
+        return None
+    return _shown(name, os.environ[name])
+
+
+def open_url(url: str, timeout_s: float) -> Any:
+    """Open the URL and return the response. Raises OSError or HTTPException."""
+    scheme, host = urlsplit(url).scheme, urlsplit(url).hostname or ""
+    proxies = urllib.request.ProxyHandler({} if is_loopback(host) else None)
+    try:  # a new opener, since urlopen keeps the proxies of its first call
+        return urllib.request.build_opener(proxies).open(url, timeout=timeout_s)
+    except OSError as error:
+        proxy = urllib.request.getproxies().get(scheme)
+        if not proxy or urllib.request.proxy_bypass(host):
+            raise
+        raise OSError(f"{error} (through {_shown(f'{scheme}_proxy', proxy)})") from error
+
+
+def _matches(host: str, entry: str) -> bool:
+    """True if an entry of no_proxy names the host by gRPC's rules: the end of a name, or a network (CIDR)."""
+    if host.lower().endswith(entry.lower()):
+        return True
+    try:
+        return "/" in entry and ipaddress.ip_address(host) in ipaddress.ip_network(entry, strict=False)
+    except ValueError:
+        return False
+
+
+def _shown(name: str, value: str) -> str:
+    """``VARIABLE=VALUE`` for an error message, without the password."""
+    return f"{name}={_CREDENTIALS.sub('***@', value)}"

@@ -2,8 +2,7 @@
 """Samples: questions to a reward model.
 
 Letters: T frames, H x W pixels, D width of a frame embedding, Dt width of a text embedding.
-Samples check their arrays once, here; all other code relies on it.
-"""
+Samples check their arrays once, here; all other code relies on it."""
 
 from __future__ import annotations
 
@@ -342,3 +341,38 @@ def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
         raise InvalidSampleError.at(
             f"{where}.video_embeddings", f"{expected} per frame, as the first trajectory (one array holds both)", got
         )
+
+
+Widths: TypeAlias = tuple[int, int] | None
+
+BLANK_FRAMES = 2
+SIDE_PX = 64
+PROBE_TASK = "probe"  # of a blank trajectory
+
+
+def blank_trajectory(widths: Widths, task: str = PROBE_TASK) -> Trajectory:
+    """Return BLANK_FRAMES embeddings, or frames, of zeros."""
+    if widths is None:
+        return Trajectory(frames=np.zeros((BLANK_FRAMES, SIDE_PX, SIDE_PX, 3), np.uint8), task=task)
+    video_dim, text_dim = widths
+    return Trajectory(
+        video_embeddings=np.zeros((BLANK_FRAMES, video_dim), np.float32), text_embedding=np.zeros(text_dim, np.float32)
+    )
+
+
+def random_trajectory(
+    random: np.random.Generator,
+    num_frames: int,
+    widths: Widths,
+    *,
+    task: str,
+    size_px: tuple[int, int] = (SIDE_PX, SIDE_PX),
+) -> Trajectory:
+    """Return normally distributed embeddings, or noise frames with ``task`` and ``size_px`` = (height, width)."""
+    if widths is None:
+        return Trajectory(frames=random.integers(0, 256, (num_frames, *size_px, 3), np.uint8), task=task)
+    video_dim, text_dim = widths
+    return Trajectory(
+        video_embeddings=random.standard_normal((num_frames, video_dim), np.float32),
+        text_embedding=random.standard_normal(text_dim, np.float32),
+    )

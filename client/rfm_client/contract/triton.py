@@ -14,8 +14,7 @@ from typing import Any, TypeAlias, TypeVar
 from urllib.parse import urljoin
 
 from rfm_client.contract import errors
-from rfm_client.contract.names import frames_name
-from rfm_client.contract.wire import GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS
+from rfm_client.contract.wire import GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS, frames_name
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 

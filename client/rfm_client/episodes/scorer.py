@@ -20,9 +20,9 @@ from weakref import WeakKeyDictionary
 from rfm_client.contract import wire
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
-from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array
+from rfm_client.contract.wire import frames_name
 from rfm_client.episodes.options import StepScore
 from rfm_client.episodes.steps import Steps, Window
 from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW

@@ -17,9 +17,9 @@ from urllib.error import HTTPError
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.addresses import open_url
 from rfm_client.contract.checks import checked_finite, checked_positive, require
 from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
-from rfm_client.contract.proxies import open_url
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.frames.pictures import FrameFileError, decoded_picture, opened_picture
 from rfm_client.frames.video_decoding import (

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 
-from rfm_client.contract.names import frames_name
 from rfm_client.contract.samples import Sample, stackable
+from rfm_client.contract.wire import frames_name
 
 MAX_REQUEST_BYTES = 8 * 2**20  # more gains nothing, since Triton batches requests
 

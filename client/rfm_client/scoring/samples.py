@@ -14,9 +14,9 @@ from typing import Any, TypeAlias, TypeVar, cast
 from rfm_client.contract import wire
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, ModelNotFoundError, RewardError
-from rfm_client.contract.names import encoder_name
 from rfm_client.contract.results import Result
 from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, UInt8Array
+from rfm_client.contract.wire import encoder_name
 from rfm_client.frames.blank_frames import BlankFrames, is_blank
 from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, whole, with_frame_indices
 from rfm_client.scoring.batching import groups, model_of, padded_bytes, parts

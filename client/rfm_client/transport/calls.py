@@ -16,10 +16,9 @@ from typing import Any, ClassVar, Protocol, TypeVar
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client.contract import errors, triton
-from rfm_client.contract.addresses import split_url
+from rfm_client.contract.addresses import grpc_proxy, split_url
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidValueError
-from rfm_client.contract.proxies import grpc_proxy
 from rfm_client.contract.wire import Tensors
 from rfm_client.transport.connection import Connection, grpc_options
 from rfm_client.transport.credentials import SECURE_SCHEMES, Credentials

@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rfm_client.contract.proxies import grpc_proxy
+from rfm_client.contract.addresses import grpc_proxy
 
 PING_MS = 330_000
 UNACKNOWLEDGED_MS = 10_000

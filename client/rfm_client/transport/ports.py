@@ -8,8 +8,7 @@ import socket
 import ssl
 
 from rfm_client.contract import errors
-from rfm_client.contract.addresses import host_of, split_url
-from rfm_client.contract.listening import in_url
+from rfm_client.contract.addresses import host_of, in_url, split_url
 
 LOOK_S = 1.0
 _READ_BYTES = 4096

@@ -18,10 +18,9 @@ from typing import Any, TypeAlias
 from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import triton
-from rfm_client.contract.addresses import split_url
+from rfm_client.contract.addresses import grpc_proxy, open_url, split_url
 from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
-from rfm_client.contract.names import encoder_name, frames_name
-from rfm_client.contract.proxies import grpc_proxy, open_url
+from rfm_client.contract.wire import encoder_name, frames_name
 from rfm_client.transport.connection import grpc_options
 from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.ports import OF_A_PORT, wrong_port

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Names, types and dimensions of the tensors, and the digest of a frame. Letters as in the package."""
+"""Names of models and requests; names, types and dimensions of the tensors; the digest of a frame.
+
+Letters as in the package.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,25 @@ import numpy.typing as npt
 
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.samples import UInt8Array
+
+Part: TypeAlias = Literal["embeddings", "encoder", "frames"]  # models of a served checkpoint
+
+DEFAULT_MODEL = "rfm"  # scores embeddings; the names of the other models derive from it
+
+PROBE_PREFIX = "rfm-probe"  # of the request ids of probes, which a model's metrics leave out
+
+ADMIN_KEY_VARIABLE = "RFM_ADMIN_KEY"
+
+
+def encoder_name(model: str) -> str:
+    """Return the name of the encoder whose embeddings ``model`` scores."""
+    return f"{model}_encoder"
+
+
+def frames_name(model: str) -> str:
+    """Return the name of the model that scores raw frames, beside ``model`` for embeddings."""
+    return f"{model}_frames"
+
 
 Tensors: TypeAlias = dict[str, npt.NDArray[Any]]
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The log of `rfm serve`, the gateway and the model processes: one format, on standard error.
+"""A server's process: its log, on standard error, and the number of files that it may have open.
+
+`rfm serve`, the gateway and the model processes write one format:
 
 2026-11-27T09:30:00.123Z ERROR rfm-gateway[57] request=7f62c7f345dedac0-1: the message
 """
@@ -17,9 +19,8 @@ from datetime import datetime, timezone
 from itertools import islice
 from urllib.parse import quote
 
-from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.settings import ConfigError
-from rfm_client.contract.wire import REQUEST_ID
+from rfm_client.contract.wire import PROBE_PREFIX, REQUEST_ID
 
 LEVEL_VARIABLE = "RFM_LOG_LEVEL"
 
@@ -111,3 +112,21 @@ class LogLines(logging.Formatter):
 
 def _printable(line: str) -> str:
     return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in line)
+
+
+MOST = 2**16  # some container runtimes allow 2**30, and programs that walk through all descriptors then stand still
+
+
+def raise_limit() -> int:
+    """Raise this process's limit to what its user may have, at most MOST; return the limit. Children inherit it."""
+    if sys.platform == "win32":
+        return MOST
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = MOST if hard == resource.RLIM_INFINITY else min(hard, MOST)
+    if soft != resource.RLIM_INFINITY and soft < allowed:
+        with suppress(OSError, ValueError):  # macOS allows less than it says
+            resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return MOST if soft == resource.RLIM_INFINITY else soft
