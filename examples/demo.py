@@ -16,10 +16,9 @@ import typer
 
 from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
-from rfm_client.cli.next_steps import next_steps, steps_with_server
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import checkpoint_of, heading
-from rfm_client.cli.show import print_tables, scores_table
+from rfm_client.cli.show import next_steps, print_tables, scores_table, steps_with_server
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.inputs import load_trajectory
 from rfm_commands.try_video import steps_without_server

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""AsyncRewardClient: asyncio client of served reward models, which RewardClient runs in a thread."""
+"""AsyncRewardClient: asyncio client of served reward models, which RewardClient runs in a thread; options of both."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
-from rfm_client.client_options import ClientOptions
 from rfm_client.contract.checks import checked_count, require
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
@@ -30,22 +31,68 @@ from rfm_client.contract.samples import (
     Trajectory,
     blank_trajectory,
 )
-from rfm_client.contract.wire import PROBE_PREFIX, Part, encoder_name, frames_name
+from rfm_client.contract.wire import DEFAULT_MODEL, PROBE_PREFIX, Part, encoder_name, frames_name
 from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes
 from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
 from rfm_client.episodes.scorer import Asked, StepScorer
 from rfm_client.episodes.steps import Steps
 from rfm_client.frames.sampling import Sampling
-from rfm_client.scoring.call import Call, CallOptions
-from rfm_client.scoring.samples import SampleScorer, results_of
-from rfm_client.transport.calls import connect
-from rfm_client.transport.credentials import Credentials
+from rfm_client.scoring.samples import Call, CallOptions, SampleScorer, results_of
+from rfm_client.transport.calls import Transport, connect
+from rfm_client.transport.connection import Credentials
 from rfm_client.transport.limits import ConcurrencyLimiter, Deadline, check_timeout
 from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
 from rfm_client.transport.threads import AsyncClosing, OneProcess
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+DEFAULT_TIMEOUT_S = 60.0
+DEFAULT_IN_FLIGHT = 128  # twice the usual batch: the next gathers while a batch is scored
+
+
+@dataclass(eq=False, repr=False)
+class ClientOptions:
+    """Options of RewardClient and AsyncRewardClient, which do not change later.
+
+    urls: one or several ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``. The least
+        busy server gets the next request; an episode stays on one server, which keeps frame features. A server is left
+        out after a failure until it is ready again
+    model: name used at export; raw frames go to ``<model>_frames``
+    timeout_s: time limit for a call with all retries; at most 1e9
+    retry: True: within the time limit, retry requests while a server is down, restarting or full
+    max_in_flight: open requests at a time, with at most 256 MiB together; further requests wait
+    shared_memory: True: large inputs go through shared memory, if client and server run on one host
+    ca_file: certificate authorities (PEM) to trust; None: the system's, over gRPC its built-in list
+    client_certificate, client_key: files (PEM) to identify this client (mutual TLS); both or neither
+    headers: sent with each request, over gRPC as metadata
+    api_key: sent with each request as ``Authorization: Bearer KEY``
+    transports: used in place of connections to ``urls``, for tests and unusual networks
+
+    Raises ValueError.
+    """
+
+    urls: str | Iterable[str]
+    _: KW_ONLY
+    model: str = DEFAULT_MODEL
+    timeout_s: float = DEFAULT_TIMEOUT_S
+    retry: bool = True
+    max_in_flight: int = DEFAULT_IN_FLIGHT
+    shared_memory: bool = False
+    ca_file: str | Path | None = None
+    client_certificate: str | Path | None = None
+    client_key: str | Path | None = None
+    headers: Mapping[str, str] | None = None
+    api_key: str | None = None
+    transports: Sequence[Transport] | None = None
+
+    def __post_init__(self) -> None:
+        """Make the client of these options."""
+        raise NotImplementedError
+
+
+ClientOptions.__init__.__doc__ = ClientOptions.__doc__  # so that help() of the clients shows it
+
 
 READY_POLL_S = 0.2
 PREFIXES_AT_A_TIME = 64  # of a trajectory, in memory

@@ -9,8 +9,7 @@ from concurrent.futures import Future
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from rfm_client.async_client import AsyncRewardClient
-from rfm_client.client_options import ClientOptions
+from rfm_client.async_client import AsyncRewardClient, ClientOptions
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
@@ -20,7 +19,7 @@ from rfm_client.episodes.episodes import Episode, Episodes
 from rfm_client.episodes.options import StepKeywords, StepScore
 from rfm_client.frames.fit_to_checkpoint import snapshot
 from rfm_client.frames.sampling import Sampling
-from rfm_client.scoring.call import CallOptions
+from rfm_client.scoring.samples import CallOptions
 from rfm_client.transport.threads import Closing, LoopThread, OneProcess
 
 if TYPE_CHECKING:

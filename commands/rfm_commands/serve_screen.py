@@ -19,7 +19,7 @@ from google.protobuf.text_format import ParseError
 
 from rfm.serve.access import Endpoints
 from rfm.serve.repository import models_in
-from rfm_client.cli.next_steps import PAGE_PORT, PAGE_URL, command, next_steps, score_step
+from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, score_step
 from rfm_client.contract.addresses import from_here
 from rfm_client.contract.wire import frames_name
 from rfm_commands.rollout import names_of

@@ -14,9 +14,8 @@ from rfm.serve.access import Endpoints
 from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.command import Given, with_options
-from rfm_client.cli.next_steps import PAGE_PORT, PAGE_URL, command, next_steps
 from rfm_client.cli.options import FrameRate
-from rfm_client.cli.show import print_tables, scores_table
+from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, print_tables, scores_table
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.contract.wire import frames_name
 from rfm_commands.command import TritonPath, fail

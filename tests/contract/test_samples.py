@@ -18,7 +18,7 @@ from rfm_client import (
     float_frames_to_uint8,
 )
 from rfm_client.contract import wire
-from rfm_client.scoring import batching
+from rfm_client.scoring.samples import MAX_REQUEST_BYTES, groups, padded_bytes, parts
 
 FRAMES = np.zeros((3, 8, 6, 3), np.uint8)
 VIDEO = np.ones((3, 5), np.float32)
@@ -156,11 +156,11 @@ def test_requests_of_two_frame_sizes_are_bounded_by_what_is_sent() -> None:
     samples: dict[int, Sample] = dict(enumerate(PreferenceSample(*pair) for pair in pairs))
     samples |= {len(counts) + index: SimilaritySample(first, first) for index, (first, _) in enumerate(pairs)}
     asked: list[int] = []
-    for _, group in batching.groups(samples, "rfm"):
-        for part in batching.parts(samples, group, max_batch_size=64):
+    for _, group in groups(samples, "rfm"):
+        for part in parts(samples, group, max_batch_size=64):
             tensors = wire.encode_samples([samples[index] for index in part])
             sent = sum(tensors[name].nbytes for name in (wire.FRAMES, wire.SECOND_FRAMES) if name in tensors)
-            assert sent == batching.padded_bytes([samples[index] for index in part])
-            assert sent <= batching.MAX_REQUEST_BYTES
+            assert sent == padded_bytes([samples[index] for index in part])
+            assert sent <= MAX_REQUEST_BYTES
             asked += part
     assert sorted(asked) == sorted(samples)

@@ -191,8 +191,8 @@ def test_every_exit_code_is_shown() -> None:
 
 
 def test_every_option_of_the_client_is_explained() -> None:
-    from rfm_client.client_options import ClientOptions
-    from rfm_client.scoring.call import CallOptions
+    from rfm_client.async_client import ClientOptions
+    from rfm_client.scoring.samples import CallOptions
 
     options = {**inspect.signature(RewardClient).parameters, **CallOptions.__annotations__}
     explained = inspect.cleandoc(f"{ClientOptions.__doc__}\n{CallOptions.__doc__}")

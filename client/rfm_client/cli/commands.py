@@ -27,7 +27,6 @@ from rfm_client.cli.command import (
     with_options,
 )
 from rfm_client.cli.messages import MOST_COLUMNS, with_remedy
-from rfm_client.cli.next_steps import steps_with_server
 from rfm_client.cli.options import (
     CredentialFiles,
     JsonOutput,
@@ -41,7 +40,14 @@ from rfm_client.cli.options import (
     WaitOptions,
     check_folder,
 )
-from rfm_client.cli.show import StreamedTable, in_place_of_progress, print_tables, scores_table, status_tables
+from rfm_client.cli.show import (
+    StreamedTable,
+    in_place_of_progress,
+    print_tables,
+    scores_table,
+    status_tables,
+    steps_with_server,
+)
 from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames, write_perf_analyzer_input
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import DeadlineExceededError, RewardError

@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 
 import typer
 
+from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.cli.command import STANDARD_OUTPUT, usage_errors
 from rfm_client.client import RewardClient
-from rfm_client.client_options import DEFAULT_TIMEOUT_S
 from rfm_client.contract import errors
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
@@ -27,7 +27,7 @@ from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.orientation import ChannelOrder, Orientation
 from rfm_client.frames.sampling import RULES, Rule, Sampling
 from rfm_client.plot import MAX_CURVES
-from rfm_client.transport.credentials import Credentials
+from rfm_client.transport.connection import Credentials
 
 DEFAULT_URL = "grpc://localhost:8001"
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 86_400

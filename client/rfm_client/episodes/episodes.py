@@ -22,7 +22,7 @@ from rfm_client.contract.samples import checked_mask
 from rfm_client.episodes.options import StepScore, StepScores
 from rfm_client.episodes.scorer import Asked, StepScorer
 from rfm_client.episodes.steps import Frame, Steps, check_cameras, copied
-from rfm_client.scoring.call import Call, CallOptions
+from rfm_client.scoring.samples import Call, CallOptions
 from rfm_client.transport.threads import AsyncClosing, Closing, LoopThread, OneProcess
 
 

@@ -14,8 +14,7 @@ from rfm_client.contract.checks import checked_count, checked_share, require
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.contract.samples import Float32Array
-from rfm_client.frames.camera_fusion import FUSES, Fuse
-from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
+from rfm_client.frames.orientation import FUSES, ChannelOrder, Correction, Fuse, Orientation
 from rfm_client.frames.sampling import Rule, Sampling
 
 StepValue: TypeAlias = Literal["progress", "remaining_s"]

@@ -26,8 +26,7 @@ from rfm_client.contract.wire import frames_name
 from rfm_client.episodes.options import StepScore
 from rfm_client.episodes.steps import Steps, Window
 from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW
-from rfm_client.scoring.call import Call
-from rfm_client.scoring.samples import SampleScorer, for_each
+from rfm_client.scoring.samples import Call, SampleScorer, for_each
 from rfm_client.transport.threads import off_loop
 
 MAX_NEW_BYTES = 3 * 2**20  # of a request's frames: the server prepares a request while the next is sent

@@ -17,8 +17,8 @@ from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.results import FRAME_SCORES, FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, as_array, check_task
 from rfm_client.episodes.options import EpisodeOptions, StepScore, StepValue
-from rfm_client.frames.camera_fusion import FUSES, Fuse
 from rfm_client.frames.fit_to_checkpoint import resize_frames
+from rfm_client.frames.orientation import FUSES, Fuse
 from rfm_client.frames.sampling import Prefix
 
 

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Convert stored frames to upright RGB, per camera: turn them, and swap red and blue. H x W pixels."""
+"""Convert stored frames to upright RGB, per camera: turn them, and swap red and blue.
+
+Also the functions that fuse the scores of several cameras. H x W pixels.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from rfm_client.contract.checks import require
 from rfm_client.contract.samples import UInt8Array
@@ -74,3 +78,7 @@ class Correction:
         """Return stored frames, uint8 [..., H, W, 3], as upright RGB."""
         is_rgb = self.channels == "rgb"
         return turned(frames if is_rgb else np.ascontiguousarray(frames[..., ::-1]), self.orient)
+
+
+Fuse: TypeAlias = Literal["mean", "min", "max"]
+FUSES: dict[Fuse, Callable[..., npt.NDArray[np.float32]]] = {"mean": np.mean, "min": np.min, "max": np.max}

@@ -20,8 +20,7 @@ from rfm_client.contract.addresses import grpc_proxy, split_url
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.connection import Connection, grpc_options
-from rfm_client.transport.credentials import SECURE_SCHEMES, Credentials
+from rfm_client.transport.connection import SECURE_SCHEMES, Connection, Credentials, grpc_options
 from rfm_client.transport.limits import check_size, timeout
 from rfm_client.transport.shared_memory import Region, SharedMemory
 from rfm_client.transport.threads import off_loop

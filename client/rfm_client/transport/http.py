@@ -18,7 +18,7 @@ from tritonclient.http import InferenceServerClient
 from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import triton
-from rfm_client.transport.credentials import SECURE_SCHEMES, Credentials
+from rfm_client.transport.connection import SECURE_SCHEMES, Credentials
 from rfm_client.transport.threads import MIN_BYTES
 
 _AS_IT_IS = {"Accept-Encoding": "identity"}  # else aiohttp asks for gzip, which hardly shrinks floats

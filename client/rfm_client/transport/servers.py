@@ -37,8 +37,8 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.contract.wire import Tensors
 from rfm_client.transport.calls import Answer, Transport, TritonTransport
+from rfm_client.transport.connection import OF_A_PORT, wrong_port
 from rfm_client.transport.limits import Deadline
-from rfm_client.transport.ports import OF_A_PORT, wrong_port
 
 Answered = TypeVar("Answered")
 Request = Callable[[Transport, float], Awaitable[Answered]]

@@ -21,9 +21,7 @@ from rfm_client.contract import triton
 from rfm_client.contract.addresses import grpc_proxy, open_url, split_url
 from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
 from rfm_client.contract.wire import encoder_name, frames_name
-from rfm_client.transport.connection import grpc_options
-from rfm_client.transport.credentials import Credentials
-from rfm_client.transport.ports import OF_A_PORT, wrong_port
+from rfm_client.transport.connection import OF_A_PORT, Credentials, grpc_options, wrong_port
 
 METRICS_PORT = 8002
 METRICS_OPTION = "--metrics-url"
