@@ -18,7 +18,7 @@ from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import checkpoint_of, heading
-from rfm_client.cli.show import next_steps, print_tables, scores_table, steps_with_server
+from rfm_client.cli.show import next_steps, scores_table, steps_with_server
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.inputs import load_trajectory
 from rfm_commands.try_video import steps_without_server
@@ -91,7 +91,7 @@ def show_clips(url: str, trajectories: Sequence[Trajectory], picture: Path) -> N
         results = client.evaluate(list(samples.values()))
         checkpoint = checkpoint_of(client, success)
     answers = dict(zip(samples, results, strict=True))
-    print_tables(scores_table(f'"{success.task}"', list(answers.items())))
+    print(scores_table(f'"{success.task}"', list(answers.items())))
     panels = [
         Panel.of(name, answers[name], sample.trajectory.frames, np.arange(sample.trajectory.num_frames) / FPS)
         for name, sample in samples.items()

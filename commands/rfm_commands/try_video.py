@@ -15,7 +15,7 @@ from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.command import Given, with_options
 from rfm_client.cli.options import FrameRate
-from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, print_tables, scores_table
+from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, scores_table
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.contract.wire import frames_name
 from rfm_commands.command import TritonPath, fail
@@ -86,7 +86,7 @@ def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str
         title = heading(task, [checkpoint_of(client, trajectory)])
     if len(result.progress) < len(frames):
         typer.echo(f"{video.name}: {len(result.progress)} of {len(frames)} frames, evenly, are scored")
-    print_tables(scores_table(f'"{task}"', [(video.name, result)]))
+    print(scores_table(f'"{task}"', [(video.name, result)]))
     plot(picture, [Panel.of(video.name, result, frames, frame_times_s(video, len(frames)))], title)
     typer.echo(f"The curves are in {picture}.")
 

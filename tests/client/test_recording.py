@@ -13,7 +13,7 @@ import numpy as np
 import rerun
 from PIL import Image
 
-from client_commands import TASK, invoke
+from client_commands import MODEL, TASK, WIDTHS, invoke
 from engine_server import EngineServer
 from rfm_client import FrameScores, load_trajectory
 from rfm_client.command_line import ExitCode
@@ -40,11 +40,11 @@ def logged(file: Path, timeline: str, entity: str, component: str) -> tuple[list
 def test_score_records_frames_and_curves_on_one_timeline(engines: EngineServer, video: Path, tmp_path: Path) -> None:
     other, seen = tmp_path / "other clip.mp4", tmp_path / "seen.npz"
     shutil.copy(video, other)
-    np.savez(seen, video_embeddings=np.ones((5, 64), np.float32), text_embedding=np.ones(32, np.float32))
+    np.savez(seen, video_embeddings=np.ones((5, WIDTHS[0]), np.float32), text_embedding=np.ones(WIDTHS[1], np.float32))
     out, target = tmp_path / "out.rrd", tmp_path / "scores.json"
     result = invoke(
-        *("score", video, other, "missing.mp4", seen, "--task", TASK, "--fps", 10, "--max-frames", 7),
-        *("--rrd", out, "--json", target, "--url", engines.url),
+        *("score", video, other, "missing.mp4", seen, "--task", TASK, "--fps", 10),
+        *("--rrd", out, "--json", target, "--url", engines.url, "--model", MODEL),
     )
     assert result.exit_code == ExitCode.FAILED  # of the missing one alone
     of_video, of_seen = {"image", "progress", "success"}, {"progress", "success"}
@@ -61,7 +61,7 @@ def test_score_records_frames_and_curves_on_one_timeline(engines: EngineServer, 
         shown = np.asarray(Image.open(io.BytesIO(bytes(image))))
         assert np.abs(shown.astype(int) - frame).mean() < JPEG_ERROR
     indices = scores["clip"]["frame_indices"]
-    assert len(indices) == 7
+    assert len(indices) == 16  # of 32
     for name in ("progress", "success"):
         curve_times, values = logged(out, "video_time", f"/clip/{name}", "Scalar")
         assert curve_times == [times[index] for index in indices]  # video and curves meet

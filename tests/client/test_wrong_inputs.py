@@ -64,13 +64,10 @@ USAGE = {
     "rfm-client score a.mp4 --fps nan": bad("--fps", "expected a finite number, got nan"),
     "rfm-client score a.mp4 --channels grb": bad("--channels", "'grb' is not one of 'rgb', 'bgr'."),
     "rfm-client score a.mp4 --frames 8": "Invalid value: --frames needs --sampling",
-    "rfm-client score a.mp4 --frame-steps 8 --sampling all": "Invalid value: --sampling conflicts with --frame-steps",
-    "rfm-client score a.mp4 --frame-steps 1": bad("--frame-steps", "expected 0 or at least 2, got 1"),
     "rfm-client score a.mp4 --plot a.jpg": bad("--plot", "expected a file that ends in .png, .pdf, .svg, got a.jpg"),
     "rfm-client score a.mp4 --plot nowhere/a.png": bad(
         "--plot", "expected a folder at nowhere, got none: mkdir -p nowhere"
     ),
-    "rfm-client score a.mp4 --npy a.txt": bad("--npy", "expected a .npy file or a folder, got a.txt"),
     "rfm-client score a.mp4 --url localhost:8001": bad("--url", f"{URL} 'localhost:8001'"),
     "rfm-client score a.mp4 --ca-file key.pem": bad(
         "--ca-file", "expected certificates (PEM) at key.pem, got a file without certificate"
@@ -83,9 +80,7 @@ USAGE = {
         "--api-key-file", "expected a text file, got nope.txt: No such file or directory"
     ),
     "rfm-client score --json a.mp4 b.mp4": bad("--json", "expected a file that ends in .json or -, got a.mp4"),
-    "rfm-client score a.mp4 b.mp4 --npy a.npy": bad("--npy", "expected a folder for 2 videos, got a.npy"),
     f"rfm-client score {' '.join(['a.mp4'] * 41)} --plot a.png": bad("--plot", "expected at most 40 videos, got 41"),
-    "rfm-client score a.mp4 --sampling all --max-frames 4": ("Invalid value: --sampling conflicts with --max-frames"),
     "rfm-client score a.mp4 --sampling all --frames 4": bad("--frames", "expected none with the rule all, got 4"),
     "rfm-client status --json /dev/null/a.json": bad(
         "--json", "expected a folder at /dev/null, got none: mkdir -p /dev/null"

@@ -108,7 +108,6 @@ EXTRAS = {
     "async_timeout": {"limits.py"},  # Python 3.10 only
     "PIL": {"pictures.py", "fit_to_checkpoint.py"},
     "typer": {"cli"},
-    "rich": {"cli"},
     "matplotlib": {"cli", "plot.py"},
     "huggingface_hub": {"hub_access.py"},
     "rerun": {"recording.py"},

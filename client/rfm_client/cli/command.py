@@ -204,7 +204,7 @@ def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> Exit
 
 def report(message: str, program: str = "rfm-client") -> None:
     """Write the message as one line to standard error."""
-    print(f"{program}: {' '.join(message.split())}", file=sys.stderr, flush=True)  # Rich moves it above a progress bar
+    print(f"{program}: {' '.join(message.split())}", file=sys.stderr, flush=True)
 
 
 def fail(message: str, program: str = "rfm-client") -> NoReturn:

@@ -11,7 +11,6 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from rfm_client.cli import comparing, documents, scoring
@@ -43,7 +42,6 @@ from rfm_client.cli.options import (
 from rfm_client.cli.show import (
     StreamedTable,
     in_place_of_progress,
-    print_tables,
     scores_table,
     status_tables,
     steps_with_server,
@@ -52,7 +50,6 @@ from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames,
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.results import FRAME_SCORES
-from rfm_client.contract.settings import ConfigError
 from rfm_client.contract.wire import frames_name
 from rfm_client.plot import save
 
@@ -107,12 +104,9 @@ def score(
     """
     output.begin(videos)
     video.begin(videos)
-    if prefix.sampling is not None and video.max_frames is not None:
-        raise ConfigError.of_two("sampling", "conflicts with", "max_frames")
     rows = StreamedTable(scoring.COLUMNS, videos)
-    arrays = output.array_files(scoring.unique_stems(videos))
 
-    def tell(number: int, outcome: scoring.Outcome) -> None:
+    def tell(outcome: scoring.Outcome) -> None:
         if isinstance(outcome, scoring.Failed):
             report(f"{outcome.name}: {outcome.message}")
             return
@@ -120,8 +114,6 @@ def score(
         _report_subsampled(outcome.name, len(result.progress), outcome.num_frames)
         for told in filter(None, (FRAME_SCORES[name].told(each) for name, each in result.arrays.items())):
             report(f"note: {outcome.name}: {told}")
-        if arrays:
-            np.save(arrays[number], np.stack([result.progress, result.success], axis=1))  # NaN: not predicted
         if output.prints_tables:
             rows.write(outcome.row)
 
@@ -165,7 +157,7 @@ def compare(
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
     if output.prints_tables:
-        print_tables(*comparison.tables())
+        typer.echo("\n".join(comparison.tables()))
     output.write_json(documents.comparison_document(server, video, comparison))
     if output.plot is not None:
         from rfm_client.cli.pictures import plot
@@ -201,7 +193,7 @@ def status(
             for url in server.urls
         ]
     if output.prints_tables:
-        print_tables(*(table for status in statuses for table in status_tables(status)))
+        typer.echo("\n".join(map(status_tables, statuses)))
         if ready := next((status for status in statuses if status.ready), None):
             typer.echo(steps_with_server(ready.url, ready.checkpoints))
     output.write_json(documents.status_document(statuses))
@@ -245,7 +237,7 @@ def sample(
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if output.prints_tables and rows:
         of = "frames" if are_frames(samples) else "embeddings"
-        print_tables(scores_table(f"{synthetic.sample_type} of random {of}", rows))
+        typer.echo(scores_table(f"{synthetic.sample_type} of random {of}", rows))
     output.write_json(documents.samples_document(server, synthetic.sample_type, outcomes))
     raise typer.Exit(exit_code_of(failures, some_succeeded=len(failures) < len(outcomes)))
 

@@ -18,7 +18,7 @@ from typing import cast
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.scoring import Source, fitted_to, scores_of
-from rfm_client.cli.show import FittingTable, at_end, number, table
+from rfm_client.cli.show import at_end, number, table
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
 from rfm_client.contract.results import PreferenceResult, ProgressResult
@@ -74,7 +74,7 @@ class Comparison:
             return None
         return sorted(self._numbers, key=lambda index: cast(int, self.ranks[index]))
 
-    def tables(self) -> list[FittingTable | str]:
+    def tables(self) -> list[str]:
         """Return a table of sources, the best first, a table of pairs, and without a ranking a legend."""
         columns = ("video", "rank", "P(wins)", "final progress", "final success", "frames")
         pairs = ("first", "second", "P(first wins)", "asked second first", "mean", "orders")

@@ -32,7 +32,7 @@ def score_document(
     server: ServerOptions, video: VideoOptions, prefix: PrefixOptions, outcomes: Sequence[Outcome]
 ) -> dict[str, Any]:
     """Return the document of ``score --json``."""
-    asked = {"frame_steps": prefix.frame_steps, "sampling": prefix.sampling, "sampled_frames": prefix.frames}
+    asked = {"sampling": prefix.sampling, "sampled_frames": prefix.frames}
     return {**server.origin, **_asked(video), **asked, "videos": [_outcome(outcome) for outcome in outcomes]}
 
 

@@ -25,7 +25,7 @@ def told(error: Exception) -> str:
     """Return the message for a command's user, who knows options and no arguments of Python functions."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    return str(with_remedy(error, "leave --no-subsample out, or score prefixes (--frame-steps, --sampling)"))
+    return str(with_remedy(error, "leave --no-subsample out, or score prefixes (--sampling)"))
 
 
 def with_remedy(error: Exception, remedy: str) -> Exception:

@@ -21,7 +21,6 @@ from rfm_client.client import RewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
-from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.orientation import ChannelOrder, Orientation
@@ -173,7 +172,6 @@ class FrameRate(Settings):
 class VideoOptions(FrameRate, VideoFiles):
     """Task of the videos, and choice and size of the frames to send."""
 
-    max_frames: int | None = setting(None, "Score at most N evenly spaced frames.", least=1)
     subsample: bool = setting(True, "Reduce each video to the number of frames of training, evenly spaced.")
 
     @property
@@ -223,23 +221,13 @@ class PrefixOptions(Settings):
         metavar="RULE",
     )
     frames: int | None = setting(None, "Frames per prefix (with --sampling). Default: as in training.", least=1)
-    frame_steps: int = setting(
-        0,
-        "Dense mode with N frames per prefix; 0 turns it off.",
-        least=0,
-        most=MAX_FRAME_STEPS,
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if 0 < self.frame_steps < MIN_FRAME_STEPS:
-            raise ConfigError.at("frame_steps", f"0 or at least {MIN_FRAME_STEPS}", self.frame_steps)
         if self.sampling is None:
             if self.frames is not None:
                 raise ConfigError.of_two("frames", "needs", "sampling")
             return
-        if self.frame_steps:
-            raise ConfigError.of_two("sampling", "conflicts with", "frame_steps")
         try:
             Sampling.of(self.sampling, self.frames, trained_frames=1)
         except InvalidValueError as error:
@@ -248,8 +236,6 @@ class PrefixOptions(Settings):
     @property
     def rule(self) -> str:
         """A line for the user: which frames decide a frame's score."""
-        if self.frame_steps:
-            return f"Each frame is scored on its prefix: linspace_trunc, {self.frame_steps} frames."
         if self.sampling is not None:
             frames = f", {self.frames} frames" if self.frames else ""
             return f"Each frame is scored on its prefix: {self.sampling}{frames}."
@@ -282,15 +268,10 @@ class JsonOutput(Settings):
         """The files to write, by option."""
         return {name: value for name in _ENDINGS if (value := getattr(self, name, None)) is not None}
 
-    @property
-    def _folders(self) -> dict[str, Path]:
-        """The folders of the files, by option."""
-        return {name: Path(value).parent for name, value in self._files.items()}
-
     def check_folders(self) -> None:
         """Raise ConfigError, before the first request, for a file in a folder that is missing or closed."""
-        for name, folder in self._folders.items():
-            check_folder(name, folder)
+        for name, file in self._files.items():
+            check_folder(name, Path(file).parent)
 
     def write_json(self, document: Mapping[str, Any]) -> None:
         """Write the document to the file or standard output, if --json is given."""
@@ -332,36 +313,3 @@ class OutputOptions(PlotOutput):
     rrd: Path | None = setting(
         None, "Record frames and scores on one timeline for Rerun's viewer: .rrd.", metavar="FILE"
     )
-    npy: Path | None = setting(
-        None,
-        "Write progress and success, float32 [T, 2], to a .npy file (one video) or into a folder.",
-        metavar="FILE|FOLDER",
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.npy is not None and not self.npy.is_dir() and self.npy.suffix not in ("", ".npy"):
-            raise ConfigError.at("npy", "a .npy file or a folder", self.npy)
-
-    @property
-    def _folders(self) -> dict[str, Path]:
-        folders = super()._folders
-        if self.npy is not None:
-            folders["npy"] = self.npy if self.npy.is_dir() else self.npy.parent
-        return folders
-
-    def begin(self, videos: Sequence[str]) -> None:
-        """Raise ConfigError for a missing folder, and for more videos than the files take. Make the folder of --npy."""
-        if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
-            raise ConfigError.at("npy", f"a folder for {len(videos)} videos", self.npy)
-        super().begin(videos)
-        if self.npy is not None and self.npy.suffix != ".npy":
-            self.npy.mkdir(exist_ok=True)
-
-    def array_files(self, stems: Sequence[str]) -> list[Path]:
-        """Return the .npy file of each video; empty without --npy."""
-        if self.npy is None:
-            return []
-        if self.npy.suffix == ".npy":
-            return [self.npy]
-        return [self.npy / f"{stem}.npy" for stem in stems]

@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, TypeAlias, cast
 
@@ -124,7 +123,7 @@ class Failed:
 
 
 Outcome: TypeAlias = Scored | Failed
-Tell = Callable[[int, Outcome], None]  # takes a source's number and outcome
+Tell = Callable[[Outcome], None]
 Record = Callable[[int, Source, FrameScores], None]  # any thread calls it
 
 
@@ -143,12 +142,11 @@ class SourceScorer:
 
     def score_all(self, names: Sequence[str], tell: Tell) -> list[Outcome]:
         """Return the outcomes of all sources, in order. ``tell`` takes each when all before it have arrived."""
-        with ThreadPoolExecutor(WORKERS) as pool, _progress_bar(len(names)) as advance:
+        with ThreadPoolExecutor(WORKERS) as pool:
             try:
                 futures = [pool.submit(self.outcome, number, name) for number, name in enumerate(names)]
-                for number, future in enumerate(futures):
-                    tell(number, future.result())
-                    advance()
+                for future in futures:
+                    tell(future.result())
             except BaseException:  # an interrupt, or a full disk: no other source shall begin
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
@@ -221,20 +219,16 @@ def fitted_to(
 ) -> FittedSample:
     """Return the sample with frames left out as the options and the checkpoint require.
 
-    The client cannot do it: it knows only the checkpoint's limit.
-
     samples_prefixes: True if each prefix is sampled, so that the checkpoint's limit does not matter
     """
     info = client.model_info(frames=sample.trajectory.frames is not None)
-    limits = (video.max_frames, info.max_frames if video.subsample and not samples_prefixes else None)
-    limit = min((frames for frames in limits if frames is not None), default=None)
+    limit = info.max_frames if video.subsample and not samples_prefixes else None
     return fitted(sample, limit, info.frame_size if video.resize else None)
 
 
-def scores_of(client: RewardClient, fits: Sequence[FittedSample], frame_steps: int = 0) -> list[ProgressResult]:
-    """Return the scores of whole trajectories, each alone. frame_steps: as in ProgressSample. Raises RewardError."""
-    asked = [replace(cast(ProgressSample, fit.sample), frame_steps=frame_steps) for fit in fits]
-    results = client.evaluate(asked, all_scores=True)
+def scores_of(client: RewardClient, fits: Sequence[FittedSample]) -> list[ProgressResult]:
+    """Return the scores of whole trajectories, each alone. Raises RewardError."""
+    results = client.evaluate([fit.sample for fit in fits], all_scores=True)
     return [
         cast(ProgressResult, with_frame_indices(result, fit.frame_indices))
         for result, fit in zip(results, fits, strict=True)
@@ -244,13 +238,12 @@ def scores_of(client: RewardClient, fits: Sequence[FittedSample], frame_steps: i
 def _evaluate(
     client: RewardClient, sample: ProgressSample, video: VideoOptions, prefix: PrefixOptions
 ) -> ProgressResult:
-    samples_prefixes = prefix.frame_steps > 0 or prefix.sampling is not None
-    fit = fitted_to(client, sample, video, samples_prefixes=samples_prefixes)
+    fit = fitted_to(client, sample, video, samples_prefixes=prefix.sampling is not None)
     sent = cast(ProgressSample, fit.sample)
     info = client.model_info(frames=sent.trajectory.frames is not None)
     # Of an episode as a whole, all frames are shown at once.
     if prefix.sampling is None or (info.needs_whole_episode and prefix.sampling == "all"):
-        return scores_of(client, [fit], prefix.frame_steps)[0]
+        return scores_of(client, [fit])[0]
     try:
         sampling = Sampling.of(prefix.sampling, prefix.frames, info.max_frames)
     except InvalidValueError as error:  # the options are valid: the checkpoint lacks the number
@@ -301,17 +294,3 @@ def recorder(file: Path | None, names: Sequence[str]) -> Iterator[Record | None]
             recording.add((stems[number],), scores, {} if frames is None else {"": frames}, source.times_s)
 
         yield record
-
-
-@contextmanager
-def _progress_bar(total: int) -> Iterator[Callable[[], None]]:
-    """Show a progress bar on standard error, if a terminal. Yield the function to call after each source."""
-    from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress
-
-    console = Console(stderr=True)
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    is_hidden, shares_terminal = not console.is_terminal, sys.stdout.isatty()
-    with Progress(*columns, console=console, transient=True, disable=is_hidden, redirect_stdout=shares_terminal) as bar:
-        task = bar.add_task("scoring", total=total)
-        yield lambda: bar.advance(task)

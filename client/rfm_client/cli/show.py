@@ -11,9 +11,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rfm_client.cli.options import DEFAULT_URL
 from rfm_client.contract.results import (
@@ -27,17 +25,10 @@ from rfm_client.contract.results import (
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.transport.status import Device, ServerStatus
 
-if TYPE_CHECKING:
-    from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
-    from rich.measure import Measurement
-    from rich.table import Table
-
 FILE_WIDTH = 200
-SHORT_CELL = 16  # characters; a column without longer cells does not wrap
 SHORTEST_NAME = 12
-UNLIMITED = 10_000  # columns
 CUT = "..."  # for the left-out part of a name
-GAP = "  "  # between columns of a ``StreamedTable``
+GAP = "  "  # between columns
 
 _GIB = 2**30
 
@@ -69,130 +60,67 @@ def shortened(name: str, width: int) -> str:
     return f"{name[: kept - end]}{CUT}{name[len(name) - end :]}"
 
 
-@dataclass(frozen=True)
-class ShortName:
-    """A name or a path in a table, shortened to fit."""
+class Table:
+    """A plain table, as wide as the terminal; to a file or a pipe, at most FILE_WIDTH. Headers wrap to their columns.
 
-    text: str
-
-    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
-        """Return the narrowest and the full width."""
-        from rich.measure import Measurement
-
-        return Measurement(min(len(self.text), SHORTEST_NAME), len(self.text))
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the name, shortened to fit."""
-        from rich.text import Text
-
-        yield Text(shortened(self.text, options.max_width), no_wrap=True, overflow="ellipsis")
-
-
-@dataclass(frozen=True)
-class FittingTable:
-    """A table whose headers stand on one line where they fit. Of too many columns, some stand in tables below.
-
-    wide, narrow: headers on one line, and as narrow as their columns
-    names, are_short: as ``table`` makes them of its arguments
+    columns: headers
+    cells: all cells of each column, or as wide ones
+    names: number of first columns with names and paths, which are shortened to fit
     """
 
-    title: str
-    wide: Sequence[str]
-    narrow: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    names: int
-    are_short: Sequence[bool]
+    def __init__(self, columns: Sequence[str], cells: Sequence[Iterable[str]], *, names: int = 1) -> None:
+        widths = [max(map(len, (*head.split(), *column, ""))) for head, column in zip(columns, cells, strict=True)]
+        room = shutil.get_terminal_size((FILE_WIDTH, 0)).columns - sum(widths[names:]) - len(GAP) * len(columns)
+        most = max(SHORTEST_NAME, room // names)
+        self._widths = [*(min(width, most) for width in widths[:names]), *widths[names:]]
+        self._names = names
+        self._columns = columns
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the table with wide headers if it fits, else with narrow ones, in parts if a cell were cut."""
-        from rich.measure import Measurement
+    @property
+    def head(self) -> list[str]:
+        """The lines above the rows."""
+        words = (textwrap.wrap(head, max(width, 1)) for head, width in zip(self._columns, self._widths, strict=True))
+        lines = [*itertools.zip_longest(*words, fillvalue=""), ["-" * width for width in self._widths]]
+        return [self._line(each) for each in lines]
 
-        def measured(shown: Table) -> Measurement:
-            return Measurement.get(console, options.update(max_width=UNLIMITED), shown)
+    def row(self, cells: Sequence[str]) -> str:
+        """Return a row."""
+        names = (shortened(name, width) for name, width in zip(cells, self._widths[: self._names], strict=False))
+        return self._line([*names, *cells[self._names :]])
 
-        begin, end = self.names, len(self.wide)
-        if measured(whole := self._part(self.wide, begin, end)).maximum <= options.max_width:
-            yield whole
-            return
-        while True:
-            parts = (self._part(self.narrow, begin, last) for last in range(end, begin, -1))
-            fitting = (each for each in parts if measured(each).minimum <= options.max_width)
-            yield (part := next(fitting, self._part(self.narrow, begin, begin + 1)))
-            begin += len(part.columns) - self.names
-            if begin >= end:
-                return
-
-    def _part(self, headers: Sequence[str], begin: int, end: int) -> Table:
-        """Return a table of the names and these columns; the title stands above the first."""
-        from rich import box
-        from rich.table import Table
-        from rich.text import Text
-
-        title = Text(self.title) if self.title and begin == self.names else None
-        shown = Table(box=box.SIMPLE_HEAD, collapse_padding=True, title=title, title_justify="left")
-        columns = [*range(self.names), *range(begin, min(end, len(headers)))]
-        for column in columns:
-            shown.add_column(Text(headers[column]), overflow="fold", no_wrap=self.are_short[column])
-        for row in self.rows:
-            shown.add_row(*(ShortName(row[each]) if each < self.names else Text(row[each]) for each in columns))
-        return shown
+    def _line(self, cells: Sequence[str]) -> str:
+        padded = (cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True))
+        return f"{GAP}{GAP.join(padded)}".rstrip()
 
 
-def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> FittingTable:
-    """Return a table of plain texts: square brackets are no markup.
-
-    names: number of first columns with names and paths, which are shortened to fit; of the other columns, only those
-        with long cells wrap
-    """
-    widest = [max((len(row[index]) for row in rows), default=0) for index in range(len(columns))]
-    are_short = [index >= names and width <= SHORT_CELL for index, width in enumerate(widest)]
-    folded = [
-        textwrap.fill(column, max(width, *map(len, column.split()))) if is_short and column else column
-        for column, width, is_short in zip(columns, widest, are_short, strict=True)
-    ]
-    return FittingTable(title, columns, folded, rows, names, are_short)
-
-
-def print_tables(*tables: object) -> None:
-    """Print tables as wide as the terminal; to a file or a pipe, as wide as the content, at most FILE_WIDTH."""
-    from rich.console import Console
-
-    console = Console()
-    console = console if console.is_terminal else Console(width=FILE_WIDTH)
-    console.print(*tables, sep="\n", markup=False, highlight=False)
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> str:
+    """Return the lines of a ``Table``, below a title unless it is empty."""
+    made = Table(columns, list(zip(*rows, strict=True)) or [()] * len(columns), names=names)
+    return "\n".join([*[title] * bool(title), *made.head, *map(made.row, rows), ""])
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> None:
     """Print the table that ``table`` returns."""
-    print_tables(table(title, columns, rows, names=names))
+    print(table(title, columns, rows, names=names))
 
 
 class StreamedTable:
-    """A table on standard output, written row by row, as wide as the terminal.
+    """A table on standard output, written row by row.
 
-    columns: headers and widths; the first column is as wide as ``names`` need and the terminal allows
+    columns: headers, and widths of the columns behind the first
     names: all cells of the first column
     """
 
     def __init__(self, columns: Sequence[tuple[str, int]], names: Sequence[str]) -> None:
-        from rich.console import Console
-
-        console = Console()
-        self._headers, widths = zip(*columns, strict=True)
-        room = (console.width if console.is_terminal else FILE_WIDTH) - sum(widths) - len(GAP) * len(columns)
-        self._widths = [max(SHORTEST_NAME, min(max(map(len, names)), room)), *widths[1:]]
+        headers, widths = zip(*columns, strict=True)
+        self._table = Table(headers, [names, *(["-" * width] for width in widths[1:])])
         self._is_begun = False
 
     def write(self, cells: Sequence[str]) -> None:
         """Write a row at once; before the first, the headers."""
-        lines: list[Sequence[str]] = [[shortened(cells[0], self._widths[0]), *cells[1:]]]
-        if not self._is_begun:
-            self._is_begun = True
-            headers = [textwrap.wrap(header, width) for header, width in zip(self._headers, self._widths, strict=True)]
-            lines = [*itertools.zip_longest(*headers, fillvalue=""), ["-" * width for width in self._widths], *lines]
-        for line in lines:
-            row = GAP.join(cell.ljust(width) for cell, width in zip(line, self._widths, strict=True))
-            print(f"{GAP}{row}".rstrip(), flush=True)
+        for line in (*self._table.head * (not self._is_begun), self._table.row(cells)):
+            print(line, flush=True)
+        self._is_begun = True
 
     def end(self, text: str) -> None:
         """Write a line below the table, if it has a row."""
@@ -200,7 +128,7 @@ class StreamedTable:
             print(f"\n{GAP}{text}", flush=True)
 
 
-def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> FittingTable:
+def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> str:
     """Return a table with a row for each trajectory: its sample's answer, and the scores of its last frame."""
     shown = []
     for name, result in rows:
@@ -217,7 +145,7 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> FittingTable
     return table(title, ("sample", "answer", "progress at the end", "success at the end"), shown)
 
 
-def status_tables(status: ServerStatus) -> list[RenderableType]:
+def status_tables(status: ServerStatus) -> str:
     """Return tables of models, of their batches, and of the machine if its metrics describe it."""
     version = f" {status.version}" if status.version else ""
     title = f"{status.url}: Triton{version}, {'ready' if status.ready else 'not ready'}"
@@ -230,7 +158,7 @@ def status_tables(status: ServerStatus) -> list[RenderableType]:
         times = number(model.compute_ms_per_batch, 2), number(model.queue_ms_per_request, 2)
         each, since = number(model.samples_per_batch, 1), "start" if model.batches and model.batches.count else "load"
         batched.append((model.name, model.version, str(model.batch_count), each, *times, since))
-    shown: list[RenderableType] = [
+    shown = [
         table(title, requests, counted),
         *(f"{model.name} {model.version}: {model.reason}" for model in status.models if model.reason),
         table("", batches, batched),
@@ -239,7 +167,7 @@ def status_tables(status: ServerStatus) -> list[RenderableType]:
     if status.devices:
         columns = ("device", "utilization", "memory used", "memory")
         shown += [table("machine", columns, [_device_row(each) for each in status.devices])]
-    return shown
+    return "\n".join(shown)
 
 
 def _device_row(device: Device) -> tuple[str, ...]:

@@ -61,7 +61,7 @@ class Transport(Protocol):
         """Close the connection to the server."""
 
 
-def connect(url: str, *, shared_memory: bool = False, credentials: Credentials | None = None) -> Transport:
+def connect(url: str, *, shared_memory: bool = False, credentials: Credentials | None = None) -> TritonTransport:
     """Return the transport for ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or ``https://``.
 
     It connects at first use. Raises ValueError.
@@ -79,7 +79,7 @@ class TritonTransport:
     """
 
     _module: ClassVar[str]  # of tritonclient, with its InferInput and InferRequestedOutput
-    _as_json: ClassVar[dict[str, bool]] = {}  # makes its methods return dictionaries
+    as_json: ClassVar[dict[str, bool]] = {}  # makes its methods return dictionaries
     _proxy: str | None = None  # for errors
 
     def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
@@ -104,7 +104,7 @@ class TritonTransport:
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         async def request(client: Any) -> ModelInfo:
-            config = await client.get_model_config(model, **self._as_json)
+            config = await client.get_model_config(model, **self.as_json)
             return ModelInfo.from_config(config.get("config", config))  # nested in gRPC's answer
 
         return await self._call(model, request, timeout_s, bad_request=errors.ModelNotFoundError)
@@ -117,6 +117,10 @@ class TritonTransport:
             return await self._call(model, request, timeout_s)
         except errors.ServerError:
             return False
+
+    async def ask(self, request: Callable[[Any], Awaitable[Answered]], timeout_s: float) -> Answered:
+        """Return what ``request`` gets from tritonclient's client. Raises RewardError."""
+        return await self._call("", request, timeout_s)
 
     async def close(self) -> None:
         try:
@@ -184,7 +188,7 @@ class TritonTransport:
         with suppress(Exception):
             async with timeout(_SERVED_TIMEOUT_S):
                 with self._connected().used() as client:
-                    told = await client.get_inference_statistics(**self._as_json)
+                    told = await client.get_inference_statistics(**self.as_json)
                     served = {each["name"] for each in told.get("model_stats", [])}
                     return triton.not_served(model, error.message, served)
         return error
@@ -225,7 +229,7 @@ class GrpcTransport(TritonTransport):
     """
 
     _module = "tritonclient.grpc.aio"
-    _as_json: ClassVar[dict[str, bool]] = {"as_json": True}
+    as_json: ClassVar[dict[str, bool]] = {"as_json": True}
     _first_process: int | None = None  # first to use gRPC
 
     def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
@@ -254,7 +258,7 @@ class HttpTransport(TritonTransport):
     def _open(self) -> Any:
         from rfm_client.transport.http import HttpClient
 
-        return HttpClient(f"{self._scheme}://{self._address}", self._credentials)
+        return HttpClient(self._scheme, self._address, self._credentials)
 
 
 def _outputs(answer: Any, names: Collection[str]) -> Tensors:

@@ -10,7 +10,7 @@ import asyncio
 import re
 import textwrap
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from http.client import HTTPException
 from typing import Any, TypeAlias
@@ -18,10 +18,11 @@ from typing import Any, TypeAlias
 from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import triton
-from rfm_client.contract.addresses import grpc_proxy, open_url, split_url
+from rfm_client.contract.addresses import open_url, split_url
 from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
 from rfm_client.contract.wire import encoder_name, frames_name
-from rfm_client.transport.connection import OF_A_PORT, Credentials, grpc_options, wrong_port
+from rfm_client.transport.calls import connect
+from rfm_client.transport.connection import OF_A_PORT, Credentials, wrong_port
 
 METRICS_PORT = 8002
 METRICS_OPTION = "--metrics-url"
@@ -39,12 +40,15 @@ _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
 _SAMPLING_S = 2.5  # Triton measures devices every two seconds; before, it reports zeros
 _POLL_S = 0.2
 _REASON_CHARACTERS = 120
+_STATES = {True: "READY", False: "UNAVAILABLE"}  # of a loaded model
 _NS_PER_MS = 1e6
 _MS_PER_S = 1e3
 _US_PER_S = 1e6
 
 _Version: TypeAlias = tuple[str, str]  # name and version of a model
-_Told: TypeAlias = tuple[str, bool, list[dict[str, Any]], list[dict[str, Any]]]  # version, readiness, index, statistics
+_Told: TypeAlias = tuple[  # version, readiness, and the entry and statistics of each model
+    str, bool, dict[_Version, tuple[Mapping[str, Any], Mapping[str, Any]]]
+]
 
 
 @dataclass(frozen=True)
@@ -177,27 +181,18 @@ class ServerStatus:
         Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for an answer
         that is not Triton's.
         """
-        scheme, address = split_url(url)
-        metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
+        metrics_url = metrics_url or f"http://{split_url(url)[1].rpartition(':')[0]}:{METRICS_PORT}/metrics"
         try:
-            version, is_ready, index, statistics = _read_server(
-                scheme, address, timeout_s, credentials or Credentials()
-            )
-            metrics = _read_metrics(metrics_url, timeout_s)
-            models = tuple(_models(index, statistics, metrics))
-        except Exception as raised:
-            proxy = grpc_proxy(address) if scheme.startswith("grpc") else None
-            error = triton.error_from(raised, url, proxy=proxy)
-            if error is None:
-                raise
-            if isinstance(error, DeadlineExceededError):
-                error = DeadlineExceededError(
-                    f"{url}{f' through {proxy}' if proxy else ''}: no answer within {timeout_s:g} s"
-                )
-            elif isinstance(error, OF_A_PORT) and (named := wrong_port(url)):
-                error = ServerUnavailableError(named)
-            raise error from raised
-        return cls(url, version, is_ready, models, metrics_url, metrics.error, metrics.devices)
+            version, is_ready, models = asyncio.run(_state(url, timeout_s, credentials))
+        except DeadlineExceededError as late:
+            raise DeadlineExceededError(f"{late.server}: no answer within {timeout_s:g} s") from late
+        except OF_A_PORT as error:
+            if named := wrong_port(url):
+                raise ServerUnavailableError(named) from error
+            raise
+        metrics = _read_metrics(metrics_url, timeout_s)
+        read = tuple(_model(entry, done, {*models}, metrics) for entry, done in models.values())
+        return cls(url, version, is_ready, read, metrics_url, metrics.error, metrics.devices)
 
     @property
     def checkpoints(self) -> list[str]:
@@ -215,92 +210,61 @@ class _Metrics:
     error: str | None = None
 
 
-def _read_server(scheme: str, address: str, timeout_s: float, credentials: Credentials) -> _Told:
-    if scheme.startswith("grpc"):
-        return _over_grpc(scheme, address, timeout_s, credentials)
-    return asyncio.run(asyncio.wait_for(_over_http(f"{scheme}://{address}", credentials), timeout_s))
+async def _state(url: str, timeout_s: float, credentials: Credentials | None) -> _Told:
+    """Return the server's version, whether it is ready, and the entry in its index and the statistics of each model."""
+    transport = connect(url, credentials=credentials)
 
-
-def _over_grpc(scheme: str, address: str, timeout_s: float, credentials: Credentials) -> _Told:
-    from tritonclient.grpc import InferenceServerClient
-
-    options = {"channel_args": grpc_options(address), **credentials.grpc_options(scheme)}
-    limited, as_json = {"client_timeout": timeout_s}, {"as_json": True, "client_timeout": timeout_s}
-    client = InferenceServerClient(address, **options)
-    credentials.show_with_each_request(client)
-    try:
-        version = client.get_server_metadata(**as_json)["version"]
-        statistics = client.get_inference_statistics(**as_json).get("model_stats", [])
+    async def request(client: Any) -> _Told:
+        version = (await client.get_server_metadata(**transport.as_json))["version"]
+        statistics = (await client.get_inference_statistics(**transport.as_json)).get("model_stats", [])
         try:
-            index = client.get_model_repository_index(**as_json).get("models", [])
+            answer = await client.get_model_repository_index(**transport.as_json)
+            index = answer if isinstance(answer, list) else answer.get("models", [])  # gRPC's is nested
         except InferenceServerException as error:
-            loaded = _loaded(statistics, error)
-            index = _index_of({each: client.is_model_ready(*each, **limited) for each in loaded})
-        return version, client.is_server_ready(**limited), index, statistics
-    finally:
-        client.close()
-
-
-async def _over_http(url: str, credentials: Credentials) -> _Told:
-    from rfm_client.transport.http import HttpClient
-
-    client = HttpClient(url, credentials)
-    try:
-        version = (await client.get_server_metadata())["version"]
-        statistics = (await client.get_inference_statistics()).get("model_stats", [])
-        try:
-            index = await client.get_model_repository_index()
-        except InferenceServerException as error:
-            index = _index_of({each: await client.is_model_ready(*each) for each in _loaded(statistics, error)})
-        return version, await client.is_server_ready(), index, statistics
-    finally:
-        await client.close()
-
-
-def _loaded(statistics: Iterable[Mapping[str, Any]], error: InferenceServerException) -> list[_Version]:
-    """Return the loaded models, for an index that needs a key. Raises any other error again."""
-    if triton.RESTRICTED not in (error.message() or ""):
-        raise error
-    loaded = [(each["name"], each["version"]) for each in statistics]
-    return sorted(loaded, key=lambda each: (each[0], int(each[1])))
-
-
-def _index_of(ready: Mapping[_Version, bool]) -> list[dict[str, Any]]:
-    """Return an index of the loaded models. ready: whether each is ready"""
-    states = {True: "READY", False: "UNAVAILABLE"}
-    return [{"name": name, "version": version, "state": states[is_so]} for (name, version), is_so in ready.items()]
-
-
-def _models(index: list[dict[str, Any]], statistics: list[dict[str, Any]], metrics: _Metrics) -> list[ModelStatus]:
-    done_by = {(entry["name"], entry["version"]): entry for entry in statistics}
-    names = {entry["name"] for entry in index}
-    models = []
-    for entry in index:
-        key = entry["name"], entry.get("version", "")
-        done = done_by.get(key, {})
-        times = done.get("inference_stats", {})
-        is_ensemble = key[0].endswith(_FRAMES) and encoder_name(key[0].removesuffix(_FRAMES)) in names
-        failures = 2 if is_ensemble else 1  # that Triton counts for a failed request
-        models.append(
-            ModelStatus(
-                name=key[0],
-                version=key[1],
-                state=entry.get("state", "UNAVAILABLE"),
-                reason=" ".join(entry.get("reason", "").split()),
-                requests_succeeded=_whole(times, "success", "count"),
-                requests_failed=_whole(times, "fail", "count") // failures,
-                requests_pending=metrics.pending.get(key),
-                samples=int(done.get("inference_count", 0)),
-                executions=int(done.get("execution_count", 0)),
-                queue_ms=_whole(times, "queue", "ns") / _NS_PER_MS,
-                compute_ms=sum(_whole(batch, "compute_infer", "ns") for batch in done.get("batch_stats", []))
-                / _NS_PER_MS,
-                last_used_s=int(done.get("last_inference", 0)) / _MS_PER_S or None,
-                batches=metrics.batches.get(key),
-                samples_refused=metrics.refused.get(key),
+            if triton.RESTRICTED not in (error.message() or ""):
+                raise
+            loaded = sorted(
+                ((each["name"], each["version"]) for each in statistics), key=lambda key: (key[0], int(key[1]))
             )
-        )
-    return models
+            index = [
+                {"name": name, "version": version, "state": _STATES[await client.is_model_ready(name, version)]}
+                for name, version in loaded
+            ]
+        done = {(each["name"], each["version"]): each for each in statistics}
+        entries = {(each["name"], each.get("version", "")): each for each in index}
+        return version, await client.is_server_ready(), {key: (entries[key], done.get(key, {})) for key in entries}
+
+    try:
+        return await transport.ask(request, timeout_s)
+    finally:
+        await transport.close()
+
+
+def _model(
+    entry: Mapping[str, Any], done: Mapping[str, Any], known: Collection[_Version], metrics: _Metrics
+) -> ModelStatus:
+    """Return the state of one version. known: all versions of all models"""
+    key = entry["name"], entry.get("version", "")
+    times = done.get("inference_stats", {})
+    encoder = encoder_name(key[0].removesuffix(_FRAMES))
+    is_ensemble = key[0].endswith(_FRAMES) and encoder in {name for name, _ in known}
+    failures = 2 if is_ensemble else 1  # that Triton counts for a failed request
+    return ModelStatus(
+        name=key[0],
+        version=key[1],
+        state=entry.get("state", "UNAVAILABLE"),
+        reason=" ".join(entry.get("reason", "").split()),
+        requests_succeeded=_whole(times, "success", "count"),
+        requests_failed=_whole(times, "fail", "count") // failures,
+        requests_pending=metrics.pending.get(key),
+        samples=int(done.get("inference_count", 0)),
+        executions=int(done.get("execution_count", 0)),
+        queue_ms=_whole(times, "queue", "ns") / _NS_PER_MS,
+        compute_ms=sum(_whole(batch, "compute_infer", "ns") for batch in done.get("batch_stats", [])) / _NS_PER_MS,
+        last_used_s=int(done.get("last_inference", 0)) / _MS_PER_S or None,
+        batches=metrics.batches.get(key),
+        samples_refused=metrics.refused.get(key),
+    )
 
 
 def _whole(statistics: Mapping[str, Any], name: str, key: str) -> int:
