@@ -18,7 +18,7 @@ import typer
 
 from rfm.serve.access import take_key
 from rfm.serve.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
-from rfm_client.cli.command import CommandGroup, Given, usage_errors, with_options
+from rfm_client.cli.command import CommandGroup, usage_errors, with_options
 from rfm_client.cli.options import CredentialFiles
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.settings import setting
@@ -31,17 +31,11 @@ app = typer.Typer(cls=CommandGroup, no_args_is_help=True)
 
 
 @dataclass(frozen=True)
-class TlsFiles(CredentialFiles):
-    """CAs and client certificate for a server with TLS."""
-
-    NO_OPTION: ClassVar[Collection[str]] = {"api_key_file"}
-
-
-@dataclass(frozen=True)
-class AdministeredServer(TlsFiles):
+class AdministeredServer(CredentialFiles):
     """A running server whose models are listed or change."""
 
     TITLE: ClassVar[str] = "Server"
+    NO_OPTION: ClassVar[Collection[str]] = {"api_key_file"}
 
     url: str = setting(
         "grpc://127.0.0.1:8001", "grpc://host:port of the server, with TLS grpcs://host:port.", variable="RFM_URL"
@@ -74,8 +68,7 @@ ExportedName = Annotated[str, typer.Argument(metavar="NAME", help="As in rfm exp
 
 
 @app.callback()
-@with_options
-def models(files: Given[TlsFiles]) -> None:
+def models() -> None:
     """List, load, unload and replace the models of a running server."""
 
 

@@ -187,26 +187,14 @@ def test_what_is_missing_to_run_is_told_with_the_command_that_installs_it() -> N
     assert result.stderr == 'rfm-client: expected the package typer, got none: pip install "./client[cli]"\n'
 
 
-BEFORE, AFTER, VARIABLE = (
-    ["--api-key-file", "/before"],
-    ["--api-key-file", "/after"],
-    {"RFM_API_KEY_FILE": "/variable"},
-)
-WINNERS = {
-    "variable": ([], [], VARIABLE, "/variable"),
-    "before the subcommand": (BEFORE, [], VARIABLE, "/before"),
-    "after it": (BEFORE, AFTER, VARIABLE, "/after"),
-    "after it alone": ([], AFTER, VARIABLE, "/after"),
-}
+VARIABLE = {"RFM_API_KEY_FILE": "/variable"}
 
 
-@pytest.mark.parametrize(("before", "after", "variables", "winner"), WINNERS.values(), ids=WINNERS)
-def test_an_option_wins_over_one_before_the_subcommand_and_both_over_the_variable(
-    before: list[str], after: list[str], variables: dict[str, str], winner: str
-) -> None:
-    result = invoke(*before, "status", *after, env=variables)
-    assert result.exit_code == ExitCode.USAGE
-    assert f"got {winner}: No such file or directory" in " ".join(result.stderr.split())
+def test_an_option_wins_over_its_variable() -> None:
+    for options, winner in (([], "/variable"), (["--api-key-file", "/option"], "/option")):
+        result = invoke("status", *options, env=VARIABLE)
+        assert result.exit_code == ExitCode.USAGE
+        assert f"got {winner}: No such file or directory" in " ".join(result.stderr.split())
 
 
 def test_a_bad_variable_hurts_no_command_that_does_not_need_it() -> None:

@@ -54,15 +54,12 @@ _ERROR_CODES: dict[type[BaseException], ExitCode] = {
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with an option for each setting of its ``Settings`` and ``Given`` parameters.
-
-    An option before a subcommand counts for the subcommand too, where it is not given again.
-    """
+    """Return the command with an option for each setting of its ``Settings`` and ``Given`` parameters."""
     # not typing.get_type_hints, which in Python 3.10 hides the annotation of a parameter whose default is None
     own = inspect.signature(command, eval_str=True).parameters.values()
     chosen = {each.name: kind for each in own if (kind := _settings_class(each.annotation)) is not None}
     options = {name: [each for each in kind.settings().values() if each.has_option] for name, kind in chosen.items()}
-    parameters = [inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)]
+    parameters: list[inspect.Parameter] = []
     for each in own:
         if each.name in options:
             parameters += map(_parameter, options[each.name])
@@ -72,16 +69,18 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     are_given = {each.name for each in own if get_origin(each.annotation) is Given}
 
     @functools.wraps(command)
-    def run(context: typer.Context, **values: Any) -> None:
+    def run(**values: Any) -> None:
+        typed = {
+            each.name: each.option for some in options.values() for each in some if values[_key(each)] not in (None, [])
+        }
         try:
             for name, kind in chosen.items():
-                given = _given(options[name], context, values)
+                given = _given(options[name], values)
                 values[name] = given if name in are_given else kind(**given)
             command(**values)
         except ConfigError as error:
             raise _named(error, {each.name: each.option for some in options.values() for each in some}) from None
         except errors.LocatedError as error:  # of what an option names: a server, a dataset
-            typed = {each.name: each.option for some in options.values() for each in some if _key(each) in context.obj}
             typed |= {option.strip("-").replace("-", "_"): option for option in typed.values()}
             if error.where not in typed or error.where == "frames":  # those of a sample
                 raise
@@ -282,18 +281,13 @@ def _help(setting: Setting) -> str:
     return f"{setting.help}  [{'; '.join(facts)}]" if facts else setting.help
 
 
-def _given(options: Sequence[Setting], context: typer.Context, values: dict[str, Any]) -> Given[Any]:
+def _given(options: Sequence[Setting], values: dict[str, Any]) -> Given[Any]:
     """Remove the options from ``values``, and return the given settings. Raises typer.BadParameter."""
-    before = context.ensure_object(dict)  # options before the subcommand, which win over variables
     given = Given[Any]()
     for each in options:
-        key = _key(each)
-        value = values.pop(key)
-        if key in before and getattr(context.get_parameter_source(key), "name", "") != "COMMANDLINE":
-            value = before[key]
+        value = values.pop(_key(each))
         if value in (None, []):
             continue
-        before[key] = value
         with usage_errors(each.option):
             value = each.parse(value) if each.parse else value
         given[each.name] = tuple(value) if isinstance(value, list) else value

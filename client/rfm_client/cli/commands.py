@@ -18,7 +18,6 @@ from rfm_client.cli.command import (
     EXIT_CODES,
     Command,
     Commands,
-    Given,
     add_missing,
     exit_code_of,
     report,
@@ -27,7 +26,6 @@ from rfm_client.cli.command import (
 )
 from rfm_client.cli.messages import MOST_COLUMNS, with_remedy
 from rfm_client.cli.options import (
-    CredentialFiles,
     JsonOutput,
     OutputOptions,
     PlotOutput,
@@ -78,9 +76,7 @@ def _print_version(is_wanted: bool) -> None:
 
 
 @app.callback()
-@with_options
 def main(
-    credentials: Given[CredentialFiles],  # which count for the subcommand
     version: Annotated[
         bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
     ] = False,
