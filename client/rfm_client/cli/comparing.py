@@ -17,12 +17,13 @@ from typing import cast
 
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel
-from rfm_client.cli.scoring import Source, fitted_to, scores_of
+from rfm_client.cli.scoring import Source
 from rfm_client.cli.show import at_end, number, table
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
 from rfm_client.contract.results import PreferenceResult, ProgressResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Trajectory
+from rfm_client.frames.fit_to_checkpoint import fitted, with_frame_indices
 
 LEGEND = (
     "no answer: the orders disagree, or both are exactly 0.5. "
@@ -121,11 +122,16 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
     """Compare every two sources at the task of the first. Raises RewardError."""
     sources = [Source.read(name, video) for name in names]
     trajectories = [_of_one_task(sources[0], source) for source in sources]
-    fits = [fitted_to(client, ProgressSample(trajectory), video) for trajectory in trajectories]
+    info = client.model_info(frames=trajectories[0].frames is not None)
+    limits = info.max_frames if video.subsample else None, info.frame_size if video.resize else None
+    fits = [fitted(ProgressSample(trajectory), *limits) for trajectory in trajectories]  # once, and not in each pair
     sent = [fit.sample.trajectories[0] for fit in fits]
     orders = list(itertools.permutations(range(len(sources)), 2))
     answers = client.evaluate([PreferenceSample(sent[first], sent[second]) for first, second in orders])
-    scores = scores_of(client, fits)
+    alone = client.evaluate([fit.sample for fit in fits], all_scores=True)
+    scores = [
+        cast(ProgressResult, with_frame_indices(each, fit.frame_indices)) for each, fit in zip(alone, fits, strict=True)
+    ]
     versions = sorted({str(result.model_version) for result in (*scores, *answers)})
     if len(versions) > 1:
         raise InferenceFailedError(f"model_version: expected one for all videos, got {', '.join(versions)}: ask again")

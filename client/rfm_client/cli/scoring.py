@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -31,10 +31,10 @@ from rfm_client.contract.errors import (
     ServerUnavailableError,
 )
 from rfm_client.contract.results import FrameScores, ProgressResult
-from rfm_client.contract.samples import ProgressSample, Trajectory
-from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, with_frame_indices
+from rfm_client.contract.samples import Trajectory
 from rfm_client.frames.sampling import Sampling
 from rfm_client.plot import plot_scores
+from rfm_client.scoring.samples import CallOptions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -161,7 +161,7 @@ class SourceScorer:
             source = Source.read(name, self.video)
             if self._gone is not None:
                 return Failed(name, self._gone, NOT_ASKED, is_server_gone=True)
-            result = _evaluate(self.client, ProgressSample(source.trajectory), self.video, self.prefix)
+            result = _evaluate(self.client, source.trajectory, self.video, self.prefix)
             checkpoint = checkpoint_of(self.client, source.trajectory)
         except ImportError as error:
             return Failed(name, error, missing_package(error))
@@ -214,42 +214,20 @@ def unique_stems(names: Sequence[str]) -> list[str]:
     return list(stems)
 
 
-def fitted_to(
-    client: RewardClient, sample: ProgressSample, video: VideoOptions, *, samples_prefixes: bool = False
-) -> FittedSample:
-    """Return the sample with frames left out as the options and the checkpoint require.
-
-    samples_prefixes: True if each prefix is sampled, so that the checkpoint's limit does not matter
-    """
-    info = client.model_info(frames=sample.trajectory.frames is not None)
-    limit = info.max_frames if video.subsample and not samples_prefixes else None
-    return fitted(sample, limit, info.frame_size if video.resize else None)
-
-
-def scores_of(client: RewardClient, fits: Sequence[FittedSample]) -> list[ProgressResult]:
-    """Return the scores of whole trajectories, each alone. Raises RewardError."""
-    results = client.evaluate([fit.sample for fit in fits], all_scores=True)
-    return [
-        cast(ProgressResult, with_frame_indices(result, fit.frame_indices))
-        for result, fit in zip(results, fits, strict=True)
-    ]
-
-
 def _evaluate(
-    client: RewardClient, sample: ProgressSample, video: VideoOptions, prefix: PrefixOptions
+    client: RewardClient, trajectory: Trajectory, video: VideoOptions, prefix: PrefixOptions
 ) -> ProgressResult:
-    fit = fitted_to(client, sample, video, samples_prefixes=prefix.sampling is not None)
-    sent = cast(ProgressSample, fit.sample)
-    info = client.model_info(frames=sent.trajectory.frames is not None)
+    info = client.model_info(frames=trajectory.frames is not None)
+    options: CallOptions = {"all_scores": True, "resize": video.resize}
     # Of an episode as a whole, all frames are shown at once.
     if prefix.sampling is None or (info.needs_whole_episode and prefix.sampling == "all"):
-        return scores_of(client, [fit])[0]
+        options["subsample"] = video.subsample and prefix.sampling is None
+        return client.progress(trajectory, **options)
     try:
         sampling = Sampling.of(prefix.sampling, prefix.frames, info.max_frames)
     except InvalidValueError as error:  # the options are valid: the checkpoint lacks the number
         raise InvalidSampleError.like(error, where=f"--{error.where}") from error
-    curve = client.curve(sent.trajectory, sampling, all_scores=True)
-    return cast(ProgressResult, with_frame_indices(curve, fit.frame_indices))
+    return client.curve(trajectory, sampling, **options)
 
 
 def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:
