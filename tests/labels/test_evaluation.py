@@ -226,7 +226,7 @@ def test_no_number_is_cut_on_a_terminal_and_episodes_without_an_outcome_are_left
     done = rfm_client("evaluate", tmp_path, "--outcome", outcomes, "--json", tmp_path / "out.json")
     assert done.exit_code == 0, done.output
     shown = re.sub(r"\x1b\[\d*m", "", done.stdout)
-    assert "4 episodes: 2 successes, 2 failures; 1 left out, whose outcome is empty " in shown
+    assert "4 episodes: 2 successes, 2 failures; 1 left out, whose outcome is empty" in shown
     document = json.loads((tmp_path / "out.json").read_text())
     assert (document["episodes"], document["num_without_outcome"]) == ([0, 1, 3, 4], 1)
     assert max(map(len, shown.partition("VOC: ")[0].splitlines())) <= 80

@@ -61,27 +61,32 @@ def shortened(name: str, width: int) -> str:
 
 
 class Table:
-    """A plain table, as wide as the terminal; to a file or a pipe, at most FILE_WIDTH. Headers wrap to their columns.
+    """A plain table. Headers wrap to their columns.
 
     columns: headers
     cells: all cells of each column, or as wide ones
-    names: number of first columns with names and paths, which are shortened to fit
+    names: number of first columns with names and paths, which are shortened to fit the terminal; a file or a pipe has
+        FILE_WIDTH
     """
 
     def __init__(self, columns: Sequence[str], cells: Sequence[Iterable[str]], *, names: int = 1) -> None:
         widths = [max(map(len, (*head.split(), *column, ""))) for head, column in zip(columns, cells, strict=True)]
-        room = shutil.get_terminal_size((FILE_WIDTH, 0)).columns - sum(widths[names:]) - len(GAP) * len(columns)
+        width = shutil.get_terminal_size((FILE_WIDTH, 0)).columns
+        room = width - sum(widths[names:]) - len(GAP) * len(columns)
         most = max(SHORTEST_NAME, room // names)
-        self._widths = [*(min(width, most) for width in widths[:names]), *widths[names:]]
+        self._widths = [*(min(each, most) for each in widths[:names]), *widths[names:]]
         self._names = names
         self._columns = columns
+        self.fits = sum(self._widths) + len(GAP) * len(columns) <= width
 
     @property
     def head(self) -> list[str]:
         """The lines above the rows."""
-        words = (textwrap.wrap(head, max(width, 1)) for head, width in zip(self._columns, self._widths, strict=True))
-        lines = [*itertools.zip_longest(*words, fillvalue=""), ["-" * width for width in self._widths]]
-        return [self._line(each) for each in lines]
+        words = (
+            textwrap.wrap(head, max(width, 1))[::-1] for head, width in zip(self._columns, self._widths, strict=True)
+        )
+        lines = [*itertools.zip_longest(*words, fillvalue="")][::-1]
+        return [self._line(each) for each in (*lines, ["-" * width for width in self._widths])]
 
     def row(self, cells: Sequence[str]) -> str:
         """Return a row."""
@@ -94,9 +99,18 @@ class Table:
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> str:
-    """Return the lines of a ``Table``, below a title unless it is empty."""
-    made = Table(columns, list(zip(*rows, strict=True)) or [()] * len(columns), names=names)
-    return "\n".join([*[title] * bool(title), *made.head, *map(made.row, rows), ""])
+    """Return a ``Table`` below a title, unless that is empty. Columns that do not fit follow below, after the names."""
+    lines, begin = [title] * bool(title), names
+    while begin < len(columns):
+        for end in range(len(columns), begin, -1):
+            shown = [*range(names), *range(begin, end)]
+            part = [[row[column] for column in shown] for row in (columns, *rows)]
+            made = Table(part[0], [*zip(*part[1:], strict=True)] or [()] * len(shown), names=names)
+            if made.fits:
+                break
+        lines += [*made.head, *map(made.row, part[1:]), ""]
+        begin = end
+    return "\n".join(lines)
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> None:
