@@ -89,7 +89,6 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
 
 
 OPTIONS: dict[str, tuple[list[object], dict[str, Any]]] = {
-    "as it is": ([], {"subsample": True}),
     "each prefix by a rule": (["--sampling", "linspace_trunc", "--frames", 4], {"frame_steps": 4}),
     "resized": (["--resize"], {"subsample": True, "resize": True}),
 }

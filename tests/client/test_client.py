@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import inspect
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
@@ -19,7 +17,6 @@ from engines import load_engine
 from mixtures import FRAMES_MODEL, assert_same, mixed_samples
 from rfm_client import (
     FRAME_SCORES,
-    AsyncRewardClient,
     InvalidSampleError,
     ModelInfo,
     ModelNotFoundError,
@@ -40,15 +37,6 @@ from transports import Answer
 
 NOBODY = "grpc://127.0.0.1:1"  # a port where nothing listens
 WIDTHS = (48, 32)  # of the embeddings of FRAMES_MODEL
-
-
-@pytest.mark.parametrize("kind", [RewardClient, AsyncRewardClient])
-def test_help_of_a_client_tells_of_each_option(kind: type[Any]) -> None:
-    parameters = inspect.signature(kind).parameters
-    assert [name for name, each in parameters.items() if each.kind is not each.KEYWORD_ONLY] == ["urls"]
-    assert len(parameters) == 12
-    for name in parameters:
-        assert re.search(rf"^    [\w, ]*\b{name}\b[\w, ]*: ", kind.__init__.__doc__ or "", re.MULTILINE), name
 
 
 def test_samples_of_frames_of_several_sizes_and_embeddings_come_back_in_order(engines: EngineServer) -> None:

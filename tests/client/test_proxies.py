@@ -117,17 +117,3 @@ def test_ipv6_addresses_are_reached(demo_server: Endpoints) -> None:
         assert (status.ready, status.metrics_url) == (True, "http://[::1]:8002/metrics")
         message = invoke("sample", "--url", other).stderr
         assert f"use {url}" in message
-
-
-BRACKETS = {
-    "grpc://::1:8001": "grpc://[::1]:8001",
-    "http://2001:db8::7:8000": "http://[2001:db8::7]:8000",
-    "grpc://::1": "grpc://[::1]:8001",
-}
-
-
-@pytest.mark.parametrize(("url", "right"), BRACKETS.items(), ids=BRACKETS)
-def test_ipv6_without_brackets_is_refused_with_the_right_form(url: str, right: str) -> None:
-    with pytest.raises(ValueError, match="expected brackets around an IPv6 address") as caught:
-        RewardClient(url)
-    assert str(caught.value) == f"url: expected brackets around an IPv6 address, {right}, got {url!r}"

@@ -109,7 +109,6 @@ REFUSED: dict[str, tuple[Any, ...]] = {
         "frames: expected 16 with the rule rewind_pad16_online, got 8",
     ),
     "no number": ("rint_pad", None, "frames: expected at least 1 with the rule rint_pad, got None"),
-    "no frame": ("linspace_trunc", 0, "frames: expected at least 1, got 0"),
 }
 
 
