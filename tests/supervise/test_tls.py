@@ -278,13 +278,13 @@ def test_the_command_has_the_same_options(mutual: Endpoints, proxied: str, paper
     names = {"ca_file": papers.ca, "client_certificate": papers.client_certificate, "client_key": papers.client_key}
     words = [f"--{name.replace('_', '-')}={file}" for name, file in names.items()]
     wrong = f"--ca-file={papers.other_ca}"
-    done = rfm_client(wrong, "sample", *words, "--url", mutual.grpc_url)  # behind the command they win
+    done = rfm_client("sample", *words, "--url", mutual.grpc_url)
     assert done.exit_code == 0, done.output
     in_environment = {f"RFM_{name.upper()}": str(file) for name, file in {**names, "api_key_file": key_file}.items()}
     for name in ("sample", "status", "wait"):
         done = rfm_client(name, "--url", proxied, env=in_environment)
         assert done.exit_code == 0, done.output
-    refused = rfm_client(*words, "sample", wrong, "--url", mutual.grpc_url)
+    refused = rfm_client("sample", *words[1:], wrong, "--url", mutual.grpc_url)
     assert (refused.exit_code, "access denied" in refused.stderr) == (1, True)
 
 

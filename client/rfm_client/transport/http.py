@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Mapping
+from http import HTTPStatus
 from typing import Any
 
 from tritonclient.http.aio import InferenceServerClient
+from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import triton
 from rfm_client.transport.connection import SECURE_SCHEMES, Credentials
@@ -39,7 +42,10 @@ class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
         return await self._ask("POST", request_uri, body, headers)
 
     async def _ask(self, method: str, path: str, body: bytes, headers: Mapping[str, Any] | None) -> Any:
-        """Return aiohttp's answer, with its content read. Raises InferenceFailedError for a redirect."""
+        """Return aiohttp's answer, with its content read.
+
+        Raises InferenceFailedError for a redirect, InferenceServerException for an error but of readiness.
+        """
         # aiohttp sends a stream piece by piece. Large bytes would block the event loop, and aiohttp warns.
         data = io.BytesIO(body) if len(body) >= MIN_BYTES else body or None
         every = {**self._own_headers, **self._fix_header(headers or {})}
@@ -48,5 +54,15 @@ class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
         if triton.is_redirect(answer.status):
             answer.release()
             raise triton.redirected(self._url, answer.headers.get("Location", ""))
-        await answer.read()  # which frees the connection
+        content = await answer.read()  # which frees the connection
+        if answer.status != HTTPStatus.OK and not path.endswith("/ready"):
+            raise InferenceServerException(_reason(content), status=str(answer.status))
         return answer
+
+
+def _reason(content: bytes) -> str:
+    """Return Triton's reason for an error; else the text of the answer, which may be a proxy's."""
+    try:
+        return str(json.loads(content)["error"])
+    except (ValueError, LookupError, TypeError):
+        return content.decode(errors="replace") or "the answer is empty"
