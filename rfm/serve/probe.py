@@ -7,7 +7,7 @@ import http.client
 import json
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
 
@@ -66,14 +66,10 @@ class Probe:
     """Probes a model in its own thread, every ``interval_s`` or less often if answers take long.
 
     hang_s: seconds without an answer after which the model counts as hung
-    observe: called with the seconds that each answer took
     """
 
-    def __init__(
-        self, http: Http, model: str, interval_s: float, hang_s: float, observe: Callable[[float], None]
-    ) -> None:
+    def __init__(self, http: Http, model: str, interval_s: float, hang_s: float) -> None:
         self._http, self._model, self._interval_s, self._hang_s = http, model, interval_s, hang_s
-        self._observe = observe
         self._waiting_since_s = time.monotonic()
         self._num_failures: int | None = None  # in a row; None: no probe has succeeded yet
         self._succeeded_s = 0.0  # time of the last success
@@ -111,15 +107,14 @@ class Probe:
             else:
                 if status != HTTPStatus.SERVICE_UNAVAILABLE:  # a full queue rejects probes, too
                     took_s = time.monotonic() - started_s
-                    self._take(status, took_s)
+                    self._take(status)
             self._closed.wait(max(self._interval_s, min(took_s / SHARE, self._hang_s)))
             if took_s:
                 self._waiting_since_s = time.monotonic()
 
-    def _take(self, status: int, took_s: float) -> None:
+    def _take(self, status: int) -> None:
         self.has_answered = True
         self._waiting_since_s = float("inf")
-        self._observe(took_s)
         if status < HTTPStatus.INTERNAL_SERVER_ERROR:
             self._num_failures, self._succeeded_s = 0, time.monotonic()
         elif self._num_failures is not None:  # counted only after a success: some models fail on any blank sample

@@ -13,13 +13,12 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, generate_latest
 
 from rfm_client.contract.addresses import ListenAddress
 
 NO_REASON = ""  # of a ready model
 REQUEST_S = 5.0  # longest silence of a connection
-_BUCKETS_S = tuple(digit * 10.0**power for power in range(-3, 2) for digit in (1, 2, 5))
 
 
 class Status:
@@ -31,10 +30,6 @@ class Status:
         gauge = partial(Gauge, registry=self._registry)
         self._ready = gauge("rfm_serve_ready", "1: the model is ready.", ["model"])
         self._reason = gauge("rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"])
-        told = "From a probe to its answer."
-        self.probe_seconds = Histogram(
-            "rfm_serve_probe_seconds", told, ["model"], registry=self._registry, buckets=_BUCKETS_S
-        )
         told = "Why Triton was started again: a model by name, or triton itself; gateway: the gateway was."
         self.restarts = Counter("rfm_serve_restarts", told, ["what"], registry=self._registry)
 

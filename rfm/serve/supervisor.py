@@ -24,7 +24,6 @@ STEADY_S = 60.0  # after a longer run, a process is not in a crash loop
 MOST = 5  # restarts in a row; a call ends a process twice at most
 ASK_S = 1.0  # between the requests to the gateway
 TRIES = 2  # requests in a row without an answer; one alone may be due to a machine that stood still
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 GATEWAY_PAUSE_S = 5.0  # between its starts
 logger = logging.getLogger(__name__)
 
@@ -33,8 +32,8 @@ class CrashLoopError(ServerStartError):
     """A process had too many faults in a row to restart it."""
 
 
-class BackOff:
-    """Growing pauses between the restarts of Triton; none before the first."""
+class FaultCount:
+    """Counts faults of Triton in a row. A fault after a run of ``steady_s`` is the first of a new row."""
 
     def __init__(self, steady_s: float = STEADY_S) -> None:
         self._steady_s = steady_s
@@ -45,8 +44,8 @@ class BackOff:
         """Record a successful start."""
         self._running_since_s = time.monotonic()
 
-    def failed(self, reason: str) -> float:
-        """Record a fault or a failed start. Return the seconds to wait before the next. Raises CrashLoopError."""
+    def failed(self, reason: str) -> None:
+        """Record a fault or a failed start. Raises CrashLoopError after more than MOST."""
         if self._running_since_s is not None and time.monotonic() - self._running_since_s >= self._steady_s:
             self._num_faults = 0
         self._running_since_s = None  # a failed start does not count as running
@@ -54,7 +53,6 @@ class BackOff:
         if self._num_faults > MOST:
             got = f"{self._num_faults} faults in a row; the last: {reason}"
             raise CrashLoopError(f"{TRITON}: expected to run, got {got}")
-        return 0.0 if self._num_faults == 1 else min(FIRST_PAUSE_S * 2.0 ** (self._num_faults - 2), LONGEST_PAUSE_S)
 
 
 class GatewayProcess:
@@ -140,7 +138,7 @@ class Supervisor:
     def __post_init__(self) -> None:
         self._status = Status()
         self._is_to_stop = threading.Event()
-        self._back_off = BackOff(STEADY_S + self.hang_s)
+        self._faults = FaultCount(STEADY_S + self.hang_s)
         self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
 
@@ -187,7 +185,7 @@ class Supervisor:
             return
         if self._served is None:
             (self.tell_ready or self._log_ready)()
-        self._back_off.started()
+        self._faults.started()
         self._watch = TritonWatch(
             self.server,
             self._status,
@@ -228,8 +226,8 @@ class Supervisor:
             self._status.record_down(f"{TRITON} is started again: {reason}")
             self.server.kill()
             self.server.stop()
-            if counts and self._is_to_stop.wait(self._back_off.failed(reason)):
-                return
+            if counts:
+                self._faults.failed(reason)
             counts = True
             self._count(what, why)
             try:

@@ -27,6 +27,7 @@ from rfm.serve.processes import ModelProcesses
 from rfm.serve.repository_api import INDEX_PATH, LOADING, UNLOADING, ModelVersion, versions_of
 from rfm.serve.status import NO_REASON, Status
 from rfm.serve.triton_server import Config, TritonServer
+from rfm_client.contract.description import num_instances
 
 LOOK_S = 0.5
 LOOKS = 3  # a restart needs at least so many looks without an answer
@@ -162,8 +163,7 @@ class TritonWatch:
             before = self._probes.get(model)
             self._forget(model)
             if can_be_probed(self.served[model]):
-                observe = self._status.probe_seconds.labels(model).observe
-                self._probes[model] = self._new_probe(model, observe=observe)
+                self._probes[model] = self._new_probe(model)
                 known = before is not None and before.has_answered
                 self._probes[model].has_answered = known  # a reloaded model stays ready
             self._ready[model] = ready
@@ -189,11 +189,6 @@ class TritonWatch:
 def parts_of(config: Config) -> list[str]:
     """Return the models of an ensemble; empty for other models."""
     return [step["model_name"] for step in config.get("ensemble_scheduling", {}).get("step", [])]
-
-
-def num_instances(config: Config) -> int:
-    """Return the number of instances, and so of processes, of each version of a model."""
-    return sum(group["count"] * max(1, len(group.get("gpus", ()))) for group in config.get("instance_group", ()))
 
 
 def serving_just(config: Config, versions: Sequence[int]) -> Config:

@@ -2,7 +2,6 @@
 """The code inside Triton's model process.
 
 ``batch_model`` is the base of every model.py. It decodes and prepares each ``request``, answers a batch together, and
-encodes each answer. A ``pipeline`` serves models whose frames take long to prepare. ``placement`` sets device and
-threads. ``watchdog`` ends a hung or broken process. ``metrics`` and ``request_log`` report outcomes.
-``weights`` checks the weights before they are loaded.
+encodes each answer. A ``pipeline`` serves models whose frames take long to prepare. ``placement`` checks
+the weights, and sets device and threads. ``watchdog`` ends a hung or broken process. ``metrics`` reports outcomes.
 """

@@ -19,17 +19,14 @@ from rfm.engine.computation import is_by_this_torch
 from rfm.engine.execution import Execution
 from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE
 from rfm.probe_request import probe_request
-from rfm.triton_model import request_log
 from rfm.triton_model.metrics import InstanceMetrics
 from rfm.triton_model.pipeline import Pipeline
-from rfm.triton_model.placement import Placement
+from rfm.triton_model.placement import Placement, check_digest, close_to_other_users
 from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Request
-from rfm.triton_model.shared_memory import close_to_other_users
 from rfm.triton_model.watchdog import Watchdog
-from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
-from rfm_client.contract.process import write_log
+from rfm_client.contract.process import about, write_log
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import Tensors
 
@@ -224,7 +221,7 @@ class BatchModel(Generic[Question, Answer]):
                 request.error = _first_error(request.answers)
         except Exception as error:  # noqa: BLE001  every request gets an answer or an error
             if len(batch) > 1:
-                _tell(request_log.report_batch, batch, error)
+                _tell(_log_split, batch, error)
                 return [scored for request in batch for scored in self._scored([request])]
             batch[0].fail(error)
             execution = Execution()
@@ -248,7 +245,7 @@ class BatchModel(Generic[Question, Answer]):
         for part, execution in scored:
             for request in part:
                 if request.error is not None:
-                    _tell(request_log.report, request)
+                    _tell(request.log_error)
             _tell(self._metrics.add, part, execution)
 
     def _score_blank(self) -> None:
@@ -266,6 +263,12 @@ def _tell(tell: Callable[..., None], *what: Any) -> None:
         tell(*what)
     except Exception:
         logger.exception("requests could not be logged or counted")
+
+
+def _log_split(batch: Sequence[Request[Any]], error: Exception) -> None:
+    """Log requests that failed in a batch, before each is scored alone."""
+    with about([request.request_id for request in batch]):
+        logger.error("the batch failed, now each request is scored alone", exc_info=error)
 
 
 def _first_error(answers: Sequence[Any]) -> RewardError | None:

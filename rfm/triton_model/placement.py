@@ -1,19 +1,28 @@
 # SPDX-License-Identifier: MIT
-"""Device and CPU threads of a model instance."""
+"""The start of a model process: its shared memory, its weights, and the device and CPU threads of its instance."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
+from google.protobuf import text_format
+from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.engine.device import use
 from rfm.engine.layers import keep_float32
 from rfm.engine.threads import num_preparing, use_threads
+from rfm.files import CheckpointError, is_there, weights_digest
 from rfm.parameters import THREADS_PARAMETER
+from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description, num_instances
+
+_REGION = re.compile(r"/dev/shm/[^/\s]+$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -50,6 +59,32 @@ class Placement:
             thread.submit(work).result()
 
 
-def num_instances(config: Mapping[str, Any]) -> int:
-    """Return the number of a model's instances on all devices. config: the model's configuration from Triton"""
-    return sum(group["count"] * max(len(group.get("gpus", [])), 1) for group in config["instance_group"])
+def close_to_other_users() -> None:
+    """Give the shared memory of this process the mode 0600. Triton creates it with 0644, whatever the umask says."""
+    for region in {*_REGION.findall(Path("/proc/self/maps").read_text())}:
+        with suppress(OSError):  # of another user
+            Path(region).chmod(0o600)
+
+
+def check_digest(version: Path, expected: str | None) -> None:
+    """Raise CheckpointError if the weights in the folder ``version`` changed after the export.
+
+    expected: digest in the model's configuration; None: unknown. The configuration in the version folder takes
+        precedence, since the model's may belong to a newer version
+    """
+    kept = version / "config.pbtxt"
+    if is_there(kept):
+        expected = _digest_in(kept)
+    if expected and (got := weights_digest([version])) != expected:
+        raise CheckpointError.at(
+            version, f"the weights that were exported ({expected})", f"others ({got})", "export them again"
+        )
+
+
+def _digest_in(file: Path) -> str | None:
+    """Return the digest of the weights in an exported configuration; None: unknown."""
+    try:
+        config = text_format.Parse(file.read_text(), pb.ModelConfig())
+        return Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value).weights_digest
+    except (OSError, ValueError, text_format.ParseError) as error:
+        raise CheckpointError.at(file, "a configuration of the export", error, "export again") from error

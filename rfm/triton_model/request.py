@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
@@ -17,10 +18,12 @@ from rfm_client.contract import (
     SimilaritySample,
     wire,
 )
+from rfm_client.contract.process import about
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import PROBE_PREFIX
 
 Question = TypeVar("Question")
+logger = logging.getLogger(__name__)
 
 OUTCOMES = SCORED, REFUSED, FAILED, CANCELLED = "scored", "refused", "failed", "cancelled"
 
@@ -93,6 +96,17 @@ class Request(Generic[Question]):
         """Set an error without details; the cause goes to the log."""
         self.error = InferenceFailedError("scoring failed; the server's log has the reason")
         self.error.__cause__ = cause
+
+    def log_error(self) -> None:
+        """Log the error.
+
+        Failures are errors. Refused and cancelled requests are logged at DEBUG, so that clients cannot fill the log.
+        """
+        assert self.error is not None
+        level = logging.ERROR if self.outcome == FAILED else logging.DEBUG
+        sample_types = ",".join(sorted(self.sample_types))
+        with about([self.request_id]):
+            logger.log(level, "%s (%s): %s", self.outcome, sample_types, self.error, exc_info=self.error.__cause__)
 
     def response(self, outputs: wire.Tensors) -> Any:
         """Return Triton's response with these tensors."""

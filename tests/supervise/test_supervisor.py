@@ -25,7 +25,7 @@ from commands import running
 from rfm.serve import probe, processes, status, supervisor, triton_server, watch
 from rfm.serve.processes import LOADING_DEAD_S, UNKNOWN, ModelProcesses
 from rfm.serve.status import NO_REASON, Status, StatusServer
-from rfm.serve.supervisor import MOST, STEADY_S, BackOff, CrashLoopError, GatewayProcess, Supervisor
+from rfm.serve.supervisor import MOST, STEADY_S, CrashLoopError, FaultCount, GatewayProcess, Supervisor
 from rfm.serve.triton_server import TritonServer
 from servers import Endpoints, Serving, wait_for
 
@@ -36,7 +36,6 @@ SILENT_S, HANG_S = 1.5, 1.5
 def _in_a_hurry(monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name, seconds in (
         (supervisor, "POLL_S", 0.01),
-        (supervisor, "FIRST_PAUSE_S", 0.0),
         (watch, "LOOK_S", 0.02),
         (probe, "BROKEN_S", 0.1),
         (triton_server, "POLL_S", 0.02),
@@ -245,31 +244,29 @@ def test_a_silent_gateway_is_started_again(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_crash_loop_is_many_faults_each_soon_after_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A long run resets the count; failed starts do not, however long they take."""
+    """A long run begins a new count; failed starts do not, however long they take."""
     now_s = 0.0
-    monkeypatch.undo()
     monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic=lambda: now_s))
 
-    def run_for(duration_s: float, starts: bool = True) -> float:
+    def fault_after(*durations_s: float, starts: bool = True) -> None:
         nonlocal now_s
-        if starts:
-            ends.started()
-        now_s += duration_s
-        return ends.failed("why")
+        for duration_s in durations_s:
+            if starts:
+                faults.started()
+            now_s += duration_s
+            faults.failed("why")
 
-    ends = BackOff()
-    assert [run_for(1.0) for _ in range(MOST)] == [0, 0.5, 1, 2, 4]
-    assert run_for(STEADY_S) == 0
-    assert [run_for(1.0) for _ in range(MOST - 1)] == [0.5, 1, 2, 4]
+    faults = FaultCount()
+    fault_after(*[1.0] * MOST)
+    fault_after(STEADY_S, *[1.0] * (MOST - 1))
     in_a_row = r"^triton: expected to run, got 6 faults in a row; the last: why$"
     with pytest.raises(CrashLoopError, match=in_a_row):
-        run_for(1.0)
-    ends = BackOff()
-    run_for(5 * STEADY_S)
-    for _ in range(MOST - 1):
-        run_for(2 * STEADY_S, starts=False)
+        fault_after(1.0)
+    faults = FaultCount()
+    fault_after(5 * STEADY_S)
+    fault_after(*[2 * STEADY_S] * (MOST - 1), starts=False)
     with pytest.raises(CrashLoopError, match=in_a_row):
-        run_for(2 * STEADY_S, starts=False)
+        fault_after(2 * STEADY_S, starts=False)
 
 
 def test_a_silent_connection_to_the_status_port_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -126,7 +126,7 @@ def test_a_log_that_cannot_be_written_costs_no_answer(tmp_path: Path, monkeypatc
         raise OSError("no space")
 
     model = Model(tmp_path)
-    monkeypatch.setattr("rfm.triton_model.request_log.logger.log", full)
+    monkeypatch.setattr("rfm.triton_model.request.logger.log", full)
     responses = model.respond(request(1), request(BREAKS))
     assert [response.error for response in responses] == [None, ("internal", REASON)]
     assert model.samples == {("progress", "scored"): 1, ("progress", "failed"): 1}

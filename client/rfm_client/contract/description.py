@@ -242,10 +242,11 @@ class ModelInfo(Description):
             versions=tuple(str(version) for version in versions),
             max_batch_size=int(config["max_batch_size"]),
             by_digest=any(tensor["name"] == wire.FRAME_DIGESTS for tensor in config["input"]),
-            instances=sum(map(_num_instances, config.get("instance_group", []))),
+            instances=num_instances(config),
         )
 
 
-def _num_instances(group: Mapping[str, Any]) -> int:
-    """Instances of a group: ``count`` on each of its GPUs, or on the CPU."""
-    return int(group.get("count", 1)) * max(len(group.get("gpus", [])), 1)
+def num_instances(config: Mapping[str, Any]) -> int:
+    """Return the number of a model's instances: a group has ``count`` on each of its GPUs, or on the CPU."""
+    groups = config.get("instance_group", [])
+    return sum(int(group.get("count", 1)) * max(len(group.get("gpus", [])), 1) for group in groups)
