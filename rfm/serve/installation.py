@@ -7,6 +7,7 @@ search path of its libraries and of libpython. This module adds both.
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import os
 import shutil

@@ -16,7 +16,7 @@ from PIL import Image
 
 from pictures import TOP, WRIST
 from rfm_client import InvalidSampleError, Trajectory, UInt8Array, as_trajectory, load_trajectory
-from rfm_client.frames import Correction, Orientation
+from rfm_client.frames import Correction, FrameFileError, Orientation, Video
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (4, 6, 8, 3), np.uint8)
 SHAPED = "uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W]"
@@ -258,19 +258,40 @@ def test_png_files_in_a_row_are_the_frames_of_a_video(tmp_path: Path) -> None:
 
 
 def test_a_stream_of_pictures_with_exif_data_is_turned_or_refused_with_a_remedy(tmp_path: Path) -> None:
-    """PyAV 17.1 and newer cannot read the EXIF data of frames."""
+    """PyAV 17.1 to 18.1 cannot read the EXIF data of frames."""
     exif = Image.Exif()
     exif[0x0112] = 6
     for t in range(3):
         Image.fromarray(np.full((32, 48, 3), 80 * t, np.uint8)).save(tmp_path / f"{t}.jpg", exif=exif)
     (tmp_path / "all.mjpeg").write_bytes(b"".join((tmp_path / f"{t}.jpg").read_bytes() for t in range(3)))
-    if tuple(map(int, av.__version__.split(".")[:2])) < (17, 1):
+    if not (17, 1) <= tuple(map(int, av.__version__.split(".")[:2])) < (19, 0):
         assert load_trajectory(tmp_path / "all.mjpeg").positions.shape == (3, 48, 32, 3)
     else:
         with pytest.raises(
             InvalidSampleError, match=r"^video: expected frames without EXIF .*ffmpeg -i IN .*all\.mjpeg"
         ):
             load_trajectory(tmp_path / "all.mjpeg")
+
+
+@pytest.mark.parametrize("is_animated", [False, True])
+@pytest.mark.parametrize("kind", ["png", "webp"])
+def test_several_pictures_that_exif_data_turn_are_refused(tmp_path: Path, kind: str, is_animated: bool) -> None:
+    """Some releases of PyAV turn none or the first of them."""
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    pictures = [Image.fromarray(np.full((32, 48, 3), 80 * t, np.uint8)) for t in range(3)]
+    if is_animated:
+        pictures[0].save(tmp_path / "all", kind, save_all=True, append_images=pictures[1:], exif=exif)
+    else:
+        with (tmp_path / "all").open("wb") as file:
+            for picture in pictures:
+                picture.save(file, kind, exif=exif)
+    with pytest.raises(
+        InvalidSampleError, match=r"^video: expected .*, got (EXIF orientation 3|3 pictures in a WEBP) "
+    ):
+        load_trajectory(tmp_path / "all")
+    with pytest.raises(FrameFileError, match=r"stored upright, .*, got EXIF orientation 3$"):
+        _ = Video(tmp_path / "all").packets
 
 
 def test_npz_files_hold_a_whole_trajectory(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +35,13 @@ ROBOMETER: dict[str, dict[str, Any]] = {
     "video_mean": VIDEO,
     "video_last": VIDEO | {"average_temporal_patches": False},
 }
+OWN_WORDS = {
+    "prompt_prefix": "A robot moves. ",
+    "prompt_suffix_template": "Has it done this: {instruction}? The answer is: Yes",
+}
 TOPREWARD: dict[str, dict[str, Any]] = {
-    "plain": {},
-    "chat": {"add_chat_template": True},
-    "fps_4": {"fps": 4.0},
+    f"{template}_{fps}_fps{own}": {"add_chat_template": template == "chat", "fps": fps} | words
+    for template, fps, (own, words) in product(("plain", "chat"), (2.0, 4.0), {"": {}, "_own_words": OWN_WORDS}.items())
 }
 FLOAT32, BFLOAT16 = "float32", "bfloat16"
 SETTINGS = {
@@ -73,8 +77,8 @@ def test_scores_are_those_of_lerobot_s_newest_release(folder: Path, frames: Any,
     settings, expected = SETTINGS[name], json.loads((folder / "scores.json").read_text())[name]
     dtype = settings["torch_dtype"]
     tolerance = TOLERANCES[settings["model"]][dtype]
-    words = {"reward_model": asked(settings)} if settings["model"] == "topreward" else {"base_model": str(BASE)}
-    engine = Engine.of(published.load(folder / name, **words), dtype=getattr(torch, dtype))
+    base_model = str(folder / name / "vlm" if settings["model"] == "topreward" else BASE)
+    engine = Engine.of(published.load(folder / name, base_model=base_model), dtype=getattr(torch, dtype))
     (result,) = engine.evaluate([ProgressSample(Trajectory(frames=frames, task=TASK))])
     assert isinstance(result, ProgressResult), result
     for kind, values in expected.items():
@@ -82,10 +86,3 @@ def test_scores_are_those_of_lerobot_s_newest_release(folder: Path, frames: Any,
         got = got if len(values) == len(got) else got[::2]  # one value for each pair of a video
         np.testing.assert_allclose(got, values, rtol=0, atol=tolerance)
         assert np.ptp(values) > 2 * tolerance
-
-
-def asked(settings: dict[str, Any]) -> str:
-    """Return the words of ``--as``."""
-    words = [f"fps={settings['fps']}"] if "fps" in settings else []
-    words += [f"chat_template={str(settings['add_chat_template']).lower()}"] if "add_chat_template" in settings else []
-    return ",".join(["topreward", *words])

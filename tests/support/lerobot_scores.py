@@ -85,12 +85,14 @@ def robometer(folder: Path, base: str, frames: torch.Tensor, settings: dict[str,
 
 
 def topreward(folder: Path, base: str, frames: torch.Tensor, settings: dict[str, Any]) -> dict[str, Any]:
-    shutil.copytree(base, folder)
+    vlm_folder = folder / "vlm"
+    shutil.copytree(base, vlm_folder)
     config = AutoConfig.for_model(**backbone(base, AutoConfig.from_pretrained(base).text_config.vocab_size))
     vlm = Qwen3VLForConditionalGeneration(config)
     scatter(vlm)
-    vlm.to(getattr(torch, settings["torch_dtype"])).save_pretrained(folder)
-    model = TOPRewardModel(TOPRewardConfig(device="cpu", image_key=CAMERA, vlm_name=str(folder), **settings))
+    vlm.to(getattr(torch, settings["torch_dtype"])).save_pretrained(vlm_folder)
+    model = TOPRewardModel(TOPRewardConfig(device="cpu", image_key=CAMERA, vlm_name=str(vlm_folder), **settings))
+    model.save_pretrained(folder)
     prefixes = [encoded(model, frames[:length]) for length in range(1, len(frames) + 1)]
     return {"log_prob": [model.compute_reward(batch).item() for batch in prefixes]}
 

@@ -31,6 +31,7 @@ _BROKEN_NPY = (  # numpy's errors for a broken .npy header
     *(tokenize.TokenError, MemoryError, RecursionError),
 )
 ARRAY_SUFFIXES = (".npy", ".npz")
+_ARRAYS = (b"\x93NUMPY", b"PK")  # first bytes of .npy and .npz files
 
 _CAMERA_PREFIX = "observation.images."  # of LeRobot's keys, before the camera's name
 _ONLY_CAMERA = "observation.image"  # LeRobot's key of a single camera without a name
@@ -161,6 +162,9 @@ def _arrays(file: Path) -> Mapping[str, npt.NDArray[Any]]:
         if pointer := git_lfs_pointer(file):
             raise ValueError(pointer)
         with file.open("rb") as stream:
+            if not stream.read(max(map(len, _ARRAYS))).startswith(_ARRAYS):
+                raise ValueError("a file of another kind")
+            stream.seek(0)
             loaded = np.load(stream, allow_pickle=False)
             if isinstance(loaded, np.ndarray):
                 return {"video_embeddings" if loaded.ndim == 2 else "frames": loaded}
@@ -168,8 +172,7 @@ def _arrays(file: Path) -> Mapping[str, npt.NDArray[Any]]:
     except FileNotFoundError as error:
         raise InvalidSampleError.at("file", "a file of arrays", f"no file of this name ({file})") from error
     except (OSError, EOFError, BadZipFile, zlib.error, *_BROKEN_NPY) as error:
-        told = "a file of another kind" if str(error).startswith("Cannot load file containing pickled") else error
-        raise InvalidSampleError.at("file", "arrays of numbers and text, none pickled", f"{told} ({file})") from error
+        raise InvalidSampleError.at("file", "arrays of numbers and text, none pickled", f"{error} ({file})") from error
 
 
 def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:

@@ -47,6 +47,7 @@ _LOST = (
 _REMUX = "extract the stream and encode it: ffmpeg -i IN -c copy RAW.h264; ffmpeg -framerate FPS -i RAW.h264 OUT.mp4"
 _RGB_BYTES = 3  # of a pixel
 _PICTURES = (b"\xff\xd8\xff", b"\x89PNG", b"RIFF", b"II*\0", b"MM\0*")  # first bytes: JPEG, PNG, WebP, TIFF
+_ANIMATED_WEBP = "webp_anim"  # FFmpeg's format, which PyAV 19 has; before, it is one packet of webp_pipe
 _WITH_PREVIEWS = "MPO"  # Pillow's name of a JPEG file with further, smaller pictures
 
 
@@ -193,6 +194,7 @@ def _still(file: BinaryIO) -> UInt8Array | None:
         return None
     with import_av().open(file) as opened:  # a stream of pictures has another format, or several packets
         is_still = opened.format.name.endswith("_pipe") and sum(packet.size > 0 for packet in opened.demux()) == 1
+        is_still |= opened.format.name == _ANIMATED_WEBP
     file.seek(0)
     if not is_still:
         return None

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from rfm_client.contract.checks import git_lfs_pointer
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.pictures import FrameFileError
+from rfm_client.frames.pictures import FrameFileError, Picture
 
 UNDAMAGED = "an undamaged frame"
 DAMAGED = "one that the decoder marks, or is made from such a one"
@@ -33,6 +33,7 @@ _MATRICES = (1, 4, _BT601, 7, _BT2020)  # that libswscale knows; it takes BT.601
 _SAME_MATRIX = {6: _BT601, 10: _BT2020}  # other numbers for the same matrix
 _BITS = 8  # most bits of a grey video's only channel; depth maps have more
 _TS_SYNC, _TS_PACKETS = 0x47, ((188, 0), (192, 4))  # first byte, lengths and its offset (ISO 13818-1, Blu-ray)
+_PNG, _WEBP, _PICTURE_HEAD_BYTES = b"\x89PNG", b"WEBP", 12  # a WebP file's name of its kind comes last
 _HEAD_BYTES = 1024  # enough to recognise MPEG-TS packets, or the padding of a GIF
 _SEVERAL_EPISODES = (
     "a file in the layout of LeRobot v3.0, which holds several: label the dataset with rfm-client label, or name a "
@@ -113,6 +114,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     is read as far as it goes.
     """
     _check_ends(file)
+    _check_upright(file)
     timed: list[tuple[float, int]] = []
     count = num_hidden = 0
     with import_av().open(file, format=container) as opened:
@@ -160,6 +162,20 @@ def _check_ends(file: BinaryIO) -> None:
         raise FrameFileError.of("a whole video file", f"one that ends inside a picture, after {num_bytes} bytes")
 
 
+def _check_upright(file: BinaryIO) -> None:
+    """Raise FrameFileError for PNG or WebP pictures with an EXIF orientation.
+
+    PyAV before 17.1 ignores it, and PyAV 19 turns only the first picture of an APNG file.
+    """
+    head = file.read(_PICTURE_HEAD_BYTES)
+    if head.startswith(_PNG) or head.endswith(_WEBP):
+        turn = Picture(head + file.read()).exif_turn
+        if turn is not None:
+            expected = "pictures that are stored upright, or one to a file (PyAV does not turn all of a file)"
+            raise FrameFileError.of(expected, f"EXIF orientation {turn}")
+    file.seek(0)
+
+
 def check_is_one_episode(source: str | Path) -> None:
     """Raise InvalidSampleError for a path or URL in the layout of LeRobot v3.0, whose files hold several episodes."""
     if isinstance(source, Path) or "://" not in source:
@@ -184,7 +200,7 @@ class Upright:
         """Return uint8 [H, W, 3]. Raises FrameFileError for a frame that FFmpeg would show aslant."""
         try:
             image, matrix = self._rgb(frame), frame.side_data.get("DISPLAYMATRIX")
-        except ValueError as error:  # PyAV 17.1 and newer fail at the EXIF data of a Motion JPEG video
+        except ValueError as error:  # PyAV 17.1 to 18.1 fail at the EXIF data of a Motion JPEG video
             remedy = "encode it anew: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
             expected = f"frames without EXIF data, which PyAV cannot read ({remedy})"
             raise FrameFileError.of(expected, error) from error

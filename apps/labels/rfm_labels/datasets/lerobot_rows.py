@@ -212,7 +212,7 @@ def values_of(column: Any) -> Any:
     values = column.to_numpy()
     if values.dtype.kind != "f":
         return values
-    return np.array([None if np.isnan(value) else value for value in values], dtype=object)
+    return np.array([None if np.isnan(value) else value for value in values.tolist()], dtype=object)
 
 
 def values_in(where: str, column: Any, own: npt.NDArray[np.int64], times_s: npt.NDArray[np.float64]) -> Any:
