@@ -13,11 +13,21 @@ from typing import Any, TypeAlias
 
 from torch import Tensor
 
+from rfm.config import CheckpointConfig
 from rfm.families.robometer.checkpoint import VlmCheckpoint, restore
 from rfm.families.robometer.collator import VlmCollator
 from rfm.families.robometer.network import VlmConfig
 from rfm.families.robometer.prompts import OF_AN_OLD_RUN
-from rfm.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, CheckpointError, expecting, is_there, read_json
+from rfm.files import (
+    ADAPTER_CONFIG,
+    NETWORK_CONFIG,
+    WEIGHTS,
+    CheckpointError,
+    expecting,
+    is_there,
+    network_config,
+    read_json,
+)
 from rfm.published.lora import Scaling, adapted, check_inside, has_adapter
 from rfm.published.provenance import Assumption
 from rfm.published.qwen import (
@@ -30,7 +40,7 @@ from rfm.published.qwen import (
     decided,
     renamed,
 )
-from rfm.published.reader import Loaded, Options, Reader
+from rfm.published.reader import Loaded, Reader
 from rfm.published.robometer_processor import check_published, differences, is_published
 from rfm.published.robometer_run import (
     LEROBOT_BACKBONE,
@@ -90,12 +100,12 @@ def reads(folder: Path) -> bool:
     """True if the folder holds an adapter, a network on a known backbone, or a Robometer of LeRobot."""
     if is_there(folder / ADAPTER_CONFIG):
         return True
-    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
+    content = network_config(folder)
     model_type = content.get("model_type")
     return is_lerobot(content) or (isinstance(model_type, str) and model_type in BACKBONES)
 
 
-def load(folder: Path, options: Options) -> Loaded:
+def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load the checkpoint of a local folder. Raises CheckpointError."""
     assumptions: tuple[Assumption, ...] = ()
     if is_saved(folder):
@@ -121,7 +131,7 @@ def _exported(folder: Path) -> _Parts:
     return restored.config, restored.weights, restored.factors, restored.processor
 
 
-def _published(folder: Path, options: Options) -> tuple[_Parts, tuple[Assumption, ...]]:
+def _published(folder: Path, options: CheckpointConfig) -> tuple[_Parts, tuple[Assumption, ...]]:
     with expecting("a vision-language checkpoint", folder):
         content = {} if has_adapter(folder) else read_json(folder / NETWORK_CONFIG)
         read = _by_lerobot if is_lerobot(content) else _trained
@@ -134,7 +144,7 @@ def _published(folder: Path, options: Options) -> tuple[_Parts, tuple[Assumption
 
 
 def _with_video_prompt(
-    config: VlmConfig, content: Mapping[str, Any], options: Options
+    config: VlmConfig, content: Mapping[str, Any], options: CheckpointConfig
 ) -> tuple[VlmConfig, tuple[Assumption, ...]]:
     """Return the configuration with the form of its video prompts, and the form if it is assumed.
 

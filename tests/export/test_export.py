@@ -25,6 +25,7 @@ from rfm.files import CheckpointError
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Origin
 from rfm_export import ExportDiffersError, ExportError
 from rfm_export.source import origin_of, read_source
+from spoilt import WEIGHTS
 
 EMBEDDINGS = goldens.config("c1_t1_disc10")
 FRAMES = goldens.config("enc_c1_t1_disc10")
@@ -209,6 +210,19 @@ def test_upstream_s_file_exports_whatever_its_batch_size_unless_it_names_gpus_th
     config = read(repository, "rfm")
     assert list(config.instance_group[0].gpus) == list(range(there + 1))
     assert config.max_batch_size == 64
+
+
+def test_a_link_out_of_a_checkpoint_is_refused_and_those_of_the_hub_s_cache_are_followed(tmp_path: Path) -> None:
+    blobs, snapshot = (tmp_path / "models--org--name" / part for part in ("blobs", f"snapshots/{'0' * 40}"))
+    snapshot.mkdir(parents=True)
+    shutil.copytree(SMALL.checkpoint, blobs)
+    for file in blobs.iterdir():
+        (snapshot / file.name).symlink_to(Path("..", "..", "blobs", file.name))
+    read_source(snapshot, serve_config(SMALL), None, print)
+    (snapshot / WEIGHTS).unlink()
+    (snapshot / WEIGHTS).symlink_to(SMALL.checkpoint / WEIGHTS)
+    with pytest.raises(CheckpointError, match=rf"{WEIGHTS}: expected a file of the checkpoint, got a link to /"):
+        read_source(snapshot, serve_config(SMALL), None, print)
 
 
 def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:

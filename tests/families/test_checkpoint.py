@@ -95,19 +95,6 @@ def test_a_checkpoint_in_another_form_is_the_same(tmp_path: Path, name: str, cha
     assert_same(published.load(folder, **golden.sources), published.load(golden.checkpoint, **golden.sources))
 
 
-def test_the_links_of_the_hub_s_cache_are_followed(tmp_path: Path) -> None:
-    blobs, snapshot = (tmp_path / "models--org--name" / part for part in ("blobs", f"snapshots/{'0' * 40}"))
-    blobs.mkdir(parents=True)
-    snapshot.mkdir(parents=True)
-    golden = goldens.config(CONTINUOUS).checkpoint
-    for number, file in enumerate(sorted(golden.iterdir())):
-        shutil.copy(file, blobs / str(number))
-        (snapshot / file.name).symlink_to(Path("..", "..", "blobs", str(number)))
-    published.load(snapshot).save(tmp_path / "saved")
-    assert_same(published.load(tmp_path / "saved"), published.load(golden))
-    assert not [path for path in (tmp_path / "saved").rglob("*") if path.is_symlink()]
-
-
 PROGRESS = {
     "of all frames": ("progress_pred_type: absolute_wrt_total_frames", "", []),
     "from the first frame": (

@@ -239,14 +239,6 @@ def test_a_question_is_read_as_if_no_other_had_been_asked_before(make: Callable[
         assert (among.spans, among.query) == (alone.spans, alone.query)
 
 
-def test_both_frames_of_a_group_carry_its_value() -> None:
-    (outcome,) = load_engine("q25_video_last_l2").evaluate([ProgressSample(video(0, 5, 56, 56))])
-    assert isinstance(outcome, ProgressResult)
-    first, second, third = outcome.progress[::2]
-    assert outcome.progress.tolist() == [first, first, second, second, third]
-    assert len({first, second, third}) == 3
-
-
 @pytest.mark.parametrize("config", goldens.VLM, ids=lambda config: config.name)
 def test_a_network_that_reads_images_is_causal_and_one_that_reads_videos_is_not(config: goldens.Config) -> None:
     """So callers need not score each prefix of a trajectory that is read as images."""
