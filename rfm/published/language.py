@@ -59,7 +59,7 @@ class LanguageFolder:
         """
         file = folder / NETWORK_CONFIG
         content = read_json(file)
-        if content.get("model_type") not in backbones:
+        if content.get("model_type") not in [*backbones]:
             expected = " or ".join(f"{kind}, of an ordinary {name}" for kind, name in backbones.items())
             raise CheckpointError.at(f"{file}: model_type", expected, shown(content.get("model_type")))
         backbone = backbone_config(content, file)
@@ -184,5 +184,5 @@ def is_ours(name: str, backbones: Collection[str], folder: Path) -> bool:
         return exported == name
     names = [folder.resolve().name, *(part for part in folder.parts if part.startswith(HUB_FOLDER))]
     is_named = any(name in each.lower().replace("-", "").replace("_", "") for each in names)
-    is_qwen = network_config(folder).get("model_type") in backbones
+    is_qwen = network_config(folder).get("model_type") in [*backbones]  # it may be a list, which has no hash
     return is_named and is_qwen and find_run_config(folder) is None

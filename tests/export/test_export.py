@@ -20,6 +20,7 @@ import rfm_export
 from engines import serve_config, training_run
 from in_process import rfm
 from repositories import changing, description_of, forget_input
+from rfm import published
 from rfm.families.rewind.checkpoint import RewindCheckpoint
 from rfm.files import CheckpointError
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Origin
@@ -162,6 +163,14 @@ RUNS: dict[str, tuple[dict[str, dict[str, object]], list[str]]] = {
         {"model": ALL_TRAINED | {"quantization": True}},
         ["model.quantization is true: the run scored with its base model rounded to a few bits; the scores "],
     ),
+    "progress from the first frame": (
+        {"model": ALL_TRAINED, "data": {"progress_pred_type": "absolute_first_frame"}},
+        ["data.progress_pred_type is absolute_first_frame: progress is 0 at the first frame that the model "],
+    ),
+    "shuffled frames": (
+        {"model": ALL_TRAINED, "data": {"shuffle_progress_frames": True}},
+        ["data.shuffle_progress_frames is true: the run shuffled all frames but the first, so "],
+    ),
     "all": ({"model": ALL_TRAINED}, []),
 }
 
@@ -180,6 +189,8 @@ def test_an_export_says_what_the_run_did_not_train(
     assert len(said) == 1 + len(expected)
     told = [of_run(checkpoint), *(f"config.yaml: {line}" for line in expected)]
     assert all(map(str.startswith, said, told))
+    for line in published.notes(checkpoint, published.read(checkpoint), answered=[]):
+        assert "model.quantization" in line  # which concerns every head
 
 
 def test_an_export_says_which_config_yaml_it_took(exported: Path) -> None:

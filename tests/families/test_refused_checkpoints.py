@@ -244,6 +244,7 @@ SETTINGS: dict[str, tuple[str, Spoil, str]] = {
     "padding that is a number": (REWIND, settings(CONFIG, trained_padding=1), r"config.json: trained_padding: expected true or false, got 1"),
     "no head of progress": (REWIND, weights(lambda w: [w.pop(name) for name in list(w) if name.startswith("progress_head")]), r"expected a ReWiND checkpoint, which has 'progress_head.4.weight'"),
     "a model type that is a list": (REWIND, settings(CONFIG, model_type=[]), r"model_type: expected rewind_transformer, by the names of the weights, got \[\]"),
+    "a model type that is a list, of a model asked in words": (TOP, settings(CONFIG, model_type=[]), r"model_type: expected qwen3_vl, of an ordinary Qwen3-VL, got \[\]"),
     "Qwen3-VL, with Qwen2.5-VL's config.json": (Q3, config_of(Q25), r"config.json: model_type: expected qwen3_vl, by the names of the weights, got 'qwen2_5_vl': the file describes"),
     "Qwen3-VL, with ReWiND's": (Q3, config_of(REWIND), r"model_type: expected qwen3_vl, by the names of the weights, got 'rewind_transformer'"),
     "Qwen3-VL, with a part's": (Q3, settings(CONFIG, model_type="qwen3_vl_text"), r"model_type: expected qwen3_vl, by the names of the weights, got 'qwen3_vl_text'"),
@@ -428,6 +429,28 @@ OPTIONS = {
 def test_a_reward_model_in_words_that_makes_no_sense_is_refused(reward_model: str | None, message: str) -> None:
     with pytest.raises(CheckpointError, match=message):
         published.load(ROOT / REWARD_MODELS[TOP][0], reward_model=reward_model)
+
+
+OF_VIDEOS = r"--video-prompt: expected a checkpoint that shows videos to a Qwen3-VL, got another checkpoint"
+OF_ANSWERS = r"--strict-answers: expected a RoboReward that writes its answers, got another checkpoint"
+NOT_FOLLOWED: dict[str, tuple[str, dict[str, Any], str]] = {
+    "video prompts of embeddings": (REWIND, {"video_prompt": "wrapped"}, OF_VIDEOS),
+    "video prompts of images": (Q3, {"video_prompt": "wrapped"}, OF_VIDEOS),
+    "video prompts of LeRobot's images": (LEROBOT, {"video_prompt": "wrapped"}, OF_VIDEOS),
+    "video prompts of a Qwen2.5-VL": (VIDEO, {"video_prompt": "wrapped"}, OF_VIDEOS),
+    "answers of TOPReward": (TOP, {"strict_answers": True}, OF_ANSWERS),
+    "expected answers": (ROBO, {"strict_answers": True, "reward_model": "roboreward-expected"}, OF_ANSWERS),
+    "few bits of a small network": (REWIND, {"weights": "int8"}, r"--weights: expected a vision-language checkpoint"),
+}
+
+
+@pytest.mark.parametrize(("name", "given", "message"), NOT_FOLLOWED.values(), ids=NOT_FOLLOWED)
+def test_an_option_that_the_network_does_not_follow_is_refused(
+    tmp_path: Path, name: str, given: dict[str, Any], message: str
+) -> None:
+    folder, options = with_sources(name, tmp_path)
+    with pytest.raises(CheckpointError, match=f"{message}.*; leave it out, or export the checkpoint again"):
+        published.load(folder, **{**options, **given})
 
 
 def test_a_model_with_reward_heads_is_not_asked_in_words() -> None:

@@ -21,7 +21,6 @@ from rfm_client import ProgressSample, Result, RewardError
 from spoilt import Spoil, in_json, in_yaml, nested, renamed, run_settings, settings, weights, with_sources
 from vlm import PLAIN, assert_close, load, video
 
-LORA_INSIDE = "q3_lora_full_disc10"
 SAMPLE = ProgressSample(video(0, 3, 60, 84))
 TWICE = ("use_multi_image", "use_per_frame_progress_token")
 

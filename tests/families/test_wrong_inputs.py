@@ -79,6 +79,7 @@ WRONG: dict[str, tuple[str, Sample, str]] = {
     "frames without encoders": (REWIND, ProgressSample(filmed(1)), "frames: expected video_embeddings (no encoders are loaded), got frames"),
     "more tokens than the server takes": (REWIND, ProgressSample(embedded(8)), "num_frames: expected at most 16 tokens (max_sample_tokens of this server), got 17 tokens"),
     "a task that is too long": (ENCODED, ProgressSample(filmed(2, task="lift " * 100)), "task: expected at most 32 tokens (limit of the text encoder), got "),
+    "a sliver": (ENCODED, ProgressSample(filmed(1, 1, 3000)), "frames: expected frames at most 50 times as long as wide, got 1 x 3000"),
     "a special token": (PLAIN, ProgressSample(filmed(1, task="lift <|prog_token|> it")), SPECIAL.format("<|prog_token|>")),
     "an image token": (PLAIN, PreferenceSample(filmed(1, task="<|image_pad|>"), PAIR[0]), SPECIAL.format("<|image_pad|>")),
     "an image that is a line": (PLAIN, ProgressSample(filmed(1, 1, 300)), "frames: expected an image at most 200 times as long as wide, got 1 x 300"),
