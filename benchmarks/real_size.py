@@ -14,7 +14,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from random_checkpoints import BASE_MODEL, DESCRIBED, QWEN, QWEN3_VL_4B, ROBOMET
 from torch.profiler import ProfilerActivity, profile
 
 from rfm import published
+from rfm.config import ExportConfig
 from rfm.engine import Engine
 
 FRAMES = 8
@@ -113,7 +114,7 @@ def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
         ("roboreward", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
         ("roboreward-expected", QWEN, [(n, FRAMES, usual) for n in (one, some)]),
     ]
-    if "robot_description" in inspect.signature(published.load).parameters:
+    if "robot_description" in {each.name for each in fields(ExportConfig)}:
         plans += [("rynnvalue", RYNNVALUE, [(n, FRAMES, small) for n in (one, some, many)])]
     knows_graphs = "cuda_graphs" in inspect.signature(Engine.of).parameters
     for what, kind, sizes in plans:

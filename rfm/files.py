@@ -136,6 +136,11 @@ def read_json(file: Path) -> dict[str, Any]:
     return content
 
 
+def network_config(folder: Path) -> dict[str, Any]:
+    """Return config.json of a checkpoint's folder; empty if there is none. Raises CheckpointError."""
+    return read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
+
+
 def read_run_config(file: Path) -> dict[str, Any]:
     """Return config.yaml as plain mappings, lists and scalars, also where its tags name Python objects.
 

@@ -16,7 +16,7 @@ from typing import Any
 from safetensors.torch import save_file
 from torch import Tensor
 
-from rfm.files import NETWORK_CONFIG, WEIGHTS, CheckpointError, is_there, read_json, read_tensors, shown
+from rfm.files import NETWORK_CONFIG, WEIGHTS, CheckpointError, network_config, read_json, read_tensors, shown
 
 SETTINGS = "rfm"  # key in config.json
 REWARD_MODEL = "reward_model"  # key in SETTINGS, of a model that is asked in words
@@ -61,17 +61,13 @@ def write_network(folder: Path, config: Mapping[str, Any], weights: Mapping[str,
     save_file({name: tensor.contiguous() for name, tensor in weights.items()}, folder / WEIGHTS, {"format": "pt"})
 
 
-def _settings_in(folder: Path) -> Any:
-    return (read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}).get(SETTINGS)
-
-
 def is_saved(folder: Path) -> bool:
     """True if the folder is an export on a Qwen backbone."""
-    return _settings_in(folder) is not None
+    return network_config(folder).get(SETTINGS) is not None
 
 
 def reward_model_of(folder: Path) -> str | None:
     """Return the reward model that an export's config.json names; None: there is none."""
-    settings = _settings_in(folder)
+    settings = network_config(folder).get(SETTINGS)
     name = settings.get(REWARD_MODEL) if isinstance(settings, dict) else None
     return name if isinstance(name, str) else None

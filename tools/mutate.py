@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 CAUGHT = 0.95
 VISION_LANGUAGE = (
-    "families/test_vlm*.py families/test_nf4.py families/test_rounded.py families/test_adapters.py"
+    "families/test_vlm*.py families/test_rounded.py families/test_adapters.py"
     " families/test_refused_checkpoints.py families/test_wrong_inputs.py families/test_tree.py families/test_shot_cache.py"
     " families/test_frame_threads.py families/test_rynnvalue.py families/test_topreward.py families/test_roboreward.py"
     " families/test_lerobot_robometer.py export/test_provenance.py"
@@ -38,7 +38,7 @@ PARTS = {
     "rfm/qwen/*.py": VISION_LANGUAGE,
     "rfm/families/robometer/*.py": VISION_LANGUAGE,
     "rfm/published/*.py": f"{VISION_LANGUAGE} families/test_checkpoint.py families/test_missing_heads.py"
-    " families/test_robodopamine.py families/test_hub.py families/test_preprocessor.py"
+    " families/test_robodopamine.py families/test_hub.py"
     " families/test_usual_encoders.py",
     "rfm/triton_model/batch_model.py": "triton/test_batch_model.py triton/test_pipeline.py",
     "rfm/triton_model/pipeline.py": "triton/test_pipeline.py",

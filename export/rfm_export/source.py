@@ -30,7 +30,6 @@ from rfm.files import read_run_config
 from rfm.parameters import CHECKPOINT_FOLDER
 from rfm.published.hub import check_links, commit_of
 from rfm.published.provenance import Assumption, is_folder, license_of, source_name
-from rfm.published.reader import Options
 from rfm.published.run_config import find_run_config
 from rfm.serve.repository import CONFIG_FILE
 from rfm.weights import num_values
@@ -90,9 +89,8 @@ def read_for_export(
 def read_source(source: str | Path, settings: ExportConfig, family: str | None, say: Say) -> Source:
     """Read a checkpoint. Tell the user the file of the training run's settings, and possible faults."""
     folder = published.find(source, say)
-    options = Options.of(settings)
-    kind = published.choose(folder, family, options)
-    loaded = published.read_from(folder, kind, options)
+    kind = published.choose(folder, family, settings)
+    loaded = published.read_from(folder, kind, settings)
     checkpoint = loaded.checkpoint
     check_links(folder)
     encoders = loaded.encoders()
@@ -104,15 +102,15 @@ def read_source(source: str | Path, settings: ExportConfig, family: str | None, 
     computed = computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0)
     origin = origin_of(source, folder, computed)
     of_encoders = None if encoders is None else described_encoders(encoders.description, origin)
-    full = None if options.weights is None else partial(_full, folder, kind, options)
+    full = None if settings.weights is None else partial(_full, folder, kind, settings)
     description = described(checkpoint, origin)
     return Source(
         kind, checkpoint, tuple(loaded.assumptions), encoders, description, of_encoders, settings, gpus, None, full
     )
 
 
-def _full(folder: Path, family: Family, options: Options) -> Checkpoint:
-    return published.read_from(folder, family, replace(options, weights=None)).checkpoint
+def _full(folder: Path, family: Family, settings: ExportConfig) -> Checkpoint:
+    return published.read_from(folder, family, replace(settings, weights=None)).checkpoint
 
 
 def device_named(name: str) -> torch.device:

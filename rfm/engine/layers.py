@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Layers shared by several families, and the precision of computation."""
+"""Layers shared by several families, the normalisation of pixels, and the precision of computation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from rfm.files import MAX_UINT8
 
 WORTH_ONEDNN = 1 << 21  # multiplications; for fewer, the start of oneDNN costs more than it saves
 
@@ -170,3 +173,26 @@ def _call_each_once() -> None:
     for dtype in (torch.float32, torch.float64):
         for function in MKL_FUNCTIONS:
             function(torch.zeros(1, dtype=dtype))
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """Normalisation of each channel's pixels: (value - 255 mean) / (255 std)."""
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    def to_config(self) -> dict[str, Any]:
+        """Return the corresponding fields of preprocessor_config.json."""
+        return {"image_mean": self.mean, "image_std": self.std, "rescale_factor": 1 / MAX_UINT8}
+
+    def __call__(self, frames: Tensor) -> Tensor:
+        """Normalise pixels: uint8 or float [..., H, W, C] -> float32 [..., C, H, W]."""
+        mean, std = (_channels(values, frames.device) for values in (self.mean, self.std))
+        return frames.movedim(-1, -3).to(torch.float32, copy=True).sub_(mean).div_(std)
+
+
+@lru_cache
+def _channels(values: tuple[float, ...], device: torch.device) -> Tensor:
+    """Return values from 0 to 1 as grey levels, float32 [C, 1, 1], cached on the device."""
+    return (torch.tensor(values).view(-1, 1, 1) * MAX_UINT8).to(device)

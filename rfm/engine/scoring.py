@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, cast
 
+import numpy as np
+import numpy.typing as npt
 import torch
 
 from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
@@ -17,12 +19,13 @@ from rfm.engine.device import memory_errors
 from rfm.engine.execution import Execution
 from rfm.engine.family import Checkpoint, FrameEncoders
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
-from rfm.engine.finite import finite
 from rfm.engine.graphs import CudaCapture, Graphs
 from rfm.engine.layers import keep_float32
 from rfm.engine.predictor import GraphedPredictor, Predictor, RowScores, of_prefixes
 from rfm_client.contract import (
+    FRAME_SCORES,
     BatchTiming,
+    InferenceFailedError,
     InvalidSampleError,
     PreferenceResult,
     PreferenceSample,
@@ -33,6 +36,7 @@ from rfm_client.contract import (
     Sample,
     SimilarityResult,
 )
+from rfm_client.contract.results import answer, trajectory_scores
 from rfm_client.contract.samples import EncoderSample, with_trajectories
 
 Outcome: TypeAlias = Result | RewardError
@@ -207,7 +211,7 @@ class Engine:
             for sample, of_sample in zip(prepared, rows_of, strict=True)
         ]
         lacks = [name for name in ("progress", "success") if not getattr(self.predictor, f"has_{name}")]
-        return finite(outcomes, lacks=lacks)
+        return _finite(outcomes, lacks=lacks)
 
     def _scores(self, rows: Sequence[Any], execution: Execution) -> list[RowScores | RewardError]:
         scores: dict[int, RowScores | RewardError] = {}
@@ -293,3 +297,35 @@ def _of_sequences(outcomes: Sequence[RowScores | RewardError]) -> RowScores | Re
     if error is not None:
         return error
     return RowScores([of_prefixes([each for each in outcomes if isinstance(each, RowScores)])], is_of_prefixes=True)
+
+
+def _finite(outcomes: Sequence[Result | RewardError], *, lacks: Collection[str]) -> list[Result | RewardError]:
+    """Return the outcomes, with an error in place of each result with a NaN or infinite score.
+
+    lacks: scores the network does not predict, which are NaN
+
+    Frames that the model does not answer about are not checked. Neither are logits of progress: RoboReward has none for
+    an answer without a digit, and progress shows the others' faults.
+    """
+    scores = [[] if isinstance(each, RewardError) else list(_scores(each, lacks)) for each in outcomes]
+    of_all = [array for of_one in scores for array in of_one]
+    if not of_all or np.isfinite(np.concatenate(of_all)).all():  # all at once, which is faster
+        return list(outcomes)
+    failed = InferenceFailedError("the network gave a score that is not finite")
+    return [
+        outcome if all(np.isfinite(array).all() for array in of_one) else failed
+        for outcome, of_one in zip(outcomes, scores, strict=True)
+    ]
+
+
+def _scores(result: Result, lacks: Collection[str]) -> Iterator[npt.NDArray[Any]]:
+    """Yield the result's scores, [N] each."""
+    if of_pair := answer(result):
+        yield np.array([*of_pair.values()], np.float32)
+    for scores in trajectory_scores(result).values():
+        known = scores.is_answered
+        if not known[-1]:  # a model that skips frames answers about the last
+            yield np.array([np.nan])
+        for name, array in scores.arrays.items():
+            if not FRAME_SCORES[name].is_per_bin and name not in lacks:
+                yield array[known]

@@ -14,13 +14,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from rfm.config import VideoPrompt, Weights
+from rfm.config import CheckpointConfig
 from rfm.engine.family import NETWORK, Checkpoint, Family
 from rfm.families import FAMILIES, named
 from rfm.files import WEIGHTS, CheckpointError
 from rfm.published.hub import find as find
 from rfm.published.provenance import told
-from rfm.published.reader import Loaded, Options, Reader
+from rfm.published.reader import Loaded, Reader, asked, check_used
 from rfm.published.run_config import HEADS, SIMILARITY, constant_heads, training_notes
 from rfm.weights import check_values
 
@@ -32,7 +32,7 @@ def reader_of(family: Family) -> Reader:
     return reader
 
 
-def choose(folder: Path, package: str | None = None, options: Options | None = None) -> Family:
+def choose(folder: Path, package: str | None = None, options: CheckpointConfig | None = None) -> Family:
     """Return the family ``package``, or of the reward model in ``options``, else the first that reads the folder.
 
     Raises CheckpointError.
@@ -41,7 +41,7 @@ def choose(folder: Path, package: str | None = None, options: Options | None = N
         return named(package)
     readers = {family: reader_of(family) for family in map(named, FAMILIES)}
     if options is not None and options.reward_model is not None:
-        wanted, _ = options.named()
+        wanted, _ = asked(options)
         found = next((family for family, reader in readers.items() if wanted in reader.reward_models), None)
         if found is not None:
             return found
@@ -51,31 +51,14 @@ def choose(folder: Path, package: str | None = None, options: Options | None = N
     return next((family for family, reader in readers.items() if reader.reads(folder)), last)
 
 
-def read(
-    source: str | Path,
-    *,
-    family: str | None = None,
-    base_model: str | None = None,
-    image_encoder: str | None = None,
-    text_encoder: str | None = None,
-    reward_model: str | None = None,
-    video_prompt: VideoPrompt | None = None,
-    strict_answers: bool = False,
-    weights: Weights | None = None,
-    robot_description: str | None = None,
-    camera_description: str | None = None,
-) -> Loaded:
+def read(source: str | Path, *, family: str | None = None, **options: Any) -> Loaded:
     """Read the checkpoint of a local folder or Hugging Face id. Raises CheckpointError.
 
     family: package of its family; None: the family that reads the folder's files
-    others: as in ``rfm.published.reader.Options``
+    options: fields of ``CheckpointConfig``
     """
-    folder = find(source)
-    options = Options(
-        base_model, image_encoder, text_encoder, reward_model, video_prompt, strict_answers, weights,
-        robot_description, camera_description,
-    )  # fmt: skip
-    return read_from(folder, choose(folder, family, options), options)
+    folder, settings = find(source), CheckpointConfig(**options)
+    return read_from(folder, choose(folder, family, settings), settings)
 
 
 def load(source: str | Path, **options: Any) -> Checkpoint:
@@ -83,10 +66,10 @@ def load(source: str | Path, **options: Any) -> Checkpoint:
     return read(source, **options).checkpoint
 
 
-def read_from(folder: Path, family: Family, options: Options) -> Loaded:
+def read_from(folder: Path, family: Family, options: CheckpointConfig) -> Loaded:
     """Read the checkpoint of a local folder. Raises CheckpointError, also for weights of NaN or zeros."""
     loaded = reader_of(family).load(folder, options)
-    options.check_used(loaded.checkpoint.config)
+    check_used(options, loaded.checkpoint.config)
     for weights in loaded.checkpoint.parts.values():
         check_values(weights)
     return loaded

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,16 +11,16 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from rfm.config import VideoPrompt, Weights
-from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
+from rfm.config import CheckpointConfig, VideoPrompt, Weights
+from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, network_config, read_json, shown
 from rfm.published.provenance import HUB_FOLDER, Assumption, source_name
 from rfm.published.qwen import QWEN_NAMES, Renames, backbone_config, decided, renamed
-from rfm.published.reader import Options
 from rfm.published.robometer_run import DTYPES
 from rfm.published.rounding import kind_of, read_published, read_unrounded_config, round_layers, rounded_as_asked
+from rfm.published.run_config import find_run_config
 from rfm.qwen.language import EMBEDDING, HEAD, LanguageCheckpoint, LanguageConfig
 from rfm.qwen.network import QWEN3, QWEN_2_5, Dtype
-from rfm.saved import PROCESSOR_FOLDER
+from rfm.saved import PROCESSOR_FOLDER, reward_model_of
 
 _NAMES: Renames = ((r"^model\.lm_head\.", "lm_head."), *QWEN_NAMES)
 _TIED = "tie_word_embeddings"
@@ -52,14 +52,14 @@ class LanguageFolder:
     assumed: tuple[Assumption, ...] = ()
 
     @classmethod
-    def read(cls, folder: Path, options: Options, backbones: Mapping[str, str] = ONLY_QWEN3) -> LanguageFolder:
+    def read(cls, folder: Path, options: CheckpointConfig, backbones: Mapping[str, str] = ONLY_QWEN3) -> LanguageFolder:
         """Read the folder. Raises CheckpointError if it is no Qwen-VL with a language head.
 
         backbones: names for the user of the networks that are read, by model_type
         """
         file = folder / NETWORK_CONFIG
         content = read_json(file)
-        if content.get("model_type") not in backbones:
+        if content.get("model_type") not in [*backbones]:
             expected = " or ".join(f"{kind}, of an ordinary {name}" for kind, name in backbones.items())
             raise CheckpointError.at(f"{file}: model_type", expected, shown(content.get("model_type")))
         backbone = backbone_config(content, file)
@@ -97,7 +97,7 @@ class LanguageFolder:
         return tuple(each for each in self.assumed if not (config.multi_image and each.name == "video_prompt"))
 
 
-def reopened(made: type[Made], folder: Path, options: Options) -> Made:
+def reopened(made: type[Made], folder: Path, options: CheckpointConfig) -> Made:
     """Load an export, with the processor and the form of weights that the user asks for. Raises CheckpointError."""
     checkpoint = made.restore(folder)
     config, weights, _ = rounded_as_asked(checkpoint.config, checkpoint.weights, {}, options.weights)
@@ -174,10 +174,15 @@ def stops_of(folder: Path) -> tuple[int, ...]:
     return tuple(found)
 
 
-def is_named(folder: Path, name: str) -> bool:
-    """True if the folder, or the repository of the Hub that it is a copy of, has ``name`` in its name.
+def is_ours(name: str, backbones: Collection[str], folder: Path) -> bool:
+    """True if the folder holds an export of the reward model ``name``, or a Qwen-VL of this name without a run's file.
 
-    name: lower case, without hyphens
+    name: lower case; the name of the folder, or of the Hub's repository that it is a copy of, may have hyphens
+    backbones: of the model, by model_type
     """
+    if (exported := reward_model_of(folder)) is not None:
+        return exported == name
     names = [folder.resolve().name, *(part for part in folder.parts if part.startswith(HUB_FOLDER))]
-    return any(name in each.lower().replace("-", "").replace("_", "") for each in names)
+    is_named = any(name in each.lower().replace("-", "").replace("_", "") for each in names)
+    is_qwen = network_config(folder).get("model_type") in [*backbones]  # it may be a list, which has no hash
+    return is_named and is_qwen and find_run_config(folder) is None

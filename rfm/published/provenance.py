@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from rfm.files import MODEL_CARD, NETWORK_CONFIG, PROVENANCE, is_there, read_json
+from rfm.files import MODEL_CARD, PROVENANCE, is_there, network_config
 
 OF_UPSTREAM = "default of upstream"
 _CARD_LICENSE = re.compile(r"\A---\n(?:.*\n)*?license: *(\S+) *\n")
@@ -60,8 +60,7 @@ def license_of(folder: Path) -> str | None:
     card = folder / MODEL_CARD
     if is_there(card) and (found := _CARD_LICENSE.search(card.read_text(errors="replace"))):
         return found[1].strip("\"'")
-    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
-    stated = content.get("license")
+    stated = network_config(folder).get("license")
     return stated if isinstance(stated, str) and stated else None
 
 

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""The options that a reader of published checkpoints takes, and the ``Loaded`` that it returns."""
+"""What a reader of published checkpoints makes of the user's options, and the ``Loaded`` that it returns."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rfm.config import ExportConfig, VideoPrompt, Weights
+from rfm.config import CheckpointConfig
 from rfm.engine.family import Checkpoint, FrameEncoders
 from rfm.files import CheckpointError
 from rfm.published.provenance import Assumption
@@ -22,62 +22,34 @@ _FOLLOWED_BY = {
 }
 
 
-@dataclass(frozen=True)
-class Options:
-    """The user's options for files that a checkpoint lacks. Each family reads its own fields.
+def check_used(options: CheckpointConfig, config: Any) -> None:
+    """Raise CheckpointError for an option that the network does not support."""
+    for name, expected in _FOLLOWED_BY.items():
+        wanted = getattr(options, name)
+        if wanted and getattr(config, name, None) != wanted:
+            flag, mend = CheckpointConfig.settings()[name].option, "leave it out, or export the checkpoint again"
+            raise CheckpointError.at(flag, expected, "another checkpoint", mend)
 
-    base_model: folder or id of a vision-language checkpoint's base model; None: as the checkpoint names it
-    image_encoder, text_encoder: folders or ids of a ReWiND checkpoint's encoders; None: upstream's, if the checkpoint
-        has weights of encoders or the other is set
-    reward_model: the way in which an ordinary vision-language model is asked, ``name,setting=value,...``; None: the
-        checkpoint is a reward model
-    video_prompt: form of a Qwen3-VL's video prompt; None: as the checkpoint's ``transformers_version`` tells
-    strict_answers: refuse an unclear written answer; False: mark it
-    weights: round the weights of a vision-language network's layers; None: as in the checkpoint
-    robot_description, camera_description: words for the robot and the camera in RynnValue's prompt; None: not named
+
+def asked(options: CheckpointConfig) -> tuple[str | None, dict[str, str]]:
+    """Return the reward model's name and the user's settings of it, from ``name,setting=value,...``.
+
+    Raises CheckpointError.
     """
+    if options.reward_model is None:
+        return None, {}
+    name, *settings = options.reward_model.split(",")
+    if wrong := [setting for setting in settings if setting.count("=") != 1]:
+        raise CheckpointError.at("--as", "setting=value", repr(wrong[0]))
+    return name, dict(setting.split("=") for setting in settings)
 
-    base_model: str | None = None
-    image_encoder: str | None = None
-    text_encoder: str | None = None
-    reward_model: str | None = None
-    video_prompt: VideoPrompt | None = None
-    strict_answers: bool = False
-    weights: Weights | None = None
-    robot_description: str | None = None
-    camera_description: str | None = None
 
-    @classmethod
-    def of(cls, settings: ExportConfig) -> Options:
-        """Return the options among an export's settings, which have the same names."""
-        return cls(**{each.name: getattr(settings, each.name) for each in fields(cls)})
+def settings_asked(options: CheckpointConfig, known: Mapping[str, type]) -> dict[str, Any]:
+    """Return the user's settings of the reward model as numbers or booleans. Raises CheckpointError if one is wrong.
 
-    def check_used(self, config: Any) -> None:
-        """Raise CheckpointError for an option that the network does not support."""
-        for name, expected in _FOLLOWED_BY.items():
-            wanted = getattr(self, name)
-            if wanted and getattr(config, name, None) != wanted:
-                flag, mend = f"--{name.replace('_', '-')}", "leave it out, or export the checkpoint again"
-                raise CheckpointError.at(flag, expected, "another checkpoint", mend)
-
-    def named(self) -> tuple[str | None, dict[str, str]]:
-        """Return the reward model's name and the user's settings of it, from ``name,setting=value,...``.
-
-        Raises CheckpointError.
-        """
-        if self.reward_model is None:
-            return None, {}
-        name, *settings = self.reward_model.split(",")
-        if wrong := [setting for setting in settings if setting.count("=") != 1]:
-            raise CheckpointError.at("--as", "setting=value", repr(wrong[0]))
-        return name, dict(setting.split("=") for setting in settings)
-
-    def settings(self, known: Mapping[str, type]) -> dict[str, Any]:
-        """Return the user's settings as numbers or booleans. Raises CheckpointError if one is unknown or wrong.
-
-        known: type of each setting
-        """
-        return {name: _value(name, text, known) for name, text in self.named()[1].items()}
+    known: type of each setting
+    """
+    return {name: _value(name, text, known) for name, text in asked(options)[1].items()}
 
 
 def _value(name: str, text: str, known: Mapping[str, type]) -> Any:
@@ -115,5 +87,5 @@ class Reader:
     """
 
     reads: Callable[[Path], bool]
-    load: Callable[[Path, Options], Loaded]
+    load: Callable[[Path, CheckpointConfig], Loaded]
     reward_models: tuple[str, ...] = ()

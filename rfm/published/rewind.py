@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rfm.config import CheckpointConfig
 from rfm.families.rewind.checkpoint import MODEL_TYPE, RewindCheckpoint
 from rfm.families.rewind.encoders import Encoders
 from rfm.families.rewind.network import RewindConfig
@@ -24,14 +25,13 @@ from rfm.files import (
     RUN_CONFIG,
     CheckpointError,
     cut,
-    is_there,
     misfits,
-    read_json,
+    network_config,
     read_run_config,
     shown,
 )
 from rfm.published.provenance import OF_UPSTREAM, Assumption, source_name
-from rfm.published.reader import Loaded, Options, Reader
+from rfm.published.reader import Loaded, Reader
 from rfm.published.run_config import MAX_COUNT, check_progress, find_run_config, frame_count, trained_frames
 from rfm.published.weights import has_head, read_weights, take_prefix
 from rfm_client.contract.checks import require
@@ -191,10 +191,10 @@ def _loaded(
 
 def reads(folder: Path) -> bool:
     """True unless config.json names another network; the first ReWiND checkpoints have no config.json."""
-    return _saved(folder).get("model_type", MODEL_TYPE) == MODEL_TYPE
+    return network_config(folder).get("model_type", MODEL_TYPE) == MODEL_TYPE
 
 
-def load(folder: Path, options: Options) -> Loaded:
+def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load the checkpoint of a local folder. Raises CheckpointError."""
     network = read_weights(folder)
     if _FIRST_CODES_FRAME in network:
@@ -211,7 +211,7 @@ def load(folder: Path, options: Options) -> Loaded:
     return _loaded(checkpoint, assumed, (options.image_encoder, options.text_encoder))
 
 
-def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -> Loaded:
+def _of_first_code(folder: Path, weights: dict[str, Tensor], options: CheckpointConfig) -> Loaded:
     """Return the checkpoint, with its weights renamed to upstream's names."""
     first = weights.pop(_FIRST_CODES_FRAME)
     require(_FIRST_CODES_FRAME, first.dim() == 2, "2 axes", list(first.shape), CheckpointError)
@@ -277,16 +277,12 @@ def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
     return shape
 
 
-def _saved(folder: Path) -> dict[str, Any]:
-    return read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
-
-
 def _stated(folder: Path) -> tuple[dict[str, Any], tuple[Assumption, ...]]:
     """Return the network's settings by config.json and config.yaml, and those of them that neither proves.
 
     Raises CheckpointError if the files disagree.
     """
-    saved, run, run_file = _saved(folder), {}, find_run_config(folder)
+    saved, run, run_file = network_config(folder), {}, find_run_config(folder)
     network: Any = {}
     if run_file is not None:
         run = read_run_config(run_file)

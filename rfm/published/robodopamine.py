@@ -4,36 +4,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+from rfm.config import CheckpointConfig
 from rfm.families.robodopamine.checkpoint import RoboDopamineCheckpoint
 from rfm.families.robodopamine.prompts import RoboDopamineConfig
-from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, read_json
-from rfm.published.language import ANY_QWEN, LanguageFolder, is_named, reopened, stops_of
+from rfm.files import CheckpointError
+from rfm.published.language import ANY_QWEN, LanguageFolder, is_ours, reopened, stops_of
 from rfm.published.provenance import Assumption
-from rfm.published.reader import Loaded, Options, Reader
-from rfm.published.run_config import find_run_config
+from rfm.published.reader import Loaded, Reader, settings_asked
 from rfm.qwen.processor import pixel_limits, read_processor
-from rfm.saved import is_saved, reward_model_of
+from rfm.saved import is_saved
 
 _NAME = RoboDopamineConfig.reward_model
 _OF_USER: dict[str, type] = {"mode": str, "interval": int}  # settings that ``--as`` takes
 
 
-def reads(folder: Path) -> bool:
-    """True if a folder holds an export of this model, or a Qwen-VL of its name without a run's config.yaml."""
-    if reward_model_of(folder) is not None:
-        return reward_model_of(folder) == _NAME
-    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
-    return is_named(folder, _NAME) and content.get("model_type") in ANY_QWEN and find_run_config(folder) is None
-
-
-def load(folder: Path, options: Options) -> Loaded:
+def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load the model of a local folder: a Qwen-VL's, or an export. Raises CheckpointError."""
     if options.video_prompt is not None:
         expected = "none: the prompt of this checkpoint has images"
         raise CheckpointError.at("--video-prompt", expected, options.video_prompt)
-    given = options.settings(_OF_USER)
+    given = settings_asked(options, _OF_USER)
     assumptions: tuple[Assumption, ...] = ()
     if is_saved(folder):
         checkpoint = reopened(RoboDopamineCheckpoint, folder, options)
@@ -51,4 +44,4 @@ def load(folder: Path, options: Options) -> Loaded:
     return Loaded(checkpoint, assumptions)
 
 
-READER = Reader(reads, load, (_NAME,))
+READER = Reader(partial(is_ours, _NAME, ANY_QWEN), load, (_NAME,))

@@ -6,6 +6,7 @@ A table of renames for each form turns the names of weights into those of VlmRew
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,11 +14,21 @@ from typing import Any, TypeAlias
 
 from torch import Tensor
 
+from rfm.config import CheckpointConfig
 from rfm.families.robometer.checkpoint import VlmCheckpoint, restore
 from rfm.families.robometer.collator import VlmCollator
 from rfm.families.robometer.network import VlmConfig
 from rfm.families.robometer.prompts import OF_AN_OLD_RUN
-from rfm.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, CheckpointError, expecting, is_there, read_json
+from rfm.files import (
+    ADAPTER_CONFIG,
+    NETWORK_CONFIG,
+    WEIGHTS,
+    CheckpointError,
+    expecting,
+    is_there,
+    network_config,
+    read_json,
+)
 from rfm.published.lora import Scaling, adapted, check_inside, has_adapter
 from rfm.published.provenance import Assumption
 from rfm.published.qwen import (
@@ -30,8 +41,7 @@ from rfm.published.qwen import (
     decided,
     renamed,
 )
-from rfm.published.reader import Loaded, Options, Reader
-from rfm.published.robometer_processor import check_published, differences, is_published
+from rfm.published.reader import Loaded, Reader
 from rfm.published.robometer_run import (
     LEROBOT_BACKBONE,
     RunConfig,
@@ -45,6 +55,7 @@ from rfm.published.robometer_run import (
 from rfm.published.rounding import kind_of, read_published, read_unrounded_config, rounded_as_asked
 from rfm.published.run_config import check_progress
 from rfm.published.weights import has_head, read_weights
+from rfm.qwen.collator import Chat, Visual
 from rfm.qwen.lora import changed_by, split
 from rfm.qwen.network import BACKBONES, QWEN3, QWEN_2_5
 from rfm.saved import PROCESSOR_FOLDER, is_saved
@@ -64,14 +75,14 @@ class PublishedVlm(VlmCheckpoint):
     def load_collator(self) -> VlmCollator:
         """Return the collator. Raises CheckpointError if the caller's base model is not like the one of the run."""
         collator = super().load_collator()
-        if self.base_model is not None and is_published(self.config.base_model_id, self.config.family):
-            check_published(collator, self.base_model)
+        if self.base_model is not None and _is_published(self.config.base_model_id, self.config.family):
+            _check_published(collator, self.base_model)
         return collator
 
     def notes(self) -> list[str]:
         """Return a line for each sign that prompts, images or positions differ from those in training."""
         lines = []
-        if not self.has_processor and (found := differences(self.collator)):
+        if not self.has_processor and (found := _differences(self.collator)):
             known = f"the published processors of {self.config.family}"
             lines.append(f"base model {self.processor}: differs from {known} in {'; '.join(found)}")
         version = str(self.config.backbone.get("transformers_version"))
@@ -90,12 +101,12 @@ def reads(folder: Path) -> bool:
     """True if the folder holds an adapter, a network on a known backbone, or a Robometer of LeRobot."""
     if is_there(folder / ADAPTER_CONFIG):
         return True
-    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
+    content = network_config(folder)
     model_type = content.get("model_type")
     return is_lerobot(content) or (isinstance(model_type, str) and model_type in BACKBONES)
 
 
-def load(folder: Path, options: Options) -> Loaded:
+def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load the checkpoint of a local folder. Raises CheckpointError."""
     assumptions: tuple[Assumption, ...] = ()
     if is_saved(folder):
@@ -121,7 +132,7 @@ def _exported(folder: Path) -> _Parts:
     return restored.config, restored.weights, restored.factors, restored.processor
 
 
-def _published(folder: Path, options: Options) -> tuple[_Parts, tuple[Assumption, ...]]:
+def _published(folder: Path, options: CheckpointConfig) -> tuple[_Parts, tuple[Assumption, ...]]:
     with expecting("a vision-language checkpoint", folder):
         content = {} if has_adapter(folder) else read_json(folder / NETWORK_CONFIG)
         read = _by_lerobot if is_lerobot(content) else _trained
@@ -134,7 +145,7 @@ def _published(folder: Path, options: Options) -> tuple[_Parts, tuple[Assumption
 
 
 def _with_video_prompt(
-    config: VlmConfig, content: Mapping[str, Any], options: Options
+    config: VlmConfig, content: Mapping[str, Any], options: CheckpointConfig
 ) -> tuple[VlmConfig, tuple[Assumption, ...]]:
     """Return the configuration with the form of its video prompts, and the form if it is assumed.
 
@@ -221,6 +232,62 @@ def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tupl
     factors = factors if scaling is None else scaling.scaled(factors)
     weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
+
+
+# The published processors of the families of backbones, with which a run's own is compared.
+_EXAMPLE = "TASK"
+_QWEN_PROMPT = "<|im_start|>user\nTASK{visual} 1: <|vision_start|><|{pad}_pad|><|vision_end|><|im_end|>\n"
+_PUBLISHED_NAMES = {
+    QWEN_2_5: r"Qwen/Qwen2\.5-VL-\w+-Instruct",
+    QWEN3: r"Qwen/Qwen3-VL-\w+-Instruct",
+}
+_FACTS: dict[str, dict[str, Any]] = {
+    QWEN_2_5: {
+        "prompt": f"<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n{_QWEN_PROMPT}",
+        "patch_size": 14,
+        "image_mean": [0.48145466, 0.4578275, 0.40821073],
+        "image_std": [0.26862954, 0.26130258, 0.27577711],
+    },
+    QWEN3: {"prompt": _QWEN_PROMPT, "patch_size": 16, "image_mean": [0.5] * 3, "image_std": [0.5] * 3},
+}
+
+
+def _is_published(base_model_id: str, family: str) -> bool:
+    """True for a base model whose published processor is known."""
+    return re.fullmatch(_PUBLISHED_NAMES[family], base_model_id) is not None
+
+
+def _facts(collator: VlmCollator) -> dict[str, Any]:
+    """Return a processor's effect, as JSON: the text of a conversation with an image or video, and image settings."""
+    visual = Visual.IMAGE if collator.config.multi_image else Visual.VIDEO
+    images = {**collator.images.to_config()}
+    del images["rescale_factor"]  # the same for every processor that loads
+    for name in ("image_mean", "image_std"):
+        images[name] = list(images[name])
+    return {"prompt": Chat(collator.tokenizer).text((_EXAMPLE, visual)), **images}
+
+
+def _check_published(collator: VlmCollator, processor: str) -> None:
+    """Raise CheckpointError if a processor in place of a published processor differs from it."""
+    found = _differences(collator)
+    if found:
+        named = collator.config.base_model_id
+        raise CheckpointError(
+            f"base model {processor}: expected a processor like that of {named}, which the run names: "
+            f"{'; '.join(found)}; name a folder with the files of {named} with --base-model, or correct "
+            "model.base_model_id of the run's config.yaml"
+        )
+
+
+def _differences(collator: VlmCollator) -> list[str]:
+    """Return the differences between a processor and the published processors of its family of backbones."""
+    words = (
+        {"visual": "Picture", "pad": "image"} if collator.config.multi_image else {"visual": "Video", "pad": "video"}
+    )
+    known = {**_FACTS[collator.config.family]}
+    known["prompt"] = known["prompt"].format(**words)
+    got = _facts(collator)
+    return [f"{name}: expected {value!r}, got {got[name]!r}" for name, value in known.items() if got[name] != value]
 
 
 READER = Reader(reads, load)

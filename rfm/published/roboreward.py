@@ -4,35 +4,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+from rfm.config import CheckpointConfig
 from rfm.families.roboreward.checkpoint import RoboRewardCheckpoint
 from rfm.families.roboreward.prompts import RoboRewardConfig
-from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, read_json
-from rfm.published.language import LanguageFolder, is_named, reopened, stops_of
+from rfm.files import CheckpointError
+from rfm.published.language import ONLY_QWEN3, LanguageFolder, is_ours, reopened, stops_of
 from rfm.published.provenance import Assumption
-from rfm.published.reader import Loaded, Options, Reader
-from rfm.published.run_config import find_run_config
-from rfm.qwen.network import QWEN3
-from rfm.saved import is_saved, reward_model_of
+from rfm.published.reader import Loaded, Reader, asked, settings_asked
+from rfm.saved import is_saved
 
 WRITTEN, EXPECTED = "roboreward", "roboreward-expected"  # of ``--as``
 REWARD_MODELS = (WRITTEN, EXPECTED)
 
 
-def reads(folder: Path) -> bool:
-    """True if the folder holds an export of RoboReward, or a Qwen3-VL of its name without a run's config.yaml."""
-    if reward_model_of(folder) is not None:
-        return reward_model_of(folder) == RoboRewardConfig.reward_model
-    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
-    has_name = is_named(folder, "roboreward")
-    return has_name and content.get("model_type") == QWEN3 and find_run_config(folder) is None
-
-
-def load(folder: Path, options: Options) -> Loaded:
+def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load the model of a local folder: a Qwen3-VL's, or an export. Raises CheckpointError."""
-    name, _ = options.named()
-    options.settings({})
+    name, _ = asked(options)
+    settings_asked(options, {})
     assumptions: tuple[Assumption, ...] = ()
     if is_saved(folder):
         checkpoint = reopened(RoboRewardCheckpoint, folder, options)
@@ -51,4 +42,4 @@ def load(folder: Path, options: Options) -> Loaded:
     return Loaded(checkpoint, assumptions)
 
 
-READER = Reader(reads, load, REWARD_MODELS)
+READER = Reader(partial(is_ours, RoboRewardConfig.reward_model, ONLY_QWEN3), load, REWARD_MODELS)

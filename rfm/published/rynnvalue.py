@@ -12,14 +12,15 @@ from typing import Any, get_args
 
 from torch import Tensor
 
+from rfm.config import CheckpointConfig
 from rfm.families.rynnvalue.checkpoint import RynnCheckpoint
 from rfm.families.rynnvalue.network import ACTIVATIONS, Bins, HeadConfig, RynnConfig, Transform
 from rfm.families.rynnvalue.prompts import META, RELATIVE_TOKEN, VALUE_TOKEN
-from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
+from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, network_config, read_json, shown
 from rfm.published.language import dtype_of
 from rfm.published.provenance import Assumption, source_name
 from rfm.published.qwen import QWEN_NAMES, UNUSED, backbone_config, renamed
-from rfm.published.reader import Loaded, Options, Reader
+from rfm.published.reader import Loaded, Reader
 from rfm.published.rounding import read_published, read_unrounded_config, rounded_as_asked
 from rfm.qwen.language import EMBEDDING
 from rfm.qwen.network import QWEN3
@@ -209,11 +210,10 @@ _OF_BACKBONE = "model."  # begins the names of the backbone's weights
 
 def reads(folder: Path) -> bool:
     """True if the folder holds a RynnValue as it was published, or an export of it."""
-    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
-    return content.get("model_type") == MODEL_TYPE or reward_model_of(folder) == RynnConfig.reward_model
+    return network_config(folder).get("model_type") == MODEL_TYPE or reward_model_of(folder) == RynnConfig.reward_model
 
 
-def load(folder: Path, options: Options) -> Loaded:
+def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load the checkpoint of a local folder. Raises CheckpointError."""
     if is_saved(folder):
         return _exported(folder, options)
@@ -224,7 +224,7 @@ def load(folder: Path, options: Options) -> Loaded:
     return _published(folder, content, options)
 
 
-def _published(folder: Path, content: dict[str, Any], options: Options) -> Loaded:
+def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig) -> Loaded:
     """Load a checkpoint as it was published."""
     file = folder / NETWORK_CONFIG
     read = Settings.read(folder, content)
@@ -254,7 +254,7 @@ def _published(folder: Path, content: dict[str, Any], options: Options) -> Loade
     return Loaded(checkpoint, (*of_dtype, *read.assumptions), lambda: notes)
 
 
-def _exported(folder: Path, options: Options) -> Loaded:
+def _exported(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load an export, with the processor, descriptions and form of weights that the user asks for."""
     checkpoint = RynnCheckpoint.restore(folder)
     changed = _descriptions(options) if checkpoint.config.use_meta else {}
@@ -262,7 +262,7 @@ def _exported(folder: Path, options: Options) -> Loaded:
     return Loaded(_rounded(replace(checkpoint, config=config, processor=processor), options))
 
 
-def _rounded(checkpoint: RynnCheckpoint, options: Options) -> RynnCheckpoint:
+def _rounded(checkpoint: RynnCheckpoint, options: CheckpointConfig) -> RynnCheckpoint:
     """Return the checkpoint, with the backbone's layers rounded if the user asks for it, and checked."""
     ours = {name: each for name, each in checkpoint.weights.items() if name.startswith(_OF_BACKBONE)}
     heads = {name: each for name, each in checkpoint.weights.items() if name not in ours}
@@ -279,7 +279,7 @@ def _set_rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Pat
     backbone["text_config"]["vocab_size"] = len(weights[EMBEDDING])
 
 
-def _descriptions(options: Options) -> dict[str, str]:
+def _descriptions(options: CheckpointConfig) -> dict[str, str]:
     """Return the user's descriptions of robot and camera, by setting."""
     return {name: words for name in META if (words := getattr(options, name))}
 

@@ -8,12 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rfm.config import CheckpointConfig
 from rfm.families.topreward.checkpoint import TopRewardCheckpoint
 from rfm.families.topreward.prompts import PROMPT_PREFIX, PROMPT_SUFFIX, TopRewardConfig
-from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, read_json, shown
+from rfm.files import NETWORK_CONFIG, CheckpointError, network_config, read_json, shown
 from rfm.published.hub import find
 from rfm.published.language import LanguageFolder, reopened
-from rfm.published.reader import Loaded, Options, Reader
+from rfm.published.reader import Loaded, Reader, asked, settings_asked
 from rfm.qwen.processor import (
     OF_VIDEOS,
     SIZED_BY_PROCESSOR,
@@ -47,13 +48,12 @@ _OF_USER = {"num_prefixes": int, "fps": float, "chat_template": bool, "max_frame
 
 def reads(folder: Path) -> bool:
     """True if the folder holds LeRobot's settings of TOPReward, or an export of it."""
-    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
-    return content.get("type") == _TYPE or reward_model_of(folder) == TopRewardConfig.reward_model
+    return network_config(folder).get("type") == _TYPE or reward_model_of(folder) == TopRewardConfig.reward_model
 
 
-def load(folder: Path, options: Options) -> Loaded:
+def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load the model of a local folder: a Qwen3-VL's, LeRobot's settings, or an export. Raises CheckpointError."""
-    name, given = options.named()
+    name, given = asked(options)
     if is_saved(folder):
         checkpoint = reopened(TopRewardCheckpoint, folder, options)
         if given or name not in (None, LEROBOT if checkpoint.config.variant == "lerobot" else ROBOMETER):
@@ -75,15 +75,15 @@ def load(folder: Path, options: Options) -> Loaded:
     return Loaded(checkpoint, files.assumptions(config))
 
 
-def _named_by_lerobot(content: Mapping[str, Any], options: Options) -> LanguageFolder:
+def _named_by_lerobot(content: Mapping[str, Any], options: CheckpointConfig) -> LanguageFolder:
     """Read the Qwen3-VL that LeRobot's config.json or the caller names."""
     folder = find(options.base_model or str(content.get("vlm_name")))
     return LanguageFolder.read(folder, replace(options, base_model=None))
 
 
-def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: Options) -> dict[str, Any]:
+def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: CheckpointConfig) -> dict[str, Any]:
     """Return the fields of TopRewardConfig that no file of a Qwen3-VL holds. Raises CheckpointError."""
-    name, given = options.named()
+    name, given = asked(options)
     is_lerobot = name != ROBOMETER
     settings: dict[str, Any] = {
         "variant": "lerobot" if is_lerobot else "robometer",
@@ -95,7 +95,7 @@ def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: Opt
         "prompt_suffix": PROMPT_SUFFIX,
         **_limits(files, is_lerobot=is_lerobot),
         **of_lerobot,
-        **options.settings(_OF_USER),
+        **settings_asked(options, _OF_USER),
     }
     if not is_lerobot and "fps" in given:
         raise CheckpointError(f"--as: fps: expected none for {ROBOMETER}, which takes each video for 24 frames/s")

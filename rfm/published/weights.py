@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +21,7 @@ from rfm.files import (
     cut,
     is_there,
     listed,
+    network_config,
     read_json,
     read_tensors,
     shown,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-PICKLE_STEM = "pytorch_model"  # of the names of transformers' pickled weights
+_PICKLE_STEM = "pytorch_model"  # of the names of transformers' pickled weights
 _ENCODERS = ("image_encoder", "text_encoder")  # subfolders of an exported checkpoint
 _LEVELS = ("*", "*/*", "*/*/*")  # depth of checkpoints in the folder of a training run or in a model repository
 _MAX_SUGGESTED = 5
@@ -75,7 +76,7 @@ def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tenso
     elif is_there(folder / WEIGHTS_INDEX):
         weights = _read_shards(folder / WEIGHTS_INDEX)
     else:
-        refuse_pickles(folder, WEIGHTS, PICKLE_STEM)
+        refuse_pickles(folder, WEIGHTS, _PICKLE_STEM)
         got = cut(", ".join(sorted(path.name for path in folder.iterdir()))) or "nothing"
         raise CheckpointError.at(folder, f"{WEIGHTS} or {WEIGHTS_INDEX}", f"{got}: {_below(folder)}")
     _check_network(folder, weights, model_type)
@@ -84,8 +85,7 @@ def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tenso
 
 def _check_network(folder: Path, names: Iterable[str], model_type: str | None) -> None:
     """Raise CheckpointError if config.json is of another network than the weights, as some trainers write it."""
-    file = folder / NETWORK_CONFIG
-    content = read_json(file) if is_there(file) else {}
+    file, content = folder / NETWORK_CONFIG, network_config(folder)
     stated = content.get("model_type")
     found = next((kind for name in names for kind, own in _NETWORKS.items() if own.search(name)), None)
     is_first = stated is None and found == next(iter(_NETWORKS))  # the first ReWiND checkpoints state nothing
@@ -153,7 +153,10 @@ def _below(folder: Path) -> str:
     found = [file.parent for level in _LEVELS for name in names for file in sorted(folder.glob(f"{level}/{name}"))]
     checkpoints = [str(path) for path in dict.fromkeys(found) if path.name not in _ENCODERS]
     if not checkpoints:
-        return "a checkpoint's folder has it, beside config.json"
+        return (
+            "a checkpoint's folder has it, beside config.json; pickled weights are not fetched: `hf download org/name "
+            "--local-dir FOLDER`, then name FOLDER, and the message says how to convert them"
+        )
     return f"name the checkpoint in it: {cut(', '.join(checkpoints[:_MAX_SUGGESTED]))}"
 
 
@@ -168,26 +171,16 @@ def has_head(weights: Iterable[str], head: str) -> bool:
     return any(name.startswith(f"{head}_head.") for name in weights)
 
 
-def pickled_weights(names: Iterable[str], stem: str) -> list[str]:
-    """Return the pickles among a folder's files that may hold weights.
-
-    stem: of transformers' names; if files with such names exist, only these are returned
-    """
-
-    def is_any(name: str, patterns: Sequence[str]) -> bool:
-        return any(fnmatch(name, pattern) for pattern in patterns)
-
-    pickles = sorted(name for name in names if is_any(name, _PICKLES) and not is_any(name, _STATES))
-    usual = [name for name in pickles if name == f"{stem}.bin" or fnmatch(name, f"{stem}-*-of-*.bin")]
-    return usual or pickles
-
-
 def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
     """Raise CheckpointError if ``folder`` has pickled weights in place of the missing file ``wanted``.
 
     Pickles are never opened, since that may run code. The message holds a command that converts them.
+    stem: of transformers' names; if files with such names exist, other pickles do not count
     """
-    names = pickled_weights((file.name for file in folder.iterdir()), stem)
+
+    files = sorted(file.name for file in folder.iterdir())
+    pickles = [name for name in files if _is_any(name, _PICKLES) and not _is_any(name, _STATES)]
+    names = [name for name in pickles if _is_any(name, (f"{stem}.bin", f"{stem}-*-of-*.bin"))] or pickles
     if not names:
         return
     if len(names) > 1 and f"{stem}.bin" in names:
@@ -202,3 +195,7 @@ def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
         f"needs more: {command}"
     )
     raise CheckpointError.at(folder, wanted, got)
+
+
+def _is_any(name: str, patterns: Iterable[str]) -> bool:
+    return any(fnmatch(name, pattern) for pattern in patterns)

@@ -330,29 +330,59 @@ def _with_room(slots: Tensor) -> Tensor:
     return F.pad(slots, (0, 0, 0, 0, 0, ROOM))
 
 
+class Part:
+    """Tokens that pass each layer together, and their hidden states so far.
+
+    language: transformers' language model
+    inputs: on its device: input_ids, int64 [B, L]; position_ids, int64 [3, B, L]; with ``features`` visual_tokens,
+        int64 [M], the visual tokens' indices among all B * L, and visual_features, int64 [M], the index of each in
+        ``features``
+    features: [N / U, levels, D], the merged tokens of all shots; None: there is no visual token
+    key_values: transformers' cache, which receives the keys and values of these tokens; None: they are not needed
+    mask: returns the tokens that each token sees, or None if each sees those before it
+    """
+
+    def __init__(
+        self,
+        language: Any,
+        inputs: dict[str, Tensor],
+        features: Tensor | None = None,
+        key_values: Any = None,
+        mask: Callable[[], Tensor | None] = lambda: None,
+    ) -> None:
+        self._mask, self._deeper = mask, list[Tensor]()
+        self.states = language.embed_tokens(inputs["input_ids"])
+        if features is not None:
+            self._at, self._picked = inputs["visual_tokens"], inputs["visual_features"]
+            merged, *self._deeper = features.unbind(1)
+            self.states.flatten(0, 1).index_copy_(0, self._at, merged[self._picked].to(self.states.dtype))
+        self._turned = language.rotary_emb(self.states, inputs["position_ids"])
+        known = inspect.signature(language.layers[0].forward).parameters
+        cache = "cache" if "cache" in known else "past_key_values"  # transformers changed the name in 5.x
+        self._options = {} if key_values is None else {cache: key_values}
+
+    def run(self, number: int, layer: Any) -> None:
+        """Pass the layer of this number."""
+        states = layer(self.states, position_embeddings=self._turned, attention_mask=self._mask(), **self._options)
+        self.states = states[0] if isinstance(states, tuple) else states  # transformers 4.57 of Qwen2.5-VL
+        if number < len(self._deeper):
+            added = self._deeper[number][self._picked].to(self.states.dtype)
+            self.states.flatten(0, 1).index_add_(0, self._at, added)
+
+
+def run_layers(language: Any, *parts: Part) -> Tensor:
+    """Pass all layers, each of which takes the parts in turn; return the states behind the final norm, [tokens, D]."""
+    for number, layer in enumerate(language.layers):
+        for part in parts:
+            part.run(number, layer)
+    return language.norm(concatenated([part.states.flatten(0, 1) for part in parts]))
+
+
 def last_hidden_state(
     language: Any, inputs: dict[str, Tensor], features: Tensor, key_values: KeyValues | None = None
 ) -> Tensor:
-    """Return the hidden states behind the final norm, [B, L, D].
-
-    language: transformers' language model
-    inputs: on its device: input_ids, int64 [B, L]; position_ids, int64 [3, B, L]; visual_tokens, int64 [M], the visual
-        tokens' indices among all B * L; visual_features, int64 [M], the index of each in ``features``
-    features: [N / U, levels, D], the merged tokens of all shots
-    key_values: receives the keys and values of all tokens; None: they are not needed
-    """
-    at, picked = inputs["visual_tokens"], inputs["visual_features"]
-    merged, *deeper = features.unbind(1)
-    hidden = language.embed_tokens(inputs["input_ids"])
-    hidden.flatten(0, 1).index_copy_(0, at, merged[picked].to(hidden.dtype))
-    turned = language.rotary_emb(hidden, inputs["position_ids"])
-    options = _cached(language, key_values)
-    for number, layer in enumerate(language.layers):
-        hidden = layer(hidden, position_embeddings=turned, attention_mask=None, **options)
-        hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # transformers 4.57 of Qwen2.5-VL
-        if number < len(deeper):
-            hidden.flatten(0, 1).index_add_(0, at, deeper[number][picked].to(hidden.dtype))
-    return language.norm(hidden)
+    """Return the hidden states behind the final norm, [B, L, D]. Parameters as of ``Part``."""
+    return run_layers(language, Part(language, inputs, features, key_values)).unflatten(0, inputs["input_ids"].shape)
 
 
 def next_hidden_state(
@@ -371,21 +401,8 @@ def next_hidden_state(
     if int(lengths.min()) < longest:  # else no mask: PyTorch's fastest attention takes none
         is_seen = (torch.arange(longest + 1, device=device) <= before[:, None])[:, None, None]
     key_values.place(before, longest)
-    hidden = language.embed_tokens(ids[:, None])
-    turned = language.rotary_emb(hidden, at[None, :, None].expand(3, -1, -1))
-    options = _cached(language, key_values)
-    for layer in language.layers:
-        hidden = layer(hidden, position_embeddings=turned, attention_mask=is_seen, **options)
-        hidden = hidden[0] if isinstance(hidden, tuple) else hidden
-    return language.norm(hidden)[:, 0]
-
-
-def _cached(language: Any, key_values: KeyValues | None) -> dict[str, KeyValues]:
-    """Return the argument of a layer for its cache, whose name transformers changed in 5.x."""
-    if key_values is None:
-        return {}
-    known = inspect.signature(language.layers[0].forward).parameters
-    return {"cache" if "cache" in known else "past_key_values": key_values}
+    inputs = {"input_ids": ids[:, None], "position_ids": at[None, :, None].expand(3, -1, -1)}
+    return run_layers(language, Part(language, inputs, None, key_values, lambda: is_seen))
 
 
 def check_attention(backbone: Any) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -60,7 +60,11 @@ class QwenCheckpoint:
 
     weights: of its network, without LoRA
     processor: folder or id with tokenizer and preprocessing
+    network_of, predictor_of: classes of the network and its predictor
     """
+
+    network_of: ClassVar[Any]
+    predictor_of: ClassVar[type[QwenPredictor]]
 
     config: Any
     weights: dict[str, Tensor]
@@ -82,16 +86,13 @@ class QwenCheckpoint:
 
     def network(self, dtype: torch.dtype) -> nn.Module:
         """Return the network, with weights of no use."""
-        raise NotImplementedError
+        network: nn.Module = self.network_of(self.config, build_backbone(self.config, dtype))
+        return network
 
     def skeleton(self) -> nn.Module:
         """Return the network without weights."""
         with torch.device("meta"):
             return self.network(self.config.torch_dtype)
-
-    def make_predictor(self, network: Any, device: torch.device, cache: FeatureCache[Any] | None) -> QwenPredictor:
-        """Return the predictor with this network."""
-        raise NotImplementedError
 
     def loaded(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the weights under all names that the network loads."""
@@ -116,7 +117,7 @@ class QwenCheckpoint:
         self.collator  # noqa: B018  first, so that a missing file is reported before the network is built
         if dtype is None and device.type == "cpu":
             dtype = torch.float32
-        return self.make_predictor(self.build(dtype), device, cache)
+        return self.predictor_of(self.build(dtype), self.collator, device, cache)
 
     def save(self, folder: Path) -> None:
         """Write all weights, a config.json with all settings, and the processor."""

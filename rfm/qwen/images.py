@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rfm.engine.pixels import Normalisation
+from rfm.engine.layers import Normalisation
 from rfm.files import MAX_UINT8, PIL_BICUBIC
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from rfm.engine.graphs import Graphs
-from rfm.engine.pixels import Normalisation
+from rfm.engine.layers import Normalisation
 from rfm.engine.predictor import check_type
 from rfm.files import NETWORK_CONFIG, CheckpointError, expecting, shown
 from rfm.qwen.backbone import Box, KeyValues, positions
@@ -25,7 +25,7 @@ from rfm.qwen.batch import VlmBatch, VlmRow
 from rfm.qwen.checkpoint import QwenCheckpoint
 from rfm.qwen.collator import VIDEO_PAD, VISION_END, VISION_START, QwenCollator, expanded, timed_groups, video_of
 from rfm.qwen.images import MERGE, QwenImages
-from rfm.qwen.network import BackboneConfig, build_backbone, qwen_states
+from rfm.qwen.network import BackboneConfig, qwen_states
 from rfm.qwen.processor import (
     SIZED_BY_PROCESSOR,
     check_tokens,
@@ -177,7 +177,9 @@ class LanguageCheckpoint(QwenCheckpoint):
     """
 
     made_of: ClassVar[type[LanguageConfig]]
+    network_of: ClassVar[Any] = LanguageNetwork
     reads_videos: ClassVar[bool] = True  # else separate images
+    has_language_head: ClassVar[bool] = True
 
     @property
     def own_tokens(self) -> dict[str, int]:
@@ -208,23 +210,19 @@ class LanguageCheckpoint(QwenCheckpoint):
         collator.check_template()
         return collator
 
-    def network(self, dtype: torch.dtype) -> LanguageNetwork:
-        """Return the network, with weights of no use."""
-        return LanguageNetwork(self.config, build_backbone(self.config, dtype))
-
     def loaded(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the weights with the embedding as the language head, if the head is tied to it."""
-        tied = {} if HEAD in weights or EMBEDDING not in weights else {HEAD: weights[EMBEDDING]}
-        return {**weights, **tied}
+        is_tied = self.has_language_head and HEAD not in weights and EMBEDDING in weights
+        return {**weights, **({HEAD: weights[EMBEDDING]} if is_tied else {})}
 
     def saved_settings(self) -> dict[str, Any]:
         """Return this project's fields of an exported config.json."""
         return {REWARD_MODEL: self.config.reward_model, **super().saved_settings()}
 
-    def build(self, dtype: torch.dtype | None = None) -> LanguageNetwork:
+    def build(self, dtype: torch.dtype | None = None) -> Any:
         """Return the network with these weights, on the CPU, in ``dtype`` (None: its own). Raises CheckpointError."""
-        network: LanguageNetwork = super().build(dtype)
-        if HEAD not in self.weights:
+        network = super().build(dtype)
+        if self.has_language_head and HEAD not in self.weights:
             network.lm_head.weight = network.model.language_model.embed_tokens.weight
         return network
 

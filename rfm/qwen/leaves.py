@@ -63,7 +63,7 @@ class Packs:
     num_keys: tokens of the longest of these trunks
     input_ids: int64 [R, P]
     position_ids: int64 [3, R, P]
-    visual_tokens, visual_features: as in ``rfm.qwen.backbone.last_hidden_state``
+    visual_tokens, visual_features: as of ``rfm.qwen.backbone.Part``
     from_trunk: int64 [R, P], number of the trunk's tokens that a token sees
     leaves, places: int64 [R, P], the leaf of each token, and its place in it; -1 and 0 for padding
     seen, upto: int64 [N, R, P], leaves that a token sees, its own first, and how many tokens of each

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, Final, Literal, TypeAlias
 
 import torch
@@ -20,7 +21,16 @@ from torch import Tensor, nn
 from rfm.config import VideoPrompt, Weights
 from rfm.engine.graphs import Graphs
 from rfm.engine.layers import concatenated
-from rfm.qwen.backbone import UNIT, KeyValues, VisionPlan, _cached, check_attention, features, last_hidden_state
+from rfm.qwen.backbone import (
+    UNIT,
+    KeyValues,
+    Part,
+    VisionPlan,
+    check_attention,
+    features,
+    last_hidden_state,
+    run_layers,
+)
 from rfm.qwen.batch import VlmBatch
 from rfm.qwen.leaves import Packs
 
@@ -135,56 +145,38 @@ def graphed_hidden_state(graphs: Graphs, language: Any, inputs: dict[str, Tensor
 
 
 class TrunkKeyValues:
-    """The keys and values of a layer's trunks, in the form of transformers' cache.
+    """The keys and values of a layer's trunks, in the form of transformers' cache."""
 
-    packs: those whose tokens the layer computes; None: it computes the trunks
-    """
-
-    packs: Packs | None = None
-
-    def __init__(self) -> None:
-        self._of_trunks: tuple[Tensor, ...] = ()
+    of_trunks: tuple[Tensor, ...] = ()
 
     def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
-        """Keep a trunk's keys and values, [B, heads, L, D / heads]; return those that the tokens of a call may see."""
-        if self.packs is None:
-            self._of_trunks = keys, values
-            return keys, values
-        before = [each[self.packs.trunks, :, : self.packs.num_keys] for each in self._of_trunks]
+        """Keep the keys and values of the trunks, [B, heads, L, D / heads], and return them."""
+        self.of_trunks = keys, values
+        return keys, values
+
+
+@dataclass(frozen=True)
+class PackKeyValues:
+    """The keys and values that the tokens of a call may see, in the form of transformers' cache."""
+
+    trunks: TrunkKeyValues
+    packs: Packs
+
+    def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+        """Return the keys and values of each pack behind those of its trunk."""
+        before = [each[self.packs.trunks, :, : self.packs.num_keys] for each in self.trunks.of_trunks]
         return torch.cat([before[0], keys], dim=2), torch.cat([before[1], values], dim=2)
-
-
-class _Part:
-    """The hidden states of the trunks, or of the packs of a call, from layer to layer."""
-
-    def __init__(self, language: Any, inputs: dict[str, Tensor], features: Tensor) -> None:
-        merged, *self._deeper = features.unbind(1)
-        self._at, self._picked = inputs["visual_tokens"], inputs["visual_features"]
-        self.hidden = language.embed_tokens(inputs["input_ids"])
-        self.hidden.flatten(0, 1).index_copy_(0, self._at, merged[self._picked].to(self.hidden.dtype))
-        self._turned = language.rotary_emb(self.hidden, inputs["position_ids"])
-
-    def run(self, number: int, layer: Any, mask: Tensor | None, options: dict[str, Any]) -> None:
-        hidden = layer(self.hidden, position_embeddings=self._turned, attention_mask=mask, **options)
-        self.hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # transformers 4.57 of Qwen2.5-VL
-        if number < len(self._deeper):
-            added = self._deeper[number][self._picked].to(self.hidden.dtype)
-            self.hidden.flatten(0, 1).index_add_(0, self._at, added)
 
 
 def tree_hidden_states(language: Any, inputs: dict[str, Tensor], packs: Sequence[Packs], features: Tensor) -> Tensor:
     """Return the hidden states behind the final norm, of the trunks and then of each call, [1, all tokens, D].
 
-    language, inputs, features: as in ``rfm.qwen.backbone.last_hidden_state``, of the trunks
+    language, inputs, features: as of ``rfm.qwen.backbone.Part``, of the trunks
     """
-    key_values = TrunkKeyValues()
-    options = _cached(language, key_values)  # type: ignore[arg-type]  # transformers asks for ``update`` alone
-    trunks, *calls = (_Part(language, each, features) for each in (inputs, *(each.inputs for each in packs)))
+    trunks, is_kept = TrunkKeyValues(), len(packs) == 1
     # The mask of a single call is kept; those of several are made anew for each layer, so that memory holds one.
-    kept = packs[0].mask() if len(packs) == 1 else None
-    for number, layer in enumerate(language.layers):
-        key_values.packs = None
-        trunks.run(number, layer, None, options)
-        for call, key_values.packs in zip(calls, packs, strict=True):
-            call.run(number, layer, key_values.packs.mask() if kept is None else kept, options)
-    return language.norm(torch.cat([part.hidden.flatten(0, 1) for part in (trunks, *calls)]))[None]
+    calls = [
+        Part(language, each.inputs, features, PackKeyValues(trunks, each), cache(each.mask) if is_kept else each.mask)
+        for each in packs
+    ]
+    return run_layers(language, Part(language, inputs, features, trunks), *calls)[None]

@@ -108,6 +108,7 @@ class QwenPredictor:
 
     def _output(self, batch: VlmBatch, *arguments: Any) -> Any:
         """Return the network's output. Out of memory, free what is kept: the engine tries again with fewer rows."""
+        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         try:
             with memory_errors():
                 return self.network(batch.to(self.device, self._dtype), *arguments)

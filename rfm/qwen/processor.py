@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from rfm.engine.pixels import Normalisation
+from rfm.engine.layers import Normalisation
 from rfm.files import (
     MAX_UINT8,
     PIL_BICUBIC,

@@ -121,7 +121,6 @@ class WritingPredictor(QwenPredictor):
 
         execution: its ``on_forward`` is called after each forward pass
         """
-        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         answers, made = self.write(rows, batch, execution)
         scores = [self._read(answer, row, execution) for answer, row in zip(answers, rows, strict=True)]
         self._keep_finite(rows, batch, made)

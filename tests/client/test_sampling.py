@@ -15,7 +15,7 @@ import torch
 import goldens
 from every_score import assert_same_scores, every_score
 from paths import GOLDEN
-from rfm.engine.pixels import Normalisation
+from rfm.engine.layers import Normalisation
 from rfm.families.rewind.encoders import ImagePreprocessor
 from rfm.qwen.images import QwenImages, fitted_size
 from rfm_client import FrameScores, FrameSize, ProgressResult, ProgressSample, Trajectory, UInt8Array

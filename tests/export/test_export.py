@@ -20,11 +20,13 @@ import rfm_export
 from engines import serve_config, training_run
 from in_process import rfm
 from repositories import changing, description_of, forget_input
+from rfm import published
 from rfm.families.rewind.checkpoint import RewindCheckpoint
 from rfm.files import CheckpointError
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Origin
 from rfm_export import ExportDiffersError, ExportError
 from rfm_export.source import origin_of, read_source
+from spoilt import WEIGHTS
 
 EMBEDDINGS = goldens.config("c1_t1_disc10")
 FRAMES = goldens.config("enc_c1_t1_disc10")
@@ -161,6 +163,14 @@ RUNS: dict[str, tuple[dict[str, dict[str, object]], list[str]]] = {
         {"model": ALL_TRAINED | {"quantization": True}},
         ["model.quantization is true: the run scored with its base model rounded to a few bits; the scores "],
     ),
+    "progress from the first frame": (
+        {"model": ALL_TRAINED, "data": {"progress_pred_type": "absolute_first_frame"}},
+        ["data.progress_pred_type is absolute_first_frame: progress is 0 at the first frame that the model "],
+    ),
+    "shuffled frames": (
+        {"model": ALL_TRAINED, "data": {"shuffle_progress_frames": True}},
+        ["data.shuffle_progress_frames is true: the run shuffled all frames but the first, so "],
+    ),
     "all": ({"model": ALL_TRAINED}, []),
 }
 
@@ -179,6 +189,8 @@ def test_an_export_says_what_the_run_did_not_train(
     assert len(said) == 1 + len(expected)
     told = [of_run(checkpoint), *(f"config.yaml: {line}" for line in expected)]
     assert all(map(str.startswith, said, told))
+    for line in published.notes(checkpoint, published.read(checkpoint), answered=[]):
+        assert "model.quantization" in line  # which concerns every head
 
 
 def test_an_export_says_which_config_yaml_it_took(exported: Path) -> None:
@@ -209,6 +221,19 @@ def test_upstream_s_file_exports_whatever_its_batch_size_unless_it_names_gpus_th
     config = read(repository, "rfm")
     assert list(config.instance_group[0].gpus) == list(range(there + 1))
     assert config.max_batch_size == 64
+
+
+def test_a_link_out_of_a_checkpoint_is_refused_and_those_of_the_hub_s_cache_are_followed(tmp_path: Path) -> None:
+    blobs, snapshot = (tmp_path / "models--org--name" / part for part in ("blobs", f"snapshots/{'0' * 40}"))
+    snapshot.mkdir(parents=True)
+    shutil.copytree(SMALL.checkpoint, blobs)
+    for file in blobs.iterdir():
+        (snapshot / file.name).symlink_to(Path("..", "..", "blobs", file.name))
+    read_source(snapshot, serve_config(SMALL), None, print)
+    (snapshot / WEIGHTS).unlink()
+    (snapshot / WEIGHTS).symlink_to(SMALL.checkpoint / WEIGHTS)
+    with pytest.raises(CheckpointError, match=rf"{WEIGHTS}: expected a file of the checkpoint, got a link to /"):
+        read_source(snapshot, serve_config(SMALL), None, print)
 
 
 def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:

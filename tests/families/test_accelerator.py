@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 import torch
@@ -14,7 +13,7 @@ from engines import load_engine
 from pretended import CUDA, SECOND, Seen, pretended
 from reward_models import ROOT, references
 from rfm import published
-from rfm.engine import Engine, Execution
+from rfm.engine import Engine
 from rfm.triton_model.placement import Placement
 from rfm_client import PreferenceSample, ProgressSample, Sample
 from vlm import PLAIN, assert_close, video
@@ -102,23 +101,6 @@ def test_batches_that_are_collated_while_others_are_scored_have_the_cpu_s_scores
             assert_close(result, expected, 1e-5)
     assert seen.calls.count("Stream") == 1
     assert {"pin_memory", "stream", "wait_stream", "record_stream"} <= {*seen.calls}
-
-
-def test_a_lack_of_memory_frees_what_pytorch_keeps(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
-    engine, network_refuses, execution = engine_there(PLAIN), iter([True, False, False]), Execution()
-    network: Any = engine.predictor.network
-    forward = network.forward
-
-    def refusing(batch: Any) -> Any:
-        if next(network_refuses):
-            raise torch.OutOfMemoryError("made up")
-        return forward(batch)
-
-    monkeypatch.setattr(network, "forward", refusing)
-    results = engine.evaluate(MIXED[:2], execution)
-    for result, expected in zip(results, load_engine(PLAIN).evaluate(MIXED[:2]), strict=True):
-        assert_close(result, expected, 1e-5)
-    assert (execution.out_of_memory_count, seen.calls.count("empty_cache")) == (1, 1)
 
 
 def test_a_thread_that_computes_is_told_its_device(seen: Seen) -> None:

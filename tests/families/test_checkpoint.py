@@ -95,45 +95,6 @@ def test_a_checkpoint_in_another_form_is_the_same(tmp_path: Path, name: str, cha
     assert_same(published.load(folder, **golden.sources), published.load(golden.checkpoint, **golden.sources))
 
 
-def test_the_links_of_the_hub_s_cache_are_followed(tmp_path: Path) -> None:
-    blobs, snapshot = (tmp_path / "models--org--name" / part for part in ("blobs", f"snapshots/{'0' * 40}"))
-    blobs.mkdir(parents=True)
-    snapshot.mkdir(parents=True)
-    golden = goldens.config(CONTINUOUS).checkpoint
-    for number, file in enumerate(sorted(golden.iterdir())):
-        shutil.copy(file, blobs / str(number))
-        (snapshot / file.name).symlink_to(Path("..", "..", "blobs", str(number)))
-    published.load(snapshot).save(tmp_path / "saved")
-    assert_same(published.load(tmp_path / "saved"), published.load(golden))
-    assert not [path for path in (tmp_path / "saved").rglob("*") if path.is_symlink()]
-
-
-PROGRESS = {
-    "of all frames": ("progress_pred_type: absolute_wrt_total_frames", "", []),
-    "from the first frame": (
-        "progress_pred_type: absolute_first_frame",
-        "",
-        ["config.yaml: data.progress_pred_type is absolute_first_frame: progress is 0 at the first frame that the model "],
-    ),
-    "shuffled": (
-        "progress_pred_type: absolute_wrt_total_frames",
-        "shuffle_progress_frames: true",
-        ["config.yaml: data.shuffle_progress_frames is true: the run shuffled all frames but the first, so "],
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("kind", "order", "expected"), PROGRESS.values(), ids=PROGRESS)
-def test_notes_name_another_meaning_of_progress(folder: Path, kind: str, order: str, expected: list[str]) -> None:
-    text = (folder / "config.yaml").read_text()
-    text = text.replace("progress_pred_type: absolute_wrt_total_frames", kind)
-    (folder / "config.yaml").write_text(text.replace("shuffle_progress_frames: false", order) if order else text)
-    loaded = published.read(folder)
-    found = [line for line in published.notes(folder, loaded) if "config.yaml: data." in line]
-    assert [line[: len(begins)] for line, begins in zip(found, expected, strict=True)] == expected
-    assert not [line for line in published.notes(folder, loaded, ["success"]) if "config.yaml: data." in line]
-
-
 STATES = ("optimizer.pt", "scheduler.pt", "rng_state.pth", "rng_state_0.pth", "training_args.bin", "scaler.pt")
 
 

@@ -32,49 +32,61 @@ from trajectories import random_trajectory
 WAIT_S = 30
 
 
-class Pipelined:
-    """A predictor whose forward waits until the next batch has been collated."""
+class Fixed:
+    """A predictor of given rows, each of a sample, which are their own scores."""
 
-    has_progress = has_success = True
+    has_progress = True
     reads_views = False
 
-    def __init__(self, batches: int) -> None:
-        self.collated = [threading.Event() for _ in range(batches)]
-        self.num_rows = 0
-        self.scored = 0
+    def __init__(self, rows: Sequence[Any], *, has_success: bool = True) -> None:
+        self.left, self.has_success = iter(rows), has_success
 
-    def rows(self, sample: Sample) -> list[int]:
-        self.num_rows += 1
-        return [self.num_rows - 1]
+    def rows(self, sample: Sample) -> list[Any]:
+        return [next(self.left)]
 
-    def num_tokens(self, row: int) -> int:
+    def num_tokens(self, row: Any) -> int:
         return 1
 
     def sequences(self, row: Any) -> Sequence[Any]:
         return (row,)
 
-    def collate(self, rows: Sequence[int]) -> Any:
-        self.collated[rows[0]].set()
+    def collate(self, rows: Sequence[Any]) -> None:
+        pass
 
-    def count(self, batch: Any, execution: Execution) -> None:
-        execution.add_tokens(1, 1)
+    def count(self, batch: None, execution: Execution) -> None:
+        pass
 
-    def score(self, rows: Sequence[int], batch: Any, execution: Execution) -> list[RowScores | RewardError]:
-        if rows[0] + 1 < len(self.collated):
-            assert self.collated[rows[0] + 1].wait(WAIT_S)
-        self.scored += 1
-        score = np.full(1, rows[0], np.float32)
-        return [RowScores([FrameScores(progress=score, success=score)])]
+    def score(self, rows: Sequence[Any], batch: None, execution: Execution) -> list[RowScores | RewardError]:
+        return list(rows)
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
         return rows[0].frames[0]
+
+
+class Pipelined(Fixed):
+    """Its forward waits until the next batch has been collated."""
+
+    def __init__(self, batches: int) -> None:
+        super().__init__(range(batches))
+        self.collated = [threading.Event() for _ in range(batches)]
+        self.num_scored = 0
+
+    def collate(self, rows: Sequence[int]) -> None:
+        self.collated[rows[0]].set()
+
+    def score(self, rows: Sequence[int], batch: None, execution: Execution) -> list[RowScores | RewardError]:
+        if rows[0] + 1 < len(self.collated):
+            assert self.collated[rows[0] + 1].wait(WAIT_S)
+        self.num_scored += 1
+        score = np.full(1, rows[0], np.float32)
+        return [RowScores([FrameScores(progress=score, success=score)])]
 
 
 def test_the_next_batch_is_collated_while_the_current_one_runs() -> None:
     predictor = Pipelined(batches=4)
     samples = [ProgressSample(random_trajectory(0, 1))] * 4
     passes: list[int] = []
-    execution = Execution(on_forward=lambda: passes.append(predictor.scored))
+    execution = Execution(on_forward=lambda: passes.append(predictor.num_scored))
     outcomes = Engine(predictor, token_budget=1).evaluate(samples, execution)
     assert passes == [1, 2, 3, 4]
     results = [outcome for outcome in outcomes if isinstance(outcome, ProgressResult)]
@@ -88,37 +100,6 @@ def test_collating_inside_a_forward_pass_counts_once(monkeypatch: pytest.MonkeyP
         with execution.forwarding(), execution.collating():
             pass
     assert (execution.collate_s, execution.forward_s) == (3, 7)
-
-
-class Fixed:
-    """A predictor of given scores, a sample a row."""
-
-    has_progress = True
-    reads_views = False
-
-    def __init__(self, scores: Sequence[RowScores], *, has_success: bool = True) -> None:
-        self.scores, self.has_success = iter(scores), has_success
-
-    def rows(self, sample: Sample) -> list[RowScores]:
-        return [next(self.scores)]
-
-    def num_tokens(self, row: RowScores) -> int:
-        return 1
-
-    def sequences(self, row: Any) -> Sequence[Any]:
-        return (row,)
-
-    def collate(self, rows: Sequence[RowScores]) -> None:
-        pass
-
-    def count(self, batch: None, execution: Execution) -> None:
-        pass
-
-    def score(self, rows: Sequence[RowScores], batch: None, execution: Execution) -> list[RowScores | RewardError]:
-        return list(rows)
-
-    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        return rows[0].frames[0]
 
 
 def scores_of(**changed: float | None) -> FrameScores:

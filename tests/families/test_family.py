@@ -23,7 +23,6 @@ from paths import ROOT
 from repositories import description_of
 from rfm import families, published
 from rfm.config import ExportConfig
-from rfm.engine import Engine
 from rfm.files import CheckpointError
 from rfm.serve.installation import Installation
 from rfm_client import (
@@ -118,18 +117,6 @@ def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> No
         "config": {"num_colours": 3},
         "parameters": {"line": 4},
     }
-
-
-@pytest.mark.slow
-@pytest.mark.triton
-def test_a_family_from_elsewhere_is_served_beside_one_of_this_package(running: Running) -> None:
-    demo = running.repository / "rfm" / "1" / "checkpoint"
-    encoders = families.encoders_of("rfm.families.rewind").load(running.repository / "rfm_encoder" / "1")
-    sample = ProgressSample(video([0.1, 0.5, 0.9]))
-    (expected,) = Engine.of(published.load(demo), encoders=encoders).evaluate([sample])
-    with RewardClient(running.url) as client:
-        (result,) = client.evaluate([sample])
-    np.testing.assert_allclose(result.progress, expected.progress, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -143,13 +143,3 @@ def test_a_black_frame_with_pixels_is_always_encoded(encoders: FrameEncoders) ->
     (outcome,) = encoders.encode([named(black, black[:0], cache)], execution, cache)
     np.testing.assert_allclose(embeddings(outcome)[0], expected[0], atol=1e-5)
     assert execution.num_encoded == 2
-
-
-def test_a_sliver_is_refused_and_fails_no_neighbour(encoders: FrameEncoders) -> None:
-    sliver, cache, frames = np.zeros((1, 1, 3000, 3), np.uint8), FeatureCache(2**20), frames_of(5, 1)
-    encoders.encode([footage(frames)], Execution(), cache)
-    batch = [named(sliver, sliver, cache), footage(sliver), named(frames, frames[:0], cache)]
-    *refused, scored = encoders.encode(batch, Execution(), cache)
-    for outcome in refused:
-        assert str(outcome) == "frames: expected frames at most 50 times as long as wide, got 1 x 3000"
-    assert isinstance(scored, EncoderSample)

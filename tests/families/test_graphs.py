@@ -159,24 +159,30 @@ def test_after_a_failed_capture_all_passes_are_plain(caplog: pytest.LogCaptureFi
     assert (graphs.has_failed, graphs.num_captured) == (True, 0)
 
 
-def test_a_lack_of_memory_drops_the_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
-    graphs = Graphs(CalledAgain())
-    engine, samples = engine_with(graphs, goldens.config(PLAIN)), [ProgressSample(video(0, 3, 64, 64))] * 2
-    for _ in range(3):
-        engine.evaluate(samples[:1])
+def test_a_lack_of_memory_drops_graphs_and_kept_features_and_halves_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    graphs, execution, freed, kept = Graphs(CalledAgain()), Execution(), list[None](), list[int]()
+    engine: Any = engine_with(graphs, goldens.config(PLAIN), 4)
+    network, cache = engine.predictor.network, engine.predictor.cache
+    *first, last, other = (ProgressSample(video(seed, 3, 64, 64)) for seed in range(5))
+    for sample in first:
+        engine.evaluate([sample])
     assert graphs.num_captured == 2
-    network: Any = engine.predictor.network  # type: ignore[attr-defined]
-    forward, refuses, replayed = network.forward, iter([True, False, False]), graphs.num_replayed
+    forward, replayed = network.forward, graphs.num_replayed
 
     def refusing(batch: Any) -> Any:
-        if next(refuses):
+        kept.append(len(cache))
+        if len(kept) == 1:
             raise torch.OutOfMemoryError("made up")
         return forward(batch)
 
     monkeypatch.setattr(network, "forward", refusing)
-    for result, expected in zip(engine.evaluate(samples), load_engine(PLAIN).evaluate(samples), strict=True):
-        assert_close(result, expected, 1e-5)
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: freed.append(None))
+    expected = load_engine(PLAIN).evaluate([last, other])
+    for result, alone in zip(engine.evaluate([last, other], execution), expected, strict=True):
+        assert_close(result, alone, 1e-5)
     assert graphs.num_replayed == replayed
+    assert kept[0] > kept[1] == 0
+    assert (execution.out_of_memory_count, len(freed)) == (1, 1)
 
 
 def test_an_engine_has_graphs_where_they_can_be_used(monkeypatch: pytest.MonkeyPatch) -> None:

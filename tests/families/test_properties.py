@@ -21,11 +21,11 @@ from hypothesis.extra import numpy as arrays
 
 import goldens
 from rfm import published
+from rfm.config import CheckpointConfig
 from rfm.families.rewind.checkpoint import RewindCheckpoint
 from rfm.families.rewind.network import RewindTransformer
 from rfm.files import CheckpointError
 from rfm.published import robometer
-from rfm.published.reader import Options
 from rfm_client import InvalidSampleError
 from rfm_client.contract import wire
 from small_network import SMALL
@@ -188,5 +188,5 @@ def test_any_setting_is_taken_or_refused(original: Path, data: st.DataObject, va
     of_part = is_vlm and data.draw(st.sampled_from([None, "text_config", "vision_config"]))
     place = content[of_part] if of_part else content
     place[data.draw(st.sampled_from(sorted(place)))] = value
-    load = (lambda copy: robometer.load(copy, Options())) if is_vlm else built
+    load = (lambda copy: robometer.load(copy, CheckpointConfig())) if is_vlm else built
     loads_or_refuses(folder, "config.json", json.dumps(content).encode(), load)

@@ -17,7 +17,6 @@ from rfm import published
 from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
 from rfm.engine.layers import progress_from_logits
-from rfm.engine.predictor import prefix_indices
 from rfm.families.rewind.network import Packing, RewindConfig, RewindTransformer, rounded_up
 from rfm.families.rewind.predictor import RewindCollator, RewindPredictor
 from rfm_client import (
@@ -195,13 +194,6 @@ def test_a_row_over_the_token_budget_runs_alone() -> None:
     for outcome, other in zip(outcomes, expected, strict=True):
         np.testing.assert_allclose(numbers(outcome), other, rtol=0, atol=TOLERANCE)
     assert rows == [2, 1, 1, 1]
-
-
-def test_prefixes_are_sampled_as_the_original_samples_them() -> None:
-    assert prefix_indices(1, 4).tolist() == [[0, 0, 0, 0]]
-    assert prefix_indices(6, 4).tolist() == [
-        [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 2], [0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 3, 5]
-    ]  # fmt: skip
 
 
 def test_frames_that_many_rows_show_are_in_a_batch_once() -> None:

@@ -18,7 +18,7 @@ from rfm import published
 from rfm.engine import Engine, Execution
 from rfm.families.rynnvalue.network import Bins, entropy
 from rfm.published import CheckpointError
-from rfm_client import InvalidSampleError, PreferenceSample, ProgressResult, ProgressSample, Trajectory, UInt8Array
+from rfm_client import ProgressResult, ProgressSample, Trajectory, UInt8Array
 from rynnvalue import CASES, FOLDER, ISOLATED, RELATIVE_TOLERANCE, USUAL, Case, engine_of, said
 from spoilt import in_json, settings
 from tolerances import BATCHED_VLM_TOLERANCE
@@ -174,13 +174,6 @@ def test_frames_have_the_seconds_of_their_prefixes_in_one_pass_and_in_dense_mode
         (alone,) = scored(engine(name), progress(shown))
         for score in ("remaining_s", "relative_s"):
             check_seconds(getattr(together, score)[last], getattr(alone, score)[-1], 1e-4)
-
-
-def test_preferences_and_special_tokens_in_a_task_are_refused() -> None:
-    first = Trajectory(frames=noise(2), task=TASK)
-    refused = engine(CAUSAL_CONFIG).evaluate([PreferenceSample(first, first), progress(noise(2), "put <value> in it")])
-    assert [type(each) for each in refused] == [InvalidSampleError] * 2
-    assert "'<value>'" in str(refused[1])
 
 
 def test_an_export_gives_the_same_seconds_and_takes_another_robot(tmp_path: Path) -> None:

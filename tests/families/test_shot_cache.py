@@ -199,28 +199,6 @@ def test_black_frames_with_pixels_are_always_encoded(name: str) -> None:
     assert execution.num_encoded == 2 * predictor_of(cached).collator.frames_per_shot
 
 
-def test_a_pass_without_memory_empties_the_cache_and_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    cache, frames, execution = FeatureCache[Any](BYTES_PER_MIB), frames_of(16, 4), Execution()
-    cached, plain = of_both(MODELS[0], cache)
-    cached.evaluate([whole(frames[:2])])
-    network, sizes = predictor_of(cached).network, list[int]()
-    forward = network.forward
-
-    def refusing(batch: Any) -> Any:
-        sizes.append(len(cache))
-        if len(sizes) == 1:
-            raise torch.OutOfMemoryError("made up")
-        return forward(batch)
-
-    monkeypatch.setattr(network, "forward", refusing)
-    samples = [whole(frames[:3]), whole(frames[1:])]
-    for outcome, expected in zip(cached.evaluate(samples, execution), plain.evaluate(samples), strict=True):
-        assert_close(outcome, expected, TOLERANCE)
-    assert sizes[0] > 0
-    assert sizes[1] == 0
-    assert execution.out_of_memory_count == 1
-
-
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_frames_that_were_evicted_are_kept_again_though_all_their_shots_are_kept(name: str) -> None:
     cache, frames, execution = FeatureCache[Any](BYTES_PER_MIB), frames_of(17, 4), Execution()

@@ -21,14 +21,14 @@ from rfm_client import (
     ProgressResult,
     ProgressSample,
     Trajectory,
-    UInt8Array,
 )
+from vlm import video
 
 FOLDER = ROOT / "topreward"
 CHECKPOINT = FOLDER / "checkpoints" / "vlm_fp32_untied"
 OF_LEROBOT = FOLDER / "lerobot_plain" / "lerobot"
 RAW, ANSWERS, ROUNDED = 1e-4, 2e-5, 0.3  # of log-probabilities, progress, and log-probabilities in bfloat16
-TASK = "put the red block in the bowl"
+CLIP = ProgressSample(video(0, 5, 64, 96))
 
 
 def is_comparable(case: Reference) -> bool:
@@ -93,22 +93,9 @@ def shortened(sample: ProgressSample, most: int) -> ProgressSample:
     return ProgressSample(Trajectory(frames=frames, task=sample.trajectory.task))
 
 
-def noise(num_frames: int, height: int = 64, width: int = 96, seed: int = 0) -> UInt8Array:
-    return np.random.default_rng(seed).integers(0, 256, (num_frames, height, width, 3), np.uint8)
-
-
-def progress(frames: UInt8Array, task: str = TASK) -> ProgressSample:
-    return ProgressSample(Trajectory(frames=frames, task=task))
-
-
 @pytest.fixture(scope="module")
 def lerobot() -> Engine:
     return asked_engine(CHECKPOINT, "topreward")
-
-
-@pytest.fixture(scope="module")
-def robometer() -> Engine:
-    return asked_engine(CHECKPOINT, "topreward-robometer")
 
 
 def test_a_large_video_is_shrunk_by_the_length_of_the_prefix(lerobot: Engine) -> None:
@@ -120,7 +107,7 @@ def test_a_large_video_is_shrunk_by_the_length_of_the_prefix(lerobot: Engine) ->
 
 
 def test_the_settings_of_lerobot_s_config_json_are_used(tmp_path: Path, lerobot: Engine) -> None:
-    (expected,) = lerobot.evaluate([progress(noise(5))])
+    (expected,) = lerobot.evaluate([CLIP])
     by_file = Engine.of(published.load(str(OF_LEROBOT), base_model=str(CHECKPOINT)))
     changed = shutil.copytree(OF_LEROBOT, tmp_path / "changed")
     content = json.loads((changed / "config.json").read_text()) | {"fps": 4.0}
@@ -128,7 +115,7 @@ def test_the_settings_of_lerobot_s_config_json_are_used(tmp_path: Path, lerobot:
     at_4_fps = Engine.of(published.load(str(changed), base_model=str(CHECKPOINT)))
     assert isinstance(expected, ProgressResult)
     for engine, is_equal in ((by_file, True), (at_4_fps, False)):
-        (result,) = engine.evaluate([progress(noise(5))])
+        (result,) = engine.evaluate([CLIP])
         assert isinstance(result, ProgressResult)
         assert np.array_equal(result.progress, expected.progress) is is_equal
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Vision-language checkpoints: the source of each setting, and refusals."""
+"""Vision-language checkpoints: the source of each setting, also of their processors."""
 
 from __future__ import annotations
 
@@ -13,18 +13,14 @@ import pytest
 import torch
 
 import goldens
-import rfm_export
 import spoilt
-from engines import load_engine, serve_config
-from repositories import description_of
+from engines import load_engine
 from rfm import published
 from rfm.engine import Engine
-from rfm.published import CheckpointError
 from rfm_client import ProgressSample, Result, RewardError
-from spoilt import Spoil, in_json, in_yaml, renamed, run_settings, settings, weights
+from spoilt import Spoil, in_json, in_yaml, nested, renamed, run_settings, settings, weights, with_sources
 from vlm import PLAIN, assert_close, load, video
 
-LORA_INSIDE = "q3_lora_full_disc10"
 SAMPLE = ProgressSample(video(0, 3, 60, 84))
 TWICE = ("use_multi_image", "use_per_frame_progress_token")
 
@@ -114,14 +110,6 @@ def test_a_video_run_of_transformers_5_is_told_about_its_positions(
     assert any(f"transformers_version is {version}: text behind a video" in note for note in notes) == is_told
 
 
-def test_a_preprocessor_file_as_qwen_publishes_it_is_read(base: Path) -> None:
-    """With few fields, where the references have all that transformers writes."""
-    few = ("size", "patch_size", "temporal_patch_size", "merge_size", "image_mean", "image_std")
-    in_json("preprocessor_config.json", lambda all: [all.pop(name) for name in [*all] if name not in few])(base)
-    (expected,) = load_engine(PLAIN).evaluate([SAMPLE])
-    assert_close(scores(goldens.config(PLAIN).checkpoint, PLAIN, base_model=str(base)), expected, 1e-6)
-
-
 def as_transformers_5_saves(base: Path) -> None:
     """Rewrites a processor's files."""
     config = json.loads((base / "tokenizer_config.json").read_text())
@@ -147,12 +135,6 @@ def test_a_processor_of_transformers_5_reads_the_same(tmp_path: Path, name: str)
     (expected,) = load_engine(name).evaluate([SAMPLE])
     for folder in (config.checkpoint, tmp_path / "saved"):
         assert_close(scores(folder, name, base_model=str(base)), expected, 1e-6)
-    (base / "processor_config.json").write_text("{}")
-    expected_told = (
-        r"expected preprocessor_config\.json, or image_processor in processor_config\.json, got none .*--base-model"
-    )
-    with pytest.raises(CheckpointError, match=expected_told):
-        _ = load(name, base=str(base)).collator
 
 
 def test_fields_that_an_old_upstream_did_not_have_are_what_it_did(copied: Callable[[str], Path]) -> None:
@@ -189,13 +171,7 @@ def test_what_upstream_ignores_changes_no_score(copied: Callable[[str], Path], n
     change(folder)
     (expected,) = load_engine(name).evaluate([SAMPLE])
     assert_close(scores(folder, name), expected, 1e-6)
-
-
-def test_clients_are_told_no_size_that_is_ignored(copied: Callable[[str], Path], tmp_path: Path) -> None:
-    folder = copied(PLAIN)
-    IGNORED["a size for images"][1](folder)
-    rfm_export.export(folder, tmp_path / "repository", serve_config(goldens.config(PLAIN)))
-    assert description_of(tmp_path / "repository" / "rfm_frames").frame_size is None
+    assert load(name, folder).description == load(name).description
 
 
 def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(
@@ -218,3 +194,44 @@ def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(
     assert prompt("2") == of_tokenizer
     (base / "chat_template.jinja").write_text("of the processor, in its newer file")
     assert prompt("3") == "of the processor, in its newer file"
+
+
+IMAGES, VIDEOS, BOTH = "preprocessor_config.json", "video_preprocessor_config.json", "processor_config.json"
+VIDEO = "q25_video_avg_disc10"
+
+
+SIZES = {"do_resize": False, "size": {"longest_edge": 1, "shortest_edge": 1}, "resample": 0, "max_pixels": 5}
+OF_TIMES = {"do_sample_frames": True, "fps": 1, "num_frames": 3, "cap_pixels_per_frame": True, "max_video_tokens": 9}
+# Keys of a Qwen2VLImageProcessor beside those of the base model, as transformers 4.40 to 5.24 write them.
+FORMS = {
+    "_valid_processor_keys": ["images", "do_resize"], "auto_map": {"AutoProcessor": "own.Processor"}, "crop_size": None,
+    "data_format": "channels_first", "default_to_square": False, "device": None, "disable_grouping": None,
+    "do_center_crop": False, "do_convert_rgb": False, "image_seq_length": 5, "pad_size": None, "return_tensors": None,
+}  # fmt: skip
+FEW = ("size", "patch_size", "temporal_patch_size", "merge_size", "image_mean", "image_std")
+TAKEN: dict[str, tuple[str, Spoil]] = {
+    "sizes, which Robometer's code decides": (PLAIN, settings(IMAGES, **SIZES)),
+    "times of videos, which RFM's code decides": (VIDEO, settings(VIDEOS, **SIZES, **OF_TIMES)),
+    "keys without effect": (PLAIN, settings(IMAGES, **FORMS)),
+    "an unknown setting that is off": (PLAIN, settings(IMAGES, sharpen=False, blur=None)),
+    "few fields, as Qwen publishes": (PLAIN, in_json(IMAGES, lambda all: [all.pop(n) for n in [*all] if n not in FEW])),
+    "the same in two files": (PLAIN, nested()),
+    "more nulls in one of two files": (PLAIN, nested(image_mean=None, crop_size=None)),
+    "images' settings for videos": (VIDEO, lambda base: (base / VIDEOS).unlink()),
+    "other settings of images": (VIDEO, settings(IMAGES, image_mean=[0.1] * 3)),
+}
+
+
+@pytest.mark.parametrize(("name", "spoil"), TAKEN.values(), ids=TAKEN)
+def test_a_setting_without_effect_changes_nothing(tmp_path: Path, name: str, spoil: Spoil) -> None:
+    base = shutil.copytree(goldens.config(name).sources["base_model"], tmp_path / "base", copy_function=shutil.copyfile)
+    spoil(base)
+    assert load(name, base=str(base)).collator.images == load(name).collator.images
+
+
+def test_transformers_5_s_file_of_videos_reads_the_same(tmp_path: Path) -> None:
+    folder, options = with_sources("topreward", tmp_path)
+    known = published.load(folder, **options).collator.images
+    (folder / BOTH).write_text(json.dumps({"video_processor": json.loads((folder / VIDEOS).read_text())}))
+    (folder / VIDEOS).unlink()
+    assert published.load(folder, **options).collator.images == known

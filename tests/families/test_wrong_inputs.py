@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import robodopamine
+import rynnvalue
 from engines import asked_engine, load_engine
 from reward_models import ROOT
 from rfm.engine import Engine
@@ -33,8 +34,8 @@ from small_network import SMALL
 from trajectories import random_trajectory
 from vlm import PLAIN, video
 
-REWIND, ENCODED, TOP, ROBOMETER, ROBO, DOPAMINE = (
-    "ReWiND", "enc_c1_t1_disc10", "topreward", "topreward-robometer", "roboreward", "Robo-Dopamine",
+REWIND, ENCODED, TOP, ROBOMETER, ROBO, DOPAMINE, RYNN = (
+    "ReWiND", "enc_c1_t1_disc10", "topreward", "topreward-robometer", "roboreward", "Robo-Dopamine", "RynnValue",
 )  # fmt: skip
 
 
@@ -45,6 +46,8 @@ def engine_of(name: str) -> Engine:
         return Engine(RewindPredictor(RewindTransformer(SMALL), torch.device("cpu")), max_sample_tokens=16)
     if name == DOPAMINE:
         return robodopamine.case_named("forward_T5").engine()
+    if name == RYNN:
+        return rynnvalue.engine_of(rynnvalue.FOLDER / "bro_quantile_fp32_tied" / "checkpoint", rynnvalue.USUAL)
     if name == ROBO:
         return asked_engine(ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint", name)
     if name in (TOP, ROBOMETER):
@@ -76,6 +79,7 @@ WRONG: dict[str, tuple[str, Sample, str]] = {
     "frames without encoders": (REWIND, ProgressSample(filmed(1)), "frames: expected video_embeddings (no encoders are loaded), got frames"),
     "more tokens than the server takes": (REWIND, ProgressSample(embedded(8)), "num_frames: expected at most 16 tokens (max_sample_tokens of this server), got 17 tokens"),
     "a task that is too long": (ENCODED, ProgressSample(filmed(2, task="lift " * 100)), "task: expected at most 32 tokens (limit of the text encoder), got "),
+    "a sliver": (ENCODED, ProgressSample(filmed(1, 1, 3000)), "frames: expected frames at most 50 times as long as wide, got 1 x 3000"),
     "a special token": (PLAIN, ProgressSample(filmed(1, task="lift <|prog_token|> it")), SPECIAL.format("<|prog_token|>")),
     "an image token": (PLAIN, PreferenceSample(filmed(1, task="<|image_pad|>"), PAIR[0]), SPECIAL.format("<|image_pad|>")),
     "an image that is a line": (PLAIN, ProgressSample(filmed(1, 1, 300)), "frames: expected an image at most 200 times as long as wide, got 1 x 300"),
@@ -92,6 +96,8 @@ WRONG: dict[str, tuple[str, Sample, str]] = {
     "preference of RoboReward": (ROBO, PreferenceSample(*PAIR), NO_HEAD.format("progress", "preference", "preference")),
     "views": (ROBO, ProgressSample(filmed(3, views=(black(3), black(3)))), "views, goal: expected none"),
     "a goal": (ROBO, ProgressSample(filmed(3, goal=black(1)[0])), "views, goal: expected none"),
+    "preference of RynnValue": (RYNN, PreferenceSample(*PAIR), NO_HEAD.format("progress", "preference", "preference")),
+    "a value token": (RYNN, ProgressSample(filmed(2, task="put <value> in it")), SPECIAL.format("<value>")),
     "one frame": (DOPAMINE, ProgressSample(filmed(1)), "num_frames: expected at least 2"),
     "one wrist": (DOPAMINE, ProgressSample(filmed(3, views=(black(3),))), "views: expected none, or those of"),
     "a placeholder": (DOPAMINE, ProgressSample(filmed(3, task="a <image>")), "task: expected text without <image>"),

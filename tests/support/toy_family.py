@@ -17,12 +17,13 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from rfm.config import CheckpointConfig
 from rfm.engine import Execution
 from rfm.engine.family import NETWORK, Family
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import RowScores, frame_scores, of_rows, prefix_indices
 from rfm.files import NETWORK_CONFIG, WEIGHTS
-from rfm.published.reader import Loaded, Options, Reader
+from rfm.published.reader import Loaded, Reader
 from rfm_client import (
     FrameScores,
     InvalidSampleError,
@@ -195,7 +196,7 @@ def restore(folder: Path) -> ToyCheckpoint:
     return ToyCheckpoint(ToyConfig(content["num_colours"]), load_file(folder / WEIGHTS))
 
 
-def load(folder: Path, options: Options) -> Loaded:
+def load(folder: Path, options: CheckpointConfig) -> Loaded:
     checkpoint = restore(folder)
     scale = torch.full((checkpoint.config.num_colours,), 1 / 255)
     return Loaded(checkpoint, encoders=lambda: Palette(scale))

@@ -9,13 +9,17 @@ import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import torch
 
 from batch_models import BREAKS, CONFIG, MODELS, REFUSED, Model, Request, backend, request  # noqa: F401  a fixture
 from rfm.engine import Execution
+from rfm.triton_model.pipeline import Pipeline
+from rfm.triton_model.placement import Placement
 from rfm_client import Result, RewardError, Sample
 from servers import PATIENCE_S, wait_for
 
@@ -126,6 +130,29 @@ def test_a_batch_has_no_more_tokens_than_its_budget(tmp_path: Path) -> None:
         wait_for(lambda: 6 in model.prepared)
         model.open(*first, *later, more)
     assert model.batches in ([2, 2, 1], [1, 3, 1])
+
+
+def test_a_batch_is_filled_up_to_exactly_its_limit_of_tokens() -> None:
+    may_score, prepared, batches = threading.Event(), list[Any](), list[list[int]]()
+
+    def score(batch: Sequence[Any]) -> Sequence[Any]:
+        batches.append([each.num_tokens for each in batch])
+        assert may_score.wait(PATIENCE_S)
+        return batch
+
+    pipeline = Pipeline(prepared.append, score, id, Placement(torch.device("cpu"), 1), MAX_BATCH, 12)
+    first, *full, last = (cast(Any, SimpleNamespace(num_samples=1, num_tokens=count)) for count in (2, 5, 3, 4, 1))
+    pipeline.put([first])
+    wait_for(lambda: batches)
+    with ThreadPoolExecutor(2) as pool:
+        taken = pool.submit(pipeline.put, full)
+        wait_for(lambda: len(prepared) == 4)
+        assert not taken.done()
+        pool.submit(pipeline.put, [last])
+        wait_for(lambda: len(prepared) == 5)
+        may_score.set()
+    pipeline.close()
+    assert batches == [[2], [5, 3, 4], [1]]
 
 
 def test_refused_failed_and_cancelled_requests_fail_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

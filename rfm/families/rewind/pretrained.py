@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rfm.engine.pixels import Normalisation
+from rfm.engine.layers import Normalisation
 from rfm.files import MAX_UINT8, PIL_BICUBIC, PREPROCESSOR_CONFIG, check_one_form, is_there, local_copy, read_json
 from rfm.weights import check_values
 from rfm_client.contract.description import FrameSize

@@ -6,10 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch
-
-from rfm.engine.feature_cache import FeatureCache
-from rfm.engine.pixels import Normalisation
+from rfm.engine.layers import Normalisation
 from rfm.families.robodopamine.predictor import RoboDopaminePredictor
 from rfm.families.robodopamine.prompts import RoboDopamineCollator, RoboDopamineConfig
 from rfm.qwen.images import BoundedImages
@@ -22,6 +19,7 @@ class RoboDopamineCheckpoint(LanguageCheckpoint):
     """A Robo-Dopamine GRM in memory."""
 
     made_of = RoboDopamineConfig
+    predictor_of = RoboDopaminePredictor
     reads_videos: ClassVar[bool] = False
 
     @property
@@ -43,9 +41,3 @@ class RoboDopamineCheckpoint(LanguageCheckpoint):
         """Return the collator with this tokenizer and preprocessing."""
         limits = {"least_px": self.config.least_px, "most_px": self.config.most_px}
         return RoboDopamineCollator(self.config, tokenizer, BoundedImages(patch_px, normalisation, **limits))
-
-    def make_predictor(
-        self, network: LanguageNetwork, device: torch.device, cache: FeatureCache[Any] | None
-    ) -> RoboDopaminePredictor:
-        """Return the predictor with this network."""
-        return RoboDopaminePredictor(network, self.collator, device, cache)

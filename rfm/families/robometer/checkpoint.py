@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from rfm.engine.family import NETWORK
-from rfm.engine.feature_cache import FeatureCache
 from rfm.families.robometer.collator import VlmCollator
 from rfm.families.robometer.network import VlmConfig, VlmRewardModel
 from rfm.families.robometer.predictor import VlmPredictor
@@ -20,7 +18,6 @@ from rfm.files import NETWORK_CONFIG, CheckpointError, expecting
 from rfm.qwen.checkpoint import LORA, QwenCheckpoint
 from rfm.qwen.images import FRAMES_PER_GROUP, MERGE, QwenImages, fitted_size
 from rfm.qwen.lora import split
-from rfm.qwen.network import build_backbone
 from rfm.qwen.processor import SIZED_BEFORE, check_tokens, normalisation_of, patch_px, read_processor
 from rfm.saved import Saved
 from rfm_client.contract import FrameSize
@@ -34,6 +31,9 @@ class VlmCheckpoint(QwenCheckpoint):
     weights: of VlmRewardModel, without LoRA
     factors: of LoRA, with the names of ``rfm.qwen.lora.split``; empty without LoRA
     """
+
+    network_of = VlmRewardModel
+    predictor_of = VlmPredictor
 
     config: VlmConfig
     factors: dict[str, Tensor] = field(default_factory=dict)
@@ -65,16 +65,6 @@ class VlmCheckpoint(QwenCheckpoint):
         """Return the collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
         embedding = next(t for name, t in self.weights.items() if name.endswith("embed_tokens.weight"))
         return load_collator(self.config, len(embedding), self.processor)
-
-    def network(self, dtype: torch.dtype) -> VlmRewardModel:
-        """Return the network, with weights of no use."""
-        return VlmRewardModel(self.config, build_backbone(self.config, dtype))
-
-    def make_predictor(
-        self, network: VlmRewardModel, device: torch.device, cache: FeatureCache[Any] | None
-    ) -> VlmPredictor:
-        """Return the predictor with this network."""
-        return VlmPredictor(network, self.collator, device, cache)
 
 
 def restore(folder: Path) -> VlmCheckpoint:

@@ -24,7 +24,6 @@ class VlmPredictor(QwenPredictor):
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
         """Run one forward pass; return each row's scores, or its error."""
-        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         output = self._output(batch)
         scores, preference, similarity, may_keep = _read(output)
         of_rows, read, num_queries = [], 0, 0

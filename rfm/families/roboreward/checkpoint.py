@@ -6,10 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
-from rfm.engine.feature_cache import FeatureCache
-from rfm.engine.pixels import Normalisation
+from rfm.engine.layers import Normalisation
 from rfm.families.roboreward.predictor import RoboRewardPredictor
 from rfm.families.roboreward.prompts import SCORES, RoboRewardCollator, RoboRewardConfig
 from rfm.files import CheckpointError
@@ -23,6 +20,7 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
     """A checkpoint of RoboReward in memory."""
 
     made_of = RoboRewardConfig
+    predictor_of = RoboRewardPredictor
 
     @property
     def description(self) -> Description:
@@ -48,9 +46,3 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
             if tokenizer.decode([token]) != str(score):
                 raise CheckpointError.at(f"base model {self.processor}", f"a token for {score}", "none")
         return collator
-
-    def make_predictor(
-        self, network: LanguageNetwork, device: torch.device, cache: FeatureCache[Any] | None
-    ) -> RoboRewardPredictor:
-        """Return the predictor with this network."""
-        return RoboRewardPredictor(network, self.collator, device, cache)

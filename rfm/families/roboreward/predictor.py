@@ -11,7 +11,7 @@ import torch
 from rfm.engine.execution import Execution
 from rfm.engine.layers import progress_from_logits
 from rfm.engine.predictor import RowScores, no_success
-from rfm.families.roboreward.prompts import SCORES, RoboRewardCollator, RoboRewardConfig, is_unclear, parsed
+from rfm.families.roboreward.prompts import SCORES, RoboRewardCollator, is_unclear, parsed
 from rfm.qwen.batch import VlmBatch, VlmRow
 from rfm.qwen.written import WritingPredictor, WrittenAnswer, unread
 from rfm_client.contract import FrameScores, RewardError
@@ -30,9 +30,8 @@ class RoboRewardPredictor(WritingPredictor):
 
         execution: its ``on_forward`` is called after each forward pass
         """
-        if not self._config.is_expected:
+        if not self.collator.config.is_expected:
             return super().score(rows, batch, execution)
-        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         output = self._output(batch)
         logits = output.logits[:, list(self.collator.digits)].float()
         read = zip(progress_from_logits(logits).tolist(), logits.cpu().numpy(), rows, strict=True)
@@ -48,15 +47,10 @@ class RoboRewardPredictor(WritingPredictor):
             return None
         unclear = is_unclear(text, score)
         execution.num_unclear += unclear
-        if unclear and self._config.strict_answers:
+        if unclear and self.collator.config.strict_answers:
             return unread(f"one whole score from {SCORES[0]} to {SCORES[-1]} (strict_answers of this model)", text)
         logits = np.full(len(SCORES), np.nan, np.float32) if answer.digit_logits is None else answer.digit_logits
         return _scores((score - SCORES[0]) / (len(SCORES) - 1), logits, row, unclear=unclear)
-
-    @property
-    def _config(self) -> RoboRewardConfig:
-        config: RoboRewardConfig = self.network.config
-        return config
 
 
 def _scores(

@@ -3,22 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch
-from torch import Tensor
-
-from rfm.engine.feature_cache import FeatureCache
-from rfm.engine.pixels import Normalisation
+from rfm.engine.layers import Normalisation
 from rfm.families.rynnvalue.network import RynnConfig, RynnNetwork
 from rfm.families.rynnvalue.predictor import RynnPredictor
 from rfm.families.rynnvalue.prompts import RELATIVE_TOKEN, VALUE_TOKEN, RynnCollator
-from rfm.qwen.checkpoint import QwenCheckpoint
 from rfm.qwen.images import BoundedImages
 from rfm.qwen.language import LanguageCheckpoint
-from rfm.qwen.network import build_backbone
 from rfm_client.contract.description import Description
 
 TRAINED_FRAMES = 8
@@ -29,6 +22,9 @@ class RynnCheckpoint(LanguageCheckpoint):
     """A RynnValue in memory."""
 
     made_of = RynnConfig
+    network_of = RynnNetwork
+    predictor_of = RynnPredictor
+    has_language_head: ClassVar[bool] = False
     reads_videos: ClassVar[bool] = False
 
     @property
@@ -58,21 +54,3 @@ class RynnCheckpoint(LanguageCheckpoint):
         """Return the collator with this tokenizer and preprocessing."""
         limits = {"least_px": self.config.least_px, "most_px": self.config.most_px}
         return RynnCollator(self.config, tokenizer, BoundedImages(patch_px, normalisation, **limits))
-
-    def network(self, dtype: torch.dtype) -> RynnNetwork:  # type: ignore[override]  # a network with other heads
-        """Return the network, with weights of no use."""
-        return RynnNetwork(self.config, build_backbone(self.config, dtype))
-
-    def make_predictor(
-        self, network: RynnNetwork, device: torch.device, cache: FeatureCache[Any] | None
-    ) -> RynnPredictor:
-        """Return the predictor with this network."""
-        return RynnPredictor(network, self.collator, device, cache)
-
-    def loaded(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the weights: no language head is tied to the embedding."""
-        return {**weights}
-
-    def build(self, dtype: torch.dtype | None = None) -> Any:
-        """Return the network with these weights, as ``QwenCheckpoint.build``. Raises CheckpointError."""
-        return QwenCheckpoint.build(self, dtype)

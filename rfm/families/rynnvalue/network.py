@@ -8,16 +8,17 @@ copies in each, D width, K bins. Source: ``rynn_value`` of ``alibaba-damo-academ
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Literal, TypeAlias
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rfm.engine.graphs import Graphs
-from rfm.families.rynnvalue.batch import RynnBatch
+from rfm.qwen.batch import VlmBatch
 from rfm.qwen.language import LanguageConfig
 from rfm.qwen.network import qwen_states
 
@@ -179,6 +180,37 @@ class ValueHead(nn.Module):
         """Float [G, R * D] -> [G, K]."""
         logits: Tensor = self.proj(states)
         return logits
+
+
+@dataclass(frozen=True)
+class RynnBatch(VlmBatch):
+    """Conversations with G groups of value tokens and Q groups of relative value tokens.
+
+    values, relatives: int64 [G] and [Q], index of the first token of each group among all tokens of the batch: the
+        B * L of the conversations, then those of the packs
+    """
+
+    values: Tensor = field(kw_only=True)
+    relatives: Tensor = field(kw_only=True)
+
+    @classmethod
+    def of(cls, batch: VlmBatch, relative_token: int, relative_copies: int) -> RynnBatch:
+        """Return the batch whose spans hold, for each frame, its relative values (if any) and its values (if any)."""
+        packs = [each.input_ids.flatten() for each in batch.packs]
+        ids = torch.cat([batch.inputs["input_ids"].flatten(), *packs]).numpy()
+        length = batch.inputs["input_ids"].shape[1]
+        rows, starts, stops = batch.spans.numpy().reshape(-1, 3).T
+        firsts, ends = rows * length + starts, rows * length + stops
+        firsts, ends = firsts[starts < stops], ends[starts < stops]
+        has_relative = ids[firsts] == relative_token
+        behind = firsts + has_relative * relative_copies
+        found = behind[behind < ends], firsts[has_relative]
+        values, relatives = (torch.from_numpy(np.ascontiguousarray(each)) for each in found)
+        return cls(**vars(batch), values=values, relatives=relatives)
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> RynnBatch:
+        own = {"values": change(self.values), "relatives": change(self.relatives)}
+        return RynnBatch(**{**vars(super()._changed(change)), **own})
 
 
 @dataclass(frozen=True)

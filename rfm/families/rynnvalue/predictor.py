@@ -11,7 +11,7 @@ import torch
 
 from rfm.engine.execution import Execution
 from rfm.engine.predictor import RowScores, no_success
-from rfm.families.rynnvalue.network import RynnConfig, RynnOutput, entropy
+from rfm.families.rynnvalue.network import RynnOutput, entropy
 from rfm.families.rynnvalue.prompts import RynnCollator
 from rfm.qwen.batch import VlmRow
 from rfm.qwen.predictor import QwenPredictor
@@ -28,7 +28,6 @@ class RynnPredictor(QwenPredictor):
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: Any, execution: Execution) -> list[RowScores | RewardError]:
         """Run one forward pass; return each row's scores."""
-        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         output = self._output(batch)
         remaining_s, entropies, relative_s, may_keep = self._read(output)
         if may_keep:
@@ -48,19 +47,14 @@ class RynnPredictor(QwenPredictor):
         """
         made = torch.zeros(1) if output.made is None else output.made
         found = {
-            "remaining_s": self._config.value_bins.seconds(output.values).mean(0),
+            "remaining_s": self.collator.config.value_bins.seconds(output.values).mean(0),
             "entropy": entropy(output.values).mean(0),
-            "relative_s": self._config.relative_bins.seconds(output.relatives),
+            "relative_s": self.collator.config.relative_bins.seconds(output.relatives),
         }
         is_finite = made.isfinite().all().float()[None].to(found["entropy"].device)
         ends = np.cumsum([*map(len, found.values())])
         remaining_s, entropies, relative_s, kept = np.split(torch.cat([*found.values(), is_finite]).cpu().numpy(), ends)
         return remaining_s, entropies, relative_s, bool(kept[0])
-
-    @property
-    def _config(self) -> RynnConfig:
-        config: RynnConfig = self.network.config
-        return config
 
 
 def _scores(remaining_s: Float32Array, entropies: Float32Array, relative_s: Float32Array) -> FrameScores:

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from rfm.engine.predictor import check_type
-from rfm.families.rynnvalue.batch import RynnBatch
-from rfm.families.rynnvalue.network import RynnConfig
+from rfm.families.rynnvalue.network import RynnBatch, RynnConfig
 from rfm.files import CheckpointError
 from rfm.qwen.batch import VlmRow
 from rfm.qwen.collator import IMAGE_PAD, KEPT_TEXTS, VISION_END, VISION_START, QwenCollator, video_of

@@ -6,10 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
-from rfm.engine.feature_cache import FeatureCache
-from rfm.engine.pixels import Normalisation
+from rfm.engine.layers import Normalisation
 from rfm.families.topreward.predictor import TopRewardPredictor
 from rfm.families.topreward.prompts import TopRewardCollator, TopRewardConfig, TopRewardImages
 from rfm.qwen.language import LanguageCheckpoint, LanguageNetwork
@@ -21,6 +18,7 @@ class TopRewardCheckpoint(LanguageCheckpoint):
     """A model of TOPReward in memory."""
 
     made_of = TopRewardConfig
+    predictor_of = TopRewardPredictor
 
     @property
     def description(self) -> Description:
@@ -40,9 +38,3 @@ class TopRewardCheckpoint(LanguageCheckpoint):
         """Return the collator with this tokenizer and preprocessing."""
         images = TopRewardImages(patch_px, normalisation, config=self.config)
         return TopRewardCollator(self.config, tokenizer, images)
-
-    def make_predictor(
-        self, network: LanguageNetwork, device: torch.device, cache: FeatureCache[Any] | None
-    ) -> TopRewardPredictor:
-        """Return the predictor with this network."""
-        return TopRewardPredictor(network, self.collator, device, cache)

@@ -11,7 +11,7 @@ import torch
 
 from rfm.engine.execution import Execution
 from rfm.engine.predictor import RowScores, no_success
-from rfm.families.topreward.prompts import TopRewardConfig
+from rfm.families.topreward.prompts import TopRewardCollator
 from rfm.qwen.batch import VlmBatch, VlmRow
 from rfm.qwen.images import FRAMES_PER_GROUP
 from rfm.qwen.predictor import QwenPredictor
@@ -22,14 +22,15 @@ from rfm_client.contract.samples import Float32Array
 class TopRewardPredictor(QwenPredictor):
     """A Qwen3-VL on a device, which is asked whether a video completes the task."""
 
+    collator: TopRewardCollator
+
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
         """Run one forward pass; return the log-probabilities of the answers of each row's prefixes, or its error."""
-        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         output = self._output(batch)
         prefixes = [ids for row in rows for ids in (*(leaf.input_ids for leaf in row.leaves), row.input_ids)]
         answers = torch.tensor([int(ids[-1]) for ids in prefixes]).to(output.logits.device)
-        logits = output.logits.float() if self._config.variant == "lerobot" else output.logits
+        logits = output.logits.float() if self.collator.config.variant == "lerobot" else output.logits
         log_probs = logits.log_softmax(-1).gather(1, answers[:, None])[:, 0].float().cpu().numpy()
         if np.isfinite(log_probs).all():
             self._keep(rows, batch.layout, output.made)
@@ -39,7 +40,7 @@ class TopRewardPredictor(QwenPredictor):
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
         """Return the scores of an episode's frames: progress is 0 at the least likely prefix, 1 at the likeliest."""
         num_frames = sample.trajectories[0].num_frames
-        prefixes = self._config.prefixes(num_frames)
+        prefixes = self.collator.config.prefixes(num_frames)
         log_probs = FrameScores.joined([row.frames[0] for row in rows]).log_prob
         assert log_probs is not None  # by ``score``
         progress = self._progress(log_probs, num_frames)
@@ -50,17 +51,12 @@ class TopRewardPredictor(QwenPredictor):
         return FrameScores(progress=progress, success=no_success(progress), log_prob=log_prob)
 
     def _progress(self, log_probs: Float32Array, num_frames: int) -> Any:
-        is_robometer = self._config.variant == "robometer"
+        is_robometer = self.collator.config.variant == "robometer"
         values = log_probs.astype(np.float64) if is_robometer else log_probs
         least, most = values.min(), values.max()
         if least == most or (is_robometer and num_frames <= FRAMES_PER_GROUP):
             return np.ones_like(values)
         return ((values - least) / (most - least)).clip(0, 1)
-
-    @property
-    def _config(self) -> TopRewardConfig:
-        config: TopRewardConfig = self.network.config
-        return config
 
 
 def _unjoined(log_probs: Float32Array) -> FrameScores:
