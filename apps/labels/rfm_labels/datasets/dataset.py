@@ -131,11 +131,6 @@ class Dataset(ABC):
     corrections: Mapping[str, Correction] = {}
     notes: Sequence[str] = ()
 
-    @property
-    def frame_notes(self) -> Sequence[str]:
-        """Further lines for the caller, about the frames of the episodes that ``check`` has seen."""
-        return ()
-
     @cached_property
     def episodes(self) -> Sequence[DatasetEpisode]:
         """All episodes, by index. Raises DatasetError, which tells the faults of all."""
@@ -217,11 +212,8 @@ class Dataset(ABC):
         """
 
     @abstractmethod
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
-        """Find every frame of the episode without decoding. Return their size in bytes, as stored.
-
-        Raises DatasetError for missing or contradictory data.
-        """
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
+        """Find every frame of the episode without decoding. Raises DatasetError for missing or contradictory data."""
 
     @abstractmethod
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:

@@ -15,7 +15,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from rfm_client import InvalidSampleError, RewardError, Trajectory, UInt8Array, load_trajectory
 from rfm_client.frames import Picture, Video
@@ -42,7 +41,7 @@ class Contents:
     """
 
     root: Path
-    tasks: Mapping[str, Any]
+    tasks: Mapping[str, str | None]
     table: Path
     task: TaskOverride
     corrections: AskedCorrections
@@ -69,7 +68,7 @@ class EpisodeFiles(Dataset):
         num_frames = self._length(name)
         while len(self._firsts) <= number:
             self._firsts.append(self._firsts[-1] + self._length_or_0(self._names[len(self._firsts) - 1]))
-        return DatasetEpisode(number, name, one_line(task), num_frames, self._firsts[number])
+        return DatasetEpisode(number, name, " ".join(task.split()), num_frames, self._firsts[number])
 
     def _length(self, name: str) -> int:
         if name not in self._lengths:
@@ -105,11 +104,6 @@ def in_natural_order(names: Iterable[str]) -> list[str]:
     return sorted(names, key=key)
 
 
-def one_line(task: Any) -> Any:
-    """Return a task with each run of spaces and line breaks as one space, and none at the ends."""
-    return " ".join(task.split()) if isinstance(task, str) else task
-
-
 class VideoFolder(EpisodeFiles):
     """Episodes in videos, each in a file of its own."""
 
@@ -135,11 +129,8 @@ class VideoFolder(EpisodeFiles):
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         return file_identity(self.root / episode.name, verify=verify)
 
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
-        self.chosen_cameras([camera])
-        file = self.root / episode.name
-        with faults_at(file):
-            return sum(self._videos(file).packets.num_bytes)
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
+        self._length(episode.name)  # finds all packets
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         file = self.root / episode.name
@@ -173,11 +164,10 @@ class ArrayFiles(EpisodeFiles):
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         return file_identity(self.root / episode.name, verify=verify)
 
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
         file = self.root / episode.name
-        frames = _frames(file)
-        require(file, len(frames) == episode.num_frames, f"{episode.num_frames} frames", len(frames))
-        return int(frames.nbytes)
+        num_frames = len(_frames(file))
+        require(file, num_frames == episode.num_frames, f"{episode.num_frames} frames", num_frames)
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         return iter(_frames(self.root / episode.name))
@@ -227,13 +217,10 @@ class FrameFolders(EpisodeFiles):
         stored = ((file, file_identity(file, verify=verify)) for file in files)
         return digest_of(f"{file.name} {identity}{turn_mark(file)}".encode() for file, identity in stored)
 
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
-        num_bytes = 0
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
         for file in self._files(episode, camera):
             with faults_at(file):
                 Picture(file).check()
-            num_bytes += file.stat().st_size
-        return num_bytes
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         for file in self._files(episode, camera):

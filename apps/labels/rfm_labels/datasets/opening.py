@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -34,12 +33,12 @@ from rfm_labels.datasets.lerobot_meta import INFO_FILE, Info
 from rfm_labels.datasets.lerobot_rows import TASK_COLUMN
 from rfm_labels.datasets.rlds import RldsDataset, rlds_folder
 from rfm_labels.datasets.rlds_meta import FEATURES_FILE
-from rfm_labels.datasets.task_tables import TABLES, read_table_of_tasks, table_in
+from rfm_labels.datasets.task_tables import TABLE, read_table_of_tasks
 
 _HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
 _LAYOUTS = (
     f"a LeRobot dataset ({INFO_FILE}), an RLDS dataset ({FEATURES_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), a "
-    f"folder of videos, of folders of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {' or '.join(TABLES)}, "
+    f"folder of videos, of folders of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {TABLE}, "
     "or a Hub id org/name[@revision]"
 )
 _CONVERT = "convert them to LeRobot, or write each episode's pictures to a video and list the videos in tasks.csv"
@@ -145,7 +144,8 @@ def hdf5_files(folder: str | Path) -> list[Path]:
     Files of labels and hidden files are left out. The order is that of the paths, with 2 before 10.
     """
     root = Path(folder)
-    if not root.is_dir() or (root / INFO_FILE).is_file() or table_in(root) or set(_found(root)) - {"HDF5 files"}:
+    is_other = any((root / name).is_file() for name in (INFO_FILE, TABLE))
+    if not root.is_dir() or is_other or set(_found(root)) - {"HDF5 files"}:
         return []
     names = (str(file.relative_to(root)) for file in root.rglob("*") if file.suffix.lower() in SUFFIXES)
     shown = [name for name in names if "/." not in f"/{name}" and not _FILES_OF_OURS.fullmatch(name)]
@@ -154,10 +154,10 @@ def hdf5_files(folder: str | Path) -> list[Path]:
 
 def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
     """The dataset of a folder with a file or a folder for each episode, or of its table. Raises DatasetError."""
-    if path.is_file() and path.suffix.lower() not in (".csv", ".json"):
+    if path.is_file() and path.suffix.lower() != ".csv":
         raise DatasetError.at(path, _LAYOUTS, _unread(path) or "another file")
-    table = table_in(path) if path.is_dir() else path
-    if table is not None:
+    table = path / TABLE if path.is_dir() else path
+    if table.is_file():
         tasks = read_table_of_tasks(table, has_tasks=task.text is None)
         there = [name for name in tasks if (table.parent / name).exists()] or list(tasks)
         kinds = {_kind_of(table.parent / name): name for name in reversed(there)}
@@ -169,9 +169,11 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         return dataset
     kind, names = _listed(path)
     reader, episode = _KINDS[kind]
-    is_told = task.text is not None or kind in _OWN_TASKS
+    is_of_before = (path / "tasks.json").is_file()  # of 0.4
+    is_told = (task.text is not None or kind in _OWN_TASKS) and not is_of_before
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
-    require(path, is_told, f"one of {' and '.join(TABLES)} with the task of each {episode}", got)
+    got = f"tasks.json: write it as {TABLE}, with the columns video and task" if is_of_before else got
+    require(path, is_told, f"{TABLE} with the task of each {episode}", got)
     return reader(Contents(path, dict.fromkeys(names), path, task, corrections))
 
 
@@ -255,8 +257,5 @@ def _unread(path: Path) -> str | None:
     if is_picture(deeper):
         listed = deeper.parent.relative_to(path)
         return f"pictures in deeper folders: list the folders of one camera ({listed}) in tasks.csv"
-    remedy = f"list those of one camera in tasks.csv ({deeper.relative_to(path)})"
-    if not re.search(r"\d", deeper.stem):  # the name of a camera, not the number of an episode
-        find = f"find . -name {shlex.quote(deeper.name)} | sort"
-        remedy = f"list those of one camera: (cd {shlex.quote(str(path))} && (echo video; {find}) > tasks.csv)"
-    return f"videos in deeper folders: {remedy}; with {_GIVE_TASK}, or a column task"
+    listed = deeper.relative_to(path)
+    return f"videos in deeper folders: list those of one camera ({listed}) in tasks.csv, with their tasks"

@@ -43,7 +43,6 @@ class _Pictures:
     """
 
     digest: str
-    num_bytes: int
     blank: str
     fault: DatasetError | None
 
@@ -118,11 +117,10 @@ class RldsDataset(Dataset):
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         return self._record(episode.index).pictures[camera].digest
 
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
-        pictures = self._record(episode.index).pictures[camera]
-        if pictures.fault is not None:
-            raise pictures.fault
-        return pictures.num_bytes
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
+        fault = self._record(episode.index).pictures[camera].fault
+        if fault is not None:
+            raise fault
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         where = f"{self._where(episode.index)}: {camera}"
@@ -192,18 +190,18 @@ class RldsDataset(Dataset):
 
 
 def _pictures(where: str, stored: Sequence[bytes]) -> _Pictures:
-    digest, num_bytes = digest_of(stored), sum(map(len, stored))
+    digest = digest_of(stored)
     for t, picture in enumerate(stored):
         try:
             with faults_at(f"{where}: frame {t}"):
                 Picture(picture).check()
         except DatasetError as fault:
-            return _Pictures(digest, num_bytes, "", fault)
+            return _Pictures(digest, "", fault)
     blank = ""
     if all(picture == stored[0] for picture in stored):
         with suppress(FrameFileError):  # raised again by the frames
             blank = BlankFrames([Picture(stored[0]).pixels()]).told
-    return _Pictures(digest, num_bytes, blank, None)
+    return _Pictures(digest, blank, None)
 
 
 def _shown(text: bytes) -> str:

@@ -1,52 +1,42 @@
 # SPDX-License-Identifier: MIT
-"""Read ``tasks.csv`` and ``tasks.json``, which list the episodes of a folder with their tasks.
+"""Read ``tasks.csv``, which lists the episodes of a folder with their tasks, in their order.
 
-The CSV file has the columns ``video`` (or ``episode``) and ``task``, between commas, semicolons or tabs; a task with a
-comma is in quotes. The JSON file is ``{"video.mp4": "put the block in the bowl"}``. Paths are relative to the table,
-whose order is the order of the episodes.
+Its columns ``video`` (or ``episode``) and ``task`` lie between commas, semicolons or tabs. A task with a comma is in
+quotes. Paths are relative to the table.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Set
 from pathlib import Path, PurePath
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require, shortened
 
-TABLES = ("tasks.csv", "tasks.json")
+TABLE = "tasks.csv"
 
 _NAMES = ("video", "episode")  # columns of the path
 _DELIMITERS = ",;\t"
 
-_Line: TypeAlias = tuple[str, str, Any]  # place, path and task
+_Line: TypeAlias = tuple[str, str, str | None]  # place, path and task
 
 
-def table_in(folder: Path) -> Path | None:
-    """Return the table of tasks in a folder; None: it has none. Raises DatasetError for two tables."""
-    found = [folder / name for name in TABLES if (folder / name).is_file()]
-    require(folder, len(found) < 2, f"one of {' and '.join(TABLES)}", "both")
-    return found[0] if found else None
-
-
-def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, Any]:
+def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, str | None]:
     """Return the task of each episode, by path; None: no task. Raises DatasetError, which lists all faulty lines.
 
-    has_tasks: True: a CSV file needs the column ``task``
+    has_tasks: True: the file needs the column ``task``
     """
     try:
         text = table.read_text(encoding="utf-8-sig")  # spreadsheets put a byte order mark first
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError.at(table, "a readable table of tasks", error) from error
     faults: list[str] = []
-    is_json = table.suffix.lower() == ".json"
-    name, lines = ("video", _from_json(table, text)) if is_json else _from_csv(table, text, has_tasks, faults)
-    tasks: dict[str, Any] = {}
+    name, lines = _from_csv(table, text, has_tasks, faults)
+    tasks: dict[str, str | None] = {}
     for where, path, task in lines:
         if not path.strip():
             faults.append(f"{where}: expected the path of a {name}, got none")
@@ -66,16 +56,6 @@ def _normal(root: Path, path: str) -> str:
     if "\\" in path and not (root / path).exists():
         path = path.replace("\\", "/")
     return PurePath(os.path.normpath(path)).as_posix()
-
-
-def _from_json(table: Path, text: str) -> Iterator[_Line]:
-    try:
-        document = json.loads(text, object_pairs_hook=tuple)  # a dict would keep the last of equal keys
-    except (ValueError, RecursionError) as error:
-        raise DatasetError.at(table, "JSON", error) from error
-    got = "an empty one" if document == () else type(document).__name__
-    require(table, isinstance(document, tuple) and bool(document), "an object of tasks by video", got)
-    return ((str(table), path, task) for path, task in document)
 
 
 def _from_csv(table: Path, text: str, has_tasks: bool, faults: list[str]) -> tuple[str, Iterator[_Line]]:
