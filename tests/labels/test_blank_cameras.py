@@ -15,7 +15,7 @@ from client_commands import invoke
 from hdf5_writers import write_robomimic
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
-from rfm_labels.datasets.cameras import word_of_no_colours
+from rfm_labels.datasets.dataset import word_of_no_colours
 
 TASK = "stack the cups"
 ADVICE = "its scores mean nothing there; leave out the camera (--cameras) or the episodes (--episodes)"

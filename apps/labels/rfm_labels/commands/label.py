@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
 import typer
 
@@ -16,9 +16,7 @@ from rfm_client import RewardError
 from rfm_client.command_line import ExitCode, ServerOptions, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, setting
-from rfm_labels.commands.progress_bar import ProgressBar, Say
-from rfm_labels.datasets.cameras import parsed_by_camera
-from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset, SeveralTasks
+from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
@@ -27,14 +25,15 @@ from rfm_labels.label_files import read_blank
 from rfm_labels.labelling import Outputs, Report, planned
 from rfm_labels.labelling import label as label_dataset
 from rfm_labels.metadata import blank_lines
-from rfm_labels.options import LabelOptions, RayOptions
+from rfm_labels.options import LabelOptions, RayOptions, Watch
 from rfm_labels.plan import check_episodes, selected
 from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
 from rfm_labels.summary import Summary, summarise
 
+SPEED_OVER_S = 600.0  # an episode may take minutes
+Say: TypeAlias = Callable[[str], None]
 _OF_CAMERAS = ("orient", "channels")  # options with a value for each camera
-
 DatasetArgument = Annotated[
     str,
     typer.Argument(
@@ -43,6 +42,76 @@ DatasetArgument = Annotated[
         "videos, of folders of pictures, or of .npy and .npz files, with tasks.csv.",
     ),
 ]
+
+
+class ProgressBar(Watch):
+    """Lines on standard error and, on a terminal, a bar with frames a second and the time left."""
+
+    def __init__(self, say: Say) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
+        from rich.text import Text
+
+        class Rate(TextColumn):
+            def render(self, task: Task) -> Text:
+                return Text(f"{task.speed:.1f}/s" if task.speed else "")
+
+        console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Rate(""), TimeRemainingColumn())
+        self._say = say
+        self._bar = Progress(
+            *columns,
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+            speed_estimate_period=SPEED_OVER_S,
+        )
+        self.num_begun = 0
+
+    def __enter__(self) -> ProgressBar:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def note(self, text: str) -> None:
+        """Write the text on a line."""
+        self._say(f"note: {text}")
+
+    def checking(self, num_episodes: int) -> None:
+        """Begin to count checked episodes."""
+        self._begin("checking episodes", num_episodes, 0)
+
+    def checked(self, episode: DatasetEpisode) -> None:
+        """Advance the bar by an episode."""
+        self._advance(1)
+
+    def begin(self, num_frames: int, num_finished: int) -> None:
+        """Begin to count labelled frames."""
+        if num_finished:
+            self.note(f"{num_finished} of {num_frames} frames are labelled already")
+        self.num_begun = num_frames
+        self._begin("labelling frames", num_frames, num_finished)
+
+    def scored(self, episode: DatasetEpisode) -> None:
+        """Advance the bar by the episode's frames."""
+        self._advance(episode.num_frames)
+
+    def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
+        """Write a line with the reason."""
+        text = str(error)
+        self._say(text if text.startswith(episode.name) else f"{episode.name}: {text}")
+        self._advance(episode.num_frames)
+
+    def _begin(self, text: str, total: int, completed: int) -> None:
+        for task in self._bar.task_ids:
+            self._bar.remove_task(task)
+        self._bar.add_task(text, total=total, completed=completed)
+
+    def _advance(self, by: int) -> None:
+        for task in self._bar.task_ids:
+            self._bar.advance(task, by)
 
 
 @dataclass(frozen=True)

@@ -16,22 +16,26 @@ from typing import Any, NoReturn
 
 from rfm_client import RewardError, UInt8Array
 from rfm_client.frames import Orientation, Picture
-from rfm_labels.datasets.cameras import AskedCorrections
-from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require
-from rfm_labels.datasets.hdf5_contents import (
+from rfm_labels.datasets.hdf5_layouts import (
     DOCUMENTS,
+    ROBOMIMIC,
+    ROBOTWIN,
     attribute,
     filter_keys,
     fps_of,
+    instructions_of,
     is_of_libero,
+    layout_of,
     opened_hdf5,
     own_task_of,
+    task_in,
     task_of,
+    task_places,
     unread,
     unread_documents,
 )
-from rfm_labels.datasets.hdf5_layouts import ROBOMIMIC, ROBOTWIN, instructions_of, layout_of, task_in, task_places
 from rfm_labels.datasets.hdf5_pictures import (
     EncodedFrames,
     fault_of,

@@ -14,9 +14,9 @@ import numpy as np
 
 from rfm_client import UInt8Array
 from rfm_client.frames import Picture
-from rfm_labels.datasets.cameras import LEAST_SIZE_PX
+from rfm_labels.datasets.dataset import LEAST_SIZE_PX
 from rfm_labels.datasets.faults import require
-from rfm_labels.datasets.hdf5_contents import members_of
+from rfm_labels.datasets.hdf5_layouts import members_of
 from rfm_labels.datasets.stored_files import faults_at
 
 _STARTS = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG

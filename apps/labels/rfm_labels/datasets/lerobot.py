@@ -16,8 +16,7 @@ from typing import Any
 from rfm_client import UInt8Array
 from rfm_client.frames import Picture, Video
 from rfm_client.options import InvalidValueError, checked_finite
-from rfm_labels.datasets.cameras import AskedCorrections
-from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
 from rfm_labels.datasets.lerobot_meta import (

@@ -16,12 +16,17 @@ from typing import Any
 from rfm_client import RewardError, UInt8Array
 from rfm_client.frames import BlankFrames, FrameFileError, Picture
 from rfm_client.options import is_blank
-from rfm_labels.datasets.cameras import AskedCorrections
-from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, require
-from rfm_labels.datasets.rlds_meta import FEATURES_FILE, INSTRUCTIONS, RldsInfo
+from rfm_labels.datasets.rlds_files import (
+    FEATURES_FILE,
+    INSTRUCTIONS,
+    RecordFile,
+    RldsInfo,
+    check_packages,
+    features_of,
+)
 from rfm_labels.datasets.stored_files import digest_of, faults_at
-from rfm_labels.datasets.tfrecords import RecordFile, check_packages, features_of
 
 
 def rlds_folder(path: Path) -> Path | None:
